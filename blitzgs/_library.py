@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads the op libraries once, when `blitzgs.ops` is first imported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+LIBRARY_DIR = Path(__file__).parent / "_lib"
+
+
+def load_libraries() -> None:
+    """Register the CPU kernels, and the CUDA kernels when this torch can use a GPU.
+
+    Raises:
+        ImportError: a library that is needed here was not built; says how to build it.
+    """
+    _load(LIBRARY_DIR / "libblitzgs_cpu.so")
+    if torch.cuda.is_available():
+        _load(LIBRARY_DIR / "libblitzgs_cuda.so")
+
+
+def _load(path: Path) -> None:
+    if not path.exists():
+        raise ImportError(
+            f"{path} is missing: the kernels are not built. Run `pip install .` (or `make build` in a "
+            "checkout); the CUDA library needs nvcc on the PATH while building."
+        )
+    torch.ops.load_library(str(path))
+
+
+load_libraries()

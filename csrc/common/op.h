@@ -1,0 +1,168 @@
+// SPDX-License-Identifier: Apache-2.0
+// What every *_op.cpp needs of torch: checks with full messages, allocation, dispatch over dtypes. Each
+// *_op.cpp is compiled once per backend; `backend` names the namespace of that backend's kernels.
+#pragma once
+#include <torch/csrc/stable/accelerator.h>
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/core/ScalarType.h>
+#include <torch/headeronly/util/Exception.h>
+
+#include <cstdint>
+#include <initializer_list>
+#include <optional>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include "common/stream.h"
+
+#ifdef BLITZGS_BACKEND_CUDA
+#define BLITZGS_DISPATCH_KEY CUDA
+namespace blitzgs::cuda {}
+namespace blitzgs {
+namespace backend = cuda;
+}
+#else
+#define BLITZGS_DISPATCH_KEY CPU
+namespace blitzgs::cpu {}
+namespace blitzgs {
+namespace backend = cpu;
+}
+#endif
+
+// STABLE_TORCH_LIBRARY_IMPL pastes its key, so the key macro has to be expanded first. One
+// BLITZGS_REGISTER block per file; the file's op name keeps the symbols apart.
+#define BLITZGS_REGISTER_EXPANDED(key, m) STABLE_TORCH_LIBRARY_IMPL(blitzgs, key, m)
+#define BLITZGS_REGISTER(m) BLITZGS_REGISTER_EXPANDED(BLITZGS_DISPATCH_KEY, m)
+
+namespace blitzgs {
+
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+inline std::string shape_of(const Tensor& tensor) {
+  std::ostringstream text;
+  text << '[';
+  for (std::int64_t i = 0; i < tensor.dim(); ++i) text << (i ? ", " : "") << tensor.size(i);
+  text << ']';
+  return text.str();
+}
+
+// shape: one entry per dimension, -1 for any size.
+inline void check_shape(const char* op, const char* name, const Tensor& tensor,
+                        std::initializer_list<std::int64_t> shape) {
+  bool ok = tensor.dim() == static_cast<std::int64_t>(shape.size());
+  std::int64_t axis = 0;
+  std::ostringstream wanted;
+  wanted << '[';
+  for (const std::int64_t size : shape) {
+    if (ok && size >= 0 && tensor.size(axis) != size) ok = false;
+    wanted << (axis ? ", " : "");
+    if (size < 0) {
+      wanted << '*';
+    } else {
+      wanted << size;
+    }
+    ++axis;
+  }
+  STD_TORCH_CHECK(ok, "blitzgs::", op, ": ", name, " must have shape ", wanted.str(), "], got ",
+                  shape_of(tensor));
+}
+
+inline void check_dtype(const char* op, const char* name, const Tensor& tensor, ScalarType dtype) {
+  STD_TORCH_CHECK(tensor.scalar_type() == dtype, "blitzgs::", op, ": ", name, " must be ",
+                  torch::headeronly::toString(dtype), ", got ",
+                  torch::headeronly::toString(tensor.scalar_type()));
+}
+
+// float32 everywhere; float64 on the CPU, where it serves gradcheck and accuracy figures.
+inline void check_floating(const char* op, const char* name, const Tensor& tensor) {
+  const ScalarType dtype = tensor.scalar_type();
+#ifdef BLITZGS_BACKEND_CUDA
+  STD_TORCH_CHECK(dtype == ScalarType::Float, "blitzgs::", op, ": ", name,
+                  " must be float32 on CUDA (float64 runs on the CPU), got ",
+                  torch::headeronly::toString(dtype));
+#else
+  STD_TORCH_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double, "blitzgs::", op, ": ", name,
+                  " must be float32 or float64, got ", torch::headeronly::toString(dtype));
+#endif
+}
+
+inline Tensor as_contiguous(const Tensor& tensor) { return torch::stable::contiguous(tensor); }
+
+inline Tensor make_empty(const Tensor& like, std::vector<std::int64_t> shape,
+                         std::optional<ScalarType> dtype = std::nullopt) {
+  return torch::stable::new_empty(like, shape, dtype);
+}
+
+inline Tensor make_zeros(const Tensor& like, std::vector<std::int64_t> shape,
+                         std::optional<ScalarType> dtype = std::nullopt) {
+  return torch::stable::new_zeros(like, shape, dtype);
+}
+
+template <class T>
+const T* data(const Tensor& tensor) {
+  return static_cast<const T*>(tensor.const_data_ptr());
+}
+template <class T>
+T* mutable_data(Tensor& tensor) {
+  return static_cast<T*>(tensor.mutable_data_ptr());
+}
+// Null for an absent optional tensor.
+template <class T>
+const T* data_or_null(const std::optional<Tensor>& tensor) {
+  return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
+}
+
+class TorchWorkspace final : public Workspace {
+ public:
+  explicit TorchWorkspace(const Tensor& like) : like_(like) {}
+  void* allocate_bytes(std::size_t bytes) override {
+    held_.push_back(make_empty(like_, {static_cast<std::int64_t>(bytes)}, ScalarType::Byte));
+    return held_.back().mutable_data_ptr();
+  }
+
+ private:
+  Tensor like_;
+  std::vector<Tensor> held_;
+};
+
+// Where an op's kernels run: makes the tensor's device current and finds its stream (CUDA), and hands
+// out scratch. Kernels take (arguments..., scope.workspace, scope.stream).
+struct DeviceScope {
+  explicit DeviceScope(const Tensor& like)
+      : workspace(like)
+#ifdef BLITZGS_BACKEND_CUDA
+        ,
+        guard(like.get_device_index())
+#endif
+  {
+#ifdef BLITZGS_BACKEND_CUDA
+    void* handle = nullptr;
+    TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(like.get_device_index(), &handle));
+    stream = static_cast<CudaStream>(handle);
+#endif
+  }
+
+  TorchWorkspace workspace;
+  CudaStream stream = nullptr;
+#ifdef BLITZGS_BACKEND_CUDA
+  torch::stable::accelerator::DeviceGuard guard;
+#endif
+};
+
+// Calls f(T{}) with T = float or double by the tensor's dtype (CUDA: float only).
+template <class F>
+void dispatch_floating(const Tensor& tensor, const F& f) {
+#ifndef BLITZGS_BACKEND_CUDA
+  if (tensor.scalar_type() == ScalarType::Double) {
+    f(double{});
+    return;
+  }
+#endif
+  f(float{});
+}
+
+}  // namespace blitzgs

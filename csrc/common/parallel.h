@@ -1,0 +1,26 @@
+// SPDX-License-Identifier: Apache-2.0
+// How CPU kernels run on several threads without knowing torch. The library links the torch thread pool
+// (parallel_torch.cpp), so torch.set_num_threads governs the kernels; the Catch2 tests link plain threads.
+#pragma once
+#include <cstdint>
+
+namespace blitzgs {
+
+using RangeFunction = void (*)(std::int64_t begin, std::int64_t end, void* context);
+
+void parallel_for_impl(std::int64_t begin, std::int64_t end, std::int64_t grain, RangeFunction function,
+                       void* context);
+int num_threads();
+
+// Calls f(chunk_begin, chunk_end) over disjoint chunks that cover [begin, end). The results must not
+// depend on how the range is cut. f must not throw.
+template <class F>
+void parallel_for(std::int64_t begin, std::int64_t end, std::int64_t grain, const F& f) {
+  if (begin >= end) return;
+  parallel_for_impl(
+      begin, end, grain,
+      [](std::int64_t b, std::int64_t e, void* context) { (*static_cast<const F*>(context))(b, e); },
+      const_cast<void*>(static_cast<const void*>(&f)));
+}
+
+}  // namespace blitzgs

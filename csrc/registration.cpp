@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: Apache-2.0
+// Every op of BlitzGS, one readable list. N Gaussians, B views, P projected rows (a Gaussian in a view), U
+// Gaussians visible in at least one view, I row-tile intersections, D channels, K = (degree + 1)^2 SH
+// coefficients. Contracts: csrc/<op>/<op>.h; Python functions, fake kernels and autograd:
+// blitzgs/ops/<op>.py.
+#include <torch/csrc/stable/library.h>
+
+STABLE_TORCH_LIBRARY(blitzgs, m) {
+  // Projection: parameters to screen-space rows, ordered by (Gaussian, view).
+  m.def(
+      "project_fwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
+      "Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, int tile_size, "
+      "int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, bool antialiased, "
+      "bool raw) -> (Tensor gaussian_ids, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, "
+      "Tensor means2d, Tensor conics, Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, "
+      "Tensor tiles_touched, Tensor counts)");
+  m.def(
+      "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
+      "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "
+      "int sh_degree, float eps2d, bool antialiased, bool raw, Tensor v_means2d, Tensor v_conics, "
+      "Tensor? v_depths, Tensor v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats) -> "
+      "(Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, Tensor "
+      "v_viewmats)");
+
+  // Which rows each tile composites, front to back by (depth, id).
+  m.def(
+      "intersect(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor depths, Tensor camera_ids, "
+      "Tensor? ids, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
+      "int n_isects) -> (Tensor isect_rows, Tensor tile_offsets)");
+
+  // Alpha compositing.
+  m.def(
+      "rasterize_fwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
+      "backgrounds, "
+      "Tensor isect_rows, Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, "
+      "int tile_begin, int tile_end) -> (Tensor renders, Tensor transmittances, Tensor last_ids, "
+      "Tensor tile_work, Tensor aux)");
+  m.def(
+      "rasterize_bwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
+      "backgrounds, "
+      "Tensor isect_rows, Tensor tile_offsets, Tensor renders, Tensor transmittances, Tensor last_ids, "
+      "Tensor aux, Tensor v_renders, Tensor? v_alphas, int n_cameras, int width, int height, int tile_size, "
+      "int tile_begin, int tile_end, bool absgrad, bool deterministic) -> (Tensor v_means2d, Tensor "
+      "v_conics, "
+      "Tensor v_row_opacities, Tensor v_colors, Tensor v_means2d_abs)");
+
+  // L1 and SSIM of the owned tiles.
+  m.def(
+      "photometric_fwd(Tensor renders, Tensor targets, Tensor? masks, int tile_size, int tile_begin, "
+      "int tile_end) -> (Tensor l1_sums, Tensor ssim_sums)");
+  m.def(
+      "photometric_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor v_l1_sums, Tensor v_ssim_sums, "
+      "int tile_size, int tile_begin, int tile_end) -> Tensor v_renders");
+
+  // Scene initialisation.
+  m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");
+  m.def("knn_distances(Tensor points, int k) -> Tensor");
+}
