@@ -40,7 +40,8 @@ def torch_folder() -> Path:
 
 class CMakeBuild(build_ext):
     def run(self) -> None:
-        output = ROOT / "blitzgs" / "_lib" if self.inplace else Path(self.build_lib).resolve() / "blitzgs" / "_lib"
+        package = ROOT if self.inplace else Path(self.build_lib).resolve()
+        output = package / "blitzgs" / "_lib"
         build = ROOT / "build" if self.inplace else Path(self.build_temp).resolve()
         arguments = [
             f"-DPython3_EXECUTABLE={sys.executable}",

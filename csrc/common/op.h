@@ -155,7 +155,7 @@ struct DeviceScope {
 
 // Calls f(T{}) with T = float or double by the tensor's dtype (CUDA: float only).
 template <class F>
-void dispatch_floating(const Tensor& tensor, const F& f) {
+void dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
 #ifndef BLITZGS_BACKEND_CUDA
   if (tensor.scalar_type() == ScalarType::Double) {
     f(double{});
