@@ -2,21 +2,82 @@
 # make demo: set up, generate the default city, train, evaluate, export.   make test: everything CI runs.
 VENV ?= .venv
 PYTHON ?= $(VENV)/bin/python
-# A machine with a GPU wants its CUDA torch: make TORCH=torch demo
+# Installed only when the environment has no torch. A machine with a GPU wants its CUDA build:
+#   make TORCH=torch demo
 TORCH ?= torch==2.13.0
-# The CPU index of PyTorch; empty to use the configured index alone.
-CMAKE = $(PYTHON) -m cmake
+# Folders of the environment's tools first, so that cmake and ninja from PyPI are used.
+RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
+CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu')
+DEMO ?= runs/demo
 
-.PHONY: venv build test test-slow lint demo clean
+.PHONY: venv venv-test build demo test test-python test-cxx test-slow lint format clean
 
 venv: $(VENV)/.installed
+venv-test: $(VENV)/.installed-test
 
-$(VENV)/.installed: pyproject.toml
+$(VENV)/bin/python:
 	python3 -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --upgrade pip "setuptools>=77" wheel
-	$(VENV)/bin/python -c "import torch" 2>/dev/null || $(VENV)/bin/pip install --quiet "$(TORCH)"
-	$(VENV)/bin/pip install --quiet cmake ninja pybind11
+	$(PYTHON) -m pip install --quiet --upgrade pip "setuptools>=77" wheel
+
+$(VENV)/.torch: | $(VENV)/bin/python
+	$(PYTHON) -c "import torch" 2>/dev/null || $(PYTHON) -m pip install --quiet "$(TORCH)"
 	touch $@
 
+# Editable: the sources run in place and the kernels are built into blitzgs/_lib.
+$(VENV)/.installed: pyproject.toml setup.py $(VENV)/.torch
+	$(PYTHON) -m pip install --quiet cmake ninja "pybind11>=2.13"
+	$(RUN) $(PYTHON) -m pip install --quiet --no-build-isolation -e ".[synth,log]"
+	touch $@
+
+$(VENV)/.installed-test: $(VENV)/.installed
+	$(RUN) $(PYTHON) -m pip install --quiet --no-build-isolation -e ".[test,lint]"
+	touch $@
+
+# Rebuilds what changed in csrc/.
 build:
-	PATH="$(dir $(abspath $(PYTHON))):$$PATH" $(PYTHON) setup.py --quiet build_ext --inplace
+	$(RUN) $(PYTHON) setup.py --quiet build_ext --inplace
+
+demo: venv build
+	$(RUN) blitzgs synth $(DEMO)/city --preset demo
+	$(RUN) blitzgs train --config configs/smoke.yaml --data $(DEMO)/city --out $(DEMO)/run
+	$(RUN) blitzgs export $(DEMO)/run --ply $(DEMO)/city.ply
+	@echo
+	@echo "Pictures (render | photo | error): $(DEMO)/run/eval"
+	@echo "Figures:                           $(DEMO)/run/summary.json"
+	@echo "The model, for any 3DGS viewer:    $(DEMO)/city.ply"
+
+test: venv-test lint test-cxx test-python
+
+test-python: build
+	$(RUN) $(PYTHON) -m pytest -q tests
+
+# The kernels and parsers without torch, under AddressSanitizer and UBSan.
+test-cxx:
+	@test -e /usr/include/catch2/catch.hpp -o -e /usr/include/catch2/catch_all.hpp \
+	  -o -e /usr/local/include/catch2/catch_all.hpp || apt-get install -y -qq catch2 >/dev/null 2>&1 \
+	  || { apt-get update -qq && apt-get install -y -qq catch2; } >/dev/null 2>&1 \
+	  || { echo "Catch2 is missing: install it (Debian: apt-get install catch2)"; exit 1; }
+	$(RUN) cmake -S . -B build-tests -G Ninja -DBLITZGS_TESTS=ON -DBLITZGS_SANITIZE=ON -DBLITZGS_CUDA=OFF \
+	  -DBLITZGS_IO=OFF -DPython3_EXECUTABLE="$(abspath $(PYTHON))" >/dev/null
+	$(RUN) cmake --build build-tests --target blitzgs_tests
+	./build-tests/blitzgs_tests
+
+test-slow: venv-test build
+	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests
+
+lint:
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+	$(RUN) mypy
+	$(RUN) lint-imports --no-logo
+	$(RUN) clang-format --dry-run -Werror $(CXX_FILES)
+	$(RUN) gersemi --check CMakeLists.txt cmake
+
+format:
+	$(RUN) ruff check --fix .
+	$(RUN) ruff format .
+	$(RUN) clang-format -i $(CXX_FILES)
+	$(RUN) gersemi -i CMakeLists.txt cmake
+
+clean:
+	rm -rf build build-tests blitzgs/_lib runs

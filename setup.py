@@ -17,24 +17,19 @@ def torch_folder() -> Path:
     """Find the torch that will load the kernels; never download a second one."""
     if folder := os.environ.get("BLITZGS_TORCH_DIR"):
         return Path(folder)
-    spec = importlib.util.find_spec("torch")
-    if spec and spec.origin:
-        return Path(spec.origin).parent
-    # pip builds in an isolated environment: look in the environment pip itself runs from.
-    for python in (os.environ.get("VIRTUAL_ENV", "") + "/bin/python", "python3", "python"):
-        probe = "import importlib.util as u; print(u.find_spec('torch').origin)"
-        try:
-            # An isolated build puts its own site folder on PYTHONPATH and PATH; neither must be seen here.
-            environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-            found = subprocess.run([python, "-c", probe], capture_output=True, text=True, env=environment)
-        except OSError:
-            continue
-        if found.returncode == 0:
-            return Path(found.stdout.strip()).parent
+    if spec := importlib.util.find_spec("torch"):
+        return Path(spec.origin or "").parent
+    # pip builds in an isolated environment that it lays over this interpreter through PYTHONPATH; without
+    # that variable the same interpreter sees the packages the kernels will be loaded beside.
+    probe = "import importlib.util as u; print(u.find_spec('torch').origin)"
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    found = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, env=environment)
+    if found.returncode == 0:
+        return Path(found.stdout.strip()).parent
     raise SystemExit(
         "blitzgs needs torch >= 2.11 installed before it is built: the kernels compile against its headers.\n"
-        "Install it (for a CPU: `pip install torch==2.13.0`) and run the same command with "
-        "--no-build-isolation, or set BLITZGS_TORCH_DIR to the folder of the torch package."
+        "Install it first (without a GPU a CPU build is enough, also for building the CUDA kernels), or set "
+        "BLITZGS_TORCH_DIR to the folder of a torch package."
     )
 
 

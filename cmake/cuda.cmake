@@ -11,15 +11,25 @@ add_library(blitzgs_cuda SHARED ${op_sources} ${cuda_kernels})
 target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_BACKEND_CUDA USE_CUDA)
 target_link_libraries(blitzgs_cuda PRIVATE blitzgs_flags blitzgs_torch CUDA::cudart_static)
 target_compile_options(
-  blitzgs_cuda PRIVATE $<$<COMPILE_LANGUAGE:CUDA>:--expt-relaxed-constexpr --extended-lambda
-                       -Xcompiler=-Wall -lineinfo -diag-suppress=20012>)
+  blitzgs_cuda
+  PRIVATE
+    $<$<COMPILE_LANGUAGE:CUDA>:--expt-relaxed-constexpr
+    --extended-lambda
+    -Xcompiler=-Wall
+    -lineinfo
+    -diag-suppress=20012>
+)
 
 # The library needs libtorch_cuda.so when it is loaded. A CPU-only torch has none to link against, so
 # a stub of the same soname stands in; the real one is found when the library is loaded.
-file(WRITE ${CMAKE_BINARY_DIR}/torch_cuda_stub.cpp
-     "extern \"C\" __attribute__((visibility(\"default\"))) int blitzgs_torch_cuda_stub() { return 0; }\n")
+file(
+  WRITE ${CMAKE_BINARY_DIR}/torch_cuda_stub.cpp
+  "extern \"C\" __attribute__((visibility(\"default\"))) int blitzgs_torch_cuda_stub() { return 0; }\n"
+)
 add_library(torch_cuda_stub SHARED ${CMAKE_BINARY_DIR}/torch_cuda_stub.cpp)
-set_target_properties(torch_cuda_stub PROPERTIES OUTPUT_NAME torch_cuda LIBRARY_OUTPUT_DIRECTORY
-                                                                       ${CMAKE_BINARY_DIR}/stub)
+set_target_properties(
+  torch_cuda_stub
+  PROPERTIES OUTPUT_NAME torch_cuda LIBRARY_OUTPUT_DIRECTORY ${CMAKE_BINARY_DIR}/stub
+)
 target_link_options(blitzgs_cuda PRIVATE -Wl,--no-as-needed -Wl,--allow-shlib-undefined)
 target_link_libraries(blitzgs_cuda PRIVATE torch_cuda_stub)

@@ -7,8 +7,15 @@ endif()
 file(GLOB test_sources CONFIGURE_DEPENDS csrc/*/*_test.cpp)
 file(GLOB io_library CONFIGURE_DEPENDS csrc/io/*.cpp)
 list(FILTER io_library EXCLUDE REGEX "(_test|module)\\.cpp$")
-add_executable(blitzgs_tests csrc/common/catch_main.cpp csrc/common/parallel_std.cpp ${test_sources}
-                             ${cpu_kernels} ${avx2_kernels} ${io_library})
+add_executable(
+  blitzgs_tests
+  csrc/common/catch_main.cpp
+  csrc/common/parallel_std.cpp
+  ${test_sources}
+  ${cpu_kernels}
+  ${avx2_kernels}
+  ${io_library}
+)
 target_link_libraries(blitzgs_tests PRIVATE blitzgs_flags pthread)
 if(Catch2_FOUND AND Catch2_VERSION VERSION_GREATER_EQUAL 3)
   target_link_libraries(blitzgs_tests PRIVATE Catch2::Catch2WithMain)
