@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Gaussians of one rank: a table of per-Gaussian columns that grow, shrink, permute and move together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+# The learned parameters, before activation: log scales, opacity logits, unnormalised quaternions (w, x, y, z).
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+EXP_AVGS = tuple(f"exp_avg.{name}" for name in PARAMETERS)
+EXP_AVG_SQS = tuple(f"exp_avg_sq.{name}" for name in PARAMETERS)
+# What new rows must bring; every other column starts at zero.
+REQUIRED = (*PARAMETERS, "last_step", "id", "parent", "birth", "level")
+NO_PARENT = -1
+
+
+class RowExchange(Protocol):
+    """What `GaussianTable.exchange` needs of a job's ranks (`blitzgs.distributed.group.Ranks`)."""
+
+    world_size: int
+
+    def exchange_counts(self, counts: Tensor) -> Tensor:
+        """Tell every rank how many rows it will get from this one."""
+
+    def all_to_all(self, rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
+        """Send consecutive groups of rows, one to each rank, and return those received."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """What one column holds: the dtype and the shape of one row."""
+
+    dtype: torch.dtype
+    shape: tuple[int, ...]
+
+
+def schema(sh_degree: int) -> dict[str, Column]:
+    """Return the columns of a table, in their order.
+
+    Args:
+        sh_degree: highest spherical-harmonics degree D; `sh` has K = (D + 1)^2 coefficients.
+
+    Returns:
+        means [3], quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam
+        moments `exp_avg.*` and `exp_avg_sq.*`; last_step int32 (optimiser steps already applied to the row);
+        id int64 (persistent, unique over ranks), parent int64 (-1: none), birth int32 (images seen when it
+        was born), level uint8 (octree level); grad_sum float32, grad_count int32, max_radii float32 (pixels):
+        density statistics since the last density event.
+    """
+    f = torch.float32
+    rows = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": ((sh_degree + 1) ** 2, 3)}
+    columns = {name: Column(f, shape) for name, shape in rows.items()}
+    for prefix in ("exp_avg", "exp_avg_sq"):
+        columns |= {f"{prefix}.{name}": Column(f, shape) for name, shape in rows.items()}
+    columns |= {
+        "last_step": Column(torch.int32, ()),
+        "id": Column(torch.int64, ()),
+        "parent": Column(torch.int64, ()),
+        "birth": Column(torch.int32, ()),
+        "level": Column(torch.uint8, ()),
+        "grad_sum": Column(f, ()),
+        "grad_count": Column(torch.int32, ()),
+        "max_radii": Column(f, ()),
+    }
+    return columns
+
+
+class GaussianTable:
+    """One rank's Gaussians as named columns of equal length N.
+
+    The four operations `append`, `keep`, `permute` and `exchange` act on every column alike, one column at a
+    time, so that peak memory exceeds the table by one column and not by a second table.
+    """
+
+    def __init__(self, columns: Mapping[str, Tensor]) -> None:
+        """Take over the given columns.
+
+        Args:
+            columns: name -> tensor [N, ...]; at least those of `schema`, all on one device.
+
+        Raises:
+            ValueError: a column is missing, or its length, row shape, dtype or device does not fit.
+        """
+        if "sh" not in columns:
+            raise ValueError(f"GaussianTable: column 'sh' is missing; got {sorted(columns)}")
+        sh = columns["sh"]
+        degree = round(sh.shape[1] ** 0.5) - 1 if sh.dim() == 3 else -1
+        expected = schema(max(degree, 0))
+        if missing := [name for name in expected if name not in columns]:
+            raise ValueError(f"GaussianTable: columns {missing} are missing; got {sorted(columns)}")
+        for name, tensor in columns.items():
+            column = expected.get(name, Column(tensor.dtype, tuple(tensor.shape[1:])))
+            wanted = (sh.shape[0], *column.shape)
+            if tuple(tensor.shape) != wanted or tensor.dtype != column.dtype or tensor.device != sh.device:
+                raise ValueError(
+                    f"GaussianTable: column '{name}' must be {column.dtype} {list(wanted)} on {sh.device}, "
+                    f"got {tensor.dtype} {list(tensor.shape)} on {tensor.device}"
+                )
+        self.columns: dict[str, Tensor] = dict(columns)
+
+    @classmethod
+    def create(cls, rows: Mapping[str, Tensor]) -> GaussianTable:
+        """Build a table from new rows; see `append` for what they must hold."""
+        columns = schema(round(rows["sh"].shape[1] ** 0.5) - 1)
+        device = rows["means"].device
+        table = cls({n: torch.empty((0, *c.shape), dtype=c.dtype, device=device) for n, c in columns.items()})
+        table.append(rows)
+        return table
+
+    def __len__(self) -> int:
+        return self.columns["means"].shape[0]
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self.columns[name]
+
+    def __setitem__(self, name: str, tensor: Tensor) -> None:
+        """Replace or add a column of the table's length; it moves with the others from then on."""
+        if tensor.shape[:1] != (len(self),):
+            raise ValueError(
+                f"GaussianTable: column '{name}' must have {len(self)} rows, got {list(tensor.shape)}"
+            )
+        self.columns[name] = tensor
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the columns live."""
+        return self.columns["means"].device
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest spherical-harmonics degree the table can hold."""
+        return round(self.columns["sh"].shape[1] ** 0.5) - 1
+
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        """The five learned columns in the order of `PARAMETERS`."""
+        return tuple(self.columns[name] for name in PARAMETERS)
+
+    @property
+    def exp_avgs(self) -> tuple[Tensor, ...]:
+        """Adam's first moments in the order of `PARAMETERS`."""
+        return tuple(self.columns[name] for name in EXP_AVGS)
+
+    @property
+    def exp_avg_sqs(self) -> tuple[Tensor, ...]:
+        """Adam's second moments in the order of `PARAMETERS`."""
+        return tuple(self.columns[name] for name in EXP_AVG_SQS)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held by all columns."""
+        return sum(column.nbytes for column in self.columns.values())
+
+    def append(self, rows: Mapping[str, Tensor]) -> None:
+        """Add rows at the end.
+
+        Args:
+            rows: name -> tensor [M, ...] with the columns of `REQUIRED`; other columns that are absent
+                (moments, statistics) are filled with zeros.
+
+        Raises:
+            ValueError: a required column is missing, an unknown one is given, or shapes or dtypes differ.
+        """
+        if missing := [name for name in REQUIRED if name not in rows]:
+            raise ValueError(f"GaussianTable.append: rows lack the columns {missing}")
+        if unknown := [name for name in rows if name not in self.columns]:
+            raise ValueError(f"GaussianTable.append: the table has no columns {unknown}")
+        count = rows["means"].shape[0]
+        for name, column in self.columns.items():
+            wanted = (count, *column.shape[1:])
+            new = rows[name] if name in rows else column.new_zeros(wanted)
+            if tuple(new.shape) != wanted or new.dtype != column.dtype:
+                raise ValueError(
+                    f"GaussianTable.append: column '{name}' must be {column.dtype} {list(wanted)}, "
+                    f"got {new.dtype} {list(new.shape)}"
+                )
+        for name, column in self.columns.items():
+            new = rows[name] if name in rows else column.new_zeros((count, *column.shape[1:]))
+            self.columns[name] = torch.cat((column, new))
+
+    def keep(self, mask: Tensor) -> None:
+        """Keep the rows where `mask` (bool [N]) is true, in their order."""
+        if mask.dtype != torch.bool or mask.shape != (len(self),):
+            raise ValueError(
+                f"GaussianTable.keep: mask must be bool [{len(self)}], got {mask.dtype} {list(mask.shape)}"
+            )
+        self._select(mask.nonzero().squeeze(1))
+
+    def permute(self, order: Tensor) -> None:
+        """Reorder the rows: row i becomes the old row `order[i]` (int64 [N], a permutation)."""
+        if order.dtype != torch.int64 or order.shape != (len(self),):
+            raise ValueError(
+                f"GaussianTable.permute: order must be int64 [{len(self)}], "
+                f"got {order.dtype} {list(order.shape)}"
+            )
+        self._select(order)
+
+    def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
+        """Move every row to a rank. Collective: every rank calls it; rows arrive by source rank, in order.
+
+        Args:
+            destination_ranks: int64 [N], the rank each row goes to.
+            ranks: the job's ranks.
+        """
+        order = torch.argsort(destination_ranks, stable=True)
+        counts = torch.bincount(destination_ranks, minlength=ranks.world_size)
+        sent = counts.tolist()
+        received = ranks.exchange_counts(counts).tolist()
+        for name in list(self.columns):
+            column = self.columns.pop(name)
+            self.columns[name] = ranks.all_to_all(column[order], sent, received)
+
+    def _select(self, rows: Tensor) -> None:
+        for name, column in self.columns.items():
+            self.columns[name] = column[rows]

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+import torch
+
+from blitzgs.model import GaussianTable, schema
+
+
+def filled_table(count: int, seed: int = 0) -> GaussianTable:
+    """A table in which every entry of every column is derived from the row's id."""
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.randperm(1000, generator=generator)[:count]
+    columns = {}
+    for name, column in schema(sh_degree=1).items():
+        value = ids.reshape(-1, *([1] * len(column.shape))).expand(count, *column.shape) % 251
+        columns[name] = ids if name == "id" else value.to(column.dtype).contiguous()
+    return GaussianTable(columns)
+
+
+def assert_rows_whole(table: GaussianTable) -> None:
+    for name in table:
+        column = table[name]
+        expected = table["id"] if name == "id" else table["id"] % 251
+        expected = expected.reshape(-1, *([1] * (column.dim() - 1))).expand(column.shape)
+        assert torch.equal(column.long(), expected), name
+
+
+def test_permute_keep_and_append_move_whole_rows():
+    table = filled_table(100)
+    table["extra"] = (table["id"] % 251).double()
+    ids = table["id"].clone()
+    order = torch.randperm(100, generator=torch.Generator().manual_seed(1))
+    table.permute(order)
+    assert torch.equal(table["id"], ids[order])
+    assert_rows_whole(table)
+    mask = table["id"] % 3 != 0
+    table.keep(mask)
+    assert torch.equal(table["id"], ids[order][mask])
+    assert_rows_whole(table)
+    more = filled_table(7, seed=2)
+    before = len(table)
+    table.append({**more.columns, "extra": (more["id"] % 251).double()})
+    assert len(table) == before + 7
+    assert_rows_whole(table)
+
+
+def test_new_rows_start_with_zero_moments_and_statistics():
+    source = filled_table(5)
+    required = ("means", "quats", "scales", "opacities", "sh", "last_step", "id", "parent", "birth", "level")
+    table = GaussianTable.create({name: source[name] for name in required})
+    for name in table:
+        if name in required:
+            assert torch.equal(table[name], source[name])
+        else:
+            assert table[name].shape == source[name].shape and not table[name].any(), name
+    assert table.sh_degree == 1
+    assert table.nbytes == sum(c.nbytes for c in table.columns.values())
+
+
+def test_empty_table():
+    table = filled_table(0)
+    table.keep(torch.zeros(0, dtype=torch.bool))
+    table.append(filled_table(3).columns)
+    assert len(table) == 3
+    assert_rows_whole(table)
+
+
+class LoopbackRanks:
+    """Two ranks on one process: what is sent to rank 1 is dropped, what comes from rank 1 is fixed."""
+
+    world_size = 2
+
+    def __init__(self, incoming):
+        self.incoming = incoming
+        self.calls = 0
+
+    def exchange_counts(self, counts):
+        self.sent = counts.tolist()
+        return torch.tensor([counts[0], len(self.incoming)])
+
+    def all_to_all(self, rows, sent, received):
+        assert rows.shape[0] == sum(sent) and sent == self.sent
+        name = list(schema(1))[self.calls]
+        self.calls += 1
+        return torch.cat((rows[: sent[0]], self.incoming[name]))
+
+
+def test_exchange_moves_every_column():
+    table, incoming = filled_table(20), filled_table(6, seed=3)
+    ids = table["id"].clone()
+    destination = ids % 2
+    table.exchange(destination, LoopbackRanks(incoming))
+    assert torch.equal(table["id"], torch.cat((ids[ids % 2 == 0], incoming["id"])))
+    assert_rows_whole(table)
+
+
+def test_errors_name_the_column():
+    columns = filled_table(4).columns
+    with pytest.raises(ValueError, match=r"columns \['quats'\] are missing"):
+        GaussianTable({k: v for k, v in columns.items() if k != "quats"})
+    with pytest.raises(ValueError, match=r"column 'means' must be torch.float32 \[4, 3\]"):
+        GaussianTable({**columns, "means": torch.zeros(4, 2)})
+    with pytest.raises(ValueError, match=r"rows lack the columns \['id'\]"):
+        filled_table(4).append({k: v for k, v in columns.items() if k != "id"})
+    with pytest.raises(ValueError, match=r"no columns \['colour'\]"):
+        filled_table(4).append({**columns, "colour": torch.zeros(4)})
+    with pytest.raises(ValueError, match=r"mask must be bool \[4\]"):
+        filled_table(4).keep(torch.ones(3, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"order must be int64 \[4\]"):
+        filled_table(4).permute(torch.arange(3))
