@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ranks of a job: who they are, how they talk, and how they fail together."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import timedelta
+from types import TracebackType
+from typing import Any, Literal, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from blitzgs.distributed.watchdog import Watchdog
+
+T = TypeVar("T")
+ReduceOp = Literal["sum", "min", "max"]
+_REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "min": dist.ReduceOp.MIN, "max": dist.ReduceOp.MAX}
+
+DEFAULT_TIMEOUT_SECONDS = 120.0
+# Starting up includes importing torch on every rank and, on NCCL, building the communicator.
+STARTUP_TIMEOUT_SECONDS = 300.0
+
+
+class MismatchError(RuntimeError):
+    """The ranks were started with different configurations, code or data."""
+
+
+@dataclass
+class Ranks:
+    """One process's view of the job. With `world_size` 1 no process group exists and every call is local.
+
+    Attributes:
+        rank: index of this process, 0 <= rank < world_size.
+        world_size: number of processes M.
+        local_rank: index of this process on its host (selects the GPU).
+        local_world_size: number of processes on this host.
+        device: where this rank computes.
+        timeout_seconds: a rank that does not show up at a collective for this long ends the job.
+    """
+
+    rank: int = 0
+    world_size: int = 1
+    local_rank: int = 0
+    local_world_size: int = 1
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
+    watchdog: Watchdog | None = None
+
+    @classmethod
+    def from_environment(
+        cls, device: str = "auto", timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
+    ) -> Ranks:
+        """Join the job that torchrun's environment describes: Gloo on the CPU, NCCL on CUDA.
+
+        Args:
+            device: "auto" (CUDA when this torch has a GPU), "cpu", "cuda" or "cuda:INDEX".
+            timeout_seconds: see the class.
+
+        Returns:
+            The ranks; the trivial object when torchrun started a single process or none.
+
+        Raises:
+            RuntimeError: a CUDA device was asked for that does not exist, or the other ranks did not appear.
+        """
+        world_size = int(os.environ.get("WORLD_SIZE", "1"))
+        rank = int(os.environ.get("RANK", "0"))
+        local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+        place = _resolve_device(device, local_rank)
+        ranks = cls(
+            rank=rank,
+            world_size=world_size,
+            local_rank=local_rank,
+            local_world_size=int(os.environ.get("LOCAL_WORLD_SIZE", "1")),
+            device=place,
+            timeout_seconds=timeout_seconds,
+        )
+        if place.type == "cuda":
+            torch.cuda.set_device(place)
+        if world_size > 1:
+            ranks._join()
+        return ranks
+
+    def _join(self) -> None:
+        on_gpu = self.device.type == "cuda"
+        dist.init_process_group(
+            backend="nccl" if on_gpu else "gloo",
+            timeout=timedelta(seconds=STARTUP_TIMEOUT_SECONDS),
+            device_id=self.device if on_gpu else None,
+        )
+        self.barrier()
+        # NCCL's own watchdog kills the process with a long dump; ours comes first and names the culprit.
+        margin = 30.0 if on_gpu else 0.0
+        dist.distributed_c10d._set_pg_timeout(
+            timedelta(seconds=self.timeout_seconds + margin), dist.group.WORLD
+        )
+        self.watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
+
+    def __enter__(self) -> Ranks:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the job; when an error is on its way out, tell the other ranks what it was."""
+        if error is not None and self.watchdog is not None:
+            self.watchdog.report_failure(f"{type(error).__name__}: {error}")
+        self.close()
+
+    def close(self) -> None:
+        """Leave the job. Safe to call twice."""
+        if self.watchdog is not None:
+            self.watchdog.stop()
+            self.watchdog = None
+        if self.world_size > 1 and dist.is_initialized():
+            dist.destroy_process_group()
+
+    def _collective(self, name: str, call: Callable[[], T]) -> T:
+        """Run a collective; when it fails, say which rank broke it instead of which socket closed."""
+        if self.watchdog is None:
+            return call()
+        self.watchdog.enter(name)
+        try:
+            result = call()
+        except RuntimeError as error:
+            self.watchdog.leave()
+            raise RuntimeError(f"{self.watchdog.diagnose(name)} ({error})") from error
+        self.watchdog.leave()
+        return result
+
+    def all_reduce(self, tensor: Tensor, op: ReduceOp = "sum") -> Tensor:
+        """Reduce `tensor` over the ranks in place and return it; every rank gets the same bits."""
+        if self.world_size > 1:
+            self._collective("all_reduce", lambda: dist.all_reduce(tensor, op=_REDUCE_OPS[op]))
+        return tensor
+
+    def exchange_counts(self, counts: Tensor) -> Tensor:
+        """Tell every rank how many items it will get from this one.
+
+        Args:
+            counts: int64 [M] or [M, C] on `device`; row m is what goes to rank m.
+
+        Returns:
+            Same shape: row m is what comes from rank m.
+        """
+        if self.world_size == 1:
+            return counts.clone()
+        received = torch.empty_like(counts)
+        self._collective("exchange_counts", lambda: dist.all_to_all_single(received, counts.contiguous()))
+        return received
+
+    def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
+        """Send consecutive groups of rows, one to each rank, and return those received, by source rank.
+
+        Args:
+            rows: [sum(sent), ...]; the rows for rank 0 first.
+            sent: rows for each rank, M values.
+            received: rows from each rank, M values (see `exchange_counts`).
+
+        Returns:
+            [sum(received), ...].
+        """
+        if self.world_size == 1:
+            return rows.clone()
+        result = rows.new_empty((sum(received), *rows.shape[1:]))
+        self._collective(
+            "all_to_all",
+            lambda: dist.all_to_all_single(result, rows.contiguous(), list(received), list(sent)),
+        )
+        return result
+
+    def exchange_rows(self, rows: Tensor, sent: Sequence[int]) -> tuple[Tensor, list[int]]:
+        """`all_to_all` with its own size exchange; returns the rows and how many came from each rank."""
+        counts = self.exchange_counts(torch.tensor(list(sent), dtype=torch.int64, device=rows.device))
+        received = counts.tolist()
+        return self.all_to_all(rows, sent, received), received
+
+    def all_gather(self, tensor: Tensor) -> list[Tensor]:
+        """Gather tensors of one shape from all ranks, in rank order. For small things."""
+        if self.world_size == 1:
+            return [tensor.clone()]
+        parts = [torch.empty_like(tensor) for _ in range(self.world_size)]
+        self._collective("all_gather", lambda: dist.all_gather(parts, tensor.contiguous()))
+        return parts
+
+    def all_gather_object(self, value: T) -> list[T]:
+        """Gather a small picklable object from all ranks, in rank order."""
+        if self.world_size == 1:
+            return [value]
+        parts: list[Any] = [None] * self.world_size
+        self._collective("all_gather_object", lambda: dist.all_gather_object(parts, value))
+        return parts
+
+    def broadcast_object(self, value: T, source: int = 0) -> T:
+        """Return rank `source`'s `value` on every rank."""
+        if self.world_size == 1:
+            return value
+        holder: list[Any] = [value]
+        self._collective(
+            "broadcast_object",
+            lambda: dist.broadcast_object_list(holder, src=source, device=self.device),
+        )
+        result: T = holder[0]
+        return result
+
+    def barrier(self) -> None:
+        """Wait for all ranks."""
+        if self.world_size > 1:
+            # An all-reduce whose result is read: on NCCL only that waits for the other ranks.
+            token = torch.zeros(1, device=self.device)
+
+            def wait() -> None:
+                dist.all_reduce(token)
+                token.item()
+
+            self._collective("barrier", wait)
+
+    def compare_across_ranks(self, fields: Mapping[str, object]) -> None:
+        """Check that every rank has the same values: configuration, code version, data fingerprint.
+
+        Args:
+            fields: name -> value; values are compared by their `repr`.
+
+        Raises:
+            MismatchError: on every rank, naming the first differing field, the ranks and their values.
+        """
+        mine = {name: repr(value) for name, value in fields.items()}
+        everyone = self.all_gather_object((socket.gethostname(), mine))
+        names = sorted({name for _, values in everyone for name in values})
+        for name in names:
+            holders: dict[str, list[int]] = {}
+            for rank, (_, values) in enumerate(everyone):
+                holders.setdefault(values.get(name, "(missing)"), []).append(rank)
+            if len(holders) > 1:
+                detail = "; ".join(
+                    f"rank{'s' if len(ranks) > 1 else ''} {_list(ranks)}"
+                    f" ({everyone[ranks[0]][0]}): {_shorten(value)}"
+                    for value, ranks in holders.items()
+                )
+                raise MismatchError(
+                    f"the ranks disagree on {name}: {detail}. Start every rank with the same configuration, "
+                    "code and data."
+                )
+
+
+def _list(ranks: Sequence[int]) -> str:
+    return ", ".join(map(str, ranks))
+
+
+def _shorten(text: str, limit: int = 200) -> str:
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def _resolve_device(device: str, local_rank: int) -> torch.device:
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    place = torch.device(device)
+    if place.type == "cuda" and place.index is None:
+        place = torch.device("cuda", local_rank)
+    if place.type == "cuda" and place.index >= torch.cuda.device_count():
+        raise RuntimeError(
+            f"local rank {local_rank} needs {place}, but this host has {torch.cuda.device_count()} "
+            "CUDA devices; start fewer processes per node (torchrun --nproc-per-node) or use --device cpu"
+        )
+    return place

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs a function on M Gloo ranks. A fork server imports torch once, so spawns are quick."""
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import time
+import traceback
+
+from torch.distributed import TCPStore
+
+from blitzgs.distributed.group import Ranks
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.distributed.group"])
+
+
+def _child(function, rank, world_size, port, timeout_seconds, arguments, pipe):
+    import torch
+
+    torch.set_num_threads(1)
+    os.environ.update(
+        RANK=str(rank),
+        LOCAL_RANK=str(rank),
+        WORLD_SIZE=str(world_size),
+        LOCAL_WORLD_SIZE=str(world_size),
+        MASTER_ADDR="127.0.0.1",
+        MASTER_PORT=str(port),
+        TORCHELASTIC_USE_AGENT_STORE="True",
+    )
+    try:
+        with Ranks.from_environment("cpu", timeout_seconds) as ranks:
+            result = function(ranks, *arguments)
+        pipe.send(("ok", result))
+    except BaseException:  # noqa: BLE001  (reported to the parent)
+        pipe.send(("error", traceback.format_exc()))
+        raise
+
+
+class RankError(AssertionError):
+    """A rank failed; `messages[rank]` is its traceback, or its exit code when it left none."""
+
+    def __init__(self, messages):
+        super().__init__("\n".join(f"--- rank {rank}\n{text}" for rank, text in messages.items()))
+        self.messages = messages
+
+
+def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.0):
+    """Return [function(ranks, *arguments) of each rank]; raise RankError if any rank fails."""
+    # Like torchrun's agent, the parent holds the store, so that it outlives any rank.
+    store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    processes, pipes = [], []
+    for rank in range(world_size):
+        receiver, sender = CONTEXT.Pipe(duplex=False)
+        process = CONTEXT.Process(
+            target=_child, args=(function, rank, world_size, store.port, timeout_seconds, arguments, sender)
+        )
+        process.start()
+        sender.close()
+        processes.append(process)
+        pipes.append(receiver)
+    results, failures = [None] * world_size, {}
+    waiting = dict(zip(pipes, range(world_size), strict=True))
+    deadline = time.monotonic() + limit
+    while waiting:
+        ready = multiprocessing.connection.wait(list(waiting), max(0.1, deadline - time.monotonic()))
+        for pipe in ready or list(waiting):
+            rank = waiting.pop(pipe)
+            if not ready:
+                processes[rank].kill()
+                failures[rank] = "stopped by the test"
+                continue
+            try:
+                status, value = pipe.recv()
+            except EOFError:
+                processes[rank].join()
+                status, value = "error", f"exit code {processes[rank].exitcode}"
+            if status == "ok":
+                results[rank] = value
+            else:
+                failures[rank] = value
+                # As torchrun does: once a rank has failed, the others get a little time and are ended.
+                deadline = min(deadline, time.monotonic() + 6)
+    for process in processes:
+        process.join(10)
+    if failures:
+        raise RankError(failures)
+    return results
