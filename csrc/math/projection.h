@@ -1,0 +1,220 @@
+// SPDX-License-Identifier: Apache-2.0
+// EWA projection of one Gaussian into one pinhole camera, and its derivative. The covariance is carried as
+// the 2x3 factor M = J W A (Sigma' = M M^T + eps I): the determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is
+// then a sum of non-negative terms, where the usual ac - b^2 cancels for elongated splats.
+#pragma once
+#include "math/covariance.h"
+
+namespace blitzgs {
+
+// A pinhole camera. Rows of the world-to-camera rotation; slopes x/z, y/z at which the Jacobian is clamped.
+template <class T>
+struct Camera {
+  Vec3<T> row_x, row_y, row_z, translation, centre;
+  T fx, fy, cx, cy;
+  T slope_min_x, slope_max_x, slope_min_y, slope_max_y;
+};
+
+// viewmat [4, 4] and K [3, 3] row-major. The slopes leave 0.15 of the image size beyond each border, which
+// is 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t.
+template <class T>
+BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int height) {
+  Camera<T> camera;
+  camera.row_x = load3(viewmat);
+  camera.row_y = load3(viewmat + 4);
+  camera.row_z = load3(viewmat + 8);
+  camera.translation = {viewmat[3], viewmat[7], viewmat[11]};
+  const Vec3<T>& t = camera.translation;
+  camera.centre = T(-1) * (t.x * camera.row_x + t.y * camera.row_y + t.z * camera.row_z);
+  camera.fx = K[0];
+  camera.fy = K[4];
+  camera.cx = K[2];
+  camera.cy = K[5];
+  const T margin_x = T(0.15) * T(width), margin_y = T(0.15) * T(height);
+  camera.slope_min_x = (-camera.cx - margin_x) / camera.fx;
+  camera.slope_max_x = (T(width) - camera.cx + margin_x) / camera.fx;
+  camera.slope_min_y = (-camera.cy - margin_y) / camera.fy;
+  camera.slope_max_y = (T(height) - camera.cy + margin_y) / camera.fy;
+  return camera;
+}
+
+// Where a mean lands. Computed in double: in float the rounding of the rotation alone moves a splat by
+// hundreds of ulps of its pixel position.
+struct ProjectedMean {
+  double slope_x, slope_y, z;  // x/z, y/z, camera-space depth
+};
+
+template <class T>
+BLITZGS_HD double row_times_point(const Vec3<T>& row, const Vec3<T>& point, T offset) {
+  return double(row.x) * double(point.x) + double(row.y) * double(point.y) + double(row.z) * double(point.z) +
+         double(offset);
+}
+
+template <class T>
+BLITZGS_HD ProjectedMean project_mean(const Camera<T>& camera, const Vec3<T>& mean) {
+  const double x = row_times_point(camera.row_x, mean, camera.translation.x);
+  const double y = row_times_point(camera.row_y, mean, camera.translation.y);
+  const double z = row_times_point(camera.row_z, mean, camera.translation.z);
+  return {x / z, y / z, z};
+}
+
+template <class T>
+BLITZGS_HD void pixel_position(const Camera<T>& camera, const ProjectedMean& p, T* mean2d) {
+  mean2d[0] = T(double(camera.fx) * p.slope_x + double(camera.cx));
+  mean2d[1] = T(double(camera.fy) * p.slope_y + double(camera.cy));
+}
+
+// Rows of J W: how the pixel position answers to a world-space displacement at the clamped slopes.
+template <class T>
+struct PixelGradients {
+  Vec3<T> gx, gy;
+  T u, v, inverse_z;
+  bool u_free, v_free;  // not clamped
+};
+
+template <class T>
+BLITZGS_HD PixelGradients<T> pixel_gradients(const Camera<T>& camera, const ProjectedMean& p) {
+  const T u = T(p.slope_x), v = T(p.slope_y);
+  PixelGradients<T> g;
+  g.u = smaller(larger(u, camera.slope_min_x), camera.slope_max_x);
+  g.v = smaller(larger(v, camera.slope_min_y), camera.slope_max_y);
+  g.u_free = g.u == u;
+  g.v_free = g.v == v;
+  g.inverse_z = T(1.0 / p.z);
+  g.gx = (camera.fx * g.inverse_z) * (camera.row_x - g.u * camera.row_z);
+  g.gy = (camera.fy * g.inverse_z) * (camera.row_y - g.v * camera.row_z);
+  return g;
+}
+
+// The splat: M's rows, the blurred covariance's diagonal, its inverse (conic a, b, c) and determinant.
+template <class T>
+struct Splat {
+  Vec3<T> m0, m1;
+  T cov_xx, cov_yy;
+  T conic[3];
+  Vec3<T> normal;   // m0 x m1, divided by `magnitude`
+  T normal_length;  // |normal|
+  T root_det;       // sqrt(det Sigma'), divided by `magnitude`
+  T magnitude;      // larger of cov_xx, cov_yy
+};
+
+// Quantities are divided by the larger diagonal entry before they are multiplied, so that neither 1e-8 nor
+// 1e4 pixel scales leave the range of float.
+template <class T>
+BLITZGS_HD Splat<T> make_splat(const PixelGradients<T>& g, const Columns3<T>& axes, T eps2d) {
+  Splat<T> s;
+  s.m0 = {dot(g.gx, axes.x), dot(g.gx, axes.y), dot(g.gx, axes.z)};
+  s.m1 = {dot(g.gy, axes.x), dot(g.gy, axes.y), dot(g.gy, axes.z)};
+  const T xx = dot(s.m0, s.m0), xy = dot(s.m0, s.m1), yy = dot(s.m1, s.m1);
+  s.cov_xx = xx + eps2d;
+  s.cov_yy = yy + eps2d;
+  s.magnitude = larger(s.cov_xx, s.cov_yy);
+  const T inverse = T(1) / s.magnitude;
+  const T shrink = std::sqrt(inverse), eps = eps2d * inverse;
+  s.normal = cross(shrink * s.m0, shrink * s.m1);
+  const T unblurred = dot(s.normal, s.normal);
+  const T det = unblurred + eps * ((xx + yy) * inverse + eps);
+  s.normal_length = std::sqrt(unblurred);
+  s.root_det = std::sqrt(det);
+  const T factor = inverse / det;
+  s.conic[0] = factor * (s.cov_yy * inverse);
+  s.conic[1] = -factor * (xy * inverse);
+  s.conic[2] = factor * (s.cov_xx * inverse);
+  return s;
+}
+
+// sqrt(det Sigma / det Sigma'): the share of its peak that the blur leaves a splat in antialiased mode.
+template <class T>
+BLITZGS_HD T compensation(const Splat<T>& s) {
+  return s.normal_length / s.root_det;
+}
+
+// Gradients of the rows of M from those of the conic (b counted once) and of the compensation.
+template <class T>
+BLITZGS_HD void splat_vjp(const Splat<T>& s, const T* v_conic, T v_compensation, Vec3<T>* v_m0,
+                          Vec3<T>* v_m1) {
+  const T a = s.conic[0], b = s.conic[1], c = s.conic[2];
+  // d(Sigma'^-1) = -Q dSigma' Q with Q the conic matrix.
+  const T p = v_conic[0], q = T(0.5) * v_conic[1], r = v_conic[2];
+  const T left_xx = a * p + b * q, left_xy = a * q + b * r, left_yx = b * p + c * q, left_yy = b * q + c * r;
+  // d log det Sigma' = tr(Q dSigma').
+  const T half = T(0.5) * v_compensation * compensation(s);
+  const T v_xx = -(left_xx * a + left_xy * b) - half * a;
+  const T v_xy = -(left_xx * b + left_xy * c) - half * b;
+  const T v_yy = -(left_yx * b + left_yy * c) - half * c;
+  *v_m0 = T(2) * (v_xx * s.m0 + v_xy * s.m1);
+  *v_m1 = T(2) * (v_xy * s.m0 + v_yy * s.m1);
+  if (v_compensation == T(0) || !(s.normal_length > T(0))) return;
+  // d|m0 x m1|; a splat seen exactly edge-on has no such derivative, and takes zero.
+  const T scale = v_compensation / (s.root_det * s.magnitude * s.normal_length);
+  const Vec3<T> v_normal = scale * s.normal;
+  *v_m0 = *v_m0 + cross(s.m1, v_normal);
+  *v_m1 = *v_m1 + cross(v_normal, s.m0);
+}
+
+// Gradients of M's rows to those of J W (v_gx, v_gy) and of the axes (added to v_axes).
+template <class T>
+BLITZGS_HD void factor_vjp(const PixelGradients<T>& g, const Columns3<T>& axes, const Vec3<T>& v_m0,
+                           const Vec3<T>& v_m1, Vec3<T>* v_gx, Vec3<T>* v_gy, Columns3<T>* v_axes) {
+  v_axes->x = v_axes->x + v_m0.x * g.gx + v_m1.x * g.gy;
+  v_axes->y = v_axes->y + v_m0.y * g.gx + v_m1.y * g.gy;
+  v_axes->z = v_axes->z + v_m0.z * g.gx + v_m1.z * g.gy;
+  *v_gx = v_m0.x * axes.x + v_m0.y * axes.y + v_m0.z * axes.z;
+  *v_gy = v_m1.x * axes.x + v_m1.y * axes.y + v_m1.z * axes.z;
+}
+
+// Gradients with respect to a camera's pose, summed over Gaussians.
+template <class T>
+struct PoseGradient {
+  Vec3<T> row_x, row_y, row_z, translation;
+};
+
+// Gradient of the camera-space mean from those of J W, of the pixel position and of the depth; the rows of
+// the rotation, on which J W depends directly, are added to pose (null: not wanted).
+template <class T>
+BLITZGS_HD Vec3<T> pixel_gradients_vjp(const Camera<T>& camera, const ProjectedMean& p,
+                                       const PixelGradients<T>& g, const Vec3<T>& v_gx, const Vec3<T>& v_gy,
+                                       const T* v_mean2d, T v_depth, PoseGradient<T>* pose) {
+  const T fx = camera.fx * g.inverse_z, fy = camera.fy * g.inverse_z;
+  const T slope_x = T(p.slope_x), slope_y = T(p.slope_y);
+  Vec3<T> v{fx * v_mean2d[0], fy * v_mean2d[1], v_depth};
+  v.z -= fx * slope_x * v_mean2d[0] + fy * slope_y * v_mean2d[1];
+  v.z -= g.inverse_z * (dot(v_gx, g.gx) + dot(v_gy, g.gy));
+  const T v_u = g.u_free ? -fx * dot(camera.row_z, v_gx) * g.inverse_z : T(0);
+  const T v_v = g.v_free ? -fy * dot(camera.row_z, v_gy) * g.inverse_z : T(0);
+  v.x += v_u;
+  v.y += v_v;
+  v.z -= v_u * slope_x + v_v * slope_y;
+  if (pose) {
+    pose->row_x = pose->row_x + fx * v_gx;
+    pose->row_y = pose->row_y + fy * v_gy;
+    pose->row_z = pose->row_z - fx * g.u * v_gx - fy * g.v * v_gy;
+  }
+  return v;
+}
+
+// p = W mean + t: v_mean += W^T v_p, and the pose (null: not wanted) its share.
+template <class T>
+BLITZGS_HD void camera_point_vjp(const Camera<T>& camera, const Vec3<T>& mean, const Vec3<T>& v_p,
+                                 Vec3<T>* v_mean, PoseGradient<T>* pose) {
+  *v_mean = *v_mean + v_p.x * camera.row_x + v_p.y * camera.row_y + v_p.z * camera.row_z;
+  if (pose) {
+    pose->row_x = pose->row_x + v_p.x * mean;
+    pose->row_y = pose->row_y + v_p.y * mean;
+    pose->row_z = pose->row_z + v_p.z * mean;
+    pose->translation = pose->translation + v_p;
+  }
+}
+
+// c = -W^T t: gradient v_c of the camera centre to the pose.
+template <class T>
+BLITZGS_HD void camera_centre_vjp(const Camera<T>& camera, const Vec3<T>& v_c, PoseGradient<T>* pose) {
+  const Vec3<T>& t = camera.translation;
+  pose->row_x = pose->row_x - t.x * v_c;
+  pose->row_y = pose->row_y - t.y * v_c;
+  pose->row_z = pose->row_z - t.z * v_c;
+  pose->translation =
+      pose->translation - Vec3<T>{dot(camera.row_x, v_c), dot(camera.row_y, v_c), dot(camera.row_z, v_c)};
+}
+
+}  // namespace blitzgs

@@ -1,0 +1,60 @@
+// SPDX-License-Identifier: Apache-2.0
+// Three-vectors and the few scalar helpers the maths headers share.
+#pragma once
+#include <cmath>
+
+#include "common/host_device.h"
+
+namespace blitzgs {
+
+template <class T>
+struct Vec3 {
+  T x, y, z;
+};
+
+template <class T>
+BLITZGS_HD Vec3<T> operator+(const Vec3<T>& a, const Vec3<T>& b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class T>
+BLITZGS_HD Vec3<T> operator-(const Vec3<T>& a, const Vec3<T>& b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+template <class T>
+BLITZGS_HD Vec3<T> operator*(T s, const Vec3<T>& a) {
+  return {s * a.x, s * a.y, s * a.z};
+}
+template <class T>
+BLITZGS_HD T dot(const Vec3<T>& a, const Vec3<T>& b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+template <class T>
+BLITZGS_HD Vec3<T> cross(const Vec3<T>& a, const Vec3<T>& b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+template <class T>
+BLITZGS_HD Vec3<T> load3(const T* p) {
+  return {p[0], p[1], p[2]};
+}
+template <class T>
+BLITZGS_HD void store3(const Vec3<T>& a, T* p) {
+  p[0] = a.x;
+  p[1] = a.y;
+  p[2] = a.z;
+}
+
+// False for NaN and for both infinities.
+template <class T>
+BLITZGS_HD bool is_finite(T value) {
+  return value - value == T(0);
+}
+template <class T>
+BLITZGS_HD T larger(T a, T b) {
+  return a > b ? a : b;
+}
+template <class T>
+BLITZGS_HD T smaller(T a, T b) {
+  return a < b ? a : b;
+}
+
+}  // namespace blitzgs

@@ -1,0 +1,248 @@
+// SPDX-License-Identifier: Apache-2.0
+// One row: a Gaussian projected into a view, forward and backward, from the maths headers. Both backends call
+// these functions, so they compute the same row. CUDA should compile them without FMA contraction: two
+// kernels that project the same row (count, then emit) must get the same bits.
+#pragma once
+#include <cstdint>
+
+#include "math/projection.h"
+#include "math/sh.h"
+
+namespace blitzgs {
+
+inline constexpr int kMaxViews = 32;  // views of one launch: a bit mask holds them
+
+template <class T>
+struct ProjectOptions {
+  int width, height, tile_size;
+  int sh_degree, sh_stride;  // sh_stride: coefficients stored per Gaussian, K
+  T near_plane, far_plane, eps2d, radius_clip;
+  bool antialiased, raw;
+};
+
+// A Gaussian after activation, shared by its rows.
+template <class T>
+struct ActiveGaussian {
+  Vec3<T> mean, scale;
+  UnitQuaternion<T> quat;
+  Columns3<T> rotation, axes;
+  T opacity;
+};
+
+template <class T>
+struct Row {
+  T mean2d[2], conic[3], depth, opacity;
+  T extent[2];  // half width and height of the box around alpha >= 1/255, px
+};
+
+inline constexpr double kMinAlpha = 1.0 / 255.0;
+
+template <class T>
+BLITZGS_HD Vec3<T> activate_scale(const T* scale, bool raw) {
+  if (!raw) return load3(scale);
+  return {std::exp(scale[0]), std::exp(scale[1]), std::exp(scale[2])};
+}
+
+template <class T>
+BLITZGS_HD T activate_opacity(T opacity, bool raw) {
+  return raw ? sigmoid(opacity) : opacity;
+}
+
+// How far from its centre, in standard deviations, a splat of this opacity can reach alpha = 1/255; negative
+// or NaN when it never does.
+template <class T>
+BLITZGS_HD T reach(T opacity) {
+  return opacity >= T(kMinAlpha) ? std::sqrt(T(2) * std::log(larger(T(255) * opacity, T(1)))) : T(-1);
+}
+
+template <class T>
+BLITZGS_HD bool touches_image(const T* mean2d, T half_x, T half_y, const ProjectOptions<T>& options) {
+  return mean2d[0] + half_x > T(0) && mean2d[0] - half_x < T(options.width) && mean2d[1] + half_y > T(0) &&
+         mean2d[1] - half_y < T(options.height);
+}
+
+template <class T>
+BLITZGS_HD bool in_depth_range(T depth, const ProjectOptions<T>& options) {
+  return depth > options.near_plane && depth <= options.far_plane;
+}
+
+// Cheap test from 7 values a Gaussian: false only when project_row would be false. Sigma'_xx cannot exceed
+// |g_x|^2 max(s)^2 + eps, so the box around the splat cannot exceed this one (1.001: float rounding).
+template <class T>
+BLITZGS_HD bool may_be_visible(const Camera<T>& camera, const Vec3<T>& mean, const Vec3<T>& scale, T opacity,
+                               const ProjectOptions<T>& options) {
+  const T sigmas = reach(opacity);
+  const ProjectedMean p = project_mean(camera, mean);
+  if (!(sigmas >= T(0)) || !in_depth_range(T(p.z), options)) return false;
+  T mean2d[2];
+  pixel_position(camera, p, mean2d);
+  const PixelGradients<T> g = pixel_gradients(camera, p);
+  const T widest = larger(larger(scale.x * scale.x, scale.y * scale.y), scale.z * scale.z);
+  const T half_x = T(1.001) * sigmas * std::sqrt(dot(g.gx, g.gx) * widest + options.eps2d);
+  const T half_y = T(1.001) * sigmas * std::sqrt(dot(g.gy, g.gy) * widest + options.eps2d);
+  return touches_image(mean2d, half_x, half_y, options);
+}
+
+template <class T>
+BLITZGS_HD ActiveGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* quat, const Vec3<T>& scale,
+                                               T opacity) {
+  ActiveGaussian<T> gaussian;
+  gaussian.mean = mean;
+  gaussian.scale = scale;
+  gaussian.quat = normalize_quaternion(quat);
+  gaussian.rotation = rotation_columns(gaussian.quat);
+  gaussian.axes = scaled_axes(gaussian.rotation, scale);
+  gaussian.opacity = opacity;
+  return gaussian;
+}
+
+// False when the row does not exist: outside (near, far], alpha below 1/255 everywhere, no overlap with the
+// image, no larger than radius_clip, or anything not finite.
+template <class T>
+BLITZGS_HD bool project_row(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
+                            const ProjectOptions<T>& options, Row<T>* row) {
+  const ProjectedMean p = project_mean(camera, gaussian.mean);
+  row->depth = T(p.z);
+  if (!in_depth_range(row->depth, options)) return false;
+  pixel_position(camera, p, row->mean2d);
+  const Splat<T> splat = make_splat(pixel_gradients(camera, p), gaussian.axes, options.eps2d);
+  for (int i = 0; i < 3; ++i) row->conic[i] = splat.conic[i];
+  row->opacity = options.antialiased ? gaussian.opacity * compensation(splat) : gaussian.opacity;
+  const T sigmas = reach(row->opacity);
+  if (!(sigmas >= T(0)) || !is_finite(splat.conic[0] + splat.conic[1] + splat.conic[2])) return false;
+  row->extent[0] = sigmas * std::sqrt(splat.cov_xx);
+  row->extent[1] = sigmas * std::sqrt(splat.cov_yy);
+  if (options.radius_clip > T(0) && !(larger(row->extent[0], row->extent[1]) > options.radius_clip)) {
+    return false;
+  }
+  // 1.0001: an extent rounded down must not lose a pixel at the border.
+  return touches_image(row->mean2d, T(1.0001) * row->extent[0], T(1.0001) * row->extent[1], options);
+}
+
+template <class T>
+BLITZGS_HD std::int32_t pixel_radius(T extent) {
+  return static_cast<std::int32_t>(std::ceil(smaller(extent, T(1 << 30))));
+}
+
+// View direction of the SH colour: normalise(mean - camera centre). Returns 1 / distance (0 at the centre).
+template <class T>
+BLITZGS_HD T view_direction(const Camera<T>& camera, const Vec3<T>& mean, Vec3<T>* direction) {
+  const Vec3<T> offset = mean - camera.centre;
+  const T squared = dot(offset, offset);
+  const T inverse = squared > T(0) ? T(1) / std::sqrt(squared) : T(0);
+  *direction = inverse * offset;
+  return inverse;
+}
+
+// Whether the coefficients in use are finite; a Gaussian for which they are not has no rows.
+template <class T>
+BLITZGS_HD bool finite_sh(const T* sh, int degree) {
+  T zero = T(0);
+  for (int i = 0; i < 3 * sh_basis_count(degree); ++i) zero += T(0) * sh[i];
+  return zero == T(0);
+}
+
+// color = max(sum_k basis_k sh_k + 0.5, 0); sh [K, 3].
+template <class T>
+BLITZGS_HD void row_color(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree, T* color) {
+  Vec3<T> direction;
+  view_direction(camera, mean, &direction);
+  T basis[kMaxShBasis];
+  sh_basis(degree, direction, basis);
+  for (int channel = 0; channel < 3; ++channel) {
+    T sum = T(0.5);
+    for (int k = 0; k < sh_basis_count(degree); ++k) sum += basis[k] * sh[3 * k + channel];
+    color[channel] = larger(sum, T(0));
+  }
+}
+
+// v_sh [K, 3] += and v_mean +=; pose (null: not wanted) += . Zero where the colour is clipped at 0.
+template <class T>
+BLITZGS_HD void row_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree,
+                              const T* v_color, T* v_sh, Vec3<T>* v_mean, PoseGradient<T>* pose) {
+  Vec3<T> direction;
+  const T inverse_distance = view_direction(camera, mean, &direction);
+  T basis[kMaxShBasis], v_basis[kMaxShBasis] = {};
+  sh_basis(degree, direction, basis);
+  const int count = sh_basis_count(degree);
+  for (int channel = 0; channel < 3; ++channel) {
+    T sum = T(0.5);
+    for (int k = 0; k < count; ++k) sum += basis[k] * sh[3 * k + channel];
+    const T v = sum > T(0) ? v_color[channel] : T(0);
+    for (int k = 0; k < count; ++k) {
+      v_sh[3 * k + channel] += basis[k] * v;
+      v_basis[k] += sh[3 * k + channel] * v;
+    }
+  }
+  const Vec3<T> v_direction = sh_basis_vjp(degree, direction, v_basis);
+  const Vec3<T> v_offset = inverse_distance * (v_direction - dot(v_direction, direction) * direction);
+  *v_mean = *v_mean + v_offset;
+  if (pose) camera_centre_vjp(camera, T(-1) * v_offset, pose);
+}
+
+template <class T>
+struct RowGradient {
+  T mean2d[2], conic[3], depth, opacity;
+};
+
+// Gradients of an activated Gaussian, summed over its rows.
+template <class T>
+struct GaussianGradient {
+  Vec3<T> mean;
+  Columns3<T> axes;
+  T opacity;
+};
+
+// Adds one row's share to gradient and to pose (null: not wanted). Recomputes the row.
+template <class T>
+BLITZGS_HD void project_row_vjp(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
+                                const ProjectOptions<T>& options, const RowGradient<T>& v,
+                                GaussianGradient<T>* gradient, PoseGradient<T>* pose) {
+  const ProjectedMean p = project_mean(camera, gaussian.mean);
+  const PixelGradients<T> g = pixel_gradients(camera, p);
+  const Splat<T> splat = make_splat(g, gaussian.axes, options.eps2d);
+  gradient->opacity += options.antialiased ? v.opacity * compensation(splat) : v.opacity;
+  Vec3<T> v_m0, v_m1, v_gx, v_gy;
+  splat_vjp(splat, v.conic, options.antialiased ? v.opacity * gaussian.opacity : T(0), &v_m0, &v_m1);
+  factor_vjp(g, gaussian.axes, v_m0, v_m1, &v_gx, &v_gy, &gradient->axes);
+  const Vec3<T> v_p = pixel_gradients_vjp(camera, p, g, v_gx, v_gy, v.mean2d, v.depth, pose);
+  camera_point_vjp(camera, gaussian.mean, v_p, &gradient->mean, pose);
+}
+
+// The paper's scale regulariser: weight * d(min_j s_j); which of two equal axes takes it is the first.
+template <class T>
+BLITZGS_HD void smallest_axis_vjp(const Vec3<T>& scale, T weight, Vec3<T>* v_scale) {
+  if (scale.x <= scale.y && scale.x <= scale.z) {
+    v_scale->x += weight;
+  } else if (scale.y <= scale.z) {
+    v_scale->y += weight;
+  } else {
+    v_scale->z += weight;
+  }
+}
+
+// Where a Gaussian's gradients go: its slots of the compact outputs.
+template <class T>
+struct ParameterGradients {
+  T *mean, *quat, *scale, *opacity;
+};
+
+// From the activated Gaussian back to the stored parameters (log scales and logit when raw). axis_weight: the
+// summed weights of the scale regulariser over the rows. Overwrites the slots.
+template <class T>
+BLITZGS_HD void activate_gaussian_vjp(const ActiveGaussian<T>& gaussian, bool raw,
+                                      const GaussianGradient<T>& gradient, T axis_weight,
+                                      const ParameterGradients<T>& out) {
+  store3(gradient.mean, out.mean);
+  Vec3<T> v_scale;
+  Columns3<T> v_rotation;
+  scaled_axes_vjp(gaussian.rotation, gaussian.scale, gradient.axes, &v_scale, &v_rotation);
+  smallest_axis_vjp(gaussian.scale, axis_weight, &v_scale);
+  for (int i = 0; i < 4; ++i) out.quat[i] = T(0);
+  rotation_columns_vjp(gaussian.quat, v_rotation, out.quat);
+  const Vec3<T>& s = gaussian.scale;
+  store3(raw ? Vec3<T>{s.x * v_scale.x, s.y * v_scale.y, s.z * v_scale.z} : v_scale, out.scale);
+  *out.opacity = raw ? gradient.opacity * sigmoid_slope(gaussian.opacity) : gradient.opacity;
+}
+
+}  // namespace blitzgs
