@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+// Intersection: which rows each tile composites, front to back.
+//
+// Row p (a splat in camera camera_ids[p]) is listed in tile t of that camera iff for_each_tile() of
+// math/tiles.h visits it. Within a tile the rows are ordered by (depth, id); without ids by (depth, row).
+// -0 and 0 are different depths; a NaN depth lists nothing defined.
+//
+//   means2d [P, 2] pixels, conics [P, 3], opacities [P], depths [P], camera_ids int32 [P], ids int64 [P] or
+//   null  ->  isect_rows int32 [I] row indices, tile_offsets int64 [B*T + 1] with T = tiles_y * tiles_x:
+//   tile t's list is isect_rows[tile_offsets[t] .. tile_offsets[t + 1]). Tiles that grid does not own have
+//   empty lists.
+//
+// capacity is the length of isect_rows and at least the true count; entries from tile_offsets[B*T] on are
+// left unspecified. The CPU kernel returns the true count and writes no list when it exceeds the capacity
+// (the op then fails with both numbers); the CUDA kernel may trust the capacity.
+//
+// Deterministic: the lists depend on the rows alone, never on threads. Row order need not follow depth.
+// O(P log-free radix passes + tile rows + I). Counts are 64-bit, P < 2^31.
+#pragma once
+#include <cstdint>
+
+#include "common/stream.h"
+#include "math/tiles.h"
+
+namespace blitzgs {
+
+template <class T>
+struct IntersectInput {
+  const T* means2d;
+  const T* conics;
+  const T* opacities;
+  const T* depths;
+  const std::int32_t* camera_ids;
+  const std::int64_t* ids;
+  std::int64_t n_rows;
+  TileGrid grid;
+};
+
+namespace cpu {
+template <class T>
+std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
+template <class T>
+std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_rows,
+                       std::int64_t* tile_offsets, Workspace&, CudaStream);
+}  // namespace cpu
+
+namespace cuda {
+// Waits for the device: the count is needed on the host.
+template <class T>
+std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
+// Returns a count that is exact or at most the capacity, without waiting for the device.
+template <class T>
+std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_rows,
+                       std::int64_t* tile_offsets, Workspace&, CudaStream);
+}  // namespace cuda
+
+}  // namespace blitzgs

@@ -1,0 +1,230 @@
+// SPDX-License-Identifier: Apache-2.0
+// Which tiles a splat touches: the test that projection (counting) and intersection (listing) share, on
+// every backend.
+//
+// A splat is drawn where opacity * exp(-q/2) >= 1/255 with q = a dx^2 + 2 b dx dy + c dy^2, that is inside
+// the ellipse q <= 2 ln(255 opacity). A tile is listed iff, over its pixel rows, that ellipse spans at least
+// one of its pixel columns: per tile row the x-interval of the ellipse over the band of pixel centres is
+// found in closed form (the interval is widest at the clamped turning point), so the cost is O(tile rows).
+//
+// Conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q and the interval by some float
+// roundings, which covers the rounding of this test and of the rasterisers that evaluate q as
+// factor_conic() writes it. Listing can therefore never change the image, nor does leaving out what is not
+// listed. Not finite, not convex (a <= 0 or c <= 0) or too faint (opacity < 1/255): no tiles.
+//
+// All contexts must count alike (a count from one kernel sizes the buffer of another), so no expression here
+// leaves the compiler a choice of contraction.
+#pragma once
+#include <cmath>
+#include <cstdint>
+
+#include "common/host_device.h"
+
+namespace blitzgs {
+
+constexpr double kAlphaCut = 1.0 / 255.0;   // a splat touches a pixel iff alpha >= this
+constexpr double kAlphaMax = 0.99;          // alpha is clipped here
+constexpr double kMinTransmittance = 1e-4;  // a pixel ends before its transmittance would fall below this
+
+// Tiles of B images of one size, flattened as (camera * tiles_y + ty) * tiles_x + tx. Only tiles in
+// [tile_begin, tile_end) are owned: the others are not listed, and their pixels are zero.
+struct TileGrid {
+  int n_cameras, width, height, tile_size, tiles_x, tiles_y;
+  std::int64_t tile_begin, tile_end;
+
+  BLITZGS_HD std::int64_t per_image() const { return static_cast<std::int64_t>(tiles_x) * tiles_y; }
+  BLITZGS_HD std::int64_t count() const { return n_cameras * per_image(); }
+};
+
+// tile_end < 0 means all tiles.
+BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int tile_size,
+                                   std::int64_t tile_begin, std::int64_t tile_end) {
+  const int tiles_x = (width + tile_size - 1) / tile_size;
+  const int tiles_y = (height + tile_size - 1) / tile_size;
+  TileGrid grid{n_cameras, width, height, tile_size, tiles_x, tiles_y, tile_begin, tile_end};
+  if (tile_end < 0) grid.tile_end = grid.count();
+  return grid;
+}
+
+namespace tiles {
+
+// On a GPU the fused form is written out; on a CPU contraction is off, and fma() would be a library call.
+template <class T>
+BLITZGS_HD T mul_add(T a, T b, T c) {
+#ifdef __CUDA_ARCH__
+  return fma(a, b, c);
+#else
+  return a * b + c;
+#endif
+}
+
+// A product that is added to something afterwards.
+template <class T>
+BLITZGS_HD T mul(T a, T b) {
+#ifdef __CUDA_ARCH__
+  if constexpr (sizeof(T) == 4) {
+    return __fmul_rn(a, b);
+  } else {
+    return __dmul_rn(a, b);
+  }
+#else
+  return a * b;
+#endif
+}
+
+// NaN becomes the lower or the upper bound, as the name says.
+template <class T>
+BLITZGS_HD T clamp_nan_low(T value, T low, T high) {
+  return value > low ? (value < high ? value : high) : low;
+}
+template <class T>
+BLITZGS_HD T clamp_nan_high(T value, T low, T high) {
+  return value < high ? (value > low ? value : low) : high;
+}
+
+template <class T>
+BLITZGS_HD bool finite(T value) {
+  return value - value == T(0);
+}
+
+}  // namespace tiles
+
+// conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2: never negative, and free of the cancellation that
+// ruins a dx^2 + 2 b dx dy + c dy^2 for thin splats. A conic whose rounding made it indefinite gets l22 = 0:
+// a splat that long is constant along its axis. The products of floats are exact in double.
+template <class T>
+struct ConicFactor {
+  T l11, l21, l22;
+};
+
+template <class T>
+BLITZGS_HD double conic_determinant(const T* conic) {
+  const double b = static_cast<double>(conic[1]);
+  const double bb = b * b;
+#ifdef __CUDA_ARCH__
+  const double det = fma(static_cast<double>(conic[0]), static_cast<double>(conic[2]), -bb);
+#else
+  const double det = static_cast<double>(conic[0]) * static_cast<double>(conic[2]) - bb;
+#endif
+  return det > 0.0 ? det : 0.0;
+}
+
+template <class T>
+BLITZGS_HD ConicFactor<T> factor_conic(const T* conic) {
+  ConicFactor<T> factor;
+  factor.l11 = std::sqrt(conic[0]);
+  factor.l21 = conic[1] / factor.l11;
+  factor.l22 = std::sqrt(static_cast<T>(conic_determinant(conic) / static_cast<double>(conic[0])));
+  return factor;
+}
+
+// The enlarged ellipse of a splat relative to its mean.
+template <class T>
+struct SplatEllipse {
+  T cut;      // q <= cut
+  T shear;    // the ellipse's chord at height dy is centred on dx = -shear * dy
+  T inv_l11;  // half a chord: sqrt(cut - (l22 dy)^2) * inv_l11
+  T l22;
+  T half_width, half_height;  // of the bounding box, infinite for a stripe
+  T turn;                     // dy of the rightmost point; the leftmost has -turn
+};
+
+// False when the splat is drawn nowhere.
+template <class T>
+BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse) {
+  const T a = conic[0], b = conic[1], c = conic[2];
+  if (!(opacity >= static_cast<T>(kAlphaCut)) || !tiles::finite(opacity)) return false;
+  if (!(a > T(0)) || !(c > T(0)) || !tiles::finite(a) || !tiles::finite(b) || !tiles::finite(c)) return false;
+  const T exact = T(2) * std::log(T(255) * opacity);
+  ellipse->cut = tiles::mul_add(exact > T(0) ? exact : T(0), T(1.00002), T(2e-5));
+  const ConicFactor<T> factor = factor_conic(conic);
+  if (!(factor.l11 > T(0))) return false;
+  const double det = conic_determinant(conic);
+  const T root = std::sqrt(ellipse->cut);
+  ellipse->inv_l11 = T(1) / factor.l11;
+  ellipse->shear = b / a;
+  ellipse->l22 = factor.l22;
+  ellipse->half_height = tiles::mul(root, std::sqrt(static_cast<T>(static_cast<double>(a) / det)));
+  ellipse->half_width = tiles::mul(root, std::sqrt(static_cast<T>(static_cast<double>(c) / det)));
+  ellipse->turn = b == T(0) ? T(0) : -(b / c) * ellipse->half_width;
+  return tiles::finite(ellipse->shear) && tiles::finite(ellipse->inv_l11);
+}
+
+// Half-widths in pixels of the box around {alpha >= 1/255} (slack included, infinite for a stripe); false,
+// and zeros, when the splat is drawn nowhere.
+template <class T>
+BLITZGS_HD bool splat_extent(const T* conic, T opacity, T* rx, T* ry) {
+  SplatEllipse<T> ellipse;
+  const bool drawn = make_ellipse(conic, opacity, &ellipse);
+  *rx = drawn ? ellipse.half_width : T(0);
+  *ry = drawn ? ellipse.half_height : T(0);
+  return drawn;
+}
+
+// First and last index of the pixel centres i + 0.5 in [low, high], within [0, size); empty: first > last.
+// A NaN bound does not bound.
+template <class T>
+BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
+  *first = static_cast<int>(std::ceil(tiles::clamp_nan_low(low - T(0.5), T(0), static_cast<T>(size))));
+  *last = static_cast<int>(std::floor(tiles::clamp_nan_high(high - T(0.5), T(-1), static_cast<T>(size - 1))));
+}
+
+// One end of the ellipse's interval over a band of rows, as x. side is -1 (left) or 1; dy is the height
+// within the band where that end reaches furthest.
+template <class T>
+BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
+  constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
+  const T w = e.l22 * dy;
+  const T rest = tiles::mul_add(-w, w, e.cut);
+  const T root = std::sqrt(rest > T(0) ? rest : T(0));
+  const T middle = tiles::mul(-e.shear, dy);
+  // What rounding may have cost: of the terms added up, and of dy through the shear.
+  const T tilt = tiles::mul_add(std::fabs(e.shear), std::fabs(y), std::fabs(x));
+  const T terms = tiles::mul_add(root, e.inv_l11, tilt + std::fabs(middle));
+  const T end = x + tiles::mul_add(side * root, e.inv_l11, middle);
+  return tiles::mul_add(side * kRounding, terms, end);
+}
+
+// Calls f(ty, tx_begin, tx_end) for each tile row with a touched tile, top to bottom.
+template <class T, class F>
+BLITZGS_HD void for_each_tile_row(const T* mean2d, const T* conic, T opacity, int width, int height,
+                                  int tile_size, const F& f) {
+  constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
+  const T x = mean2d[0], y = mean2d[1];
+  SplatEllipse<T> e;
+  if (!tiles::finite(x) || !tiles::finite(y) || !make_ellipse(conic, opacity, &e)) return;
+  const T half = tiles::mul_add(kRounding, std::fabs(y), e.half_height);
+  int row_first, row_last;
+  pixels_between(y - half, y + half, height, &row_first, &row_last);
+  for (int row = row_first; row <= row_last;) {
+    const int ty = row / tile_size;
+    const int band_last = (ty + 1) * tile_size - 1 < row_last ? (ty + 1) * tile_size - 1 : row_last;
+    const T low = static_cast<T>(row) + T(0.5) - y, high = static_cast<T>(band_last) + T(0.5) - y;
+    const T left = chord_end(e, x, y, tiles::clamp_nan_low(-e.turn, low, high), T(-1));
+    const T right = chord_end(e, x, y, tiles::clamp_nan_low(e.turn, low, high), T(1));
+    int column_first, column_last;
+    pixels_between(left, right, width, &column_first, &column_last);
+    if (column_first <= column_last) f(ty, column_first / tile_size, column_last / tile_size + 1);
+    row = band_last + 1;
+  }
+}
+
+// Calls f(tx, ty) for each touched tile, row by row.
+template <class T, class F>
+BLITZGS_HD void for_each_tile(const T* mean2d, const T* conic, T opacity, int width, int height,
+                              int tile_size, const F& f) {
+  for_each_tile_row(mean2d, conic, opacity, width, height, tile_size, [&](int ty, int begin, int end) {
+    for (int tx = begin; tx < end; ++tx) f(tx, ty);
+  });
+}
+
+template <class T>
+BLITZGS_HD std::int32_t count_tiles(const T* mean2d, const T* conic, T opacity, int width, int height,
+                                    int tile_size) {
+  std::int32_t count = 0;
+  for_each_tile_row(mean2d, conic, opacity, width, height, tile_size,
+                    [&](int, int begin, int end) { count += end - begin; });
+  return count;
+}
+
+}  // namespace blitzgs

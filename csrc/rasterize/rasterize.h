@@ -1,0 +1,102 @@
+// SPDX-License-Identifier: Apache-2.0
+// Rasterisation: alpha compositing of each tile's list, front to back, and its gradient.
+//
+// Per pixel with centre (i + 0.5, j + 0.5), over the tile's list in order, T = 1 at the start:
+//   q     = a dx^2 + 2 b dx dy + c dy^2,  (dx, dy) = pixel centre - mean2d,  conic = (a, b, c)
+//   alpha = min(0.99, opacity * exp(-q / 2));           skipped unless alpha >= 1/255
+//   if T (1 - alpha) < 1e-4 the pixel ends and this splat is not composited
+//   color += alpha T row_color;  T *= 1 - alpha
+// and at the end color += T background. No other cut: culling inside the kernel is conservative (q is best
+// evaluated through factor_conic() of math/tiles.h, which the tile test's slack is made for).
+//
+//   means2d [P, 2], conics [P, 3], opacities [P], colors [P, D], backgrounds [B, D] or null, isect_rows and
+//   tile_offsets from intersect  ->  renders [B, H, W, D]; transmittances [B, H, W] (final T; alpha = 1 - T);
+//   last_ids int32 [B, H, W]: 1 + index in the tile's list of the last composited entry, 0 for none;
+//   tile_work int32 [B*T]: list entries processed before every pixel of the tile had ended (or the list
+//   had): what the tile cost. Pixels of unowned tiles are zero in all outputs, transmittance included.
+//
+// Exact: a pixel depends on its tile's list and the rows in it alone, so tile ranges, batch position, threads
+// and (CPU) the instruction set change no bit. The CPU float32 kernel does the same operations with and
+// without AVX2. CPU and CUDA agree to rounding.
+//
+// Gradients, given v_renders [B, H, W, D] and optionally v_alphas [B, H, W]: per row v_means2d [P, 2],
+// v_conics [P, 3] (of a, b, c as three independent numbers), v_opacities [P], v_colors [P, D], and with
+// absgrad v_means2d_abs [P, 2] = sum over pixels of |that pixel's gradient of mean2d| per axis. Zero where
+// min(0.99, .) clips; the order, the cut at 1/255 and the end of a pixel are constants. The gradient of the
+// background is sum over pixels of v_renders * T, left to the caller. Rows in no list get zeros. v_renders
+// of unowned tiles are not read.
+//
+// The CPU gradient is bitwise repeatable for any number of threads: one partial sum per (row, tile), added in
+// the order of the tiles. CUDA: when deterministic is set. O(entries processed x pixels of the splat).
+#pragma once
+#include <cstdint>
+
+#include "common/stream.h"
+#include "math/tiles.h"
+
+namespace blitzgs {
+
+template <class T>
+struct RasterizeInput {
+  const T* means2d;
+  const T* conics;
+  const T* opacities;
+  const T* colors;
+  const T* backgrounds;  // null: black
+  const std::int32_t* isect_rows;
+  const std::int64_t* tile_offsets;
+  std::int64_t n_rows;
+  int n_channels;
+  TileGrid grid;
+};
+
+template <class T>
+struct RasterizeOutput {
+  T* renders;
+  T* transmittances;
+  std::int32_t* last_ids;
+  std::int32_t* tile_work;
+};
+
+template <class T>
+struct RasterizeSaved {
+  const T* renders;
+  const T* transmittances;
+  const std::int32_t* last_ids;
+  const T* v_renders;
+  const T* v_alphas;  // null: zero
+};
+
+template <class T>
+struct RasterizeGradients {
+  T* v_means2d;
+  T* v_conics;
+  T* v_opacities;
+  T* v_colors;
+  T* v_means2d_abs;  // null: not wanted
+};
+
+namespace cpu {
+// All outputs are written in full.
+template <class T>
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, Workspace&, CudaStream);
+template <class T>
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved,
+                   const RasterizeGradients<T>& gradients, Workspace&, CudaStream);
+}  // namespace cpu
+
+namespace cuda {
+// aux is the backend's own memory between forward and backward, 16-byte aligned. aux_bytes() may depend on
+// the shapes and the number of entries, not on values on the device.
+std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, std::int64_t n_isects,
+                                 int n_channels);
+template <class T>
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t n_isects,
+                   void* aux, Workspace&, CudaStream);
+template <class T>
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
+                   const void* aux, bool deterministic, const RasterizeGradients<T>& gradients, Workspace&,
+                   CudaStream);
+}  // namespace cuda
+
+}  // namespace blitzgs
