@@ -10,7 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-# The learned parameters, before activation: log scales, opacity logits, unnormalised quaternions (w, x, y, z).
+# The learned parameters, before activation: log scales, opacity logits, unnormalised quaternions.
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 EXP_AVGS = tuple(f"exp_avg.{name}" for name in PARAMETERS)
 EXP_AVG_SQS = tuple(f"exp_avg_sq.{name}" for name in PARAMETERS)
@@ -113,7 +113,7 @@ class GaussianTable:
         return table
 
     def __len__(self) -> int:
-        return self.columns["means"].shape[0]
+        return int(self.columns["means"].shape[0])
 
     def __getitem__(self, name: str) -> Tensor:
         return self.columns[name]

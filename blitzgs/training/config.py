@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The configuration of a run: nested dataclasses, one per concern, with the defaults of the method.
+
+Times are counted in images and are multiplied by `schedule.scale`; lengths are relative to the scene's
+`extent` (1.1 x the largest distance of a camera from their mean centre), never absolute.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Where images come from and which are held out.
+
+    Attributes:
+        images: image folder inside the capture.
+        downscale: integer factor by which images are reduced (1: as they are).
+        masks: mask folder inside the capture, or null.
+        split: "every" (each `test_every`-th view is held out), "val" (Mega-NeRF's `val/` layout) or the path
+            of a text file with one held-out image name a line.
+        test_every: see `split`; 0 holds nothing out.
+        cache_bytes: budget for the compressed images held in memory.
+        threads: decoder threads.
+        prefetch: batches decoded and uploaded ahead.
+    """
+
+    images: str = "images"
+    downscale: int = 1
+    masks: str | None = None
+    split: str = "every"
+    test_every: int = 8
+    cache_bytes: int = 8_000_000_000
+    threads: int = 4
+    prefetch: int = 3
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What is rendered.
+
+    Attributes:
+        sh_degree: highest spherical-harmonics degree, 0..3.
+        background: colour behind everything, RGB in [0, 1].
+        antialiased: compensate the screen-space blur (Mip-Splatting's 2D filter) instead of the classic
+            image.
+        near: near plane, relative to extent.
+        far: far plane, relative to extent.
+        eps2d: screen-space blur added to the projected covariance, pixels squared.
+        initial_opacity: opacity of the initial Gaussians.
+    """
+
+    sh_degree: int = 3
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    antialiased: bool = False
+    near: float = 0.01
+    far: float = 1e6
+    eps2d: float = 0.3
+    initial_opacity: float = 0.1
+
+
+@dataclass(frozen=True)
+class LodConfig:
+    """The octree of the initial Gaussians (METHOD: multi-resolution voxels of the SfM cloud).
+
+    Attributes:
+        fork: ratio f of the voxel sizes of neighbouring levels.
+        visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
+            cameras.
+        base_resolution: finest sensible voxel relative to the scene's box; sets the coarsest level's size.
+    """
+
+    fork: float = 2.0
+    visible_threshold: float = 0.9
+    base_resolution: float = 0.001
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """When things happen, in images; `scale` multiplies every time below.
+
+    Attributes:
+        iterations: length of the run.
+        scale: stretches or compresses the whole schedule without changing its shape.
+        batch_size: views per optimiser step B; one step advances the clock by B.
+        densify_from, densify_until, densify_every: density-control events at from, from + every, ... < until.
+        size_prune_after: density events later than this also prune by size.
+        sh_every: the spherical-harmonics degree grows by one each time.
+        position_decay: length of the exponential decay of the position learning rate.
+        checkpoint_every: 0 saves at the end only.
+        evaluate_every: 0 evaluates at the end only.
+    """
+
+    iterations: int = 30_000
+    scale: float = 1.0
+    batch_size: int = 1
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    size_prune_after: int = 3_000
+    sh_every: int = 1_000
+    position_decay: int = 30_000
+    checkpoint_every: int = 0
+    evaluate_every: int = 0
+
+
+@dataclass(frozen=True)
+class OptimiserConfig:
+    """Adam with batch scaling: lr sqrt(B), beta^B, eps / sqrt(B).
+
+    Attributes:
+        position, position_final: learning rates of the means, relative to extent, at the start and after
+            `schedule.position_decay`.
+        sh_dc, sh_rest, opacity, scale, rotation: learning rates.
+        beta1, beta2, eps: Adam's constants for B = 1.
+        sparse: leave the rows outside a step's active set alone (no decay, no drift) instead of repaying the
+            steps they missed.
+    """
+
+    position: float = 1.6e-4
+    position_final: float = 1.6e-6
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 1.25e-4
+    opacity: float = 2.5e-2
+    scale: float = 5e-3
+    rotation: float = 1e-3
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+    sparse: bool = False
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """(1 - ssim) L1 + ssim (1 - SSIM) + scale L_scale per view.
+
+    Attributes:
+        ssim: weight of the SSIM term.
+        scale: weight of the mean smallest axis of the visible Gaussians.
+        scale_reference: that axis is measured in units of extent x scale_reference.
+    """
+
+    ssim: float = 0.2
+    scale: float = 10.0
+    scale_reference: float = 10.0
+
+
+@dataclass(frozen=True)
+class PopulationConfig:
+    """Density control: which Gaussians are cloned, split and pruned.
+
+    Attributes:
+        grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
+            densified.
+        clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split.
+        min_opacity: Gaussians below are pruned.
+        prune_screen_radius: pixels; larger Gaussians are pruned after `schedule.size_prune_after`.
+        prune_world_scale: relative to extent; Gaussians with a larger axis are pruned after the same time.
+        max_gaussians: the population never exceeds this; the strongest candidates come first. 0: no cap.
+    """
+
+    grad_threshold: float = 2e-4
+    clone_scale: float = 0.01
+    min_opacity: float = 0.005
+    prune_screen_radius: float = 20.0
+    prune_world_scale: float = 0.1
+    max_gaussians: int = 0
+
+
+@dataclass(frozen=True)
+class LogConfig:
+    """What a run reports.
+
+    Attributes:
+        every: images between two log records.
+        tensorboard: also write TensorBoard events (when the package is installed).
+        pictures: side-by-side pictures written by an evaluation.
+        keep_checkpoints: how many checkpoints stay on disk.
+        lpips_weights: path of LPIPS weights for the evaluation, or null.
+    """
+
+    every: int = 100
+    tensorboard: bool = True
+    pictures: int = 8
+    keep_checkpoints: int = 3
+    lpips_weights: str | None = None
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides what a run computes.
+
+    Attributes:
+        seed: of the batch order and of every random draw.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    lod: LodConfig = field(default_factory=LodConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    population: PopulationConfig = field(default_factory=PopulationConfig)
+    log: LogConfig = field(default_factory=LogConfig)
+    seed: int = 0

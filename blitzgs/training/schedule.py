@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one clock of a run: which events happen in a step, and the learning rates of every step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from blitzgs.training.config import OptimiserConfig, ScheduleConfig
+
+EventKind = Literal["densify", "evaluate", "checkpoint"]
+# The columns of the learning-rate table.
+RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
+
+
+@dataclass(frozen=True, order=True)
+class Event:
+    """Something that happens at the end of the step that contains `time` (in images)."""
+
+    time: int
+    order: int
+    kind: EventKind
+
+
+class Schedule:
+    """Answers what happens when. Time t counts images; a step covers [t, t + B) and has the number t / B + 1.
+
+    Every time of the configuration is multiplied by `scale` and rounded down, so the same shape runs at any
+    length.
+
+    Attributes:
+        batch_size: views per step, B.
+        steps: optimiser steps of the whole run.
+        iterations: images of the whole run, steps x B.
+    """
+
+    def __init__(self, config: ScheduleConfig) -> None:
+        self._config = config
+        self.batch_size = config.batch_size
+        self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
+        self.iterations = self.steps * self.batch_size
+
+    def _scaled(self, time: float) -> int:
+        # The small excess keeps 0.1 * 30 from falling to 2.
+        return math.floor(time * self._config.scale + 1e-6)
+
+    def events(self, begin: int, end: int) -> list[Event]:
+        """Return the events with begin <= time < end, in the order in which they happen."""
+        config = self._config
+        found = [
+            Event(time, 0, "densify")
+            for time in self._series(
+                config.densify_from, config.densify_until, config.densify_every, begin, end
+            )
+        ]
+        for order, (kind, every) in enumerate(
+            (("evaluate", config.evaluate_every), ("checkpoint", config.checkpoint_every)), start=1
+        ):
+            if every > 0:
+                times = self._series(every, math.inf, every, begin, end)
+                found += [Event(time, order, kind) for time in times]  # type: ignore[arg-type]
+        return sorted(found)
+
+    def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
+        """Times floor(scale (first + k every)) below `until` that lie in [begin, end)."""
+        k = max(0, math.floor((begin / self._config.scale - first) / every) - 1)
+        times: list[int] = []
+        while (unscaled := first + k * every) < until and (time := self._scaled(unscaled)) < end:
+            # A compressed schedule may put two of a kind on one image: they are one event.
+            if time >= begin and (not times or times[-1] != time):
+                times.append(time)
+            k += 1
+        return times
+
+    def sh_degree(self, begin: int, limit: int) -> int:
+        """Degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
+        every = self._config.sh_every * self._config.scale
+        return min(limit, math.ceil((begin + self.batch_size) / every - 1e-9) - 1)
+
+    def prunes_by_size(self, time: int) -> bool:
+        """Tell whether a density event at `time` also prunes by screen and world size."""
+        return time > self._scaled(self._config.size_prune_after)
+
+    def learning_rates(self, config: OptimiserConfig, extent: float) -> Tensor:
+        """Tabulate the learning rates of the whole run.
+
+        The position rate falls exponentially from `position` to `position_final` over `position_decay`
+        images, both times `extent`; every rate is multiplied by sqrt(B).
+
+        Args:
+            config: the rates for B = 1.
+            extent: the scene's extent in its own unit.
+
+        Returns:
+            float32 [S + 1, 6]: row s holds the rates of step s = 1..S for `RATES`; row 0 is zero.
+        """
+        begin = torch.arange(self.steps, dtype=torch.float64) * self.batch_size
+        progress = (begin / (self._config.position_decay * self._config.scale)).clamp(max=1.0)
+        position = config.position * (config.position_final / config.position) ** progress * extent
+        constants = (config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest)
+        table = torch.zeros(self.steps + 1, len(RATES), dtype=torch.float64)
+        table[1:, 0] = position
+        table[1:, 1:] = torch.tensor(constants, dtype=torch.float64)
+        return (table * math.sqrt(self.batch_size)).float()

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import pytest
+import torch
+
+from blitzgs.training.config import OptimiserConfig, ScheduleConfig
+from blitzgs.training.schedule import Schedule
+
+
+def all_events(config):
+    schedule = Schedule(config)
+    steps = [
+        schedule.events(step * schedule.batch_size, (step + 1) * schedule.batch_size)
+        for step in range(schedule.steps)
+    ]
+    return schedule, steps
+
+
+def test_paper_schedule_densifies_thirty_times_and_last_at_31000():
+    config = ScheduleConfig(
+        iterations=90_000, batch_size=4, densify_from=2_000, densify_until=32_000, densify_every=1_000
+    )
+    schedule, steps = all_events(config)
+    times = [event.time for step in steps for event in step]
+    assert times == list(range(2_000, 32_000, 1_000))
+    assert schedule.steps == 22_500
+    for step, events in enumerate(steps):
+        assert all(4 * step <= event.time < 4 * step + 4 for event in events)
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.25, 1 / 3, 2.0])
+def test_one_field_scales_every_time(scale):
+    config = ScheduleConfig(
+        iterations=3_000, densify_from=50, densify_until=1_500, densify_every=10, scale=scale
+    )
+    schedule, steps = all_events(config)
+    times = [event.time for step in steps for event in step]
+    expected = sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
+    assert times == expected
+    assert schedule.steps == math.floor(3_000 * scale + 1e-6)
+
+
+def test_events_do_not_depend_on_how_the_run_is_cut():
+    config = ScheduleConfig(
+        iterations=400, densify_from=20, densify_until=300, densify_every=7, evaluate_every=50
+    )
+    schedule = Schedule(config)
+    whole = schedule.events(0, 400)
+    pieces = [event for begin in range(0, 400, 3) for event in schedule.events(begin, min(begin + 3, 400))]
+    assert pieces == whole
+    assert [event.kind for event in whole if event.time == 50] == ["evaluate"]
+
+
+def test_sh_degree_grows_in_the_step_that_contains_the_event():
+    schedule = Schedule(ScheduleConfig(batch_size=4, sh_every=10))
+    assert [schedule.sh_degree(begin, 3) for begin in (0, 4, 8, 12, 16, 20, 28, 40)] == [
+        0,
+        0,
+        1,
+        1,
+        1,
+        2,
+        3,
+        3,
+    ]
+
+
+def test_size_pruning_starts_after_its_time():
+    schedule = Schedule(ScheduleConfig(size_prune_after=3_000, scale=0.5))
+    assert not schedule.prunes_by_size(1_500)
+    assert schedule.prunes_by_size(1_501)
+
+
+def test_learning_rates():
+    config = OptimiserConfig()
+    schedule = Schedule(ScheduleConfig(iterations=1_000, batch_size=4, position_decay=500))
+    table = schedule.learning_rates(config, extent=2.0).double()
+    assert table.shape == (251, 6)
+    assert not table[0].any()
+    for step in (1, 2, 77, 126, 250):
+        fraction = min((step - 1) * 4 / 500, 1.0)
+        position = 2.0 * math.exp(
+            (1 - fraction) * math.log(config.position) + fraction * math.log(config.position_final)
+        )
+        expected = torch.tensor(
+            [position, config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest]
+        ).double()
+        torch.testing.assert_close(table[step], 2.0 * expected, rtol=1e-6, atol=0.0)
