@@ -93,8 +93,8 @@ class Ranks:
             device_id=self.device if on_gpu else None,
         )
         self.barrier()
-        # NCCL's own watchdog kills the process with a long dump; ours comes first and names the culprit.
-        margin = 30.0 if on_gpu else 0.0
+        # The libraries' own timeouts say only which socket or operation; ours comes first and names a rank.
+        margin = 2.0 * Watchdog.period_for(self.timeout_seconds) + 10.0
         dist.distributed_c10d._set_pg_timeout(
             timedelta(seconds=self.timeout_seconds + margin), dist.group.WORLD
         )

@@ -34,7 +34,7 @@ class Watchdog:
         self.rank = rank
         self.world_size = world_size
         self.timeout_seconds = timeout_seconds
-        self.period = min(2.0, timeout_seconds / 5)
+        self.period = self.period_for(timeout_seconds)
         # A connection of its own: the process group's may block inside a collective.
         client = TCPStore(
             os.environ["MASTER_ADDR"],
@@ -53,6 +53,11 @@ class Watchdog:
         self.thread = threading.Thread(target=self._run, name="blitzgs-watchdog", daemon=True)
         self._publish()
         self.thread.start()
+
+    @staticmethod
+    def period_for(timeout_seconds: float) -> float:
+        """Seconds between two looks at the clock."""
+        return min(2.0, timeout_seconds / 5)
 
     def enter(self, name: str) -> None:
         """Note that this rank waits in a collective."""

@@ -4,6 +4,7 @@
 import multiprocessing
 import multiprocessing.connection
 import os
+import pickle
 import time
 import traceback
 
@@ -30,17 +31,21 @@ def _child(function, rank, world_size, port, timeout_seconds, arguments, pipe):
     )
     try:
         with Ranks.from_environment("cpu", timeout_seconds) as ranks:
-            result = function(ranks, *arguments)
-        pipe.send(("ok", result))
+            result = function(ranks, *pickle.loads(arguments))
+        pipe.send_bytes(pickle.dumps(("ok", result)))
     except BaseException:  # noqa: BLE001  (reported to the parent)
-        pipe.send(("error", traceback.format_exc()))
+        pipe.send_bytes(pickle.dumps(("error", traceback.format_exc())))
         raise
 
 
 class RankError(AssertionError):
-    """A rank failed; `messages[rank]` is its traceback, or its exit code when it left none."""
+    """A rank failed; `messages[rank]` is its traceback, or its exit code when it left none.
 
-    def __init__(self, messages):
+    `blame` is what the first rank to fail told the others.
+    """
+
+    def __init__(self, messages, blame):
+        self.blame = blame
         super().__init__("\n".join(f"--- rank {rank}\n{text}" for rank, text in messages.items()))
         self.messages = messages
 
@@ -49,11 +54,13 @@ def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.
     """Return [function(ranks, *arguments) of each rank]; raise RankError if any rank fails."""
     # Like torchrun's agent, the parent holds the store, so that it outlives any rank.
     store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    # Plain pickles: multiprocessing's own would share the tensors' memory with the ranks.
+    payload = pickle.dumps(arguments)
     processes, pipes = [], []
     for rank in range(world_size):
         receiver, sender = CONTEXT.Pipe(duplex=False)
         process = CONTEXT.Process(
-            target=_child, args=(function, rank, world_size, store.port, timeout_seconds, arguments, sender)
+            target=_child, args=(function, rank, world_size, store.port, timeout_seconds, payload, sender)
         )
         process.start()
         sender.close()
@@ -71,7 +78,7 @@ def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.
                 failures[rank] = "stopped by the test"
                 continue
             try:
-                status, value = pipe.recv()
+                status, value = pickle.loads(pipe.recv_bytes())
             except EOFError:
                 processes[rank].join()
                 status, value = "error", f"exit code {processes[rank].exitcode}"
@@ -84,5 +91,6 @@ def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.
     for process in processes:
         process.join(10)
     if failures:
-        raise RankError(failures)
+        key = "blitzgs/0/failure"
+        raise RankError(failures, store.get(key).decode() if store.check([key]) else "")
     return results

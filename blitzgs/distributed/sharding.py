@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which rank owns which Gaussian: positions of the global order, dealt round-robin (paper §3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+
+
+def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
+    """Position in the global order of each row of one shard.
+
+    The global order takes row 0 of every rank, then row 1 of every rank, and so on, leaving out the ranks
+    that have run out. A table dealt round-robin therefore keeps its order, and shards whose sizes differ by
+    at most one (the larger ones first) already hold exactly the positions = rank (mod M).
+
+    Args:
+        sizes: rows on each rank, M values.
+        rank: the shard asked about.
+
+    Returns:
+        int64 [sizes[rank]], ascending.
+    """
+    rows = torch.arange(sizes[rank], dtype=torch.int64)
+    positions = torch.zeros_like(rows)
+    for other, size in enumerate(sizes):
+        # Rows of `other` in the rounds before this one, plus its row of this round if it comes first.
+        positions += (rows + 1 if other < rank else rows).clamp(max=size)
+    return positions
+
+
+def shard_sizes(rows: int, ranks: Ranks) -> list[int]:
+    """Rows on each rank now."""
+    counts = ranks.all_gather(torch.tensor([rows], dtype=torch.int64, device=ranks.device))
+    return [int(count.item()) for count in counts]
+
+
+def imbalance(sizes: Sequence[int]) -> float:
+    """Largest over smallest shard; infinite when one is empty and another is not, 1 when all are."""
+    if max(sizes) == 0:
+        return 1.0
+    return max(sizes) / min(sizes) if min(sizes) else float("inf")

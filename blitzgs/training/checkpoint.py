@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints that survive crashes and load at any world size.
+
+A checkpoint is a folder: one safetensors file per rank with the columns of its shard, and `manifest.json`
+with the size and SHA-256 of each file and the training state. It is written to a temporary folder, synced to
+disk, and renamed, so a folder with the final name is complete; whether its bytes are still right is checked
+against the digests on loading. The folder must be on a file system that every rank sees.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.sharding import global_positions
+from blitzgs.training.shard_file import file_digest, header_of, sync_folder, write_shard
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+_NAME = re.compile(r"checkpoint_(\d{6})")
+_UNFINISHED = ".unfinished_"
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint could not be written or read; says which and why."""
+
+
+@dataclass
+class Shard:
+    """One file of a checkpoint: name, rows of the table in it, size and SHA-256."""
+
+    file: str
+    rows: int
+    bytes: int
+    sha256: str
+
+
+def save(
+    directory: str | os.PathLike[str],
+    columns: Mapping[str, Tensor],
+    state: Mapping[str, Any],
+    ranks: Ranks,
+    keep: int = 3,
+) -> Path:
+    """Write a checkpoint; returns on every rank when it is safely on disk.
+
+    Args:
+        directory: folder of checkpoints, made if missing.
+        columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every rank.
+        state: what else a resume needs, as JSON values; rank 0's is stored.
+        ranks: the job.
+        keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
+
+    Returns:
+        The folder of the new checkpoint, `directory/checkpoint_NNNNNN`.
+
+    Raises:
+        CheckpointError: on every rank, when any of them could not write; earlier checkpoints are untouched.
+        ValueError: the columns differ in length, or `keep` < 1.
+    """
+    if keep < 1:
+        raise ValueError(f"checkpoint: keep must be at least 1, got {keep}")
+    rows = _common_length(columns)
+    directory = Path(directory)
+    name = _next_name(directory) if ranks.rank == 0 else ""
+    if ranks.rank == 0:
+        _delete_unfinished(directory)
+    name = ranks.broadcast_object(name)
+    unfinished = directory / (_UNFINISHED + name)
+    mine, problem = None, None
+    try:
+        _reached("begin")
+        unfinished.mkdir(parents=True, exist_ok=True)
+        _check_space(unfinished, columns)
+        _reached("folder made")
+        file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
+        size, digest = write_shard(unfinished / file, columns, _reached)
+        mine = Shard(file, rows, size, digest)
+    except OSError as error:
+        problem = f"rank {ranks.rank} could not write: {_explain(error)}"
+    results = ranks.all_gather_object((mine, problem))
+    problems = [text for _, text in results if text]
+    if not problems and ranks.rank == 0:
+        try:
+            _finish(directory, name, [shard for shard, _ in results if shard], state, ranks.world_size)
+        except OSError as error:
+            problems.append(f"rank 0 could not write: {_explain(error)}")
+    problems = ranks.broadcast_object(problems)
+    if problems:
+        if ranks.rank == 0:
+            shutil.rmtree(unfinished, ignore_errors=True)
+        raise CheckpointError(
+            f"checkpoint {directory / name} was not saved: {'; '.join(problems)}. "
+            "Earlier checkpoints are untouched."
+        )
+    if ranks.rank == 0:
+        _delete_old(directory, keep)
+    return directory / name
+
+
+def load_latest(
+    directory: str | os.PathLike[str], ranks: Ranks, device: torch.device | str
+) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    """Load this rank's share of the newest sound checkpoint.
+
+    A damaged one is refused with a warning that names it and the reason, and the one before it is tried.
+
+    Args:
+        directory: folder given to `save`.
+        ranks: the job, of any world size.
+        device: where the columns go.
+
+    Returns:
+        The columns of this rank's shard and the state; None when there is no checkpoint at all.
+
+    Raises:
+        CheckpointError: checkpoints exist, but none is sound.
+    """
+    found = ranks.broadcast_object(_names(Path(directory)) if ranks.rank == 0 else [])
+    refused = []
+    for name in reversed(found):
+        try:
+            return load(Path(directory) / name, ranks, device)
+        except CheckpointError as error:
+            refused.append(str(error))
+            if ranks.rank == 0:
+                warnings.warn(f"{error}; trying the one before it", stacklevel=2)
+    if refused:
+        raise CheckpointError(f"no sound checkpoint in {directory}: {'; '.join(refused)}")
+    return None
+
+
+def load(
+    path: str | os.PathLike[str], ranks: Ranks, device: torch.device | str
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Load this rank's share of one checkpoint.
+
+    At the world size it was saved at, each rank gets its shard back as it was. At another one the rows are
+    dealt anew: rank m gets the positions = m (mod M) of the global order (`sharding.global_positions`), and
+    opens only the files that hold some of them.
+
+    Args:
+        path: folder returned by `save`.
+        ranks: the job, of any world size.
+        device: where the columns go.
+
+    Returns:
+        The columns of this rank's shard, name -> [N_rank, ...], and the state.
+
+    Raises:
+        CheckpointError: on every rank, when a file is missing, torn or altered.
+    """
+    path = Path(path)
+    manifest, problem = None, None
+    try:
+        manifest = _read_manifest(path)
+        # The files are shared out for checking, so that each is read for its digest once.
+        for shard in manifest.shards[ranks.rank :: ranks.world_size]:
+            _verify(path, shard)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        problem = str(error) or type(error).__name__
+    problems = [text for text in ranks.all_gather_object(problem) if text]
+    if problems or manifest is None:
+        raise CheckpointError(f"checkpoint {path} is damaged: {'; '.join(sorted(set(problems)))}")
+    return _read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state
+
+
+@dataclass
+class _Manifest:
+    shards: list[Shard]
+    state: dict[str, Any]
+
+
+def _reached(point: str) -> None:
+    """Mark a labelled point of a save; crash tests stop the process here."""
+
+
+def _read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
+    sizes = [shard.rows for shard in shards]
+    if len(shards) == ranks.world_size:
+        with safe_open(path / shards[ranks.rank].file, "pt") as file:
+            return {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
+    positions = [global_positions(sizes, index) for index in range(len(shards))]
+    count = len(range(ranks.rank, sum(sizes), ranks.world_size))
+    columns = {
+        name: torch.empty((count, *spec.shape[1:]), dtype=spec.dtype, device=device)
+        for name, spec in header_of(path / shards[0].file).items()
+    }
+    for shard, order in zip(shards, positions, strict=True):
+        chosen = (order % ranks.world_size == ranks.rank).nonzero().squeeze(1)
+        if len(chosen) == 0:
+            continue
+        target = (order[chosen] // ranks.world_size).to(device)
+        with safe_open(path / shard.file, "pt") as file:
+            for name, column in columns.items():
+                column[target] = file.get_tensor(name)[chosen].to(device)
+    return columns
+
+
+def _read_manifest(path: Path) -> _Manifest:
+    try:
+        content = json.loads((path / MANIFEST).read_text())
+    except FileNotFoundError:
+        raise ValueError(f"{MANIFEST} is missing") from None
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{MANIFEST} is not valid JSON ({error})") from error
+    if content["format"] != FORMAT:
+        raise ValueError(f"{MANIFEST} has format {content['format']}, this version reads format {FORMAT}")
+    return _Manifest([Shard(**shard) for shard in content["shards"]], content["state"])
+
+
+def _verify(path: Path, shard: Shard) -> None:
+    file = path / shard.file
+    if not file.exists():
+        raise ValueError(f"{shard.file} is missing")
+    if file.stat().st_size != shard.bytes:
+        raise ValueError(f"{shard.file} has {file.stat().st_size} bytes, the manifest says {shard.bytes}")
+    if file_digest(file) != shard.sha256:
+        raise ValueError(f"{shard.file} does not match its SHA-256")
+
+
+def _finish(
+    directory: Path, name: str, shards: list[Shard], state: Mapping[str, Any], world_size: int
+) -> None:
+    """Write the manifest beside the shards and give the folder its final name, each step synced."""
+    unfinished = directory / (_UNFINISHED + name)
+    missing = [shard.file for shard in shards if not (unfinished / shard.file).exists()]
+    if missing:
+        raise OSError(f"{', '.join(missing)} not in {unfinished}: every rank must see the same file system")
+    content = {
+        "format": FORMAT,
+        "world_size": world_size,
+        "shards": [asdict(shard) for shard in shards],
+        "state": dict(state),
+    }
+    with open(unfinished / MANIFEST, "w") as file:
+        json.dump(content, file, indent=1)
+        _reached("manifest written")
+        file.flush()
+        os.fsync(file.fileno())
+    sync_folder(unfinished)
+    _reached("manifest synced")
+    unfinished.rename(directory / name)
+    _reached("renamed")
+    sync_folder(directory)
+    _reached("finished")
+
+
+def _delete_old(directory: Path, keep: int) -> None:
+    """Delete all but the newest `keep`."""
+    for name in _names(directory)[:-keep]:
+        # Renamed first: a deletion cut short must not leave half a checkpoint under a final name.
+        (directory / name).rename(directory / (_UNFINISHED + name))
+        _reached("old one renamed")
+    _delete_unfinished(directory)
+
+
+def _delete_unfinished(directory: Path) -> None:
+    """Delete what interrupted saves and deletions left behind."""
+    for leftover in directory.glob(_UNFINISHED + "*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _names(directory: Path) -> list[str]:
+    if not directory.is_dir():
+        return []
+    return sorted(entry.name for entry in directory.iterdir() if _NAME.fullmatch(entry.name))
+
+
+def _next_name(directory: Path) -> str:
+    names = _names(directory)
+    return f"checkpoint_{int(names[-1].rsplit('_', 1)[1]) + 1 if names else 0:06d}"
+
+
+def _common_length(columns: Mapping[str, Tensor]) -> int:
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len(set(lengths.values())) != 1:
+        raise ValueError(f"checkpoint: the columns must be given and of one length, got {lengths}")
+    return next(iter(lengths.values()))
+
+
+def _check_space(folder: Path, columns: Mapping[str, Tensor]) -> None:
+    needed = sum(column.numel() * column.element_size() for column in columns.values())
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC, f"{needed / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free", str(folder)
+        )
+
+
+def _explain(error: OSError) -> str:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return f"the disk is full ({error}); free some space or lower the number of checkpoints kept"
+    return str(error)
