@@ -1,0 +1,232 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <vector>
+
+#include "common/parallel.h"
+#include "math/tiles.h"
+#include "project/project.h"
+
+namespace blitzgs::cpu {
+namespace {
+
+template <class T>
+std::vector<Camera<T>> make_cameras(const ProjectInputs<T>& in) {
+  std::vector<Camera<T>> cameras;
+  for (int view = 0; view < in.n_views; ++view) {
+    cameras.push_back(
+        make_camera(in.viewmats + 16 * view, in.Ks + 9 * view, in.options.width, in.options.height));
+  }
+  return cameras;
+}
+
+template <class T>
+std::int64_t candidate_id(const ProjectInputs<T>& in, std::int64_t candidate) {
+  return in.active_ids ? in.active_ids[candidate] : candidate;
+}
+
+template <class T>
+ActiveGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
+  return activate_gaussian(load3(in.means + 3 * id), in.quats + 4 * id,
+                           activate_scale(in.scales + 3 * id, in.options.raw),
+                           activate_opacity(in.opacities[id], in.options.raw));
+}
+
+template <class T>
+int tiles_of(const Row<T>& row, const ProjectOptions<T>& o) {
+  return static_cast<int>(count_tiles(row.mean2d, row.conic, row.opacity, o.width, o.height, o.tile_size));
+}
+
+// The views that see a candidate, and the tiles its rows touch.
+template <class T>
+std::uint32_t visible_views(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras,
+                            std::int64_t candidate, std::int64_t* tiles) {
+  const std::int64_t id = candidate_id(in, candidate);
+  const std::uint32_t allowed =
+      in.active_views ? static_cast<std::uint32_t>(in.active_views[candidate]) : ~std::uint32_t{0};
+  const Vec3<T> mean = load3(in.means + 3 * id);
+  const Vec3<T> scale = activate_scale(in.scales + 3 * id, in.options.raw);
+  const T opacity = activate_opacity(in.opacities[id], in.options.raw);
+  std::uint32_t maybe = 0;
+  for (int view = 0; view < in.n_views; ++view) {
+    const std::uint32_t bit = std::uint32_t{1} << view;
+    if ((allowed & bit) && may_be_visible(cameras[view], mean, scale, opacity, in.options)) maybe |= bit;
+  }
+  if (maybe == 0) return 0;
+  if (in.sh && !finite_sh(in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree)) return 0;
+  const ActiveGaussian<T> gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity);
+  std::uint32_t seen = 0;
+  for (int view = 0; view < in.n_views; ++view) {
+    Row<T> row;
+    if (!(maybe >> view & 1) || !project_row(cameras[view], gaussian, in.options, &row)) continue;
+    seen |= std::uint32_t{1} << view;
+    *tiles += tiles_of(row, in.options);
+  }
+  return seen;
+}
+
+template <class T>
+void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
+              std::int64_t id, std::int64_t index, const ProjectOutputs<T>& out) {
+  Row<T> row;
+  project_row(camera, gaussian, in.options, &row);
+  std::copy_n(row.mean2d, 2, out.means2d + 2 * index);
+  std::copy_n(row.conic, 3, out.conics + 3 * index);
+  out.depths[index] = row.depth;
+  out.opacities[index] = row.opacity;
+  out.radii[2 * index] = pixel_radius(row.extent[0]);
+  out.radii[2 * index + 1] = pixel_radius(row.extent[1]);
+  out.tiles_touched[index] = tiles_of(row, in.options);
+  if (in.sh) {
+    row_color(camera, gaussian.mean, in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree,
+              out.colors + 3 * index);
+  }
+}
+
+// Scratch of one Gaussian's backward pass: slots to write to when the caller wants no such gradient.
+template <class T>
+void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras, const ProjectRows& rows,
+                  const ProjectRowGradients<T>& v, const T* scale_reg, std::int64_t u, PoseGradient<T>* poses,
+                  const ProjectGradients<T>& out) {
+  const std::int64_t id = rows.visible_ids[u];
+  const std::int64_t stride = 3 * in.options.sh_stride;
+  const ActiveGaussian<T> gaussian = load_gaussian(in, id);
+  GaussianGradient<T> gradient{};
+  T axis_weight = T(0);
+  if (out.sh) std::fill_n(out.sh + stride * u, stride, T(0));
+  for (std::int64_t r = rows.row_offsets[u]; r < rows.row_offsets[u + 1]; ++r) {
+    const int view = rows.camera_ids[r];
+    PoseGradient<T>* pose = poses ? poses + view : nullptr;
+    const RowGradient<T> v_row{{v.means2d[2 * r], v.means2d[2 * r + 1]},
+                               {v.conics[3 * r], v.conics[3 * r + 1], v.conics[3 * r + 2]},
+                               v.depths ? v.depths[r] : T(0),
+                               v.opacities[r]};
+    project_row_vjp(cameras[view], gaussian, in.options, v_row, &gradient, pose);
+    if (in.sh && v.colors) {
+      row_color_vjp(cameras[view], gaussian.mean, in.sh + stride * id, in.options.sh_degree, v.colors + 3 * r,
+                    out.sh + stride * u, &gradient.mean, pose);
+    }
+    if (scale_reg) axis_weight += scale_reg[view];
+  }
+  activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
+                        {out.means + 3 * u, out.quats + 4 * u, out.scales + 3 * u, out.opacities + u});
+}
+
+// Adds one block's pose gradients, [B] of them, to its slice [B, 12] of doubles.
+template <class T>
+void store_poses(const std::vector<PoseGradient<T>>& poses, double* sums) {
+  for (const PoseGradient<T>& pose : poses) {
+    const Vec3<T> columns[4] = {pose.row_x, pose.row_y, pose.row_z, pose.translation};
+    for (const Vec3<T>& column : columns) {
+      *sums++ += column.x;
+      *sums++ += column.y;
+      *sums++ += column.z;
+    }
+  }
+}
+
+template <class T>
+void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_viewmats) {
+  std::fill_n(v_viewmats, 16 * n_views, T(0));
+  for (int view = 0; view < n_views; ++view) {
+    for (int i = 0; i < 12; ++i) {
+      double sum = 0;
+      for (std::int64_t block = 0; block < n_blocks; ++block) sum += sums[(block * n_views + view) * 12 + i];
+      const int row = i < 9 ? i / 3 : i - 9, column = i < 9 ? i % 3 : 3;
+      v_viewmats[16 * view + 4 * row + column] = static_cast<T>(sum);
+    }
+  }
+}
+
+}  // namespace
+
+template <class T>
+void project_count(const ProjectInputs<T>& in, const ProjectPlan& plan, ProjectCounts* counts, Workspace&,
+                   CudaStream) {
+  const std::vector<Camera<T>> cameras = make_cameras(in);
+  const std::int64_t blocks = project_blocks(in.n_candidates);
+  std::vector<std::int64_t> tiles(blocks, 0);
+  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t block = begin; block < end; ++block) {
+      std::int64_t visible = 0, rows = 0;
+      const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
+      for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
+        const std::uint32_t seen = visible_views(in, cameras, c, &tiles[block]);
+        plan.view_masks[c] = seen;
+        visible += seen != 0;
+        rows += __builtin_popcount(seen);
+      }
+      plan.visible_before[block] = visible;
+      plan.rows_before[block] = rows;
+    }
+  });
+  *counts = {};
+  for (std::int64_t block = 0; block < blocks; ++block) {
+    const std::int64_t visible = plan.visible_before[block], rows = plan.rows_before[block];
+    plan.visible_before[block] = counts->visible;
+    plan.rows_before[block] = counts->rows;
+    counts->visible += visible;
+    counts->rows += rows;
+    counts->tiles += tiles[block];
+  }
+  plan.visible_before[blocks] = counts->visible;
+  plan.rows_before[blocks] = counts->rows;
+}
+
+template <class T>
+void project_emit(const ProjectInputs<T>& in, const ProjectPlan& plan, const ProjectOutputs<T>& out,
+                  Workspace&, CudaStream) {
+  const std::vector<Camera<T>> cameras = make_cameras(in);
+  const std::int64_t blocks = project_blocks(in.n_candidates);
+  out.row_offsets[plan.visible_before[blocks]] = static_cast<std::int32_t>(plan.rows_before[blocks]);
+  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t block = begin; block < end; ++block) {
+      std::int64_t u = plan.visible_before[block], row = plan.rows_before[block];
+      const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
+      for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
+        if (plan.view_masks[c] == 0) continue;
+        const std::int64_t id = candidate_id(in, c);
+        const ActiveGaussian<T> gaussian = load_gaussian(in, id);
+        out.visible_ids[u] = static_cast<std::int32_t>(id);
+        out.row_offsets[u++] = static_cast<std::int32_t>(row);
+        for (int view = 0; view < in.n_views; ++view) {
+          if (!(plan.view_masks[c] >> view & 1)) continue;
+          out.gaussian_ids[row] = static_cast<std::int32_t>(id);
+          out.camera_ids[row] = view;
+          emit_row(in, cameras[view], gaussian, id, row++, out);
+        }
+      }
+    }
+  });
+}
+
+template <class T>
+void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const ProjectRowGradients<T>& v,
+                 const T* scale_reg, const ProjectGradients<T>& out, Workspace&, CudaStream) {
+  const std::vector<Camera<T>> cameras = make_cameras(in);
+  const std::int64_t blocks = project_blocks(rows.n_visible);
+  std::vector<double> pose_sums(out.viewmats ? blocks * in.n_views * 12 : 0, 0.0);
+  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t block = begin; block < end; ++block) {
+      std::vector<PoseGradient<T>> poses(out.viewmats ? in.n_views : 0);
+      const std::int64_t last = std::min(rows.n_visible, (block + 1) * kProjectBlock);
+      for (std::int64_t u = block * kProjectBlock; u < last; ++u) {
+        gaussian_bwd(in, cameras, rows, v, scale_reg, u, poses.empty() ? nullptr : poses.data(), out);
+      }
+      if (out.viewmats) store_poses(poses, &pose_sums[block * in.n_views * 12]);
+    }
+  });
+  if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
+}
+
+#define BLITZGS_INSTANTIATE(T)                                                                              \
+  template void project_count<T>(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&,   \
+                                 CudaStream);                                                               \
+  template void project_emit<T>(const ProjectInputs<T>&, const ProjectPlan&, const ProjectOutputs<T>&,      \
+                                Workspace&, CudaStream);                                                    \
+  template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,  \
+                               const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
+BLITZGS_INSTANTIATE(float)
+BLITZGS_INSTANTIATE(double)
+#undef BLITZGS_INSTANTIATE
+
+}  // namespace blitzgs::cpu
