@@ -12,8 +12,8 @@
 // between them: project_count finds, in few bytes per candidate, which views see it; project_emit projects
 // those and evaluates SH for them alone. O(candidates * B + rows); no output of size N.
 //
-// project_bwd visits each visible Gaussian once, recomputes its rows and sums their gradients in row order: no
-// atomics, deterministic. The pose gradient is summed in double over fixed blocks of Gaussians.
+// project_bwd visits each visible Gaussian once, recomputes its rows and sums their gradients in row order:
+// no atomics, deterministic. The pose gradient is summed in double over fixed blocks of Gaussians.
 #pragma once
 #include <cstdint>
 

@@ -3,7 +3,6 @@
 #include <vector>
 
 #include "common/parallel.h"
-#include "math/tiles.h"
 #include "project/project.h"
 
 namespace blitzgs::cpu {
@@ -32,8 +31,8 @@ ActiveGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
 }
 
 template <class T>
-int tiles_of(const Row<T>& row, const ProjectOptions<T>& o) {
-  return static_cast<int>(count_tiles(row.mean2d, row.conic, row.opacity, o.width, o.height, o.tile_size));
+std::int32_t tiles_of(const Row<T>& row, const ProjectOptions<T>& o) {
+  return count_tiles(row.mean2d, row.conic, row.opacity, o.width, o.height, o.tile_size);
 }
 
 // The views that see a candidate, and the tiles its rows touch.
@@ -56,7 +55,7 @@ std::uint32_t visible_views(const ProjectInputs<T>& in, const std::vector<Camera
   const ActiveGaussian<T> gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity);
   std::uint32_t seen = 0;
   for (int view = 0; view < in.n_views; ++view) {
-    Row<T> row;
+    Row<T> row{};
     if (!(maybe >> view & 1) || !project_row(cameras[view], gaussian, in.options, &row)) continue;
     seen |= std::uint32_t{1} << view;
     *tiles += tiles_of(row, in.options);
@@ -67,7 +66,7 @@ std::uint32_t visible_views(const ProjectInputs<T>& in, const std::vector<Camera
 template <class T>
 void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
               std::int64_t id, std::int64_t index, const ProjectOutputs<T>& out) {
-  Row<T> row;
+  Row<T> row{};
   project_row(camera, gaussian, in.options, &row);
   std::copy_n(row.mean2d, 2, out.means2d + 2 * index);
   std::copy_n(row.conic, 3, out.conics + 3 * index);
@@ -82,7 +81,7 @@ void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, const ActiveG
   }
 }
 
-// Scratch of one Gaussian's backward pass: slots to write to when the caller wants no such gradient.
+// Gradients of visible Gaussian u; poses [B] or null.
 template <class T>
 void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras, const ProjectRows& rows,
                   const ProjectRowGradients<T>& v, const T* scale_reg, std::int64_t u, PoseGradient<T>* poses,
@@ -218,12 +217,12 @@ void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const Proj
   if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                              \
-  template void project_count<T>(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&,   \
-                                 CudaStream);                                                               \
-  template void project_emit<T>(const ProjectInputs<T>&, const ProjectPlan&, const ProjectOutputs<T>&,      \
-                                Workspace&, CudaStream);                                                    \
-  template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,  \
+#define BLITZGS_INSTANTIATE(T)                                                                             \
+  template void project_count<T>(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&,  \
+                                 CudaStream);                                                              \
+  template void project_emit<T>(const ProjectInputs<T>&, const ProjectPlan&, const ProjectOutputs<T>&,     \
+                                Workspace&, CudaStream);                                                   \
+  template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&, \
                                const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)

@@ -7,6 +7,7 @@
 
 #include "math/projection.h"
 #include "math/sh.h"
+#include "math/tiles.h"
 
 namespace blitzgs {
 
@@ -35,8 +36,6 @@ struct Row {
   T extent[2];  // half width and height of the box around alpha >= 1/255, px
 };
 
-inline constexpr double kMinAlpha = 1.0 / 255.0;
-
 template <class T>
 BLITZGS_HD Vec3<T> activate_scale(const T* scale, bool raw) {
   if (!raw) return load3(scale);
@@ -52,7 +51,7 @@ BLITZGS_HD T activate_opacity(T opacity, bool raw) {
 // or NaN when it never does.
 template <class T>
 BLITZGS_HD T reach(T opacity) {
-  return opacity >= T(kMinAlpha) ? std::sqrt(T(2) * std::log(larger(T(255) * opacity, T(1)))) : T(-1);
+  return opacity >= T(kAlphaCut) ? std::sqrt(T(2) * std::log(larger(T(255) * opacity, T(1)))) : T(-1);
 }
 
 template <class T>

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projection: Gaussians and pinhole views to screen-space rows, one for each Gaussian that a view sees."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+
+class Rows(NamedTuple):
+    """What the views see, ordered by (Gaussian, view): P rows of U different Gaussians."""
+
+    gaussian_ids: Tensor  # int32 [P]
+    camera_ids: Tensor  # int32 [P]
+    visible_ids: Tensor  # int32 [U], ascending
+    row_offsets: Tensor  # int32 [U + 1]: rows row_offsets[u] to row_offsets[u + 1] are of visible_ids[u]
+    means2d: Tensor  # [P, 2], px; the centre of pixel (i, j) is (i + 0.5, j + 0.5)
+    conics: Tensor  # [P, 3]: a, b, c of the inverse 2D covariance, 1/px^2
+    depths: Tensor  # [P]: camera-space z
+    opacities: Tensor  # [P]: compensated in antialiased mode
+    colors: Tensor  # [P, 3]; [0, 3] without SH
+    radii: Tensor  # int32 [P, 2]: half width and height of the box around alpha >= 1/255, rounded up
+    tiles_touched: Tensor  # int32 [P]
+    counts: Tensor  # int64 [3] on the CPU: U, P, sum of tiles_touched
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    active_ids: Tensor | None = None,
+    active_views: Tensor | None = None,
+    tile_size: int = 16,
+    sh_degree: int = 0,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    eps2d: float = 0.3,
+    radius_clip: float = 0.0,
+    antialiased: bool = False,
+    raw: bool = True,
+) -> Rows:
+    """Project Gaussians into B views (EWA splatting; the image's definition).
+
+    A row exists where a Gaussian can reach alpha = 1/255 in the image at a depth in (near, far]. Anything
+    NaN or infinite hides its Gaussian. Differentiable in means, quats, scales, opacities, sh and viewmats
+    (dense gradients; the pose's as 12 free entries); the culling itself has no gradient.
+
+    Args:
+        means: [N, 3] in world units, float32 or (CPU) float64; the other tensors share its dtype and device.
+        quats: [N, 4] (w, x, y, z), of any length; zero counts as the identity.
+        scales: [N, 3] log standard deviations, or standard deviations when not `raw`.
+        opacities: [N] logits, or opacities in [0, 1] when not `raw`.
+        sh: [N, K, 3] SH coefficients with K >= (sh_degree + 1)^2, coefficient 0 the DC, or None.
+        viewmats: [B, 4, 4] world to camera, a rotation and a translation; B <= 32.
+        Ks: [B, 3, 3] pinhole intrinsics in px (no skew).
+        width: image width in px.
+        height: image height in px.
+        active_ids: int32 [A] ascending rows to consider; None for all.
+        active_views: int32 [A] bit masks of the views to consider for each; None for all.
+        tile_size: edge of a tile in px (only for `tiles_touched`).
+        sh_degree: degree to evaluate, 0 to 3.
+        near_plane: rows have z > near_plane, world units.
+        far_plane: rows have z <= far_plane, world units.
+        eps2d: variance added to both screen axes, px^2.
+        radius_clip: drop rows that reach no further than this, px.
+        antialiased: scale opacities by sqrt(det before / det after) of that addition.
+        raw: whether scales and opacities are before their activation.
+
+    Returns:
+        Rows, bit-identical for a Gaussian and a view whatever else is projected with them.
+
+    Raises:
+        RuntimeError: a wrong shape, dtype or value, by name.
+    """
+    return Rows(
+        *torch.ops.blitzgs.project_fwd(
+            means,
+            quats,
+            scales,
+            opacities,
+            sh,
+            viewmats,
+            Ks,
+            active_ids,
+            active_views,
+            width,
+            height,
+            tile_size,
+            sh_degree,
+            near_plane,
+            far_plane,
+            eps2d,
+            radius_clip,
+            antialiased,
+            raw,
+        )
+    )
+
+
+@torch.library.register_fake("blitzgs::project_fwd")
+def _(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None, *rest: Any) -> Any:
+    context = torch.library.get_ctx()
+    U, P = context.new_dynamic_size(), context.new_dynamic_size()
+
+    def ints(*shape: Any) -> Tensor:
+        return means.new_empty(shape, dtype=torch.int32)
+
+    return (
+        ints(P),
+        ints(P),
+        ints(U),
+        ints(U + 1),
+        means.new_empty(P, 2),
+        means.new_empty(P, 3),
+        means.new_empty(P),
+        means.new_empty(P),
+        means.new_empty(0 if sh is None else P, 3),
+        ints(P, 2),
+        ints(P),
+        torch.empty(3, dtype=torch.int64, device="cpu"),
+    )
+
+
+@torch.library.register_fake("blitzgs::project_bwd")
+def _(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    camera_ids: Tensor,
+    visible_ids: Tensor,
+    *rest: Any,
+) -> Any:
+    U = visible_ids.shape[0]
+    return (
+        means.new_empty(U, 3),
+        means.new_empty(U, 4),
+        means.new_empty(U, 3),
+        means.new_empty(U),
+        means.new_empty(U, 0 if sh is None else sh.shape[1], 3),
+        means.new_empty(viewmats.shape[0] if rest[-1] else 0, 4, 4),
+    )
+
+
+def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+    means, quats, scales, opacities, sh, viewmats, Ks = inputs[:7]
+    width, height, _, sh_degree = inputs[9:13]
+    eps2d, _, antialiased, raw = inputs[15:19]
+    rows = Rows(*output)
+    ctx.save_for_backward(
+        means, quats, scales, opacities, sh, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets
+    )
+    ctx.options = (width, height, sh_degree, eps2d, antialiased, raw)
+
+
+def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
+    means, quats, scales, opacities, sh, viewmats, Ks, camera_ids, visible_ids, row_offsets = (
+        ctx.saved_tensors
+    )
+    v = Rows(*v_output)  # type: ignore[arg-type]
+    P = camera_ids.shape[0]
+    zeros = means.new_zeros(P, 3)
+    gradients = torch.ops.blitzgs.project_bwd(
+        means,
+        quats,
+        scales,
+        opacities,
+        sh,
+        viewmats,
+        Ks,
+        camera_ids,
+        visible_ids,
+        row_offsets,
+        *ctx.options,
+        zeros[:, :2] if v.means2d is None else v.means2d,
+        zeros if v.conics is None else v.conics,
+        v.depths,
+        zeros[:, 0] if v.opacities is None else v.opacities,
+        v.colors if sh is not None else None,
+        None,
+        ctx.needs_input_grad[5],
+    )
+    ids = visible_ids.long()
+    dense = [
+        parameter.new_zeros(parameter.shape).index_copy(0, ids, gradient) if needed else None
+        for parameter, gradient, needed in zip(
+            (means, quats, scales, opacities, sh), gradients, ctx.needs_input_grad, strict=False
+        )
+    ]
+    v_viewmats = gradients[5] if ctx.needs_input_grad[5] else None
+    return (*dense, v_viewmats, *(None,) * 13)
+
+
+torch.library.register_autograd("blitzgs::project_fwd", _backward, setup_context=_setup_context)
