@@ -52,6 +52,16 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "photometric_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor v_l1_sums, Tensor v_ssim_sums, "
       "int tile_size, int tile_begin, int tile_end) -> Tensor v_renders");
 
+  // The optimiser: dense Adam over an index list, and its statistics for density control.
+  m.def(
+      "lazy_adam_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, Tensor[] grads, "
+      "Tensor ids, Tensor(d!) last_step, Tensor table, Tensor lr_table, int step, int explicit_steps, "
+      "float beta1, float beta2, float eps, bool sparse) -> ()");
+  m.def(
+      "lazy_adam_catch_up_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, Tensor? ids, "
+      "Tensor(d!) last_step, Tensor table, Tensor lr_table, int step, int explicit_steps, float beta1, "
+      "float beta2, float eps) -> ()");
+
   // Scene initialisation.
   m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");
   m.def("knn_distances(Tensor points, int k) -> Tensor");

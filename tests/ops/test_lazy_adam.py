@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import pytest
+import torch
+
+from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_
+
+COEFFICIENTS = 4
+BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
+
+
+def shapes(n, k=COEFFICIENTS):
+    return [(n, 3), (n, 4), (n, 3), (n,), (n, k, 3)]
+
+
+class State:
+    def __init__(self, n, dtype, device="cpu", k=COEFFICIENTS, seed=0):
+        generator = torch.Generator().manual_seed(seed)
+        make = lambda s: torch.randn(s, generator=generator, dtype=torch.float64).to(device, dtype)  # noqa: E731
+        self.params = [make(s) for s in shapes(n, k)]
+        self.exp_avgs = [torch.zeros_like(p) for p in self.params]
+        self.exp_avg_sqs = [torch.zeros_like(p) for p in self.params]
+        self.last_step = torch.zeros(n, dtype=torch.int32, device=device)
+
+    def moments(self):
+        return self.exp_avgs, self.exp_avg_sqs
+
+    def step(self, grads, ids, lr_table, step, **kwargs):
+        lazy_adam_step_(
+            self.params,
+            *self.moments(),
+            grads,
+            ids,
+            self.last_step,
+            lr_table,
+            step,
+            BETA1,
+            BETA2,
+            EPS,
+            **kwargs,
+        )
+
+    def catch_up(self, ids, lr_table, step):
+        lazy_adam_catch_up_(
+            self.params, *self.moments(), ids, self.last_step, lr_table, step, BETA1, BETA2, EPS
+        )
+
+
+def learning_rates(steps):
+    t = torch.arange(steps + 1) / steps
+    base = torch.tensor([1.6e-3, 1e-3, 7e-3, 2e-2, 7.5e-3, 7.5e-3 / 20])
+    return (base * (0.01**t)[:, None]).float()
+
+
+class DenseAdam:
+    """torch.optim.Adam over every row, SH split in two groups."""
+
+    def __init__(self, params, lr_table, dtype=torch.float64):
+        self.dtype = dtype
+        means, quats, scales, opacities, sh = (p.cpu().to(dtype, copy=True) for p in params)
+        self.tensors = [means, quats, scales, opacities, sh[:, :1].clone(), sh[:, 1:].clone()]
+        self.lr_table = lr_table.double().cpu()
+        groups = [{"params": [t], "lr": 0.0} for t in self.tensors]
+        self.optimizer = torch.optim.Adam(groups, betas=(BETA1, BETA2), eps=EPS, foreach=False)
+
+    def step(self, grads, ids, step):
+        grads = [g.cpu().to(self.dtype) for g in grads]
+        split = [*grads[:4], grads[4][:, :1], grads[4][:, 1:]]
+        for tensor, grad in zip(self.tensors, split, strict=True):
+            tensor.grad = torch.zeros_like(tensor)
+            tensor.grad[ids.long().cpu()] = grad
+        for g, group in enumerate(self.optimizer.param_groups):
+            group["lr"] = float(self.lr_table[step, g])
+        self.optimizer.step()
+
+    def columns(self, tensors):
+        return [*tensors[:4], torch.cat(tensors[4:], 1)]
+
+    def params(self):
+        return self.columns(self.tensors)
+
+    def moment(self, name):
+        return self.columns([self.optimizer.state[t][name] for t in self.tensors])
+
+
+def random_step(n, dtype, generator, k=COEFFICIENTS):
+    """A few rows are seen often, most rarely; gradients span ten orders of magnitude over the rows."""
+    chance = torch.linspace(0.001, 0.6, n) ** 2
+    ids = torch.nonzero(torch.rand(n, generator=generator) < chance).flatten().int()
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(1))
+    size = 10.0 ** torch.linspace(-12, -2, n, dtype=torch.float64)[order]
+    grads = []
+    for shape in shapes(len(ids), k):
+        noise = torch.randn(shape, generator=generator, dtype=torch.float64)
+        grads.append((noise * size[ids.long()].reshape(-1, *[1] * (len(shape) - 1))).to(dtype))
+    return ids, grads
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_equals_dense_adam_over_thousands_of_steps(dtype):
+    steps, n = 2000, 60
+    lr_table = learning_rates(steps)
+    state = State(n, dtype)
+    exact, rounded = DenseAdam(state.params, lr_table), DenseAdam(state.params, lr_table, torch.float32)
+    start = [p.clone() for p in exact.params()]
+    generator = torch.Generator().manual_seed(3)
+    for step in range(1, steps + 1):
+        ids, grads = random_step(n, dtype, generator)
+        state.step(grads, ids, lr_table, step)
+        exact.step(grads, ids, step)
+        rounded.step(grads, ids, step)
+        if step == steps // 2:
+            state.catch_up(None, lr_table, step)
+    assert int(state.last_step.min()) < steps  # rows really were left behind
+    state.catch_up(None, lr_table, steps)
+    assert bool((state.last_step == steps).all())
+
+    columns = zip(state.params, exact.params(), rounded.params(), start, strict=True)
+    for ours, dense, dense32, before in columns:
+        error = (ours.double() - dense).abs().max()
+        assert (dense - before).abs().max() > 0.01
+        if dtype == torch.float32:  # no further from exact arithmetic than torch's own dense Adam
+            assert error <= 1.5 * (dense32.double() - dense).abs().max()
+        else:
+            assert error < 1e-11
+    for ours, name in ((state.exp_avgs, "exp_avg"), (state.exp_avg_sqs, "exp_avg_sq")):
+        for mine, dense in zip(ours, exact.moment(name), strict=True):
+            tolerance = 1e-4 if dtype == torch.float32 else 1e-11
+            largest = float(dense.abs().max())
+            torch.testing.assert_close(mine.double(), dense, rtol=tolerance, atol=tolerance * 1e-9 * largest)
+
+
+def one_update(n=7, dtype=torch.float64):
+    """A state after one step of every row, and its schedule of 4000 steps."""
+    lr_table = learning_rates(4000)
+    state = State(n, dtype)
+    generator = torch.Generator().manual_seed(4)
+    ids = torch.arange(n, dtype=torch.int32)
+    grads = [torch.randn(s, generator=generator, dtype=torch.float64).to(dtype) for s in shapes(n)]
+    state.step(grads, ids, lr_table, 1)
+    return state, lr_table
+
+
+@pytest.mark.parametrize("gap", [1, 2, 30, 200, 3000])
+def test_one_catch_up_equals_many(gap):
+    once, lr_table = one_update()
+    often, _ = one_update()
+    for step in range(2, 2 + gap, max(1, gap // 50)):
+        often.catch_up(None, lr_table, step)
+    often.catch_up(None, lr_table, 1 + gap)
+    once.catch_up(None, lr_table, 1 + gap)
+    for a, b in zip(once.params, often.params, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_eps_is_exact_where_it_matters():
+    """Gradients at and below eps take the explicit path and agree with dense Adam there too."""
+    lr_table = learning_rates(400)
+    state = State(40, torch.float64)
+    dense = DenseAdam(state.params, lr_table)
+    ids = torch.arange(40, dtype=torch.int32)
+    size = 10.0 ** torch.linspace(-18, -6, 40, dtype=torch.float64)
+    grads = [size.reshape(-1, *[1] * (len(s) - 1)).expand(s).clone() for s in shapes(40)]
+    state.step(grads, ids, lr_table, 1)
+    dense.step(grads, ids, 1)
+    none = torch.zeros(0, dtype=torch.int32)
+    for step in range(2, 401):
+        dense.step([torch.zeros((0, *s[1:]), dtype=torch.float64) for s in shapes(40)], none, step)
+    state.catch_up(None, lr_table, 400)
+    for ours, exact in zip(state.params, dense.params(), strict=True):
+        torch.testing.assert_close(ours, exact, rtol=0, atol=1e-9)
+
+
+def test_order_of_the_list_does_not_matter():
+    a, lr_table = one_update(50, torch.float32)
+    b, _ = one_update(50, torch.float32)
+    ids = torch.arange(0, 50, 2, dtype=torch.int32)
+    order = torch.randperm(25, generator=torch.Generator().manual_seed(5))
+    grads = [torch.randn(s, generator=torch.Generator().manual_seed(6)) for s in shapes(25)]
+    a.step(grads, ids, lr_table, 90)
+    b.step([g[order] for g in grads], ids[order], lr_table, 90)
+    for x, y in zip(
+        [*a.params, *a.exp_avgs, *a.exp_avg_sqs], [*b.params, *b.exp_avgs, *b.exp_avg_sqs], strict=True
+    ):
+        assert torch.equal(x, y)
+
+
+def test_sparse_skips_decay_and_drift():
+    state, lr_table = one_update()
+    before = [t.clone() for t in (*state.params, *state.exp_avgs, *state.exp_avg_sqs)]
+    grads = [torch.ones(s, dtype=torch.float64) for s in shapes(1)]
+    state.step(grads, torch.tensor([2], dtype=torch.int32), lr_table, 500, sparse=True)
+    after = (*state.params, *state.exp_avgs, *state.exp_avg_sqs)
+    for a, b in zip(after, before, strict=True):
+        others = torch.arange(7) != 2
+        assert torch.equal(a[others], b[others])
+        assert not torch.equal(a[2], b[2])
+    torch.testing.assert_close(after[5][2], BETA1 * before[5][2] + (1 - BETA1))
+
+
+def test_empty_list_and_zero_gradient():
+    state, lr_table = one_update()
+    before = [p.clone() for p in state.params]
+    state.step(
+        [torch.zeros((0, *s[1:]), dtype=torch.float64) for s in shapes(0)],
+        torch.zeros(0, dtype=torch.int32),
+        lr_table,
+        2,
+    )
+    state.catch_up(None, lr_table, 1)
+    for a, b in zip(state.params, before, strict=True):
+        assert torch.equal(a, b)
+    fresh = State(3, torch.float32)
+    still = [p.clone() for p in fresh.params]
+    fresh.step([torch.zeros(s) for s in shapes(3)], torch.arange(3, dtype=torch.int32), lr_table, 10)
+    for a, b in zip(fresh.params, still, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_errors_name_the_value():
+    state, lr_table = one_update()
+    with pytest.raises(ValueError, match=r"beta1=0.9, beta2=0.5"):
+        lazy_adam_catch_up_(state.params, *state.moments(), None, state.last_step, lr_table, 5, 0.9, 0.5, EPS)
+    with pytest.raises(
+        RuntimeError, match="step 9999 is outside the learning-rate table, which ends at step 4000"
+    ):
+        state.catch_up(None, lr_table, 9999)
+    bad = [torch.zeros(s, dtype=torch.float64) for s in shapes(2)]
+    with pytest.raises(
+        RuntimeError, match=r"the gradient of means must have 1 rows of 3 values, got \[2, 3\]"
+    ):
+        state.step(bad, torch.zeros(1, dtype=torch.int32), lr_table, 2)
+
+
+def test_opcheck():
+    state, lr_table = one_update(5, torch.float32)
+    from blitzgs.ops.lazy_adam import schedule_table
+
+    table = schedule_table(lr_table, BETA1, BETA2)
+    grads = [torch.randn(s) for s in shapes(2)]
+    ids = torch.tensor([1, 3], dtype=torch.int32)
+    torch.library.opcheck(
+        torch.ops.blitzgs.lazy_adam_step_,
+        (
+            state.params,
+            *state.moments(),
+            grads,
+            ids,
+            state.last_step,
+            table,
+            lr_table,
+            2,
+            100,
+            BETA1,
+            BETA2,
+            EPS,
+            False,
+        ),
+    )
+    torch.library.opcheck(
+        torch.ops.blitzgs.lazy_adam_catch_up_,
+        (state.params, *state.moments(), ids, state.last_step, table, lr_table, 9, 100, BETA1, BETA2, EPS),
+    )
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("k", [1, 4, 9, 16])
+def test_cuda_equals_cpu(k):
+    rates = {device: learning_rates(300).to(device) for device in ("cpu", "cuda")}
+    states = {device: State(1000, torch.float32, device, k) for device in rates}
+    generator = torch.Generator().manual_seed(8)
+    for step in range(1, 301):
+        ids, grads = random_step(1000, torch.float32, generator, k)
+        for device, state in states.items():
+            state.step([g.to(device) for g in grads], ids.to(device), rates[device], step)
+    for device, state in states.items():
+        state.catch_up(None, rates[device], 300)
+    for name in ("params", "exp_avgs", "exp_avg_sqs"):
+        for a, b in zip(getattr(states["cpu"], name), getattr(states["cuda"], name), strict=True):
+            torch.testing.assert_close(a, b.cpu(), rtol=1e-4, atol=1e-5 * float(a.abs().max()))
