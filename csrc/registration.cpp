@@ -44,13 +44,19 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "v_conics, "
       "Tensor v_row_opacities, Tensor v_colors, Tensor v_means2d_abs)");
 
-  // L1 and SSIM of the owned tiles.
+  // L1 and SSIM of the owned tiles; fwd_bwd does both at once when the weights of the sums are known.
   m.def(
       "photometric_fwd(Tensor renders, Tensor targets, Tensor? masks, int tile_size, int tile_begin, "
       "int tile_end) -> (Tensor l1_sums, Tensor ssim_sums)");
   m.def(
-      "photometric_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor v_l1_sums, Tensor v_ssim_sums, "
+      "photometric_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor l1_weights, Tensor "
+      "ssim_weights, "
       "int tile_size, int tile_begin, int tile_end) -> Tensor v_renders");
+  m.def(
+      "photometric_fwd_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor l1_weights, "
+      "Tensor ssim_weights, int tile_size, int tile_begin, int tile_end) -> (Tensor l1_sums, Tensor "
+      "ssim_sums, "
+      "Tensor v_renders)");
 
   // The optimiser: dense Adam over an index list, and its statistics for density control.
   m.def(
@@ -58,9 +64,15 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor ids, Tensor(d!) last_step, Tensor table, Tensor lr_table, int step, int explicit_steps, "
       "float beta1, float beta2, float eps, bool sparse) -> ()");
   m.def(
-      "lazy_adam_catch_up_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, Tensor? ids, "
+      "lazy_adam_catch_up_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, Tensor? "
+      "ids, "
       "Tensor(d!) last_step, Tensor table, Tensor lr_table, int step, int explicit_steps, float beta1, "
       "float beta2, float eps) -> ()");
+  m.def(
+      "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
+      "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
+      "weight) "
+      "-> ()");
 
   // Scene initialisation.
   m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");

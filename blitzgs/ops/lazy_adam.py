@@ -59,9 +59,21 @@ def lazy_adam_step_(
     """
     table = _schedule_table(lr_table, beta1, beta2)
     torch.ops.blitzgs.lazy_adam_step_(
-        list(params), list(exp_avgs), list(exp_avg_sqs), list(grads), ids, last_step, table, lr_table, step,
-        _explicit_steps(beta1, beta2, params[0].dtype), beta1, beta2, eps, sparse,
-    )  # fmt: skip
+        list(params),
+        list(exp_avgs),
+        list(exp_avg_sqs),
+        list(grads),
+        ids,
+        last_step,
+        table,
+        lr_table,
+        step,
+        _explicit_steps(beta1, beta2, params[0].dtype),
+        beta1,
+        beta2,
+        eps,
+        sparse,
+    )
 
 
 @torch.no_grad()
@@ -88,9 +100,19 @@ def lazy_adam_catch_up_(
     """
     table = _schedule_table(lr_table, beta1, beta2)
     torch.ops.blitzgs.lazy_adam_catch_up_(
-        list(params), list(exp_avgs), list(exp_avg_sqs), ids, last_step, table, lr_table, step,
-        _explicit_steps(beta1, beta2, params[0].dtype), beta1, beta2, eps,
-    )  # fmt: skip
+        list(params),
+        list(exp_avgs),
+        list(exp_avg_sqs),
+        ids,
+        last_step,
+        table,
+        lr_table,
+        step,
+        _explicit_steps(beta1, beta2, params[0].dtype),
+        beta1,
+        beta2,
+        eps,
+    )
 
 
 def _explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The statistics that density control reads: screen-space gradients, visibility counts and radii."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+
+@torch.no_grad()
+def density_stats_(
+    grad_sum: Tensor,
+    grad_count: Tensor,
+    max_radii: Tensor,
+    visible_ids: Tensor,
+    row_offsets: Tensor,
+    v_means2d: Tensor,
+    conics: Tensor,
+    width: int,
+    height: int,
+    weight: float,
+    phi: Tensor | None = None,
+) -> None:
+    """Add one step's rows to the statistics of the visible Gaussians, in place.
+
+    Per row: ``grad_sum += phi * weight * |v_means2d * (width / 2, height / 2)|``, ``grad_count += 1`` and
+    ``max_radii = max(max_radii, ceil(3 sigma))`` (Kerbl et al. 2023, section 5; its normalised units).
+
+    Args:
+        grad_sum: [N], float32 (CPU also float64).
+        grad_count: int32 [N].
+        max_radii: [N], pixels, dtype of `grad_sum`.
+        visible_ids: int32 [U], Gaussians with rows, each once.
+        row_offsets: int32 [U + 1], the rows of each.
+        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel.
+        conics: [P, 3], inverse 2D covariances (a, b, c).
+        width: image width in pixels.
+        height: image height in pixels.
+        weight: turns the gradient of the step's loss into that of one view's: B when it is a mean over B.
+        phi: [N], factor of each Gaussian's gradient; None = 1.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    torch.ops.blitzgs.density_stats_(
+        grad_sum,
+        grad_count,
+        max_radii,
+        visible_ids,
+        row_offsets,
+        v_means2d,
+        conics,
+        phi,
+        width,
+        height,
+        weight,
+    )
+
+
+@torch.library.register_fake("blitzgs::density_stats_")
+def _(*_args: Any) -> None:
+    return None

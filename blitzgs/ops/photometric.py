@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fused L1 and SSIM of rendered views, differentiable in the renders."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+
+def photometric_loss(
+    renders: Tensor, targets: Tensor, masks: Tensor | None = None, ssim_weight: float = 0.2
+) -> Tensor:
+    """Return ``(1 - w) mean |x - y| + w (1 - mean SSIM)`` of each view; differentiable in `renders`.
+
+    Means are over the unmasked pixels and the channels of a view; a view with no such pixel has loss 0.
+
+    Args:
+        renders: x [B, H, W, 3], float32 (CPU also float64), nominal range [0, 1].
+        targets: y [B, H, W, 3], uint8 (value / 255) or the dtype of `renders`.
+        masks: [B, H, W], bool or uint8, 0 = excluded; windows centred elsewhere still see such a pixel.
+        ssim_weight: w in [0, 1].
+
+    Returns:
+        [B], dtype of `renders`.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    l1, ssim_sums = photometric_sums(renders, targets, masks)
+    counts = pixel_counts(renders, masks)
+    loss = ((1 - ssim_weight) * l1 + ssim_weight * (counts - ssim_sums)) / counts.clamp_min(1)
+    return loss
+
+
+def ssim(renders: Tensor, targets: Tensor, masks: Tensor | None = None) -> Tensor:
+    """Return the mean SSIM [B] of each view over unmasked pixels and channels; differentiable in `renders`.
+
+    11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zero padding (Wang et al. 2004).
+    Arguments and errors as in `photometric_loss`.
+    """
+    return photometric_sums(renders, targets, masks)[1] / pixel_counts(renders, masks).clamp_min(1)
+
+
+def pixel_counts(renders: Tensor, masks: Tensor | None = None) -> Tensor:
+    """Return the number of values each view's means are over: 3 x its unmasked pixels, [B], float."""
+    if masks is None:
+        views, height, width = renders.shape[:3]
+        return renders.new_full((views,), 3.0 * height * width)
+    return 3 * (masks != 0).sum((1, 2)).to(renders.dtype)
+
+
+def photometric_sums(
+    renders: Tensor,
+    targets: Tensor,
+    masks: Tensor | None = None,
+    tile_size: int = 16,
+    tile_begin: int = 0,
+    tile_end: int = -1,
+) -> tuple[Tensor, Tensor]:
+    """Sum |x - y| and the SSIM map of each view over the owned, unmasked pixels and the channels.
+
+    Owned pixels are those of the tiles [tile_begin, tile_end) of all views, tile (b, ty, tx) having index
+    ``(b * tiles_y + ty) * tiles_x + tx``. Sums over a partition of the tiles add up to the whole. The
+    gradient is that of the sums over ALL tiles, returned for the owned pixels and zero elsewhere, so
+    gradients over a partition add up as well; `renders` must be valid within 10 pixels of the owned tiles.
+
+    Args:
+        renders: x [B, H, W, 3], float32 (CPU also float64).
+        targets: y [B, H, W, 3], uint8 (value / 255) or the dtype of `renders`.
+        masks: [B, H, W], bool or uint8, 0 = excluded from the sums.
+        tile_size: edge of a tile in pixels.
+        tile_begin: first owned tile.
+        tile_end: one past the last owned tile; -1 = all.
+
+    Returns:
+        (l1 sums [B], SSIM sums [B]), dtype of `renders`.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    return torch.ops.blitzgs.photometric_fwd(
+        renders, targets, _as_bytes(masks), tile_size, tile_begin, tile_end
+    )
+
+
+@torch.no_grad()
+def photometric_fwd_bwd(
+    renders: Tensor,
+    targets: Tensor,
+    masks: Tensor | None,
+    l1_weights: Tensor,
+    ssim_weights: Tensor,
+    tile_size: int = 16,
+    tile_begin: int = 0,
+    tile_end: int = -1,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return `photometric_sums` and the gradient of their weighted total in one go, without autograd.
+
+    For the loss of `photometric_loss`, summed over views: ``l1_weights = (1 - w) / counts`` and
+    ``ssim_weights = -w / counts`` with ``counts = pixel_counts(renders, masks)``.
+
+    Args:
+        renders: as in `photometric_sums`.
+        targets: as in `photometric_sums`.
+        masks: as in `photometric_sums`.
+        l1_weights: [B], weight of each view's L1 sum, dtype of `renders`.
+        ssim_weights: [B], weight of each view's SSIM sum.
+        tile_size: as in `photometric_sums`.
+        tile_begin: as in `photometric_sums`.
+        tile_end: as in `photometric_sums`.
+
+    Returns:
+        (l1 sums [B], SSIM sums [B], v_renders [B, H, W, 3]).
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    return torch.ops.blitzgs.photometric_fwd_bwd(
+        renders, targets, _as_bytes(masks), l1_weights, ssim_weights, tile_size, tile_begin, tile_end
+    )
+
+
+def _as_bytes(masks: Tensor | None) -> Tensor | None:
+    return masks.view(torch.uint8) if masks is not None and masks.dtype == torch.bool else masks
+
+
+@torch.library.register_fake("blitzgs::photometric_fwd")
+def _(renders: Tensor, targets: Tensor, masks: Tensor | None, *_tiles: int) -> tuple[Tensor, Tensor]:
+    return renders.new_empty(renders.shape[0]), renders.new_empty(renders.shape[0])
+
+
+@torch.library.register_fake("blitzgs::photometric_bwd")
+def _(renders: Tensor, *_others: Any) -> Tensor:
+    return torch.empty_like(renders, memory_format=torch.contiguous_format)
+
+
+@torch.library.register_fake("blitzgs::photometric_fwd_bwd")
+def _(renders: Tensor, *_others: Any) -> tuple[Tensor, Tensor, Tensor]:
+    sums = renders.new_empty(renders.shape[0]), renders.new_empty(renders.shape[0])
+    return *sums, torch.empty_like(renders, memory_format=torch.contiguous_format)
+
+
+def _save_inputs(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    renders, targets, masks, *tiles = inputs
+    ctx.save_for_backward(renders, targets, masks)
+    ctx.tiles = tiles
+
+
+def _backward(ctx: Any, v_l1_sums: Tensor, v_ssim_sums: Tensor) -> tuple[Tensor | None, ...]:
+    renders, targets, masks = ctx.saved_tensors
+    v_renders = torch.ops.blitzgs.photometric_bwd(renders, targets, masks, v_l1_sums, v_ssim_sums, *ctx.tiles)
+    return v_renders, None, None, None, None, None
+
+
+torch.library.register_autograd("blitzgs::photometric_fwd", _backward, setup_context=_save_inputs)

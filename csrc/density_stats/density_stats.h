@@ -1,0 +1,74 @@
+// SPDX-License-Identifier: Apache-2.0
+// Statistics that density control reads, added up over the views of one step (Kerbl et al. 2023, section 5).
+//
+// For every visible Gaussian g and each of its rows r (g in one view):
+//   grad_sum[g]   += phi[g] * weight * |(v_means2d[r].x * width / 2, v_means2d[r].y * height / 2)|
+//   grad_count[g] += 1
+//   max_radii[g]   = max(max_radii[g], ceil(3 sqrt(largest eigenvalue of the 2D covariance))) pixels, with
+//   the
+//                    eigenvalue's root term clamped at sqrt(0.1) as in the original renderer
+//
+// v_means2d [P, 2] gradient by the pixel position; weight turns the gradient of the batch's loss into that of
+// one view's (B for a mean over B views); phi [N] or null (1); conics [P, 3] inverse covariance (a, b, c);
+// visible_ids int32 [U], row_offsets int32 [U + 1]. In place, one thread a Gaussian, rows in order:
+// deterministic. O(P).
+#pragma once
+#include <cmath>
+#include <cstdint>
+
+#include "common/host_device.h"
+#include "common/stream.h"
+
+namespace blitzgs {
+
+template <class T>
+struct DensityStatsArgs {
+  T* grad_sum;               // [N]
+  std::int32_t* grad_count;  // [N]
+  T* max_radii;              // [N]
+  const std::int32_t* visible_ids;
+  const std::int32_t* row_offsets;
+  const T* v_means2d;
+  const T* conics;
+  const T* phi;
+  std::int64_t visible;
+  T half_width, half_height, weight;
+};
+
+// Half-extent in pixels at three standard deviations; 0 for a conic that is not positive definite.
+template <class T>
+BLITZGS_HD T three_sigma_radius(const T* conic) {
+  const T determinant = conic[0] * conic[2] - conic[1] * conic[1];
+  if (!(determinant > 0)) return 0;
+  const T half_trace = T(0.5) * (conic[0] + conic[2]) / determinant;
+  const T gap = half_trace * half_trace - T(1) / determinant;
+  return std::ceil(T(3) * std::sqrt(half_trace + std::sqrt(gap > T(0.1) ? gap : T(0.1))));
+}
+
+template <class T>
+BLITZGS_HD void density_stats_of(const DensityStatsArgs<T>& args, std::int64_t u) {
+  const std::int32_t id = args.visible_ids[u];
+  const std::int32_t begin = args.row_offsets[u], end = args.row_offsets[u + 1];
+  T sum = 0, radius = args.max_radii[id];
+  for (std::int32_t r = begin; r < end; ++r) {
+    const T x = args.v_means2d[2 * std::int64_t{r}] * args.half_width;
+    const T y = args.v_means2d[2 * std::int64_t{r} + 1] * args.half_height;
+    sum += std::sqrt(x * x + y * y);
+    const T reach = three_sigma_radius(args.conics + 3 * std::int64_t{r});
+    radius = reach > radius ? reach : radius;
+  }
+  args.grad_sum[id] += (args.phi ? args.phi[id] : T(1)) * args.weight * sum;
+  args.grad_count[id] += end - begin;
+  args.max_radii[id] = radius;
+}
+
+namespace cpu {
+template <class T>
+void density_stats(const DensityStatsArgs<T>& args, Workspace&, CudaStream);
+}
+namespace cuda {
+template <class T>
+void density_stats(const DensityStatsArgs<T>& args, Workspace&, CudaStream);
+}
+
+}  // namespace blitzgs

@@ -1,0 +1,69 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "density_stats/density_stats.h"
+
+#include "common/op.h"
+
+namespace blitzgs {
+namespace {
+
+constexpr const char* kOp = "density_stats_";
+
+void check_column(const char* name, const Tensor& column, ScalarType dtype, std::int64_t rows) {
+  check_dtype(kOp, name, column, dtype);
+  check_shape(kOp, name, column, {rows});
+  STD_TORCH_CHECK(column.is_contiguous(), "blitzgs::", kOp, ": ", name,
+                  " is updated in place and must be contiguous");
+}
+
+void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const Tensor& visible_ids_in,
+                    const Tensor& row_offsets_in, const Tensor& v_means2d_in, const Tensor& conics_in,
+                    const std::optional<Tensor>& phi_in, std::int64_t width, std::int64_t height,
+                    double weight) {
+  check_floating(kOp, "grad_sum", grad_sum);
+  const ScalarType dtype = grad_sum.scalar_type();
+  const std::int64_t rows = grad_sum.numel();
+  check_column("grad_sum", grad_sum, dtype, rows);
+  check_column("grad_count", grad_count, ScalarType::Int, rows);
+  check_column("max_radii", max_radii, dtype, rows);
+  check_dtype(kOp, "visible_ids", visible_ids_in, ScalarType::Int);
+  check_shape(kOp, "visible_ids", visible_ids_in, {-1});
+  const std::int64_t visible = visible_ids_in.size(0);
+  check_dtype(kOp, "row_offsets", row_offsets_in, ScalarType::Int);
+  check_shape(kOp, "row_offsets", row_offsets_in, {visible + 1});
+  check_dtype(kOp, "v_means2d", v_means2d_in, dtype);
+  check_shape(kOp, "v_means2d", v_means2d_in, {-1, 2});
+  check_dtype(kOp, "conics", conics_in, dtype);
+  check_shape(kOp, "conics", conics_in, {v_means2d_in.size(0), 3});
+  std::optional<Tensor> phi;
+  if (phi_in) {
+    check_dtype(kOp, "phi", *phi_in, dtype);
+    check_shape(kOp, "phi", *phi_in, {rows});
+    phi = as_contiguous(*phi_in);
+  }
+  if (visible == 0) return;
+  const Tensor visible_ids = as_contiguous(visible_ids_in), row_offsets = as_contiguous(row_offsets_in);
+  const Tensor v_means2d = as_contiguous(v_means2d_in), conics = as_contiguous(conics_in);
+
+  DeviceScope scope(grad_sum);
+  dispatch_floating(grad_sum, [&](auto zero) {
+    using T = decltype(zero);
+    const DensityStatsArgs<T> args{mutable_data<T>(grad_sum),
+                                   mutable_data<std::int32_t>(grad_count),
+                                   mutable_data<T>(max_radii),
+                                   data<std::int32_t>(visible_ids),
+                                   data<std::int32_t>(row_offsets),
+                                   data<T>(v_means2d),
+                                   data<T>(conics),
+                                   data_or_null<T>(phi),
+                                   visible,
+                                   static_cast<T>(width) / 2,
+                                   static_cast<T>(height) / 2,
+                                   static_cast<T>(weight)};
+    backend::density_stats(args, scope.workspace, scope.stream);
+  });
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) { m.impl("density_stats_", TORCH_BOX(&blitzgs::density_stats_)); }

@@ -1,0 +1,100 @@
+// SPDX-License-Identifier: Apache-2.0
+// Fused L1 and SSIM of rendered views against their images, and the gradient to the renders.
+//
+//   l1[b]   = sum over owned, unmasked pixels and channels of |x - y|
+//   ssim[b] = sum over the same of SSIM(x, y), Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5, zero
+//             padding, C1 = 0.01^2, C2 = 0.03^2
+//
+// x renders [B, H, W, 3]; y targets of the same shape, uint8 (value / 255) or the dtype of x; masks uint8
+// [B, H, W], 0 = excluded from the sums (a window centred elsewhere still sees the pixel as it is). The
+// caller divides by the number of pixels. Owned pixels are those of the tiles [tile_begin, tile_end) of the B
+// views, tile index (b * tiles_y + ty) * tiles_x + tx; the forward reads x up to 5 pixels beyond them.
+//
+// v_renders = d(sum_b l1_weights[b] l1[b] + ssim_weights[b] ssim[b]) / dx for the sums over ALL tiles,
+// written for the owned pixels and zero elsewhere, so that the owners' gradients add up to the whole; it
+// reads x up to 10 pixels beyond the owned tiles. The derivative of |x - y| at 0 is 0.
+//
+// With e = mean(x) - mean(y), P = E[x^2 + y^2], Q = E[(x - y)^2] under the window, SSIM is computed as
+//   (1 - e^2 / A) (1 - V / S),  A = mean(x)^2 + mean(y)^2 + C1,
+//   V = Q - e^2 (variance of x - y),  S = P - mean(x)^2 - mean(y)^2 + C2,
+// the textbook quotient rearranged: it needs four windowed quantities rather than five and stays accurate in
+// flat regions, where var(x) + var(y) cancels. Separable windows: O(22 B H W) multiply-adds a quantity.
+// Sums are taken in double over fixed blocks in a fixed order: repeatable for any number of threads.
+#pragma once
+#include <cstdint>
+
+#include "common/host_device.h"
+#include "common/stream.h"
+
+namespace blitzgs {
+
+constexpr int kSsimRadius = 5;
+constexpr int kSsimTaps = 2 * kSsimRadius + 1;
+
+template <class T>
+struct PhotometricArgs {
+  const T* renders;
+  const T* targets;  // or
+  const std::uint8_t* targets_u8;
+  const std::uint8_t* masks;  // null: all pixels count
+  const T* l1_weights;        // [B]; null: no gradient
+  const T* ssim_weights;      // [B]
+  T* l1_sums;                 // [B]; null: no sums
+  T* ssim_sums;               // [B]
+  T* v_renders;               // with l1_weights
+  std::int64_t views;
+  int width, height, tile_size, tiles_x, tiles_y;
+  std::int64_t tile_begin, tile_end;
+  T window[kSsimTaps];
+};
+
+// The owned columns [begin, end) of one pixel row: always an interval, as a tile range is contiguous.
+struct OwnedColumns {
+  int begin, end;
+};
+
+template <class T>
+BLITZGS_HD OwnedColumns owned_columns(const PhotometricArgs<T>& args, std::int64_t view, int row) {
+  const std::int64_t first = (view * args.tiles_y + row / args.tile_size) * args.tiles_x;
+  const std::int64_t begin = args.tile_begin - first, end = args.tile_end - first;
+  const std::int64_t tiles = args.tiles_x;
+  const std::int64_t b = begin < 0 ? 0 : (begin > tiles ? tiles : begin);
+  const std::int64_t e = end < b ? b : (end > tiles ? tiles : end);
+  const std::int64_t from = b * args.tile_size, to = e * args.tile_size;
+  return {static_cast<int>(from < args.width ? from : args.width),
+          static_cast<int>(to < args.width ? to : args.width)};
+}
+
+// One window: its SSIM and the derivatives by mean(x), P and Q.
+template <class T>
+struct SsimTerms {
+  T value, by_mean, by_p, by_q;
+};
+
+template <class T>
+BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {
+  const T c1 = static_cast<T>(0.0001), c2 = static_cast<T>(0.0009);
+  const T mean_y = mean_x - e;
+  const T energy = mean_x * mean_x + mean_y * mean_y;
+  const T inverse_a = T(1) / (energy + c1);
+  const T inverse_s = T(1) / (p - energy + c2);
+  const T u = e * inverse_a, w = (q - e * e) * inverse_s;
+  const T luminance = T(1) - e * u, structure = T(1) - w;
+  SsimTerms<T> terms;
+  terms.value = luminance * structure;
+  terms.by_mean = T(2) * (u * (u * mean_x - T(1)) * structure + luminance * inverse_s * (e - mean_x * w));
+  terms.by_q = -luminance * inverse_s;
+  terms.by_p = -terms.by_q * w;
+  return terms;
+}
+
+namespace cpu {
+template <class T>
+void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
+}
+namespace cuda {
+template <class T>
+void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
+}
+
+}  // namespace blitzgs

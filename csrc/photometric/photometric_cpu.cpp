@@ -1,0 +1,70 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <type_traits>
+
+#include "common/parallel.h"
+#include "photometric/photometric_strip.h"
+
+namespace blitzgs::cpu {
+
+// photometric_avx2.cpp
+void photometric_strips_avx2(const PhotometricArgs<float>& args, const std::int64_t* strips,
+                             std::int64_t begin, std::int64_t end, double* sums);
+
+namespace {
+
+template <class T>
+void run_strips(const PhotometricArgs<T>& args, const std::int64_t* strips, std::int64_t begin,
+                std::int64_t end, double* sums) {
+#ifdef __x86_64__
+  if constexpr (std::is_same_v<T, float>) {
+    if (__builtin_cpu_supports("avx2")) return photometric_strips_avx2(args, strips, begin, end, sums);
+  }
+#endif
+  run_photometric_strips(args, strips, begin, end, sums);
+}
+
+}  // namespace
+
+template <class T>
+void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStream) {
+  const std::int64_t per_view = (args.height + kStripRows - 1) / kStripRows;
+  const std::int64_t total = args.views * per_view;
+  const std::int64_t view_tiles = std::int64_t{args.tiles_x} * args.tiles_y;
+  std::int64_t* strips = workspace.allocate<std::int64_t>(total);
+  double* sums = workspace.allocate<double>(2 * total);
+  std::fill_n(sums, 2 * total, 0.0);
+  std::int64_t count = 0;
+  for (std::int64_t strip = 0; strip < total; ++strip) {
+    const std::int64_t first = strip / per_view * view_tiles;
+    const int begin = static_cast<int>(strip % per_view) * kStripRows;
+    const int end = std::min(args.height, begin + kStripRows);
+    const bool owned =
+        first + begin / args.tile_size * std::int64_t{args.tiles_x} < args.tile_end &&
+        first + ((end - 1) / args.tile_size + 1) * std::int64_t{args.tiles_x} > args.tile_begin;
+    if (owned) {
+      strips[count++] = strip;
+    } else if (args.v_renders) {
+      const std::int64_t row = 3 * std::int64_t{args.width};
+      T* rows = args.v_renders + (strip / per_view * args.height + begin) * row;
+      std::fill_n(rows, (end - begin) * row, T(0));
+    }
+  }
+  parallel_for(0, count, 1,
+               [&](std::int64_t begin, std::int64_t end) { run_strips(args, strips, begin, end, sums); });
+  if (!args.l1_sums) return;
+  for (std::int64_t view = 0; view < args.views; ++view) {
+    double l1 = 0, ssim = 0;
+    for (std::int64_t strip = view * per_view; strip < (view + 1) * per_view; ++strip) {
+      l1 += sums[2 * strip];
+      ssim += sums[2 * strip + 1];
+    }
+    args.l1_sums[view] = static_cast<T>(l1);
+    args.ssim_sums[view] = static_cast<T>(ssim);
+  }
+}
+
+template void photometric<float>(const PhotometricArgs<float>&, Workspace&, CudaStream);
+template void photometric<double>(const PhotometricArgs<double>&, Workspace&, CudaStream);
+
+}  // namespace blitzgs::cpu

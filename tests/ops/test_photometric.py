@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+import torch
+import torch.nn.functional as F  # noqa: N812
+
+from blitzgs.ops.photometric import (
+    photometric_fwd_bwd,
+    photometric_loss,
+    photometric_sums,
+    pixel_counts,
+    ssim,
+)
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
+
+
+def reference_ssim_map(x, y):
+    """Textbook SSIM in float64 with conv2d, [B, H, W, 3]."""
+    x, y = (t.double().permute(0, 3, 1, 2) for t in (x, y))
+    line = torch.exp(-((torch.arange(11, dtype=torch.float64, device=x.device) - 5) ** 2) / 4.5)
+    window = torch.outer(line, line)
+    window = (window / window.sum()).expand(3, 1, 11, 11)
+    blur = lambda t: F.conv2d(t, window, padding=5, groups=3)  # noqa: E731
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    top = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2)
+    return (top / ((mx * mx + my * my + 0.01**2) * (vx + vy + 0.03**2))).permute(0, 2, 3, 1)
+
+
+def reference_sums(x, y, masks=None):
+    keep = 1 if masks is None else (masks != 0).double()[..., None]
+    return ((x.double() - y.double()).abs() * keep).sum((1, 2, 3)), (reference_ssim_map(x, y) * keep).sum(
+        (1, 2, 3)
+    )
+
+
+def images(shape=(2, 53, 70), dtype=torch.float32, device="cpu", seed=0):
+    """Smooth, flat and noisy areas; targets as bytes."""
+    generator = torch.Generator().manual_seed(seed)
+    b, h, w = shape
+    coarse = torch.rand(b, 3, max(h // 8, 1), max(w // 8, 1), generator=generator, dtype=torch.float64)
+    y = F.interpolate(coarse, (h, w), mode="bicubic").permute(0, 2, 3, 1).clamp(0, 1)
+    y[:, : h // 4] = 1.0
+    targets = (y * 255).round().to(torch.uint8)
+    noise = 0.05 * torch.randn(y.shape, generator=generator, dtype=torch.float64)
+    noise[:, :, w // 2 :] = 0
+    masks = (torch.rand(b, h, w, generator=generator) > 0.2).to(torch.uint8)
+    return (y + noise).to(device, dtype), targets.to(device), masks.to(device)
+
+
+def test_reference_is_one_for_equal_images_and_low_for_noise():
+    x, _, _ = images(dtype=torch.float64)
+    torch.testing.assert_close(reference_ssim_map(x, x), torch.ones_like(x))
+    assert reference_ssim_map(x, torch.rand_like(x)).mean() < 0.3
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("shape", [(2, 53, 70), (1, 1, 1), (3, 7, 200), (1, 130, 3), (1, 200, 400)])
+def test_float32_matches_the_definition(device, masked, shape):
+    x, targets, masks = images(shape, device=device)
+    masks = masks if masked else None
+    weights = torch.tensor([0.8, 1.3, 0.2], device=device)[: shape[0]] / (shape[1] * shape[2])
+    exact_x = x.double().requires_grad_()
+    l1, ssims = reference_sums(exact_x, targets.double() / 255, masks)
+    (expected,) = torch.autograd.grad((weights * l1 - 0.7 * weights * ssims).sum(), exact_x)
+
+    got_l1, got_ssim, v_renders = photometric_fwd_bwd(x, targets, masks, weights, -0.7 * weights)
+    torch.testing.assert_close(got_l1.double(), l1.detach(), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(got_ssim.double(), ssims.detach(), rtol=1e-6, atol=1e-6)
+    assert (v_renders - expected).norm() <= 3e-5 * expected.norm()
+    separate = photometric_sums(x, targets, masks)
+    assert torch.equal(separate[0], got_l1) and torch.equal(separate[1], got_ssim)
+    bwd = torch.ops.blitzgs.photometric_bwd(x, targets, masks, weights, -0.7 * weights, 16, 0, -1)
+    assert torch.equal(bwd, v_renders)
+
+
+def test_float64_matches_to_rounding():
+    x, targets, masks = images(dtype=torch.float64)
+    y = targets.double() / 255
+    for got, expected in zip(photometric_sums(x, y, masks), reference_sums(x, y, masks), strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_gradcheck(masked):
+    x, targets, masks = images((2, 13, 12), torch.float64)
+    y = targets.double() / 255 + 0.003  # off the kink of |x - y|
+    arguments = (y, masks if masked else None)
+    assert torch.autograd.gradcheck(lambda r: photometric_sums(r, *arguments), (x.requires_grad_(),))
+    assert torch.autograd.gradcheck(lambda r: photometric_sums(r, *arguments, 4, 5, 14)[1].sum() * 0
+                                    + photometric_loss(r, *arguments), (x,))  # fmt: skip
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("tile_size", [16, 7])
+def test_a_partition_of_the_tiles_adds_up_to_the_whole(device, tile_size):
+    x, targets, masks = images((3, 75, 61), device=device)
+    weights = torch.tensor([1.0, 0.5, 2.0], device=device)
+    whole = photometric_fwd_bwd(x, targets, masks, weights, -weights, tile_size)
+    tiles_x, tiles_y = -(-61 // tile_size), -(-75 // tile_size)
+    total = 3 * tiles_x * tiles_y
+    cuts = [0, 1, tiles_x + 2, tiles_x + 2, total // 3 + 1, total - 3, total]
+    l1, ssims, v_renders = (torch.zeros_like(t) for t in whole)
+    for begin, end in zip(cuts[:-1], cuts[1:], strict=True):
+        index = torch.arange(total, device=device).reshape(3, tiles_y, tiles_x)
+        owned = (
+            ((index >= begin) & (index < end)).repeat_interleave(tile_size, 1).repeat_interleave(tile_size, 2)
+        )
+        owned = owned[:, :75, :61]
+        # A rank knows its own tiles and a ring of 10 pixels around them; the rest must not matter.
+        known = F.max_pool2d(owned[:, None].float(), 21, 1, 10)[:, 0, :, :, None] > 0
+        part = photometric_fwd_bwd(
+            torch.where(known, x, torch.full_like(x, 7.0)),
+            targets,
+            masks,
+            weights,
+            -weights,
+            tile_size,
+            begin,
+            end,
+        )
+        assert (part[2][~owned] == 0).all()
+        torch.testing.assert_close(part[2][owned], whole[2][owned], rtol=1e-5, atol=1e-6)
+        l1, ssims, v_renders = l1 + part[0], ssims + part[1], v_renders + part[2]
+    torch.testing.assert_close(l1, whole[0], rtol=1e-6, atol=0)
+    torch.testing.assert_close(ssims, whole[1], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_loss_and_ssim_are_means(device):
+    x, targets, masks = images(device=device)
+    l1, ssims = reference_sums(x, targets.double() / 255, masks)
+    counts = 3 * (masks != 0).sum((1, 2)).double()
+    expected = 0.8 * l1 / counts + 0.2 * (1 - ssims / counts)
+    torch.testing.assert_close(
+        photometric_loss(x, targets, masks.bool()).double(), expected, rtol=1e-6, atol=1e-7
+    )
+    torch.testing.assert_close(ssim(x, targets, masks).double(), ssims / counts, rtol=1e-6, atol=1e-7)
+    assert pixel_counts(x).tolist() == [3 * 53 * 70] * 2
+    assert photometric_loss(x, targets, torch.zeros_like(masks)).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_equal_images_have_ssim_one_and_no_gradient(device):
+    y = images(device=device)[1]
+    x = (y.float() * (1 / 255)).requires_grad_()
+    torch.testing.assert_close(ssim(x, y), torch.ones(2, device=device), rtol=0, atol=1e-6)
+    (gradient,) = torch.autograd.grad(photometric_loss(x, y).sum(), x)
+    assert gradient.abs().max() < 1e-7
+
+
+def test_threads_do_not_change_the_result():
+    x, targets, masks = images((2, 200, 90))
+    weights = torch.ones(2)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = photometric_fwd_bwd(x, targets, masks, weights, weights)
+        torch.set_num_threads(3)
+        three = photometric_fwd_bwd(x, targets, masks, weights, weights)
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_empty_batch(device):
+    x = torch.zeros(0, 8, 8, 3, device=device)
+    outputs = photometric_fwd_bwd(x, x, None, x.new_zeros(0), x.new_zeros(0))
+    assert [tuple(t.shape) for t in outputs] == [(0,), (0,), (0, 8, 8, 3)]
+
+
+def test_errors_name_the_value():
+    x, targets, _ = images()
+    with pytest.raises(RuntimeError, match=r"targets must have shape \[2, 53, 70, 3\], got \[1, 53, 70, 3\]"):
+        photometric_sums(x, targets[:1])
+    with pytest.raises(RuntimeError, match="masks must be Byte, got Float"):
+        photometric_sums(x, targets, torch.ones(2, 53, 70))
+    with pytest.raises(RuntimeError, match=r"targets \(if not uint8\) must be Float, got Double"):
+        photometric_sums(x, targets.double())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_opcheck(device):
+    x, targets, masks = images((1, 12, 9), device=device)
+    weights = torch.ones(1, device=device)
+    torch.library.opcheck(
+        torch.ops.blitzgs.photometric_fwd, (x.clone().requires_grad_(), targets, masks, 16, 0, -1)
+    )
+    torch.library.opcheck(torch.ops.blitzgs.photometric_bwd, (x, targets, masks, weights, weights, 16, 0, -1))
+    torch.library.opcheck(
+        torch.ops.blitzgs.photometric_fwd_bwd, (x, targets, None, weights, weights, 16, 0, -1)
+    )
