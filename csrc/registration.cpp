@@ -28,6 +28,13 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor? ids, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
       "int n_isects) -> (Tensor isect_rows, Tensor tile_offsets)");
 
+  // Which ranks a row has to be sent to.
+  m.def(
+      "route_count(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor camera_ids, int[] "
+      "tile_bounds, "
+      "int width, int height, int tile_size) -> (Tensor masks, Tensor counts)");
+  m.def("route_rows(Tensor masks, int[] rows_per_rank) -> Tensor rows");
+
   // Alpha compositing.
   m.def(
       "rasterize_fwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "

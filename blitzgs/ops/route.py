@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Routing: which ranks a projected row has to be sent to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+MAX_RANKS = 63
+
+
+def route_count(
+    means2d: Tensor,
+    conics: Tensor,
+    row_opacities: Tensor,
+    camera_ids: Tensor,
+    tile_bounds: Sequence[int],
+    width: int,
+    height: int,
+    tile_size: int = 16,
+) -> tuple[Tensor, Tensor]:
+    """Find the ranks whose tiles each row touches, by the same tile test as `intersect`.
+
+    Args:
+        means2d: [P, 2] pixels.
+        conics: [P, 3], inverse 2D covariance (a, b, c) in 1 / pixel^2.
+        row_opacities: [P].
+        camera_ids: int32 [P].
+        tile_bounds: M + 1 ascending flattened tile indices (camera * T + ty * tiles_x + tx); rank m owns
+            [tile_bounds[m], tile_bounds[m + 1]).
+        width: image width in pixels.
+        height: image height in pixels.
+        tile_size: tile edge in pixels.
+
+    Returns:
+        masks int64 [P], bit m set when the row goes to rank m, and counts int64 [M, 2]: the rows that go to
+        rank m and the row-tile intersections they make there.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, bounds that descend, or more than 63 ranks.
+    """
+    masks, counts = torch.ops.blitzgs.route_count(
+        means2d, conics, row_opacities, camera_ids, list(tile_bounds), width, height, tile_size
+    )
+    return masks, counts
+
+
+def route_rows(masks: Tensor, rows_per_rank: Sequence[int]) -> Tensor:
+    """List the rows for each rank.
+
+    Args:
+        masks: int64 [P] from `route_count`.
+        rows_per_rank: how many go to each rank, column 0 of `route_count`'s counts.
+
+    Returns:
+        int32 [sum(rows_per_rank)]: the rows for rank 0 in ascending order, then those for rank 1, ...
+    """
+    return torch.ops.blitzgs.route_rows(masks, list(rows_per_rank))
+
+
+@torch.library.register_fake("blitzgs::route_count")
+def _(
+    means2d: Tensor,
+    conics: Tensor,
+    row_opacities: Tensor,
+    camera_ids: Tensor,
+    tile_bounds: Sequence[int],
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor]:
+    masks = means2d.new_empty(means2d.shape[0], dtype=torch.int64)
+    return masks, means2d.new_empty((len(tile_bounds) - 1, 2), dtype=torch.int64)
+
+
+@torch.library.register_fake("blitzgs::route_rows")
+def _(masks: Tensor, rows_per_rank: Sequence[int]) -> Tensor:
+    return masks.new_empty(sum(rows_per_rank), dtype=torch.int32)

@@ -1,0 +1,77 @@
+// SPDX-License-Identifier: Apache-2.0
+// Routing: which ranks a projected row has to be sent to.
+//
+// The tiles of all cameras, flattened as in math/tiles.h, are cut at bounds[0] = 0 <= ... <= bounds[M] into
+// one contiguous range per rank. Row p goes to rank m iff for_each_tile_row() visits a tile in
+// [bounds[m], bounds[m + 1]): exactly the rows that intersect lists there.
+//
+//   means2d [P, 2] pixels, conics [P, 3], opacities [P], camera_ids int32 [P]
+//   -> masks int64 [P], bit m set for rank m; counts int64 [M, 2]: rows for rank m, and the row-tile
+//      intersections they make there.
+//   route_rows: masks, rows per rank -> int32 [sum], the rows for rank 0 in ascending order, then rank 1, ...
+//
+// Integers only, so deterministic on every backend. O(tile rows of the splats) and O(P M). M <= 63.
+#pragma once
+#include <cstdint>
+
+#include "common/stream.h"
+#include "math/tiles.h"
+
+namespace blitzgs {
+
+constexpr int kMaxRanks = 63;
+
+struct RankBounds {
+  std::int64_t tile[kMaxRanks + 1];
+  int n_ranks;
+};
+
+template <class T>
+struct RouteInput {
+  const T* means2d;
+  const T* conics;
+  const T* opacities;
+  const std::int32_t* camera_ids;
+  std::int64_t n_rows;
+  TileGrid grid;
+  RankBounds bounds;
+};
+
+// Calls f(rank, tiles) for each piece of a tile row inside a rank's range; returns the mask of the ranks.
+template <class T, class F>
+BLITZGS_HD std::int64_t route_row(const RouteInput<T>& in, std::int64_t row, const F& f) {
+  const TileGrid& grid = in.grid;
+  const std::int64_t first_tile = in.camera_ids[row] * grid.per_image();
+  std::int64_t mask = 0;
+  int rank = 0;  // tile rows come in ascending order, so the search never goes back
+  for_each_tile_row(in.means2d + 2 * row, in.conics + 3 * row, in.opacities[row], grid.width, grid.height,
+                    grid.tile_size, [&](int ty, int tx_begin, int tx_end) {
+                      const std::int64_t start = first_tile + static_cast<std::int64_t>(ty) * grid.tiles_x;
+                      const std::int64_t begin = start + tx_begin, end = start + tx_end;
+                      while (rank < in.bounds.n_ranks && in.bounds.tile[rank + 1] <= begin) ++rank;
+                      for (int m = rank; m < in.bounds.n_ranks && in.bounds.tile[m] < end; ++m) {
+                        const std::int64_t low = in.bounds.tile[m], high = in.bounds.tile[m + 1];
+                        const std::int64_t tiles = (high < end ? high : end) - (low > begin ? low : begin);
+                        if (tiles <= 0) continue;
+                        mask |= std::int64_t{1} << m;
+                        f(m, tiles);
+                      }
+                    });
+  return mask;
+}
+
+namespace cpu {
+template <class T>
+void route_count(const RouteInput<T>& in, std::int64_t* masks, std::int64_t* counts, Workspace&, CudaStream);
+void route_rows(const std::int64_t* masks, std::int64_t n_rows, const std::int64_t* rows_per_rank,
+                int n_ranks, std::int32_t* rows, Workspace&, CudaStream);
+}  // namespace cpu
+
+namespace cuda {
+template <class T>
+void route_count(const RouteInput<T>& in, std::int64_t* masks, std::int64_t* counts, Workspace&, CudaStream);
+void route_rows(const std::int64_t* masks, std::int64_t n_rows, const std::int64_t* rows_per_rank,
+                int n_ranks, std::int32_t* rows, Workspace&, CudaStream);
+}  // namespace cuda
+
+}  // namespace blitzgs

@@ -1,0 +1,47 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <mutex>
+
+#include "common/parallel.h"
+#include "route/route.h"
+
+namespace blitzgs::cpu {
+
+template <class T>
+void route_count(const RouteInput<T>& in, std::int64_t* masks, std::int64_t* counts, Workspace&, CudaStream) {
+  const int n_ranks = in.bounds.n_ranks;
+  std::fill(counts, counts + 2 * n_ranks, 0);
+  std::mutex adding;
+  parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
+    std::int64_t local[2 * kMaxRanks] = {};
+    for (std::int64_t row = begin; row < end; ++row) {
+      masks[row] = route_row(in, row, [&](int m, std::int64_t tiles) { local[2 * m + 1] += tiles; });
+      for (int m = 0; m < n_ranks; ++m) local[2 * m] += (masks[row] >> m) & 1;
+    }
+    const std::lock_guard<std::mutex> lock(adding);
+    for (int i = 0; i < 2 * n_ranks; ++i) counts[i] += local[i];
+  });
+}
+
+template void route_count<float>(const RouteInput<float>&, std::int64_t*, std::int64_t*, Workspace&,
+                                 CudaStream);
+template void route_count<double>(const RouteInput<double>&, std::int64_t*, std::int64_t*, Workspace&,
+                                  CudaStream);
+
+void route_rows(const std::int64_t* masks, std::int64_t n_rows, const std::int64_t* rows_per_rank,
+                int n_ranks, std::int32_t* rows, Workspace&, CudaStream) {
+  parallel_for(0, n_ranks, 1, [&](std::int64_t begin, std::int64_t end) {
+    std::int32_t* out = rows;
+    for (std::int64_t m = 0; m < begin; ++m) out += rows_per_rank[m];
+    for (std::int64_t m = begin; m < end; ++m) {
+      std::int64_t written = 0;
+      // Never past what was announced, whatever the masks say.
+      for (std::int64_t row = 0; row < n_rows && written < rows_per_rank[m]; ++row) {
+        if ((masks[row] >> m) & 1) out[written++] = static_cast<std::int32_t>(row);
+      }
+      out += rows_per_rank[m];
+    }
+  });
+}
+
+}  // namespace blitzgs::cpu

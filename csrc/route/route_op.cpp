@@ -1,0 +1,88 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "route/route.h"
+
+#include <limits>
+#include <tuple>
+
+#include "common/op.h"
+
+namespace blitzgs {
+namespace {
+
+std::tuple<Tensor, Tensor> route_count(const Tensor& means2d, const Tensor& conics, const Tensor& opacities,
+                                       const Tensor& camera_ids, const std::vector<std::int64_t>& tile_bounds,
+                                       std::int64_t width, std::int64_t height, std::int64_t tile_size) {
+  constexpr const char* kOp = "route_count";
+  check_floating(kOp, "means2d", means2d);
+  check_shape(kOp, "means2d", means2d, {-1, 2});
+  const std::int64_t n = means2d.size(0);
+  check_shape(kOp, "conics", conics, {n, 3});
+  check_shape(kOp, "row_opacities", opacities, {n});
+  check_shape(kOp, "camera_ids", camera_ids, {n});
+  check_dtype(kOp, "conics", conics, means2d.scalar_type());
+  check_dtype(kOp, "row_opacities", opacities, means2d.scalar_type());
+  check_dtype(kOp, "camera_ids", camera_ids, ScalarType::Int);
+  STD_TORCH_CHECK(width > 0 && height > 0 && tile_size > 0,
+                  "blitzgs::route_count: width, height and tile_size must be positive, got ", width, ", ",
+                  height, ", ", tile_size);
+  STD_TORCH_CHECK(n <= std::numeric_limits<std::int32_t>::max(), "blitzgs::route_count: ", n,
+                  " rows exceed 2^31 - 1; project fewer views at a time");
+  const std::int64_t n_ranks = static_cast<std::int64_t>(tile_bounds.size()) - 1;
+  STD_TORCH_CHECK(n_ranks >= 1 && n_ranks <= kMaxRanks, "blitzgs::route_count: 1 to ", kMaxRanks,
+                  " ranks are supported, got ", n_ranks);
+  RankBounds bounds{};
+  bounds.n_ranks = static_cast<int>(n_ranks);
+  for (std::int64_t m = 0; m <= n_ranks; ++m) {
+    STD_TORCH_CHECK(tile_bounds[m] >= (m ? tile_bounds[m - 1] : 0),
+                    "blitzgs::route_count: tile_bounds must ascend from 0, got ", tile_bounds[m], " at ", m);
+    bounds.tile[m] = tile_bounds[m];
+  }
+  const Tensor means2d_c = as_contiguous(means2d), conics_c = as_contiguous(conics);
+  const Tensor opacities_c = as_contiguous(opacities), cameras = as_contiguous(camera_ids);
+  Tensor masks = make_empty(means2d_c, {n}, ScalarType::Long);
+  Tensor counts = make_empty(means2d_c, {n_ranks, 2}, ScalarType::Long);
+  DeviceScope scope(means2d_c);
+  // The grid's own range is not used: the bounds are the ranges.
+  const TileGrid grid = make_tile_grid(1, static_cast<int>(width), static_cast<int>(height),
+                                       static_cast<int>(tile_size), 0, -1);
+  dispatch_floating(means2d_c, [&](auto zero) {
+    using T = decltype(zero);
+    const RouteInput<T> in{data<T>(means2d_c),
+                           data<T>(conics_c),
+                           data<T>(opacities_c),
+                           data<std::int32_t>(cameras),
+                           n,
+                           grid,
+                           bounds};
+    backend::route_count(in, mutable_data<std::int64_t>(masks), mutable_data<std::int64_t>(counts),
+                         scope.workspace, scope.stream);
+  });
+  return {masks, counts};
+}
+
+Tensor route_rows(const Tensor& masks, const std::vector<std::int64_t>& rows_per_rank) {
+  constexpr const char* kOp = "route_rows";
+  check_shape(kOp, "masks", masks, {-1});
+  check_dtype(kOp, "masks", masks, ScalarType::Long);
+  const Tensor masks_c = as_contiguous(masks);
+  std::int64_t total = 0;
+  for (const std::int64_t count : rows_per_rank) {
+    STD_TORCH_CHECK(count >= 0 && count <= masks.size(0), "blitzgs::route_rows: ", count, " rows of ",
+                    masks.size(0), " cannot go to one rank");
+    total += count;
+  }
+  Tensor rows = make_empty(masks_c, {total}, ScalarType::Int);
+  DeviceScope scope(masks_c);
+  backend::route_rows(data<std::int64_t>(masks_c), masks_c.size(0), rows_per_rank.data(),
+                      static_cast<int>(rows_per_rank.size()), mutable_data<std::int32_t>(rows),
+                      scope.workspace, scope.stream);
+  return rows;
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) {
+  m.impl("route_count", TORCH_BOX(&blitzgs::route_count));
+  m.impl("route_rows", TORCH_BOX(&blitzgs::route_rows));
+}
