@@ -1,0 +1,12 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The image by definition: plain float64 PyTorch, one short function for each formula.
+
+Every kernel of every backend is held against `render`. It visits each Gaussian at each pixel (no tiles, no
+radius, no culling but the depth range), so it is for small inputs; autograd differentiates it.
+"""
+
+from blitzgs.reference.compositing import Composite, composite
+from blitzgs.reference.projection import Splats, project_splats
+from blitzgs.reference.render import ReferenceImage, render
+
+__all__ = ["Composite", "ReferenceImage", "Splats", "composite", "project_splats", "render"]

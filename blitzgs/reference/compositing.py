@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Front-to-back alpha compositing of every splat at every pixel, and which pixels sit on a cut."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+ALPHA_CUT = 1.0 / 255.0
+ALPHA_MAX = 0.99
+MIN_TRANSMITTANCE = 1e-4
+
+
+@dataclass
+class Composite:
+    """One image, float64."""
+
+    values: Tensor  # [H, W, D]
+    transmittances: Tensor  # [H, W]: what reaches the background
+    cut: Tensor  # bool [H, W]: a decision here falls within the tolerance, so rounding may change it
+
+
+def composite(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    depths: Tensor,
+    width: int,
+    height: int,
+    *,
+    tolerance: float = 1e-4,
+) -> Composite:
+    """Composite M splats that are ordered front to back.
+
+    alpha = min(0.99, o exp(-q / 2)), q the Mahalanobis distance of the pixel centre; a splat takes part where
+    alpha >= 1/255; one that would take the transmittance below 1e-4 is left out and ends the pixel.
+
+    Args:
+        means2d: [M, 2] px.
+        conics: [M, 3].
+        opacities: [M].
+        colors: [M, D].
+        depths: [M], ascending.
+        width: px.
+        height: px.
+        tolerance: relative distance within which alpha (to 1/255 or 0.99), transmittance (to 1e-4) or the
+            depths of two consecutive splats of a pixel count as undecided.
+    """
+    alphas, unclipped = _alphas(means2d, conics, opacities, width, height)
+    touched = alphas >= ALPHA_CUT
+    alphas = torch.where(touched, alphas, torch.zeros_like(alphas))
+    after = torch.cumprod(1 - alphas, dim=0)  # [M, H W], never increasing
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    composited = touched & (after >= MIN_TRANSMITTANCE)
+    weights = torch.where(composited, alphas * before, torch.zeros_like(alphas))
+    values = torch.einsum("mp,md->pd", weights, colors)
+    transmittances = torch.where(composited, 1 - alphas, torch.ones_like(alphas)).prod(dim=0)
+    cut = _cut(unclipped.detach(), after.detach(), before.detach(), depths.detach(), tolerance)
+    shape = (height, width)
+    return Composite(values.reshape(*shape, -1), transmittances.reshape(shape), cut.reshape(shape))
+
+
+def _alphas(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Return alpha [M, H W] clipped at 0.99 and before clipping."""
+    columns = torch.arange(width, dtype=means2d.dtype) + 0.5
+    rows = torch.arange(height, dtype=means2d.dtype) + 0.5
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    dx = x.reshape(1, -1) - means2d[:, :1]
+    dy = y.reshape(1, -1) - means2d[:, 1:]
+    a, b, c = conics[:, :, None].unbind(dim=1)
+    unclipped = opacities[:, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    return unclipped.clamp(max=ALPHA_MAX), unclipped
+
+
+def _cut(unclipped: Tensor, after: Tensor, before: Tensor, depths: Tensor, tolerance: float) -> Tensor:
+    def near(value: Tensor, limit: float) -> Tensor:
+        return (value - limit).abs() <= tolerance * limit
+
+    # What lies behind the end of a pixel decides nothing there.
+    reached = before >= MIN_TRANSMITTANCE * (1 - tolerance)
+    undecided = near(unclipped, ALPHA_CUT) | near(unclipped, ALPHA_MAX) | near(after, MIN_TRANSMITTANCE)
+    touched = unclipped >= ALPHA_CUT * (1 - tolerance)
+    front = torch.where(touched, depths[:, None], -torch.inf).cummax(dim=0).values
+    gap = depths[1:, None] - front[:-1]
+    tie = touched.clone()
+    tie[:1] = False
+    # Equal depths are decided, by the index.
+    tie[1:] &= (gap > 0) & (gap <= tolerance * 1e-2 * depths[1:, None].abs())
+    return ((undecided | tie) & reached).any(dim=0)

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small scenes, and error measures that cannot pass by accident (tests/test_helpers.py tests them)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from blitzgs.reference import ReferenceImage, render
+
+PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
+
+
+@dataclass
+class Scene:
+    """Activated Gaussians and the cameras that see them; everything [N, ...] or [C, ...]."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor  # SH [N, 16, 3]
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+    sh_degree: int | None = 3
+
+    def to(self, dtype: torch.dtype, device: str = "cpu") -> Scene:
+        tensors = {k: v.to(device, dtype) for k, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **tensors)
+
+    def leaves(self) -> Scene:
+        """Return a copy whose PARAMETERS require gradients."""
+        return replace(self, **{k: getattr(self, k).detach().clone().requires_grad_() for k in PARAMETERS})
+
+    def arguments(self) -> tuple:
+        """Return the positional arguments of `blitzgs.rasterization`."""
+        return (
+            self.means,
+            self.quats,
+            self.scales,
+            self.opacities,
+            self.colors,
+            self.viewmats,
+            self.Ks,
+            self.width,
+            self.height,
+        )
+
+
+def random_scene(
+    n: int = 60,
+    cameras: int = 2,
+    width: int = 40,
+    height: int = 32,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float32,
+    scale: float = 0.12,
+) -> Scene:
+    """Gaussians in a unit ball seen from a few units away, with off-centre principal points."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    means = normal(n, 3)
+    means = (
+        means / means.norm(dim=1, keepdim=True) * torch.rand(n, 1, generator=generator, dtype=torch.float64)
+    )
+    Ks = torch.zeros(cameras, 3, 3, dtype=torch.float64)
+    Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 2, 2] = 1.1 * width, 1.15 * width, 1.0
+    Ks[:, 0, 2], Ks[:, 1, 2] = 0.45 * width, 0.56 * height
+    viewmats = [orbit_camera(2.0 * math.pi * c / max(cameras, 1) + 0.3) for c in range(cameras)]
+    return Scene(
+        means,
+        normal(n, 4) * 3.0,
+        scale * torch.exp(0.6 * normal(n, 3)),
+        torch.sigmoid(normal(n)),
+        0.4 * normal(n, 16, 3),
+        torch.stack(viewmats) if viewmats else torch.zeros(0, 4, 4, dtype=torch.float64),
+        Ks,
+        width,
+        height,
+    ).to(dtype)
+
+
+def orbit_camera(angle: float, distance: float = 3.0, lift: float = 0.4) -> Tensor:
+    """World-to-camera [4, 4] that looks at the origin from a circle around it (z forward, y down)."""
+    eye = torch.tensor([math.sin(angle), -lift, -math.cos(angle)], dtype=torch.float64) * distance
+    forward = -eye / eye.norm()
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), forward)
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ eye
+    return viewmat
+
+
+def reference_images(scene: Scene, backgrounds: Tensor | None = None, **options) -> list[ReferenceImage]:
+    """Render each view of the scene by definition, in float64."""
+    return [
+        render(
+            scene.means,
+            scene.quats,
+            scene.scales,
+            scene.opacities,
+            scene.colors,
+            scene.viewmats[c],
+            scene.Ks[c],
+            scene.width,
+            scene.height,
+            sh_degree=scene.sh_degree,
+            background=None if backgrounds is None else backgrounds[c],
+            **options,
+        )
+        for c in range(len(scene.viewmats))
+    ]
+
+
+def relative_error(actual: Tensor, expected: Tensor) -> float:
+    """Return max |actual - expected| / max |expected|; infinite for NaN or anything else not finite."""
+    assert actual.shape == expected.shape, f"shapes differ: {list(actual.shape)}, {list(expected.shape)}"
+    if expected.numel() == 0:
+        return 0.0
+    actual, expected = actual.detach().double().cpu(), expected.detach().double().cpu()
+    difference = (actual - expected).abs().max().item()
+    size = expected.abs().max().item()
+    if not (math.isfinite(difference) and math.isfinite(size)):
+        return math.inf
+    if size == 0.0:
+        return 0.0 if difference == 0.0 else math.inf
+    return difference / size
+
+
+def image_error(actual: Tensor, expected: Tensor, cut: Tensor, most_cut: float = 0.1) -> float:
+    """Return max |actual - expected| over the pixels that are not cut; infinite for NaN anywhere.
+
+    Fails when more than the share `most_cut` of the pixels is cut: then there is nothing left to compare.
+    """
+    assert actual.shape == expected.shape, f"shapes differ: {list(actual.shape)}, {list(expected.shape)}"
+    share = cut.double().mean().item()
+    assert share <= most_cut, f"{share:.1%} of the pixels are on a cut, more than {most_cut:.1%}"
+    actual, expected = actual.detach().double().cpu(), expected.detach().double().cpu()
+    if not (actual.isfinite().all() and expected.isfinite().all()):
+        return math.inf
+    return (actual - expected)[~cut].abs().max().item() if (~cut).any() else 0.0

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reference against a scalar loop over pixels and splats, and against closed forms."""
+
+import math
+
+import pytest
+import torch
+
+from blitzgs.reference import composite, render
+from blitzgs.reference.gaussians import rotation_matrices, sh_basis
+from tests.helpers import random_scene, reference_images
+
+
+def loop_pixel(means2d, conics, opacities, colors, x, y):
+    """The definition of a pixel, one statement for each sentence of it."""
+    transmittance, value = 1.0, [0.0] * colors.shape[1]
+    for (mx, my), (a, b, c), o, color in zip(
+        means2d.tolist(), conics.tolist(), opacities.tolist(), colors.tolist(), strict=True
+    ):
+        dx, dy = x + 0.5 - mx, y + 0.5 - my
+        alpha = min(0.99, o * math.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)))
+        if alpha < 1 / 255:
+            continue
+        if transmittance * (1 - alpha) < 1e-4:
+            break
+        value = [v + alpha * transmittance * channel for v, channel in zip(value, color, strict=True)]
+        transmittance *= 1 - alpha
+    return value, transmittance
+
+
+def test_compositing_equals_a_scalar_loop():
+    splats = reference_images(random_scene(n=150, cameras=1, width=12, height=9, scale=0.4))[0].splats
+    # Opaque enough that pixels end early.
+    opacities = splats.opacities.clamp(min=0.6)
+    result = composite(splats.means2d, splats.conics, opacities, splats.colors, splats.depths, 12, 9)
+    ended = 0
+    for y in range(9):
+        for x in range(12):
+            value, transmittance = loop_pixel(splats.means2d, splats.conics, opacities, splats.colors, x, y)
+            assert result.values[y, x].tolist() == pytest.approx(value, abs=1e-13)
+            assert result.transmittances[y, x].item() == pytest.approx(transmittance, abs=1e-13)
+            ended += transmittance < 2e-4
+    assert ended > 0
+
+
+def test_projection_of_a_gaussian_on_the_axis_is_its_scaled_covariance():
+    identity = torch.eye(4, dtype=torch.float64)
+    K = torch.tensor([[50.0, 0, 8], [0, 60.0, 6], [0, 0, 1]], dtype=torch.float64)
+    quat = torch.tensor([[math.cos(0.35), 0, 0, math.sin(0.35)]], dtype=torch.float64)
+    means = torch.tensor([[0.0, 0, 5]])
+    scales = torch.tensor([[0.3, 0.1, 0.7]])
+    splats = render(means, quat, scales, torch.ones(1) * 0.5, torch.ones(1, 2), identity, K, 16, 12).splats
+    assert splats.means2d.tolist() == [[8.0, 6.0]]
+    R = torch.tensor([[math.cos(0.7), -math.sin(0.7)], [math.sin(0.7), math.cos(0.7)]], dtype=torch.float64)
+    zoom = torch.diag(torch.tensor([10.0, 12.0], dtype=torch.float64))
+    s = scales[0, :2].double()
+    covariance = zoom @ R @ torch.diag(s**2) @ R.T @ zoom + 0.3 * torch.eye(2)
+    a, b, c = splats.conics[0]
+    assert torch.allclose(torch.stack([a, b, b, c]).reshape(2, 2), covariance.inverse(), atol=1e-12)
+
+
+def test_depth_range_is_open_at_near_and_closed_at_far():
+    K = torch.tensor([[10.0, 0, 4], [0, 10.0, 4], [0, 0, 1]])
+    means = torch.tensor([[0.0, 0, 1], [0, 0, 1.5], [0, 0, 2], [0, 0, 2.5], [0, 0, -1.5]])
+    n = len(means)
+    splats = render(
+        means,
+        torch.ones(n, 4),
+        torch.ones(n, 3),
+        torch.full((n,), 0.5),
+        torch.ones(n, 1),
+        torch.eye(4),
+        K,
+        8,
+        8,
+        near_plane=1.0,
+        far_plane=2.0,
+    ).splats
+    assert splats.ids.tolist() == [1, 2]
+
+
+def test_sh_basis_is_orthonormal():
+    # A product rule on the sphere, exact for the degree-6 products: Gauss-Legendre in z, equal angles.
+    import numpy as np
+
+    z, weight = np.polynomial.legendre.leggauss(8)
+    z, weight = torch.tensor(z), torch.tensor(weight)
+    angle = torch.arange(16, dtype=torch.float64) * (2 * math.pi / 16)
+    r = (1 - z * z).sqrt()
+    directions = torch.stack(
+        [r[:, None] * angle.cos(), r[:, None] * angle.sin(), z[:, None].expand(-1, 16)], dim=-1
+    ).reshape(-1, 3)
+    basis = sh_basis(directions, 3)
+    weights = (weight[:, None].expand(-1, 16) * (2 * math.pi / 16)).reshape(-1)
+    assert torch.allclose(
+        basis.T @ (weights[:, None] * basis), torch.eye(16, dtype=torch.float64), atol=1e-12
+    )
+
+
+def test_rotations_are_rotations_for_any_quaternion():
+    quats = torch.tensor(
+        [[0.0, 0, 0, 0], [1e150, 2e150, 0, 1e150], [1e-200, 0, 1e-200, 0], [1, 2, 3, 4]], dtype=torch.float64
+    )
+    R = rotation_matrices(quats)
+    assert torch.allclose(
+        R @ R.transpose(1, 2), torch.eye(3, dtype=torch.float64).expand(4, 3, 3), atol=1e-14
+    )
+    assert torch.allclose(torch.linalg.det(R), torch.ones(4, dtype=torch.float64))
+
+
+def test_non_finite_gaussians_spread_nowhere_not_even_into_gradients():
+    scene = random_scene(n=20, cameras=1)
+    clean = reference_images(scene)[0]
+    scene.means[3, 1] = math.nan
+    scene.scales[7, 0] = math.inf
+    scene.quats[9] = math.nan
+    scene.opacities[11] = math.nan
+    scene.colors[13, 2, 0] = math.nan
+    leaves = scene.leaves()
+    image = reference_images(leaves)[0]
+    assert image.image.isfinite().all() and not torch.equal(image.image, clean.image)
+    image.image.sum().backward()
+    for tensor in (
+        leaves.means,
+        leaves.quats,
+        leaves.scales,
+        leaves.opacities,
+        leaves.colors,
+        leaves.viewmats,
+    ):
+        assert tensor.grad.isfinite().all() and tensor.grad.abs().sum() > 0
+    assert leaves.means.grad[3].tolist() == [0, 0, 0]
