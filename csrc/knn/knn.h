@@ -1,0 +1,221 @@
+// SPDX-License-Identifier: Apache-2.0
+// Distances to the k nearest other points, exact.
+//
+// points [N, 3]; distances [N, k] ascending, in the unit of the points. Duplicates are at distance 0 of each
+// other. A row that is not finite is nobody's neighbour and gets infinity, and so do the entries beyond the
+// last neighbour when fewer than k others exist.
+//
+// Points are sorted along a Morton curve; boxes of 8 consecutive points, of 8 such boxes and so on form an
+// implicit tree, which follows the density of the cloud. A query starts in its own leaf and climbs,
+// descending into the siblings whose box is nearer than the worst neighbour so far. The distance to a box is
+// computed with the operations of the distance to a point, so rounding is monotone and no neighbour is lost.
+// O(N log N); results do not depend on the number of threads.
+#pragma once
+#include <cmath>
+#include <cstdint>
+
+#include "common/host_device.h"
+#include "common/stream.h"
+
+namespace blitzgs {
+
+constexpr int kKnnFan = 8;      // points per leaf and children per node
+constexpr int kKnnLevels = 11;  // 8^11 > 2^31 points
+constexpr int kKnnMaxK = 32;
+
+template <class T>
+struct KnnBox {
+  T low[3], high[3];
+};
+
+template <class T>
+struct KnnTree {
+  const T* points;            // [n, 3], in curve order
+  const std::int32_t* order;  // [n], row of each sorted point
+  std::int32_t n;             // finite points
+  int levels;                 // the top level has one node
+  std::int64_t offset[kKnnLevels];
+  std::int32_t count[kKnnLevels];
+  const KnnBox<T>* boxes;
+};
+
+// Sizes of the levels above n sorted points; returns the number of boxes.
+template <class T>
+std::int64_t plan_knn_levels(std::int32_t n, KnnTree<T>& tree) {
+  std::int64_t total = 0;
+  std::int32_t count = n;
+  tree.levels = 0;
+  do {
+    count = static_cast<std::int32_t>((static_cast<std::int64_t>(count) + kKnnFan - 1) / kKnnFan);
+    tree.offset[tree.levels] = total;
+    tree.count[tree.levels++] = count;
+    total += count;
+  } while (count > 1);
+  return total;
+}
+
+struct MortonFrame {
+  double low[3];
+  double cells_per_unit;  // 2^21 cells along the longest axis
+};
+
+BLITZGS_HD std::uint64_t spread_bits(std::uint64_t x) {
+  x &= 0x1fffff;
+  x = (x | x << 32) & 0x1f00000000ffffULL;
+  x = (x | x << 16) & 0x1f0000ff0000ffULL;
+  x = (x | x << 8) & 0x100f00f00f00f00fULL;
+  x = (x | x << 4) & 0x10c30c30c30c30c3ULL;
+  x = (x | x << 2) & 0x1249249249249249ULL;
+  return x;
+}
+
+template <class T>
+BLITZGS_HD bool is_finite_point(const T* p) {
+  const T sum = p[0] * T(0) + p[1] * T(0) + p[2] * T(0);
+  return sum == T(0);
+}
+
+// All ones for a point that is not finite: it sorts last.
+template <class T>
+BLITZGS_HD std::uint64_t morton_code(const T* p, const MortonFrame& frame) {
+  if (!is_finite_point(p)) return ~std::uint64_t{0};
+  std::uint64_t code = 0;
+  for (int axis = 0; axis < 3; ++axis) {
+    const double cell = (static_cast<double>(p[axis]) - frame.low[axis]) * frame.cells_per_unit;
+    const double clamped = cell > 0 ? (cell < 2097151.0 ? cell : 2097151.0) : 0.0;
+    code |= spread_bits(static_cast<std::uint64_t>(clamped)) << axis;
+  }
+  return code;
+}
+
+// Box of node i of a level: of 8 points (level 0) or 8 boxes of the level below.
+template <class T>
+BLITZGS_HD KnnBox<T> make_knn_box(const KnnTree<T>& tree, int level, std::int32_t i) {
+  const std::int64_t begin = std::int64_t{i} * kKnnFan;
+  const std::int64_t below = level == 0 ? tree.n : tree.count[level - 1];
+  const std::int64_t end = begin + kKnnFan < below ? begin + kKnnFan : below;
+  KnnBox<T> box;
+  for (std::int64_t j = begin; j < end; ++j) {
+    const T* low = level == 0 ? tree.points + 3 * j : tree.boxes[tree.offset[level - 1] + j].low;
+    const T* high = level == 0 ? low : tree.boxes[tree.offset[level - 1] + j].high;
+    for (int axis = 0; axis < 3; ++axis) {
+      box.low[axis] = j == begin || low[axis] < box.low[axis] ? low[axis] : box.low[axis];
+      box.high[axis] = j == begin || high[axis] > box.high[axis] ? high[axis] : box.high[axis];
+    }
+  }
+  return box;
+}
+
+// The K smallest squared distances so far, ascending.
+template <class T, int K>
+struct KnnQuery {
+  const KnnTree<T>& tree;
+  T p[3];
+  T best[K];
+
+  BLITZGS_HD void scan_leaf(std::int32_t leaf, std::int32_t self) {
+    const std::int32_t begin = leaf * kKnnFan;
+    const std::int32_t end = tree.n - begin < kKnnFan ? tree.n : begin + kKnnFan;
+    for (std::int32_t j = begin; j < end; ++j) {
+      if (j == self) continue;
+      const T* q = tree.points + 3 * std::int64_t{j};
+      const T x = q[0] - p[0], y = q[1] - p[1], z = q[2] - p[2];
+      const T d = x * x + y * y + z * z;
+      if (!(d < best[K - 1])) continue;
+      for (int i = K - 1; i > 0; --i) best[i] = d < best[i - 1] ? best[i - 1] : (d < best[i] ? d : best[i]);
+      best[0] = d < best[0] ? d : best[0];
+    }
+  }
+
+  BLITZGS_HD bool reaches(int level, std::int32_t node) const {
+    const KnnBox<T>& box = tree.boxes[tree.offset[level] + node];
+    T d[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const T below = box.low[axis] - p[axis], above = p[axis] - box.high[axis];
+      d[axis] = below > 0 ? below : (above > 0 ? above : T(0));
+    }
+    return d[0] * d[0] + d[1] * d[1] + d[2] * d[2] < best[K - 1];
+  }
+
+  // Everything under one node.
+  BLITZGS_HD void descend(int from_level, std::int32_t from_node) {
+    std::int32_t nodes[kKnnLevels * kKnnFan];
+    signed char levels[kKnnLevels * kKnnFan];
+    int top = 0;
+    nodes[0] = from_node;
+    levels[0] = static_cast<signed char>(from_level);
+    while (top >= 0) {
+      const std::int32_t node = nodes[top];
+      const int level = levels[top--];
+      if (!reaches(level, node)) continue;
+      if (level == 0) {
+        scan_leaf(node, -1);
+        continue;
+      }
+      const std::int32_t begin = node * kKnnFan;
+      const std::int32_t count = tree.count[level - 1];
+      const std::int32_t end = count - begin < kKnnFan ? count : begin + kKnnFan;
+      for (std::int32_t child = begin; child < end; ++child) {
+        nodes[++top] = child;
+        levels[top] = static_cast<signed char>(level - 1);
+      }
+    }
+  }
+
+  BLITZGS_HD void run(std::int32_t self) {
+    for (int i = 0; i < K; ++i) best[i] = static_cast<T>(INFINITY);
+    std::int32_t node = self / kKnnFan;
+    scan_leaf(node, self);
+    for (int level = 0; level + 1 < tree.levels; ++level) {
+      const std::int32_t begin = node / kKnnFan * kKnnFan;
+      const std::int32_t count = tree.count[level];
+      const std::int32_t end = count - begin < kKnnFan ? count : begin + kKnnFan;
+      for (std::int32_t sibling = begin; sibling < end; ++sibling) {
+        if (sibling != node) descend(level, sibling);
+      }
+      node /= kKnnFan;
+    }
+  }
+};
+
+template <class T, int K>
+BLITZGS_HD void knn_row(const KnnTree<T>& tree, std::int32_t i, int k, T* distances) {
+  const T* p = tree.points + 3 * std::int64_t{i};
+  KnnQuery<T, K> query{tree, {p[0], p[1], p[2]}, {}};
+  query.run(i);
+  T* out = distances + std::int64_t{tree.order[i]} * k;
+#ifdef __CUDA_ARCH__
+#pragma unroll
+#endif
+  for (int j = 0; j < K; ++j) {
+    if (j < k) out[j] = std::sqrt(query.best[j]);
+  }
+}
+
+// Calls f with the list length to use for k as a compile-time constant.
+template <class F>
+void with_knn_length(int k, const F& f) {
+  switch (k) {
+    case 1:
+      return f.template operator()<1>();
+    case 2:
+      return f.template operator()<2>();
+    case 3:
+      return f.template operator()<3>();
+    case 4:
+      return f.template operator()<4>();
+    default:
+      return k <= 8 ? f.template operator()<8>() : f.template operator()<kKnnMaxK>();
+  }
+}
+
+namespace cpu {
+template <class T>
+void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspace&, CudaStream);
+}
+namespace cuda {
+template <class T>
+void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspace&, CudaStream);
+}
+
+}  // namespace blitzgs
