@@ -2,6 +2,7 @@
 // How CPU kernels run on several threads without knowing torch. The library links the torch thread pool
 // (parallel_torch.cpp), so torch.set_num_threads governs the kernels; the Catch2 tests link plain threads.
 #pragma once
+#include <atomic>
 #include <cstdint>
 
 namespace blitzgs {
@@ -21,6 +22,16 @@ void parallel_for(std::int64_t begin, std::int64_t end, std::int64_t grain, cons
       begin, end, grain,
       [](std::int64_t b, std::int64_t e, void* context) { (*static_cast<const F*>(context))(b, e); },
       const_cast<void*>(static_cast<const void*>(&f)));
+}
+
+// Calls f(task, worker) once for each task in [0, n), tasks handed out one at a time to the workers: for
+// tasks of uneven cost. worker < num_threads() names the caller's own scratch. f must not throw.
+template <class F>
+void parallel_tasks(std::int64_t n, const F& f) {
+  std::atomic<std::int64_t> next{0};
+  parallel_for(0, num_threads(), 1, [&](std::int64_t begin, std::int64_t) {
+    for (std::int64_t task = next++; task < n; task = next++) f(task, static_cast<int>(begin));
+  });
 }
 
 }  // namespace blitzgs

@@ -9,8 +9,9 @@
 //
 // Conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q and the interval by some float
 // roundings, which covers the rounding of this test and of the rasterisers that evaluate q as
-// factor_conic() writes it. Listing can therefore never change the image, nor does leaving out what is not
-// listed. Not finite, not convex (a <= 0 or c <= 0) or too faint (opacity < 1/255): no tiles.
+// factor_conic() writes it. What is not listed
+// therefore contributes nothing to the image. Not finite, not convex (a <= 0 or c <= 0) or too faint (opacity
+// < 1/255): no tiles.
 //
 // All contexts must count alike (a count from one kernel sizes the buffer of another), so no expression here
 // leaves the compiler a choice of contraction.

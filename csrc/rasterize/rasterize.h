@@ -76,18 +76,22 @@ struct RasterizeGradients {
   T* v_means2d_abs;  // null: not wanted
 };
 
+// aux is the backend's own memory between forward and backward, 16-byte aligned and of
+// rasterize_aux_bytes(), which may depend on the shapes and the number of entries, not on values on the
+// device. All outputs are written in full.
 namespace cpu {
-// All outputs are written in full.
+std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, std::int64_t n_isects,
+                                 int n_channels);
 template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, Workspace&, CudaStream);
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t n_isects,
+                   void* aux, Workspace&, CudaStream);
 template <class T>
-void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved,
-                   const RasterizeGradients<T>& gradients, Workspace&, CudaStream);
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
+                   const void* aux, bool deterministic, const RasterizeGradients<T>& gradients, Workspace&,
+                   CudaStream);
 }  // namespace cpu
 
 namespace cuda {
-// aux is the backend's own memory between forward and backward, 16-byte aligned. aux_bytes() may depend on
-// the shapes and the number of entries, not on values on the device.
 std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, std::int64_t n_isects,
                                  int n_channels);
 template <class T>

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Intersection: which projected rows each image tile composites, front to back."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+
+def tile_counts(width: int, height: int, tile_size: int) -> tuple[int, int]:
+    """Return (tiles_x, tiles_y), the tiles that cover an image of width x height pixels."""
+    return -(-width // tile_size), -(-height // tile_size)
+
+
+def intersect(
+    means2d: Tensor,
+    conics: Tensor,
+    row_opacities: Tensor,
+    depths: Tensor,
+    camera_ids: Tensor,
+    ids: Tensor | None = None,
+    *,
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int = 16,
+    tile_begin: int = 0,
+    tile_end: int = -1,
+    n_isects: int = -1,
+) -> tuple[Tensor, Tensor]:
+    """List, for every tile of every view, the rows that touch it, ordered by (depth, id).
+
+    A row touches a tile iff its alpha, ``opacity * exp(-q / 2)``, can reach 1/255 on the tile's pixels
+    (conservatively: culling never changes the image). Tiles are numbered
+    ``(camera * tiles_y + ty) * tiles_x + tx``. Not differentiable.
+
+    Args:
+        means2d: projected means [P, 2], pixels, float32 or float64.
+        conics: inverse 2D covariances (a, b, c) [P, 3], 1/pixel^2.
+        row_opacities: [P], in [0, 1].
+        depths: sort keys [P], the z of each row in its view.
+        camera_ids: int32 [P], the view of each row.
+        ids: int64 [P] that decide between equal depths, or None: the row order does.
+        n_cameras: number of views B.
+        width: of every view, pixels.
+        height: of every view, pixels.
+        tile_size: edge of a tile in pixels, 1 to 64.
+        tile_begin: first owned tile; tiles outside [tile_begin, tile_end) get empty lists.
+        tile_end: end of the owned tiles, -1 for all.
+        n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``),
+            -1 to have them counted.
+
+    Returns:
+        ``isect_rows`` int32 [I] row indices and ``tile_offsets`` int64 [B * T + 1]: tile t composites
+        ``isect_rows[tile_offsets[t]:tile_offsets[t + 1]]``. I is ``n_isects`` when that was given; entries
+        past ``tile_offsets[-1]`` mean nothing.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, a tile range outside the image, 2^31 rows or more, or (CPU) more
+            intersections than ``n_isects``.
+    """
+    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
+        means2d, conics, row_opacities, depths, camera_ids, ids, n_cameras, width, height, tile_size,
+        tile_begin, tile_end, n_isects,
+    )  # fmt: skip
+    return isect_rows, tile_offsets
+
+
+@torch.library.register_fake("blitzgs::intersect")
+def _(
+    means2d: Tensor,
+    conics: Tensor,
+    row_opacities: Tensor,
+    depths: Tensor,
+    camera_ids: Tensor,
+    ids: Tensor | None,
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int,
+    tile_begin: int,
+    tile_end: int,
+    n_isects: int,
+) -> tuple[Tensor, Tensor]:
+    tiles_x, tiles_y = tile_counts(width, height, tile_size)
+    size = n_isects if n_isects >= 0 else torch.library.get_ctx().new_dynamic_size()
+    return (
+        means2d.new_empty(size, dtype=torch.int32),
+        means2d.new_empty(n_cameras * tiles_x * tiles_y + 1, dtype=torch.int64),
+    )

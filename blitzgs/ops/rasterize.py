@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rasterisation: front-to-back alpha compositing of splats, tile by tile, and its gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.intersect import tile_counts
+
+
+def rasterize(
+    means2d: Tensor,
+    conics: Tensor,
+    row_opacities: Tensor,
+    colors: Tensor,
+    isect_rows: Tensor,
+    tile_offsets: Tensor,
+    *,
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    tile_begin: int = 0,
+    tile_end: int = -1,
+    means2d_abs: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Composite the rows of each tile's list into images.
+
+    Per pixel, in list order, with d from the row's mean to the pixel centre (i + 0.5, j + 0.5)::
+
+        alpha = min(0.99, opacity * exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2)), skipped below 1/255
+        the pixel ends before T (1 - alpha) would fall below 1e-4
+        color += alpha T row_color;  T *= 1 - alpha
+
+    and the background is added with the remaining T. Differentiable in means2d, conics, row_opacities,
+    colors and backgrounds; no gradient flows where alpha is clipped, nor through the order and the two cuts.
+    Gradients are bitwise repeatable on the CPU, and on CUDA under
+    ``torch.use_deterministic_algorithms(True)``.
+
+    Args:
+        means2d: [P, 2], pixels, float32 or (CPU) float64.
+        conics: inverse 2D covariances (a, b, c) [P, 3].
+        row_opacities: [P].
+        colors: [P, D], any D.
+        isect_rows: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
+        tile_offsets: int64 [B * T + 1], likewise.
+        n_cameras: number of views B.
+        width: of every view, pixels.
+        height: of every view, pixels.
+        tile_size: edge of a tile in pixels, as given to ``intersect``.
+        backgrounds: [B, D], or None for black.
+        tile_begin: first owned tile; pixels of tiles outside [tile_begin, tile_end) are zero.
+        tile_end: end of the owned tiles, -1 for all.
+        means2d_abs: a tensor [P, 2] that requires grad (its values are not used) to receive, as its
+            gradient, the sum over pixels of the absolute gradient of means2d, per axis.
+
+    Returns:
+        Renders [B, H, W, D] and alphas [B, H, W].
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, or a tile range outside the images.
+    """
+    renders, transmittances, _, _, _ = torch.ops.blitzgs.rasterize_fwd(
+        means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets, n_cameras, width,
+        height, tile_size, tile_begin, tile_end, means2d_abs,
+    )  # fmt: skip
+    alphas = 1 - transmittances
+    if (tile_begin, tile_end) != (0, -1):
+        alphas = alphas * _owned_pixels(alphas, tile_size, tile_begin, tile_end)
+    return renders, alphas
+
+
+def _owned_pixels(images: Tensor, tile_size: int, tile_begin: int, tile_end: int) -> Tensor:
+    n_cameras, height, width = images.shape
+    tiles_x, tiles_y = tile_counts(width, height, tile_size)
+    tiles = torch.arange(n_cameras * tiles_y * tiles_x, device=images.device)
+    end = tile_end if tile_end >= 0 else tiles.numel()
+    owned = ((tiles >= tile_begin) & (tiles < end)).view(n_cameras, tiles_y, tiles_x)
+    owned = owned.repeat_interleave(tile_size, 1).repeat_interleave(tile_size, 2)
+    return owned[:, :height, :width]
+
+
+@torch.library.register_fake("blitzgs::rasterize_fwd")
+def _(
+    means2d: Tensor,
+    conics: Tensor,
+    row_opacities: Tensor,
+    colors: Tensor,
+    backgrounds: Tensor | None,
+    isect_rows: Tensor,
+    tile_offsets: Tensor,
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int,
+    tile_begin: int,
+    tile_end: int,
+    means2d_abs: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    pixels = (n_cameras, height, width)
+    aux_size = 0 if means2d.device.type == "cpu" else torch.library.get_ctx().new_dynamic_size()
+    return (
+        means2d.new_empty(*pixels, colors.shape[1]),
+        means2d.new_empty(pixels),
+        means2d.new_empty(pixels, dtype=torch.int32),
+        means2d.new_empty(tile_offsets.shape[0] - 1, dtype=torch.int32),
+        means2d.new_empty(aux_size, dtype=torch.uint8),
+    )
+
+
+@torch.library.register_fake("blitzgs::rasterize_bwd")
+def _(
+    means2d: Tensor,
+    conics: Tensor,
+    row_opacities: Tensor,
+    colors: Tensor,
+    backgrounds: Tensor | None,
+    isect_rows: Tensor,
+    tile_offsets: Tensor,
+    renders: Tensor,
+    transmittances: Tensor,
+    last_ids: Tensor,
+    aux: Tensor,
+    v_renders: Tensor,
+    v_alphas: Tensor | None,
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int,
+    tile_begin: int,
+    tile_end: int,
+    absgrad: bool,
+    deterministic: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    n_rows = means2d.shape[0]
+    return (
+        means2d.new_empty(n_rows, 2),
+        means2d.new_empty(n_rows, 3),
+        means2d.new_empty(n_rows),
+        means2d.new_empty(n_rows, colors.shape[1]),
+        means2d.new_empty(n_rows if absgrad else 0, 2),
+    )
+
+
+def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    splats, grid, means2d_abs = inputs[:7], inputs[7:13], inputs[13]
+    renders, transmittances, last_ids, tile_work, aux = output
+    ctx.mark_non_differentiable(last_ids, tile_work, aux)
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*splats, renders, transmittances, last_ids, aux)
+    ctx.grid = grid
+    ctx.absgrad = means2d_abs is not None and means2d_abs.requires_grad
+
+
+def _backward(
+    ctx: Any, v_renders: Tensor | None, v_transmittances: Tensor | None, *_: Tensor | None
+) -> tuple[Tensor | None, ...]:
+    if v_renders is None and v_transmittances is None:
+        return (None,) * 14
+    *splats, renders, transmittances, last_ids, aux = ctx.saved_tensors
+    if v_renders is None:
+        v_renders = torch.zeros_like(renders)
+    v_alphas = None if v_transmittances is None else -v_transmittances
+    v_means2d, v_conics, v_opacities, v_colors, v_abs = torch.ops.blitzgs.rasterize_bwd(
+        *splats, renders, transmittances, last_ids, aux, v_renders, v_alphas, *ctx.grid, ctx.absgrad,
+        torch.are_deterministic_algorithms_enabled(),
+    )  # fmt: skip
+    v_backgrounds = None
+    if ctx.needs_input_grad[4]:
+        v_backgrounds = torch.einsum("bhwd,bhw->bd", v_renders, transmittances)
+    splat_gradients = (v_means2d, v_conics, v_opacities, v_colors, v_backgrounds)
+    return (*splat_gradients, *(None,) * 8, v_abs if ctx.absgrad else None)
+
+
+torch.library.register_autograd("blitzgs::rasterize_fwd", _backward, setup_context=_setup_context)

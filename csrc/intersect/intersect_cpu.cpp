@@ -1,0 +1,210 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cstddef>
+#include <type_traits>
+#include <vector>
+
+#include "common/parallel.h"
+#include "intersect/intersect.h"
+
+namespace blitzgs::cpu {
+namespace {
+
+// Tiles [first, first + count) of one tile row, counted from grid.tile_begin, which a row touches.
+struct Span {
+  std::int32_t row;
+  std::int32_t count;
+  std::int64_t first;
+};
+
+template <class T>
+using KeyOf = std::conditional_t<sizeof(T) == 4, std::uint32_t, std::uint64_t>;
+
+template <class Key>
+struct Keyed {
+  Key key;
+  std::int32_t row;
+};
+
+// Integers in the order of the floats.
+template <class T>
+KeyOf<T> depth_key(T depth) {
+  using Key = KeyOf<T>;
+  constexpr Key kSign = Key(1) << (8 * sizeof(Key) - 1);
+  const Key bits = std::bit_cast<Key>(depth);
+  return bits & kSign ? ~bits : bits | kSign;
+}
+
+template <class T, class F>
+void for_each_span(const IntersectInput<T>& in, std::int32_t row, const F& f) {
+  const TileGrid& grid = in.grid;
+  const std::int64_t image = in.camera_ids[row] * grid.per_image();
+  for_each_tile_row(in.means2d + 2 * static_cast<std::int64_t>(row),
+                    in.conics + 3 * static_cast<std::int64_t>(row), in.opacities[row], grid.width,
+                    grid.height, grid.tile_size, [&](int ty, int begin, int end) {
+                      const std::int64_t tile_row = image + static_cast<std::int64_t>(ty) * grid.tiles_x;
+                      const std::int64_t first = std::max(tile_row + begin, grid.tile_begin);
+                      const std::int64_t last = std::min(tile_row + end, grid.tile_end);
+                      if (first < last) f(first - grid.tile_begin, static_cast<std::int32_t>(last - first));
+                    });
+}
+
+// [0, n) in `pieces` parts of nearly equal length.
+std::int64_t piece_start(std::int64_t n, int pieces, int piece) { return n * piece / pieces; }
+
+template <class F>
+void parallel_pieces(int pieces, const F& f) {
+  parallel_for(0, pieces, 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t piece = begin; piece < end; ++piece) f(static_cast<int>(piece));
+  });
+}
+
+// One stable counting pass on 11 bits; false, and nothing moved, when all keys agree on them.
+template <class Key>
+bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, std::int64_t n, int shift) {
+  constexpr int kBuckets = 1 << 11;
+  const int pieces = num_threads();
+  const auto bucket_of = [shift](Key key) { return static_cast<int>(key >> shift) & (kBuckets - 1); };
+  std::vector<std::array<std::int64_t, kBuckets>> places(pieces);
+  parallel_pieces(pieces, [&](int piece) {
+    places[piece].fill(0);
+    const std::int64_t end = piece_start(n, pieces, piece + 1);
+    for (std::int64_t i = piece_start(n, pieces, piece); i < end; ++i)
+      ++places[piece][bucket_of(from[i].key)];
+  });
+  std::int64_t place = 0;
+  for (int bucket = 0; bucket < kBuckets; ++bucket) {
+    const std::int64_t start = place;
+    for (auto& counts : places) {
+      const std::int64_t count = counts[bucket];
+      counts[bucket] = place;
+      place += count;
+    }
+    if (place - start == n) return false;
+  }
+  parallel_pieces(pieces, [&](int piece) {
+    const std::int64_t end = piece_start(n, pieces, piece + 1);
+    for (std::int64_t i = piece_start(n, pieces, piece); i < end; ++i) {
+      to[places[piece][bucket_of(from[i].key)]++] = from[i];
+    }
+  });
+  return true;
+}
+
+// The row order of equal depths is already theirs; with ids, each run of equal depths is put in id order.
+template <class Key>
+void order_ties(Keyed<Key>* rows, std::int64_t n, const std::int64_t* ids) {
+  for (std::int64_t begin = 0; begin < n;) {
+    std::int64_t end = begin + 1;
+    while (end < n && rows[end].key == rows[begin].key) ++end;
+    if (end - begin > 1) {
+      std::sort(rows + begin, rows + end, [ids](const Keyed<Key>& a, const Keyed<Key>& b) {
+        return ids[a.row] != ids[b.row] ? ids[a.row] < ids[b.row] : a.row < b.row;
+      });
+    }
+    begin = end;
+  }
+}
+
+// Rows of all cameras by (depth, id): within one camera's tile that is the order of compositing.
+template <class T>
+const Keyed<KeyOf<T>>* sort_rows(const IntersectInput<T>& in, Workspace& workspace) {
+  using Key = KeyOf<T>;
+  auto* rows = workspace.allocate<Keyed<Key>>(in.n_rows);
+  auto* spare = workspace.allocate<Keyed<Key>>(in.n_rows);
+  parallel_for(0, in.n_rows, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i)
+      rows[i] = {depth_key(in.depths[i]), static_cast<std::int32_t>(i)};
+  });
+  for (int shift = 0; shift < static_cast<int>(8 * sizeof(Key)); shift += 11) {
+    if (radix_pass(rows, spare, in.n_rows, shift)) std::swap(rows, spare);
+  }
+  if (in.ids) order_ties(rows, in.n_rows, in.ids);
+  return rows;
+}
+
+// As many pieces as threads, fewer where a count per tile and piece would take too much memory.
+int choose_pieces(std::int64_t n_tiles) {
+  constexpr std::int64_t kMostCounts = 1 << 25;
+  return static_cast<int>(
+      std::clamp<std::int64_t>(kMostCounts / std::max<std::int64_t>(n_tiles, 1), 1, num_threads()));
+}
+
+}  // namespace
+
+template <class T>
+std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream) {
+  const int pieces = num_threads();
+  std::vector<std::int64_t> counts(pieces, 0);
+  parallel_pieces(pieces, [&](int piece) {
+    std::int64_t count = 0;
+    const std::int64_t end = piece_start(in.n_rows, pieces, piece + 1);
+    for (std::int64_t row = piece_start(in.n_rows, pieces, piece); row < end; ++row) {
+      for_each_span(in, static_cast<std::int32_t>(row), [&](std::int64_t, std::int32_t n) { count += n; });
+    }
+    counts[piece] = count;
+  });
+  std::int64_t total = 0;
+  for (const std::int64_t count : counts) total += count;
+  return total;
+}
+
+template <class T>
+std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_rows,
+                       std::int64_t* tile_offsets, Workspace& workspace, CudaStream) {
+  const TileGrid& grid = in.grid;
+  const std::int64_t n_tiles = grid.tile_end - grid.tile_begin;
+  const auto* rows = sort_rows(in, workspace);
+
+  // Each piece of the depth order notes its spans and counts them per tile ...
+  const int pieces = choose_pieces(n_tiles);
+  auto* places = workspace.allocate<std::int64_t>(n_tiles * pieces);
+  std::vector<std::vector<Span>> spans(pieces);
+  parallel_pieces(pieces, [&](int piece) {
+    std::int64_t* counts = places + n_tiles * piece;
+    std::fill_n(counts, n_tiles, 0);
+    const std::int64_t begin = piece_start(in.n_rows, pieces, piece);
+    const std::int64_t end = piece_start(in.n_rows, pieces, piece + 1);
+    spans[piece].reserve(2 * (end - begin));
+    for (std::int64_t i = begin; i < end; ++i) {
+      for_each_span(in, rows[i].row, [&](std::int64_t first, std::int32_t count) {
+        spans[piece].push_back({rows[i].row, count, first});
+        for (std::int32_t tile = 0; tile < count; ++tile) ++counts[first + tile];
+      });
+    }
+  });
+
+  // ... which gives every piece its place in every list ...
+  std::int64_t place = 0;
+  std::fill_n(tile_offsets, grid.tile_begin, 0);
+  for (std::int64_t tile = 0; tile < n_tiles; ++tile) {
+    tile_offsets[grid.tile_begin + tile] = place;
+    for (int piece = 0; piece < pieces; ++piece) {
+      const std::int64_t count = places[n_tiles * piece + tile];
+      places[n_tiles * piece + tile] = place;
+      place += count;
+    }
+  }
+  std::fill_n(tile_offsets + grid.tile_end, grid.count() + 1 - grid.tile_end, place);
+  if (place > capacity) return place;
+
+  // ... and the pieces write their parts.
+  parallel_pieces(pieces, [&](int piece) {
+    std::int64_t* next = places + n_tiles * piece;
+    for (const Span& span : spans[piece]) {
+      for (std::int32_t tile = 0; tile < span.count; ++tile) isect_rows[next[span.first + tile]++] = span.row;
+    }
+  });
+  return place;
+}
+
+template std::int64_t count_intersections<float>(const IntersectInput<float>&, Workspace&, CudaStream);
+template std::int64_t count_intersections<double>(const IntersectInput<double>&, Workspace&, CudaStream);
+template std::int64_t intersect<float>(const IntersectInput<float>&, std::int64_t, std::int32_t*,
+                                       std::int64_t*, Workspace&, CudaStream);
+template std::int64_t intersect<double>(const IntersectInput<double>&, std::int64_t, std::int32_t*,
+                                        std::int64_t*, Workspace&, CudaStream);
+
+}  // namespace blitzgs::cpu

@@ -1,0 +1,75 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "intersect/intersect.h"
+
+#include <limits>
+#include <tuple>
+
+#include "common/op.h"
+#include "common/tile_grid_op.h"
+
+#ifndef BLITZGS_BACKEND_CUDA
+namespace blitzgs {
+namespace {
+
+std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
+                                     const Tensor& depths, const Tensor& camera_ids,
+                                     const std::optional<Tensor>& ids, std::int64_t n_cameras,
+                                     std::int64_t width, std::int64_t height, std::int64_t tile_size,
+                                     std::int64_t tile_begin, std::int64_t tile_end, std::int64_t n_isects) {
+  constexpr const char* kOp = "intersect";
+  check_floating(kOp, "means2d", means2d);
+  const std::int64_t n_rows = means2d.size(0);
+  check_shape(kOp, "means2d", means2d, {n_rows, 2});
+  check_shape(kOp, "conics", conics, {n_rows, 3});
+  check_shape(kOp, "row_opacities", row_opacities, {n_rows});
+  check_shape(kOp, "depths", depths, {n_rows});
+  check_shape(kOp, "camera_ids", camera_ids, {n_rows});
+  const ScalarType dtype = means2d.scalar_type();
+  check_dtype(kOp, "conics", conics, dtype);
+  check_dtype(kOp, "row_opacities", row_opacities, dtype);
+  check_dtype(kOp, "depths", depths, dtype);
+  check_dtype(kOp, "camera_ids", camera_ids, ScalarType::Int);
+  if (ids) {
+    check_shape(kOp, "ids", *ids, {n_rows});
+    check_dtype(kOp, "ids", *ids, ScalarType::Long);
+  }
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  STD_TORCH_CHECK(n_rows <= std::numeric_limits<std::int32_t>::max(),
+                  "blitzgs::intersect: row indices are 32-bit, got ", n_rows,
+                  " rows; render fewer views at once");
+
+  const Tensor means = as_contiguous(means2d), shapes = as_contiguous(conics),
+               opacities = as_contiguous(row_opacities), order = as_contiguous(depths),
+               cameras = as_contiguous(camera_ids);
+  std::optional<Tensor> id_rows;
+  if (ids) id_rows = as_contiguous(*ids);
+  Tensor offsets = make_empty(means, {grid.count() + 1}, ScalarType::Long);
+  Tensor rows;
+  DeviceScope scope(means);
+  dispatch_floating(means, [&](auto zero) {
+    using T = decltype(zero);
+    const IntersectInput<T> in{data<T>(means),
+                               data<T>(shapes),
+                               data<T>(opacities),
+                               data<T>(order),
+                               data<std::int32_t>(cameras),
+                               data_or_null<std::int64_t>(id_rows),
+                               n_rows,
+                               grid};
+    const std::int64_t capacity =
+        n_isects >= 0 ? n_isects : backend::count_intersections(in, scope.workspace, scope.stream);
+    rows = make_empty(means, {capacity}, ScalarType::Int);
+    const std::int64_t count =
+        backend::intersect(in, capacity, mutable_data<std::int32_t>(rows),
+                           mutable_data<std::int64_t>(offsets), scope.workspace, scope.stream);
+    STD_TORCH_CHECK(count <= capacity, "blitzgs::intersect: n_isects is ", capacity, " but there are ", count,
+                    " intersections; pass the sum of tiles_touched, or -1 to have them counted");
+  });
+  return {rows, offsets};
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) { m.impl("intersect", TORCH_BOX(&blitzgs::intersect)); }
+#endif

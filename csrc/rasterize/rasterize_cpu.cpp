@@ -1,0 +1,265 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <cstdlib>
+#include <cstring>
+#include <type_traits>
+#include <vector>
+
+#include "common/parallel.h"
+#include "rasterize/rasterize.h"
+#include "rasterize/tile_kernels.h"
+
+namespace blitzgs::cpu {
+namespace {
+
+// Partial gradients held at once: a few megabytes, so that they are summed out of the cache.
+constexpr std::int64_t kPartialsPerChunk = 1 << 17;
+
+bool use_avx2() {
+  static const bool use = std::getenv("BLITZGS_NO_AVX2") == nullptr && __builtin_cpu_supports("avx2") &&
+                          __builtin_cpu_supports("fma");
+  return use;
+}
+
+template <class T>
+TileKernels<T> tile_kernels(int n_channels, bool absgrad) {
+  if constexpr (std::is_same_v<T, float>) {
+    if (use_avx2()) return avx2_tile_kernels(n_channels, absgrad);
+  }
+  return select_kernels<PlainLanes<T>>(n_channels, absgrad);
+}
+
+template <class T>
+SplatRow<T> pack_row(const RasterizeInput<T>& in, std::int64_t row) {
+  constexpr T kScale = ExponentScale<T>::value;
+  constexpr T kRounding = sizeof(T) == 4 ? T(2e-6) : T(2e-14);
+  SplatRow<T> splat{};
+  SplatEllipse<T> e;
+  splat.x = in.means2d[2 * row];
+  splat.y = in.means2d[2 * row + 1];
+  splat.half_height = T(-1);
+  splat.cut = T(-1);
+  if (!make_ellipse(in.conics + 3 * row, in.opacities[row], &e)) return splat;
+  const ConicFactor<T> factor = factor_conic(in.conics + 3 * row);
+  const T root = std::sqrt(kScale);
+  splat.l11 = factor.l11 * root;
+  splat.l21 = factor.l21 * root;
+  splat.l22 = factor.l22 * root;
+  splat.opacity = in.opacities[row];
+  splat.cut = e.cut * kScale;
+  splat.inv_l11 = T(1) / splat.l11;
+  splat.shear = e.shear;
+  splat.half_height = e.half_height + kRounding * std::fabs(splat.y);
+  const T height = static_cast<T>(in.grid.height);
+  splat.slack = kRounding * (std::fabs(splat.x) + std::fabs(e.shear) * (std::fabs(splat.y) + height) +
+                             std::sqrt(splat.cut) * splat.inv_l11);
+  for (int c = 0; c < std::min(in.n_channels, kPackedChannels); ++c) {
+    splat.color[c] = in.colors[row * in.n_channels + c];
+  }
+  return splat;
+}
+
+template <class T>
+const SplatRow<T>* pack_rows(const RasterizeInput<T>& in, Workspace& workspace) {
+  const std::size_t bytes = static_cast<std::size_t>(in.n_rows + 1) * sizeof(SplatRow<T>);
+  auto address = reinterpret_cast<std::uintptr_t>(workspace.allocate_bytes(bytes));
+  auto* splats = reinterpret_cast<SplatRow<T>*>((address + 63) / 64 * 64);
+  parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t row = begin; row < end; ++row) splats[row] = pack_row(in, row);
+  });
+  return splats;
+}
+
+// The part of a job that is the tile's place in the images and its list.
+template <class T>
+TileJob<T> make_job(const RasterizeInput<T>& in, const SplatRow<T>* splats, std::int64_t tile) {
+  const TileGrid& grid = in.grid;
+  const std::int64_t camera = tile / grid.per_image(), within = tile % grid.per_image();
+  TileJob<T> job{};
+  job.splats = splats;
+  job.colors = in.colors;
+  job.background = in.backgrounds ? in.backgrounds + camera * in.n_channels : nullptr;
+  job.list = in.isect_rows + in.tile_offsets[tile];
+  job.n_entries = static_cast<std::int32_t>(in.tile_offsets[tile + 1] - in.tile_offsets[tile]);
+  job.n_channels = in.n_channels;
+  job.tile_size = grid.tile_size;
+  job.x0 = static_cast<int>(within % grid.tiles_x) * grid.tile_size;
+  job.y0 = static_cast<int>(within / grid.tiles_x) * grid.tile_size;
+  job.width = std::min(grid.tile_size, grid.width - job.x0);
+  job.height = std::min(grid.tile_size, grid.height - job.y0);
+  job.image_width = grid.width;
+  job.first_pixel = (camera * grid.height + job.y0) * grid.width + job.x0;
+  return job;
+}
+
+// Memory of each worker for the pixels of its tile.
+template <class T>
+class TileMemory {
+ public:
+  TileMemory(const RasterizeInput<T>& in, Workspace& workspace)
+      : numbers_(tile_memory(in.grid.tile_size, in.n_channels)),
+        integers_(PlaneLayout(in.grid.tile_size).plane),
+        memory_(workspace.allocate<T>(static_cast<std::int64_t>(numbers_) * num_threads())),
+        last_(workspace.allocate<std::int32_t>(static_cast<std::int64_t>(integers_) * num_threads())) {}
+
+  void lend(int worker, TileJob<T>* job) const {
+    job->memory = memory_ + worker * numbers_;
+    job->last_memory = last_ + worker * integers_;
+  }
+
+ private:
+  std::size_t numbers_, integers_;
+  T* memory_;
+  std::int32_t* last_;
+};
+
+template <class T>
+void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {
+  const TileGrid& grid = in.grid;
+  if (grid.tile_begin == 0 && grid.tile_end == grid.count()) return;
+  const std::int64_t pixels = static_cast<std::int64_t>(grid.n_cameras) * grid.height * grid.width;
+  std::fill_n(out.renders, pixels * in.n_channels, T(0));
+  std::fill_n(out.transmittances, pixels, T(0));
+  std::fill_n(out.last_ids, pixels, 0);
+  std::fill_n(out.tile_work, grid.count(), 0);
+}
+
+// Length of each owned tile's list up to its last composited entry.
+template <class T>
+void find_used_entries(const RasterizeInput<T>& in, const std::int32_t* last_ids, std::int32_t* used) {
+  const TileGrid& grid = in.grid;
+  parallel_for(grid.tile_begin, grid.tile_end, 8, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t tile = begin; tile < end; ++tile) {
+      const TileJob<T> job = make_job<T>(in, nullptr, tile);
+      std::int32_t most = 0;
+      for (int row = 0; row < job.height; ++row) {
+        const std::int32_t* last = last_ids + job.first_pixel + static_cast<std::int64_t>(row) * grid.width;
+        for (int x = 0; x < job.width; ++x) most = std::max(most, last[x]);
+      }
+      used[tile - grid.tile_begin] = most;
+    }
+  });
+}
+
+// Owned tiles [begin, end) and the place of each one's partial gradients.
+struct Chunk {
+  std::int64_t begin, end;
+  std::int64_t partials;
+};
+
+std::vector<Chunk> cut_chunks(const TileGrid& grid, const std::int32_t* used, std::int64_t* places) {
+  std::vector<Chunk> chunks;
+  for (std::int64_t tile = grid.tile_begin; tile < grid.tile_end; ++tile) {
+    const std::int64_t length = used[tile - grid.tile_begin];
+    if (chunks.empty() || chunks.back().partials + length > kPartialsPerChunk) {
+      chunks.push_back({tile, tile, 0});
+    }
+    places[tile - grid.tile_begin] = chunks.back().partials;
+    chunks.back().partials += length;
+    chunks.back().end = tile + 1;
+  }
+  return chunks;
+}
+
+// Adds a chunk's partial gradients to the sums [P, width], each row by one thread, in the order of the tiles.
+template <class T>
+void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const std::int32_t* used,
+                  const T* partials, int width, T* sums) {
+  parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
+    const T* partial = partials;
+    for (std::int64_t tile = chunk.begin; tile < chunk.end; ++tile) {
+      const std::int32_t* list = in.isect_rows + in.tile_offsets[tile];
+      const std::int32_t length = used[tile - in.grid.tile_begin];
+      for (std::int32_t entry = 0; entry < length; ++entry, partial += width) {
+        const std::int64_t row = list[entry];
+        if (row < begin || row >= end) continue;
+        T* sum = sums + row * width;
+        for (int i = 0; i < width; ++i) sum[i] += partial[i];
+      }
+    }
+  });
+}
+
+template <class T>
+void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
+                     const RasterizeGradients<T>& gradients) {
+  parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t row = begin; row < end; ++row) {
+      const T* sum = sums + row * width;
+      std::copy_n(sum + kMeanX, 2, gradients.v_means2d + 2 * row);
+      std::copy_n(sum + kConicA, 3, gradients.v_conics + 3 * row);
+      gradients.v_opacities[row] = sum[kOpacity];
+      std::copy_n(sum + kColor, in.n_channels, gradients.v_colors + row * in.n_channels);
+      if (gradients.v_means2d_abs) {
+        std::copy_n(sum + kColor + in.n_channels, 2, gradients.v_means2d_abs + 2 * row);
+      }
+    }
+  });
+}
+
+}  // namespace
+
+// The kernels prepare the rows anew in the backward pass: cheaper than the memory.
+std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t, std::int64_t, int) { return 0; }
+
+template <class T>
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t, void*,
+                   Workspace& workspace, CudaStream) {
+  clear_unowned(in, out);
+  const SplatRow<T>* splats = pack_rows(in, workspace);
+  const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, false);
+  const TileMemory<T> memory(in, workspace);
+  parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](std::int64_t task, int worker) {
+    const std::int64_t tile = in.grid.tile_begin + task;
+    TileJob<T> job = make_job(in, splats, tile);
+    job.out = out;
+    memory.lend(worker, &job);
+    out.tile_work[tile] = kernels.forward(job);
+  });
+}
+
+template <class T>
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t, const void*,
+                   bool, const RasterizeGradients<T>& gradients, Workspace& workspace, CudaStream) {
+  const bool absgrad = gradients.v_means2d_abs != nullptr;
+  const int width = partial_width(in.n_channels, absgrad);
+  const std::int64_t n_owned = in.grid.tile_end - in.grid.tile_begin;
+  auto* used = workspace.allocate<std::int32_t>(n_owned);
+  auto* places = workspace.allocate<std::int64_t>(n_owned);
+  find_used_entries(in, saved.last_ids, used);
+  const std::vector<Chunk> chunks = cut_chunks(in.grid, used, places);
+  std::int64_t most = 0;
+  for (const Chunk& chunk : chunks) most = std::max(most, chunk.partials);
+  auto* partials = workspace.allocate<T>(most * width);
+  auto* sums = workspace.allocate<T>(in.n_rows * width);
+  parallel_for(0, in.n_rows * width, 1 << 16,
+               [&](std::int64_t begin, std::int64_t end) { std::fill(sums + begin, sums + end, T(0)); });
+
+  const SplatRow<T>* splats = pack_rows(in, workspace);
+  const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, absgrad);
+  const TileMemory<T> memory(in, workspace);
+  for (const Chunk& chunk : chunks) {
+    parallel_tasks(chunk.end - chunk.begin, [&](std::int64_t task, int worker) {
+      const std::int64_t tile = chunk.begin + task, owned = tile - in.grid.tile_begin;
+      if (used[owned] == 0) return;
+      TileJob<T> job = make_job(in, splats, tile);
+      job.n_entries = used[owned];
+      job.saved = saved;
+      memory.lend(worker, &job);
+      kernels.backward(job, partials + places[owned] * width);
+    });
+    add_partials(in, chunk, used, partials, width, sums);
+  }
+  write_gradients(in, sums, width, gradients);
+}
+
+#define BLITZGS_INSTANTIATE(T)                                                                             \
+  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, std::int64_t, void*, \
+                                 Workspace&, CudaStream);                                                  \
+  template void rasterize_bwd<T>(const RasterizeInput<T>&, const RasterizeSaved<T>&, std::int64_t,         \
+                                 const void*, bool, const RasterizeGradients<T>&, Workspace&, CudaStream);
+BLITZGS_INSTANTIATE(float)
+BLITZGS_INSTANTIATE(double)
+#undef BLITZGS_INSTANTIATE
+
+}  // namespace blitzgs::cpu
