@@ -1,5 +1,190 @@
 // SPDX-License-Identifier: Apache-2.0
 // blitzgs._lib._io: host-side readers and writers. The only code that depends on Python's version.
+// Columns leave as numpy arrays that own the parsed memory; files are parsed and written without the GIL.
+#include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
-PYBIND11_MODULE(_io, m) { m.doc() = "Host-side I/O of BlitzGS"; }
+#include <algorithm>
+#include <fstream>
+#include <memory>
+
+#include "io/colmap.h"
+#include "io/ply.h"
+
+namespace py = pybind11;
+using namespace py::literals;  // NOLINT
+namespace io = blitzgs::io;
+
+namespace {
+
+template <class T>
+using Column = py::array_t<T, py::array::c_style | py::array::forcecast>;
+
+template <class T>
+py::array_t<T> to_array(std::vector<T>&& values, py::ssize_t width = 0) {
+  auto owner = std::make_unique<std::vector<T>>(std::move(values));
+  const py::ssize_t size = static_cast<py::ssize_t>(owner->size());
+  T* data = owner->data();
+  py::capsule capsule(owner.get(), [](void* p) { delete static_cast<std::vector<T>*>(p); });
+  owner.release();
+  if (width == 0) return py::array_t<T>({size}, data, capsule);
+  return py::array_t<T>({size / width, width}, data, capsule);
+}
+
+template <class T>
+std::vector<T> to_vector(const py::dict& columns, const char* name) {
+  const auto column = columns[name].cast<Column<T>>();
+  return std::vector<T>(column.data(), column.data() + column.size());
+}
+
+bool is_text(const std::string& path) { return path.ends_with(".txt"); }
+
+// Runs `read(stream)` on the file without the GIL.
+template <class Read>
+auto from_file(const std::string& path, Read read) {
+  py::gil_scoped_release release;
+  std::ifstream in(path, std::ios::binary);
+  if (!in) throw io::FormatError(path + ": cannot be opened");
+  return read(in);
+}
+
+template <class Write>
+void to_file(const std::string& path, Write write) {
+  py::gil_scoped_release release;
+  std::ofstream out(path, std::ios::binary | std::ios::trunc);
+  if (!out) throw std::runtime_error(path + ": cannot be opened for writing");
+  write(out);
+  out.close();
+  if (!out) throw std::runtime_error(path + ": writing failed (disk full?)");
+}
+
+py::list camera_models() {
+  py::list models;
+  for (const io::CameraModel& model : io::camera_models()) {
+    models.append(py::make_tuple(model.id, std::string(model.name), std::string(model.params)));
+  }
+  return models;
+}
+
+py::list read_cameras(const std::string& path) {
+  auto cameras = from_file(path, [&](std::istream& in) {
+    return is_text(path) ? io::read_cameras_text(in, path) : io::read_cameras_binary(in, path);
+  });
+  py::list out;
+  for (io::ColmapCamera& camera : cameras) {
+    out.append(py::make_tuple(camera.id, std::string(io::find_camera_model(camera.model)->name), camera.width,
+                              camera.height, to_array(std::move(camera.params))));
+  }
+  return out;
+}
+
+py::dict read_images(const std::string& path, bool with_points2d) {
+  auto images = from_file(path, [&](std::istream& in) {
+    return is_text(path) ? io::read_images_text(in, path, with_points2d)
+                         : io::read_images_binary(in, path, with_points2d);
+  });
+  return py::dict("ids"_a = to_array(std::move(images.ids)), "quats"_a = to_array(std::move(images.quats), 4),
+                  "translations"_a = to_array(std::move(images.translations), 3),
+                  "camera_ids"_a = to_array(std::move(images.camera_ids)), "names"_a = images.names,
+                  "point2d_offsets"_a = to_array(std::move(images.point2d_offsets)),
+                  "points2d"_a = to_array(std::move(images.points2d), 2),
+                  "point3d_ids"_a = to_array(std::move(images.point3d_ids)));
+}
+
+py::dict read_points(const std::string& path, bool with_tracks) {
+  auto points = from_file(path, [&](std::istream& in) {
+    return is_text(path) ? io::read_points_text(in, path, with_tracks)
+                         : io::read_points_binary(in, path, with_tracks);
+  });
+  return py::dict(
+      "ids"_a = to_array(std::move(points.ids)), "positions"_a = to_array(std::move(points.positions), 3),
+      "colors"_a = to_array(std::move(points.colors), 3), "errors"_a = to_array(std::move(points.errors)),
+      "track_offsets"_a = to_array(std::move(points.track_offsets)),
+      "track_image_ids"_a = to_array(std::move(points.track_image_ids)),
+      "track_point2d_ids"_a = to_array(std::move(points.track_point2d_ids)));
+}
+
+using CameraRow = std::tuple<std::uint32_t, std::string, std::uint64_t, std::uint64_t, std::vector<double>>;
+
+void write_cameras(const std::string& path, const std::vector<CameraRow>& rows) {
+  std::vector<io::ColmapCamera> cameras;
+  for (const auto& [id, model, width, height, params] : rows) {
+    const io::CameraModel* known = io::find_camera_model(model);
+    if (!known) throw std::invalid_argument("unknown camera model " + model);
+    cameras.push_back({id, known->id, width, height, params});
+  }
+  io::check_columns(cameras);
+  to_file(path, [&](std::ostream& out) {
+    is_text(path) ? io::write_cameras_text(out, cameras) : io::write_cameras_binary(out, cameras);
+  });
+}
+
+void write_images(const std::string& path, const py::dict& columns) {
+  const io::ColmapImages images{to_vector<std::uint32_t>(columns, "ids"),
+                                to_vector<std::uint32_t>(columns, "camera_ids"),
+                                to_vector<double>(columns, "quats"),
+                                to_vector<double>(columns, "translations"),
+                                columns["names"].cast<std::vector<std::string>>(),
+                                to_vector<std::uint64_t>(columns, "point2d_offsets"),
+                                to_vector<double>(columns, "points2d"),
+                                to_vector<std::int64_t>(columns, "point3d_ids")};
+  io::check_columns(images);  // before the file is opened, so that bad columns leave no file behind
+  to_file(path, [&](std::ostream& out) {
+    is_text(path) ? io::write_images_text(out, images) : io::write_images_binary(out, images);
+  });
+}
+
+void write_points(const std::string& path, const py::dict& columns) {
+  const io::ColmapPoints points{to_vector<std::int64_t>(columns, "ids"),
+                                to_vector<double>(columns, "positions"),
+                                to_vector<std::uint8_t>(columns, "colors"),
+                                to_vector<double>(columns, "errors"),
+                                to_vector<std::uint64_t>(columns, "track_offsets"),
+                                to_vector<std::uint32_t>(columns, "track_image_ids"),
+                                to_vector<std::uint32_t>(columns, "track_point2d_ids")};
+  io::check_columns(points);
+  to_file(path, [&](std::ostream& out) {
+    is_text(path) ? io::write_points_text(out, points) : io::write_points_binary(out, points);
+  });
+}
+
+constexpr const char* kNumpyTypes[] = {"i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"};
+
+py::tuple read_ply(const std::string& path) {
+  auto table = from_file(path, [&](std::istream& in) { return io::read_ply(in, path); });
+  py::list properties;
+  for (const io::PlyProperty& property : table.properties) {
+    properties.append(py::make_tuple(property.name, kNumpyTypes[static_cast<int>(property.type)]));
+  }
+  return py::make_tuple(table.comments, properties, table.count, to_array(std::move(table.rows)));
+}
+
+void write_ply(const std::string& path, const std::vector<std::string>& comments,
+               const std::vector<std::pair<std::string, std::string>>& properties, std::uint64_t count,
+               const Column<std::uint8_t>& rows) {
+  io::PlyTable table{comments, {}, count, {}};
+  for (const auto& [name, type] : properties) {
+    const auto found = std::find(std::begin(kNumpyTypes), std::end(kNumpyTypes), type);
+    if (found == std::end(kNumpyTypes)) throw std::invalid_argument("ply: unknown type " + type);
+    table.properties.push_back({name, static_cast<io::PlyType>(found - std::begin(kNumpyTypes))});
+  }
+  table.rows.assign(rows.data(), rows.data() + rows.size());
+  to_file(path, [&](std::ostream& out) { io::write_ply(out, table); });
+}
+
+}  // namespace
+
+PYBIND11_MODULE(_io, m) {
+  m.doc() = "Host-side I/O of BlitzGS; blitzgs.scene.colmap and blitzgs.scene.ply are its public face.";
+  py::register_exception<io::FormatError>(m, "FormatError", PyExc_ValueError);
+  m.def("camera_models", &camera_models);
+  m.def("read_cameras", &read_cameras, "path"_a);
+  m.def("read_images", &read_images, "path"_a, "with_points2d"_a);
+  m.def("read_points", &read_points, "path"_a, "with_tracks"_a);
+  m.def("write_cameras", &write_cameras, "path"_a, "cameras"_a);
+  m.def("write_images", &write_images, "path"_a, "columns"_a);
+  m.def("write_points", &write_points, "path"_a, "columns"_a);
+  m.def("read_ply", &read_ply, "path"_a);
+  m.def("write_ply", &write_ply, "path"_a, "comments"_a, "properties"_a, "count"_a, "rows"_a);
+}

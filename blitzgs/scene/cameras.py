@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera of a capture: a pinhole view of the re-centred world, and how its image is made from its file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.scene.undistort import Rectification
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One view. All lengths of the image are pixels after undistortion and downscaling."""
+
+    name: str
+    width: int
+    height: int
+    K: Float64
+    """[3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5)."""
+    world_to_camera: Float64
+    """[4, 4], rigid, of the world whose origin was moved to `Capture.offset`."""
+    image_path: Path
+    mask_path: Path | None
+    orientation: int
+    """EXIF orientation (1 to 8) to apply to the decoded file; 1 leaves it as it is stored."""
+    rectification: Rectification
+    """From the file's pixels to a pinhole image, before downscaling."""
+
+    @property
+    def center(self) -> Float64:
+        """The camera's position in the re-centred world, float64 [3]."""
+        return np.asarray(camera_centers(self.world_to_camera[None])[0])
+
+
+def camera_centers(world_to_camera: Float64) -> Float64:
+    """Positions [N, 3] of rigid poses [N, 4, 4]."""
+    return np.asarray(-np.einsum("nji,nj->ni", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]))
+
+
+def scaled_matrix(K: Float64, old: tuple[int, int], new: tuple[int, int]) -> Float64:
+    """K of an image resized from old to new (width, height), each axis by its own ratio.
+
+    With pixel centres at halves the image covers [0, width], so every entry of a row scales alike.
+    """
+    return np.asarray(np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K)
+
+
+def downscaled_size(width: int, height: int, factor: float) -> tuple[int, int]:
+    """Size of an image downscaled by `factor`, each side rounded to the nearest pixel, at least 1."""
+    return max(1, int(width / factor + 0.5)), max(1, int(height / factor + 0.5))

@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A capture: posed images and a point cloud, ready to train on.
+
+`load_capture` reads a COLMAP model or transforms.json, finds every image file, decides how each becomes a
+pinhole image of the wanted size, re-centres the world in float64 and splits the views. No image is decoded.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.scene import colmap, transforms
+from blitzgs.scene.cameras import Camera, Float64, camera_centers, downscaled_size, scaled_matrix
+from blitzgs.scene.files import ImageFinder, find_mask
+from blitzgs.scene.image_files import ImageHeader, read_header
+from blitzgs.scene.lens import Lens
+from blitzgs.scene.ply import read_points
+from blitzgs.scene.splits import split_views
+from blitzgs.scene.undistort import Policy, Rectification, rectify
+
+_HEADER_THREADS = 16
+
+
+@dataclass(eq=False)
+class Capture:
+    """Posed views and points of a re-centred world: world position = re-centred position + `offset`."""
+
+    root: Path
+    cameras: list[Camera]
+    """Sorted by name."""
+    points: Float64
+    """[M, 3] re-centred."""
+    colors: npt.NDArray[np.uint8]
+    """[M, 3]."""
+    track_lengths: npt.NDArray[np.int64] | None
+    """[M] number of images that saw each point, where the capture says so."""
+    errors: Float64 | None
+    """[M] mean reprojection errors in pixels, where the capture says so."""
+    offset: Float64
+    """[3] the mean camera centre of the capture's own world."""
+    train: list[int]
+    test: list[int]
+    extent: float
+    """INRIA's: 1.1 x the largest distance of a training camera from their mean centre, in world units."""
+    background: tuple[float, float, float] | None
+    """Colour that images with an alpha channel are composited over; None when no image has one."""
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A view as its file describes it."""
+
+    name: str
+    path: Path
+    mask_path: Path | None
+    lens: Lens
+    world_to_camera: Float64
+    is_test: bool | None = None
+
+
+@dataclass(eq=False)
+class _Points:
+    positions: Float64
+    colors: npt.NDArray[np.uint8]
+    track_lengths: npt.NDArray[np.int64] | None = None
+    errors: Float64 | None = None
+
+
+def load_capture(
+    path: Path | str,
+    *,
+    images: str = "images",
+    downscale: float = 1,
+    split: int | str | Path = "auto",
+    masks: str | bool | None = None,
+    undistort: Policy = "crop",
+    exif: str = "auto",
+    allow_missing: bool = False,
+) -> Capture:
+    """Load a capture without decoding its images.
+
+    Args:
+        path: folder with a COLMAP sparse model (sparse/0, sparse, ...; or train/ and val/ folders that each
+            have one) or transforms.json / transforms_train.json.
+        images: folder of the images, relative to `path`; not used for transforms.json, which has paths.
+        downscale: reduce both sides of the camera model's size by this factor. A folder such as images_4 is
+            used for 4 when every image is in it with the right size; otherwise images are area-averaged when
+            they are decoded.
+        split: see `splits.split_views`: n, "val", a list file, or "auto" (what the files say, or every 8th).
+        masks: folder of masks (NAME.png or STEM.png; black = excluded). None uses `masks/` when it exists;
+            True requires it; False uses none.
+        undistort: what to do where a distorted image does not fill the pinhole image: "crop" or "mask".
+        exif: "auto" turns an image by its EXIF orientation only where its stored size does not fit the camera
+            and the turned one does (COLMAP itself ignores the tag); "apply" and "ignore" do as they say.
+        allow_missing: drop views whose image is not on disk, with a warning, instead of failing.
+
+    Raises:
+        FileNotFoundError: nothing to load, or images are missing on disk.
+        ValueError: a file is damaged, or sizes, poses or options make no sense.
+    """
+    root = Path(path)
+    if downscale < 1:
+        raise ValueError(f"downscale must be at least 1, got {downscale}")
+    if exif not in ("auto", "apply", "ignore"):
+        raise ValueError(f"exif must be auto, apply or ignore, got {exif!r}")
+    views, points, is_blender = _read_views(root, images, downscale)
+    views = _existing(_with_finite_poses(views), root, images, allow_missing)
+    views.sort(key=lambda view: view.name)
+    with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # headers may lie on a slow network disk
+        headers = list(pool.map(lambda view: read_header(view.path), views))
+    mask_folder = _mask_folder(root, masks)
+    offset = camera_centers(np.stack([v.world_to_camera for v in views])).mean(axis=0)
+    plans: dict[Lens, Rectification] = {}
+    cameras = [
+        _camera(view, header, offset, downscale, undistort, exif, mask_folder, plans)
+        for view, header in zip(views, headers, strict=True)
+    ]
+    train, test = _split(views, root, split)
+    centers = camera_centers(np.stack([c.world_to_camera for c in cameras]))
+    points = _finite_points(points) if points else _random_points(cameras, offset)
+    points.positions = points.positions - offset
+    has_alpha = any(header.has_alpha for header in headers)
+    return Capture(
+        root=root,
+        cameras=cameras,
+        points=points.positions,
+        colors=points.colors,
+        track_lengths=points.track_lengths,
+        errors=points.errors,
+        offset=offset,
+        train=train,
+        test=test,
+        extent=_extent(centers[train], points.positions),
+        background=((1.0, 1.0, 1.0) if is_blender else (0.0, 0.0, 0.0)) if has_alpha else None,
+    )
+
+
+def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View], _Points | None, bool]:
+    if not root.is_dir():
+        raise FileNotFoundError(f"{root} is not a folder: --data needs a capture (images and a COLMAP model)")
+    folder = colmap.find_model(root)
+    parts = [part for part in ("train", "val") if colmap.find_model(root / part)]
+    if transforms.find_transforms(root) and (folder is None or "colmap" in folder.relative_to(root).parts):
+        return _read_transforms(root)
+    if folder is not None:
+        views, points = _read_colmap(root, folder, images, downscale)
+        return views, points, False
+    if "train" in parts:
+        found = [_read_colmap(root / p, _model_in(root / p), images, downscale, part=p) for p in parts]
+        return [view for views, _ in found for view in views], found[0][1], False
+    raise FileNotFoundError(
+        f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
+        ".bin or .txt), or transforms.json"
+    )
+
+
+def _model_in(root: Path) -> Path:
+    folder = colmap.find_model(root)
+    assert folder is not None
+    return folder
+
+
+def _read_transforms(root: Path) -> tuple[list[_View], _Points | None, bool]:
+    content = transforms.read_transforms(root)
+    views = [_View(f.name, f.path, f.mask_path, f.lens, f.world_to_camera, f.is_test) for f in content.frames]
+    points = _Points(*read_points(content.points_path)) if content.points_path else None
+    return views, points, content.is_blender
+
+
+def _read_colmap(
+    root: Path, folder: Path, images: str, downscale: float, part: str = ""
+) -> tuple[list[_View], _Points]:
+    model = colmap.read_model(folder)
+    lenses: dict[int, Lens] = {}
+    for camera in model.cameras:
+        try:
+            lenses[camera.id] = Lens(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
+        except ValueError as error:
+            raise ValueError(f"{folder}: camera {camera.id}: {error}") from error
+    names = model.images.names
+    unknown = [names[i] for i, c in enumerate(model.images.camera_ids.tolist()) if c not in lenses]
+    if unknown:
+        raise ValueError(
+            f"{folder}: {len(unknown)} images (first: {unknown[0]}) name a camera that is not there"
+        )
+    lens_of = [lenses[c] for c in model.images.camera_ids.tolist()]
+    paths = ImageFinder(root, images).find_all(names, lens_of, downscale)
+    poses = colmap.world_to_camera(model.images)
+    prefix = f"{part}/" if part else ""
+    views = [
+        _View(prefix + name, path, None, lens, pose)
+        for name, path, lens, pose in zip(names, paths, lens_of, poses, strict=True)
+    ]
+    p = model.points
+    return views, _Points(p.positions, p.colors, p.track_lengths, p.errors)
+
+
+def _with_finite_poses(views: list[_View]) -> list[_View]:
+    finite = [view for view in views if np.isfinite(view.world_to_camera).all()]
+    if not finite:
+        raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
+    if len(finite) < len(views):
+        first = next(v.name for v in views if not np.isfinite(v.world_to_camera).all())
+        warnings.warn(
+            f"{len(views) - len(finite)} views without a finite pose dropped (first: {first})", stacklevel=3
+        )
+    return finite
+
+
+def _existing(views: list[_View], root: Path, images: str, allow_missing: bool) -> list[_View]:
+    exists = [view.path.is_file() for view in views]
+    missing = [view.name for view, there in zip(views, exists, strict=True) if not there]
+    if not missing:
+        return views
+    shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+    message = f"{len(missing)} of {len(views)} images are not in {root / images}: {shown}"
+    if not allow_missing or len(missing) == len(views):
+        raise FileNotFoundError(
+            f"{message}; check the images folder, or load with allow_missing=True to drop them"
+        )
+    warnings.warn(f"{message}; dropped", stacklevel=3)
+    return [view for view, there in zip(views, exists, strict=True) if there]
+
+
+def _mask_folder(root: Path, masks: str | bool | None) -> Path | None:
+    if masks is False:
+        return None
+    folder = root / (masks if isinstance(masks, str) else "masks")
+    if folder.is_dir():
+        return folder
+    if masks is not None:
+        raise FileNotFoundError(f"{folder}: no such folder of masks")
+    return None
+
+
+def _camera(
+    view: _View,
+    header: ImageHeader,
+    offset: Float64,
+    downscale: float,
+    policy: Policy,
+    exif: str,
+    mask_folder: Path | None,
+    plans: dict[Lens, Rectification],
+) -> Camera:
+    orientation = _orientation(view, header, exif)
+    width, height = (header.height, header.width) if orientation >= 5 else (header.width, header.height)
+    if abs(width * view.lens.height - height * view.lens.width) > 2 * max(view.lens.width, view.lens.height):
+        raise ValueError(
+            f"{view.path} is {width} x {height}, which does not fit its camera of {view.lens.width} x "
+            f"{view.lens.height}: the image was cropped or turned after the poses were found"
+        )
+    lens = view.lens.scaled(width, height)
+    if lens not in plans:
+        plans[lens] = rectify(lens, policy)
+    plan = plans[lens]
+    # Images that came downscaled from images_N count as such: only what is left is done on the fly.
+    already = max(1.0, view.lens.width / width) if downscale > 1 else 1.0
+    left = downscale / already if downscale / already > 1.01 else 1.0
+    size = downscaled_size(plan.width, plan.height, left)
+    pose = view.world_to_camera.copy()
+    pose[:3, 3] += pose[:3, :3] @ offset
+    mask = view.mask_path
+    if mask is None and mask_folder is not None:
+        mask = find_mask(mask_folder, view.name)
+    return Camera(
+        name=view.name,
+        width=size[0],
+        height=size[1],
+        K=scaled_matrix(plan.K, (plan.width, plan.height), size),
+        world_to_camera=pose,
+        image_path=view.path,
+        mask_path=mask,
+        orientation=orientation,
+        rectification=plan,
+    )
+
+
+def _orientation(view: _View, header: ImageHeader, exif: str) -> int:
+    """The orientation to apply: COLMAP ignores the tag, so the camera's own shape decides."""
+    if header.orientation == 1 or exif == "ignore":
+        return 1
+    if exif == "apply":
+        return header.orientation
+    swaps = header.orientation >= 5 and view.lens.width != view.lens.height
+    turned = (view.lens.width > view.lens.height) != (header.width > header.height)
+    return header.orientation if swaps and turned else 1
+
+
+def _split(views: Sequence[_View], root: Path, spec: int | str | Path) -> tuple[list[int], list[int]]:
+    if spec == "auto" and any(view.is_test is not None for view in views):
+        test = [i for i, view in enumerate(views) if view.is_test]
+        train = [i for i, view in enumerate(views) if not view.is_test]
+        if not train:
+            raise ValueError(f"{root}: the files hold out every view: no training view is left")
+        return train, test
+    return split_views([v.name for v in views], [v.path for v in views], root, spec)
+
+
+def _finite_points(points: _Points) -> _Points:
+    finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(points.positions).all(axis=1))
+    if finite.all():
+        return points
+    warnings.warn(
+        f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped", stacklevel=3
+    )
+    return _Points(
+        points.positions[finite],
+        points.colors[finite],
+        points.track_lengths[finite] if points.track_lengths is not None else None,
+        points.errors[finite] if points.errors is not None else None,
+    )
+
+
+def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_000) -> _Points:
+    """Uniform points of random colours around where the cameras look, for captures that have none."""
+    warnings.warn(f"the capture has no points: starting from {count} random ones", stacklevel=3)
+    poses = np.stack([camera.world_to_camera for camera in cameras])
+    centers, axes = camera_centers(poses), poses[:, 2, :3]
+    # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    target = np.linalg.solve(
+        across.sum(axis=0) + 1e-6 * np.eye(3),
+        np.einsum("nij,nj->i", across, centers) + 1e-6 * centers.mean(axis=0),
+    )
+    half = 0.35 * float(np.linalg.norm(centers - target, axis=1).mean())
+    random = np.random.default_rng(0)
+    positions = target + offset + random.uniform(-half, half, (count, 3))
+    return _Points(positions, random.integers(0, 256, (count, 3), dtype=np.uint8))
+
+
+def _extent(centers: Float64, points: Float64) -> float:
+    extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    if extent > 0:
+        return extent
+    if len(points) == 0:
+        return 1.0
+    extent = float(np.median(np.linalg.norm(points - centers[0], axis=1)))
+    warnings.warn(
+        f"all training cameras are in one place: extent is the points' median distance, {extent:g}",
+        stacklevel=3,
+    )
+    return extent or 1.0

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""COLMAP sparse models (cameras, images, points3D; binary and text) as columns of numpy arrays.
+
+Poses map world to camera: x_camera = R(q) x_world + t with q = (w, x, y, z); pixel (i, j) has its centre at
+(i + 0.5, j + 0.5). Parsing is done by the compiled readers, which check every count against the bytes left.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+Float64 = npt.NDArray[np.float64]
+FILES = ("cameras", "images", "points3D")
+
+
+@cache
+def native_io() -> ModuleType:
+    """Import the compiled readers and writers (`blitzgs._lib._io`).
+
+    Raises:
+        ImportError: the module was not built for this Python; says how to build it.
+    """
+    try:
+        module = importlib.import_module("blitzgs._lib._io")
+    except ImportError as error:
+        raise ImportError(
+            f"the host I/O module of blitzgs is missing for this Python ({error}); run `pip install .`, or "
+            "`make build` in a checkout"
+        ) from error
+    return module
+
+
+def _empty(dtype: str, *shape: int) -> Any:
+    return field(default_factory=lambda: np.zeros(shape, dtype=dtype))
+
+
+@dataclass
+class ColmapCamera:
+    """One camera: `model` is COLMAP's name ("PINHOLE", "OPENCV", ...), `params` in COLMAP's order."""
+
+    id: int
+    model: str
+    width: int
+    height: int
+    params: Float64
+
+
+@dataclass
+class ColmapImages:
+    """N registered images. Observations of image i are rows point2d_offsets[i] to point2d_offsets[i + 1]."""
+
+    ids: npt.NDArray[np.uint32] = _empty("u4", 0)
+    camera_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
+    quats: Float64 = _empty("f8", 0, 4)
+    """[N, 4] w, x, y, z."""
+    translations: Float64 = _empty("f8", 0, 3)
+    """[N, 3]."""
+    names: list[str] = field(default_factory=list)
+    point2d_offsets: npt.NDArray[np.uint64] = _empty("u8", 1)
+    """[N + 1]; all zero when the observations were not read."""
+    points2d: Float64 = _empty("f8", 0, 2)
+    """[O, 2] pixels."""
+    point3d_ids: npt.NDArray[np.int64] = _empty("i8", 0)
+    """[O]; -1 where the observation has no point."""
+
+
+@dataclass
+class ColmapPoints:
+    """M points. The track of point i is rows track_offsets[i] to track_offsets[i + 1]."""
+
+    ids: npt.NDArray[np.int64] = _empty("i8", 0)
+    positions: Float64 = _empty("f8", 0, 3)
+    """[M, 3] world."""
+    colors: npt.NDArray[np.uint8] = _empty("u1", 0, 3)
+    """[M, 3]."""
+    errors: Float64 = _empty("f8", 0)
+    """[M] mean reprojection error in pixels; -1 = unknown."""
+    track_offsets: npt.NDArray[np.uint64] = _empty("u8", 1)
+    """[M + 1]; right even when the tracks themselves were not read."""
+    track_image_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
+    track_point2d_ids: npt.NDArray[np.uint32] = _empty("u4", 0)
+
+    @property
+    def track_lengths(self) -> npt.NDArray[np.int64]:
+        """Number of images that see each point, int64 [M]."""
+        ends = self.track_offsets.astype(np.int64)
+        return np.asarray(ends[1:] - ends[:-1])
+
+
+@dataclass
+class ColmapModel:
+    """A sparse model."""
+
+    cameras: list[ColmapCamera] = field(default_factory=list)
+    images: ColmapImages = field(default_factory=ColmapImages)
+    points: ColmapPoints = field(default_factory=ColmapPoints)
+
+
+@cache
+def camera_models() -> dict[str, list[str]]:
+    """Every camera model of COLMAP: name to the names of its parameters, in order."""
+    return {name: params.split(",") for _, name, params in native_io().camera_models()}
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder of a sparse model below `path` (sparse/0, sparse, `path` itself, colmap/...), or None."""
+    for folder in ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse"):
+        for suffix in (".bin", ".txt"):
+            if all((path / folder / (name + suffix)).is_file() for name in FILES):
+                return path / folder
+    return None
+
+
+def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = False) -> ColmapModel:
+    """Read a sparse model; binary files are preferred where both kinds exist.
+
+    Args:
+        folder: holds cameras, images and points3D as .bin or .txt (rigs and frames files are not needed).
+        points2d: read the observations of the images too (most of the file's size).
+        tracks: read the tracks of the points too (their lengths are always there).
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged; names the file, the byte offset or line, and the reason.
+    """
+    folder = Path(folder)
+    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    paths = {name: folder / (name + suffix) for name in FILES}
+    for path in paths.values():
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} is missing: {folder} is not a complete COLMAP sparse model")
+    io = native_io()
+    return ColmapModel(
+        [ColmapCamera(*row) for row in io.read_cameras(str(paths["cameras"]))],
+        ColmapImages(**io.read_images(str(paths["images"]), points2d)),
+        ColmapPoints(**io.read_points(str(paths["points3D"]), tracks)),
+    )
+
+
+def write_model(folder: Path | str, model: ColmapModel, *, text: bool = False) -> None:
+    """Write a sparse model as .bin (or .txt) files, creating the folder.
+
+    Raises:
+        ValueError: columns disagree in length, or a camera's parameters do not fit its model.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    suffix = ".txt" if text else ".bin"
+    io = native_io()
+    rows = [(c.id, c.model, c.width, c.height, [float(p) for p in c.params]) for c in model.cameras]
+    io.write_cameras(str(folder / f"cameras{suffix}"), rows)
+    io.write_images(str(folder / f"images{suffix}"), _columns(model.images))
+    io.write_points(str(folder / f"points3D{suffix}"), _columns(model.points))
+
+
+def _columns(table: ColmapImages | ColmapPoints) -> dict[str, Any]:
+    return {f.name: getattr(table, f.name) for f in fields(table)}
+
+
+def quats_to_rotations(quats: Float64) -> Float64:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z; any length, but zero gives NaN)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def world_to_camera(images: ColmapImages) -> Float64:
+    """The poses as matrices [N, 4, 4]."""
+    poses = np.tile(np.eye(4), (len(images.ids), 1, 1))
+    poses[:, :3, :3] = quats_to_rotations(images.quats)
+    poses[:, :3, 3] = images.translations
+    return poses

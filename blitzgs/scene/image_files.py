@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Image files: size and orientation from the header alone, and decoding that refuses damaged files."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+UInt8 = npt.NDArray[np.uint8]
+
+_HEADER_BYTES = 1 << 16
+_EXIF_ORIENTATION = 0x0112
+_TURNS: dict[int, tuple[int, ...]] = {3: (cv2.ROTATE_180,), 6: (cv2.ROTATE_90_CLOCKWISE,)}
+_TURNS[8] = (cv2.ROTATE_90_COUNTERCLOCKWISE,)
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """Size as stored (pixels), EXIF orientation (1 to 8) and whether there is an alpha channel."""
+
+    width: int
+    height: int
+    orientation: int = 1
+    has_alpha: bool = False
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Size and orientation of an image file; JPEG and PNG are not decoded for it.
+
+    Raises:
+        ValueError: the file is damaged or not an image; names it.
+    """
+    with path.open("rb") as file:
+        data = file.read(_HEADER_BYTES)
+        if data[:2] == b"\xff\xd8":
+            try:
+                header = _jpeg_header(data)
+            except (EOFError, struct.error):  # a large preview or colour profile comes before the size
+                try:
+                    header = _jpeg_header(data + file.read())
+                except (EOFError, struct.error):
+                    raise ValueError(f"{path}: truncated JPEG: the file ends inside its header") from None
+            if header is None:
+                raise ValueError(f"{path}: damaged JPEG: no size in its header")
+            return header
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 26:
+        width, height = struct.unpack(">II", data[16:24])
+        return ImageHeader(width, height, has_alpha=data[25] in (4, 6))
+    pixels = _imdecode(path.read_bytes(), cv2.IMREAD_UNCHANGED, str(path))
+    return ImageHeader(pixels.shape[1], pixels.shape[0], has_alpha=pixels.ndim == 3 and pixels.shape[2] == 4)
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Marker and payload of every segment before the image data; EOFError when the bytes end before it."""
+    at = 2
+    while True:
+        if at + 4 > len(data):
+            raise EOFError
+        if data[at] != 0xFF:
+            return
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        (length,) = struct.unpack(">H", data[at + 2 : at + 4])
+        if at + 2 + length > len(data):
+            raise EOFError
+        yield marker, data[at + 4 : at + 2 + length]
+        if marker == 0xDA:
+            return
+        at += 2 + length
+
+
+def _jpeg_header(data: bytes) -> ImageHeader | None:
+    orientation = 1
+    for marker, payload in _jpeg_segments(data):
+        if marker == 0xE1 and payload[:6] == b"Exif\0\0":
+            orientation = _exif_orientation(payload[6:])
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", payload[1:5])
+            return ImageHeader(width, height, orientation)
+    return None
+
+
+def _exif_orientation(tiff: bytes) -> int:
+    """The orientation tag of the first directory; 1 when there is none or it makes no sense."""
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    try:
+        if order is None:
+            return 1
+        (at,) = struct.unpack(order + "I", tiff[4:8])
+        (entries,) = struct.unpack(order + "H", tiff[at : at + 2])
+        for entry in range(at + 2, at + 2 + 12 * entries, 12):
+            tag, _, _, value = struct.unpack(order + "HHIH", tiff[entry : entry + 10])
+            if tag == _EXIF_ORIENTATION:
+                return value if 1 <= value <= 8 else 1
+    except struct.error:
+        pass
+    return 1
+
+
+def _jpeg_is_complete(data: bytes) -> bool:
+    """Whether the end marker follows the image data, where 0xFF is always escaped."""
+    start = 2
+    try:
+        for _, payload in _jpeg_segments(data):
+            start += 4 + len(payload)
+    except EOFError:
+        return False
+    return data.find(b"\xff\xd9", start) >= 0
+
+
+def _imdecode(data: bytes, flags: int, name: str) -> UInt8:
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    except cv2.error as error:
+        raise ValueError(f"{name}: cannot be decoded: {error}") from error
+    if pixels is None:
+        raise ValueError(f"{name}: cannot be decoded (damaged, truncated or not an image)")
+    return np.asarray(pixels)
+
+
+def check_complete(data: bytes, name: str) -> None:
+    """Refuse a JPEG that was cut off: decoders fill the missing part with grey.
+
+    Raises:
+        ValueError: names the file.
+    """
+    if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
+        raise ValueError(f"{name}: truncated JPEG: its end marker is missing after {len(data)} bytes")
+
+
+def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | None = None) -> UInt8:
+    """Decode to RGB uint8 [H, W, 3] as stored (EXIF orientation not applied).
+
+    Args:
+        data: the file.
+        name: names the file in errors.
+        background: composite an alpha channel over this colour (0 to 1); None drops it.
+
+    Raises:
+        ValueError: the file is damaged, truncated or not an image.
+    """
+    check_complete(data, name)
+    if background is not None:
+        pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name)
+        if pixels.ndim == 3 and pixels.shape[2] == 4:
+            return _over(pixels, background)
+    pixels = _imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, name)
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+
+
+def _over(bgra: npt.NDArray[np.uint8], background: tuple[float, float, float]) -> UInt8:
+    full = float(np.iinfo(bgra.dtype).max)
+    alpha = bgra[..., 3:].astype(np.float32) / full
+    rgb = bgra[..., 2::-1].astype(np.float32) / full
+    blended = rgb * alpha + np.asarray(background, dtype=np.float32) * (1 - alpha)
+    return np.asarray((blended * 255 + 0.5).astype(np.uint8))
+
+
+def decode_mask(data: bytes, name: str) -> UInt8:
+    """Decode a mask to uint8 [H, W]: 0 where the file is black (excluded), 1 elsewhere.
+
+    Raises:
+        ValueError: the file is damaged, truncated or not an image.
+    """
+    check_complete(data, name)
+    pixels = _imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, name)
+    return np.asarray((pixels > 0).astype(np.uint8))
+
+
+def apply_orientation(pixels: UInt8, orientation: int) -> UInt8:
+    """Turn stored pixels [H, W, ...] upright by the EXIF orientation (1 to 8)."""
+    if orientation in (2, 5, 7):
+        pixels = np.asarray(cv2.flip(pixels, 1))
+        orientation = {2: 1, 5: 8, 7: 6}[orientation]
+    elif orientation == 4:
+        return np.asarray(cv2.flip(pixels, 0))
+    for turn in _TURNS.get(orientation, ()):
+        pixels = np.asarray(cv2.rotate(pixels, turn))
+    return pixels

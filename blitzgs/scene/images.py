@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The images of a capture: files kept compressed in memory under a budget, decoded ahead by a thread pool.
+
+Two bounded caches, both dropping what was used longest ago: the bytes of the files, and decoded images. What
+comes out does not depend on budgets, threads or order: everything is derived from the files each time.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from blitzgs.scene.cameras import Camera
+from blitzgs.scene.capture import Capture
+from blitzgs.scene.image_files import UInt8, apply_orientation, decode_mask, decode_rgb
+from blitzgs.scene.undistort import Rectification
+
+K = TypeVar("K")
+V = TypeVar("V")
+DEFAULT_BUDGET = 4 << 30
+_MAPS_KEPT = 4
+
+
+class BoundedCache(Generic[K, V]):
+    """Least-recently-used entries within a budget of bytes; one that exceeds it alone is not kept."""
+
+    def __init__(self, budget: int) -> None:
+        """Hold at most `budget` bytes."""
+        self.budget = budget
+        self.bytes = 0
+        self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: K) -> V | None:
+        """The entry, now the most recently used; None when it is not there."""
+        with self._lock:
+            if key not in self._entries:
+                return None
+            self._entries.move_to_end(key)
+            return self._entries[key][0]
+
+    def put(self, key: K, value: V, size: int) -> None:
+        """Add or replace an entry of `size` bytes, dropping the oldest until all fit."""
+        with self._lock:
+            if key in self._entries:
+                self.bytes -= self._entries.pop(key)[1]
+            if size > self.budget:
+                return
+            while self.bytes + size > self.budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
+            self._entries[key] = (value, size)
+            self.bytes += size
+
+
+@dataclass(frozen=True)
+class _Maps:
+    columns: npt.NDArray[np.float32]
+    rows: npt.NDArray[np.float32]
+    seen: UInt8
+
+
+class ImageStore:
+    """Decoded images and masks of a capture's cameras, by index; any thread may call any method."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        budget_bytes: int = DEFAULT_BUDGET,
+        threads: int = 4,
+        decoded_bytes: int | None = None,
+    ) -> None:
+        """Read nothing yet.
+
+        Args:
+            capture: whose images.
+            budget_bytes: of the files' bytes kept in memory.
+            threads: that decode ahead.
+            decoded_bytes: of decoded images kept; a quarter of `budget_bytes` when left out.
+        """
+        self.capture = capture
+        self._files: BoundedCache[Path, bytes] = BoundedCache(budget_bytes)
+        self._decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(
+            budget_bytes // 4 if decoded_bytes is None else decoded_bytes
+        )
+        self._maps: OrderedDict[Rectification, _Maps] = OrderedDict()
+        self._maps_lock = threading.Lock()
+        self._pending: dict[tuple[str, int], Future[UInt8]] = {}
+        self._pending_lock = threading.Lock()
+        self._pool = ThreadPoolExecutor(max(1, threads), thread_name_prefix="blitzgs-images")
+
+    def get(self, index: int) -> Tensor:
+        """The image of a camera, uint8 RGB [height, width, 3] on the CPU. It is shared: do not write to it.
+
+        Raises:
+            ValueError: the file is damaged or its size changed; names it.
+            OSError: the file cannot be read.
+        """
+        return torch.from_numpy(self._result("image", index))
+
+    def get_rows(self, index: int, y0: int, y1: int) -> Tensor:
+        """Rows y0 to y1 (exclusive) of `get(index)`."""
+        height = self.capture.cameras[index].height
+        if not 0 <= y0 <= y1 <= height:
+            raise ValueError(f"rows {y0} to {y1} are not inside an image of {height} rows")
+        return self.get(index)[y0:y1]
+
+    def mask(self, index: int) -> Tensor | None:
+        """Which pixels count, uint8 [height, width] of 0 and 1; None when all do. Shared: do not write to it.
+
+        A pixel that mixes counted and excluded pixels of the file is excluded.
+        """
+        camera = self.capture.cameras[index]
+        if camera.mask_path is None and not camera.rectification.has_invalid:
+            return None
+        return torch.from_numpy(self._result("mask", index))
+
+    def prefetch(self, indices: Iterable[int]) -> None:
+        """Start decoding images that will be asked for, in order, as many as the decoded budget holds."""
+        planned = 0
+        for index in indices:
+            camera = self.capture.cameras[index]
+            planned += 3 * camera.width * camera.height
+            if planned > self._decoded.budget:
+                return
+            if self._decoded.get(("image", index)) is None:
+                self._submit("image", index)
+
+    def close(self) -> None:
+        """Stop the threads; decoding that has not begun is dropped."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _result(self, kind: str, index: int) -> UInt8:
+        found = self._decoded.get((kind, index))
+        return found if found is not None else self._submit(kind, index).result()
+
+    def _submit(self, kind: str, index: int) -> Future[UInt8]:
+        key = (kind, index)
+        with self._pending_lock:
+            if key not in self._pending:
+                self._pending[key] = self._pool.submit(self._produce, kind, index)
+            return self._pending[key]
+
+    def _produce(self, kind: str, index: int) -> UInt8:
+        try:
+            make = self._make_image if kind == "image" else self._make_mask
+            pixels = make(self.capture.cameras[index])
+            self._decoded.put((kind, index), pixels, pixels.nbytes)
+            return pixels
+        finally:
+            with self._pending_lock:
+                del self._pending[(kind, index)]
+
+    def _read(self, path: Path) -> bytes:
+        data = self._files.get(path)
+        if data is None:
+            data = path.read_bytes()
+            self._files.put(path, data, len(data))
+        return data
+
+    def _make_image(self, camera: Camera) -> UInt8:
+        pixels = decode_rgb(self._read(camera.image_path), str(camera.image_path), self.capture.background)
+        pixels = self._upright(camera, pixels, camera.image_path)
+        if not camera.rectification.is_identity:
+            maps = self._maps_of(camera.rectification)
+            remap = partial(cv2.remap, pixels, maps.columns, maps.rows, cv2.INTER_LINEAR)
+            pixels = _uint8(remap(borderMode=cv2.BORDER_REPLICATE))
+        return _shrunk(pixels, camera)
+
+    def _make_mask(self, camera: Camera) -> UInt8:
+        lens = camera.rectification.lens
+        mask = np.ones((lens.height, lens.width), dtype=np.uint8)
+        if camera.mask_path is not None:
+            mask = self._file_mask(camera, camera.mask_path)
+        if not camera.rectification.is_identity:
+            maps = self._maps_of(camera.rectification)
+            mask = _uint8(cv2.remap(mask, maps.columns, maps.rows, cv2.INTER_NEAREST)) * maps.seen
+        return _uint8(_shrunk(mask * np.uint8(255), camera) == 255)
+
+    def _file_mask(self, camera: Camera, path: Path) -> UInt8:
+        lens = camera.rectification.lens
+        mask = decode_mask(self._read(path), str(path))
+        stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
+        if (mask.shape[1], mask.shape[0]) == stored:
+            mask = apply_orientation(mask, camera.orientation)
+        if mask.shape != (lens.height, lens.width):  # masks of another resolution
+            mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
+        return mask
+
+    def _upright(self, camera: Camera, pixels: UInt8, path: Path) -> UInt8:
+        lens = camera.rectification.lens
+        pixels = apply_orientation(pixels, camera.orientation)
+        if pixels.shape[:2] != (lens.height, lens.width):
+            raise ValueError(
+                f"{path} is {pixels.shape[1]} x {pixels.shape[0]} now but was {lens.width} x {lens.height} "
+                "when the capture was loaded"
+            )
+        return pixels
+
+    def _maps_of(self, plan: Rectification) -> _Maps:
+        """Few are kept: those of a 12-megapixel image take 100 MB."""
+        with self._maps_lock:
+            if plan not in self._maps:
+                columns, rows, seen = plan.maps()
+                self._maps[plan] = _Maps(columns, rows, seen.astype(np.uint8))
+                if len(self._maps) > _MAPS_KEPT:
+                    self._maps.popitem(last=False)
+            self._maps.move_to_end(plan)
+            return self._maps[plan]
+
+
+def _uint8(pixels: npt.ArrayLike) -> UInt8:
+    return np.asarray(pixels, dtype=np.uint8)
+
+
+def _shrunk(pixels: UInt8, camera: Camera) -> UInt8:
+    """Average down to the camera's size."""
+    if pixels.shape[:2] == (camera.height, camera.width):
+        return pixels
+    return _uint8(cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA))

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PLY files: Gaussians in the INRIA layout, and coloured points.
+
+The INRIA layout is binary little endian, every property a float32 in this order: x y z nx ny nz f_dc_0..2
+f_rest_0.. opacity scale_0..2 rot_0..3. f_rest is channel-major: all coefficients of red, then green, then
+blue. Values are pre-activation (log scales, logit opacities, unnormalised quaternions w x y z). A file in
+this layout that is read and written again is the same, byte for byte.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from blitzgs.scene.colmap import native_io
+
+_REST_TO_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
+
+
+@dataclass
+class GaussianPly:
+    """N Gaussians as stored, float32 CPU tensors."""
+
+    means: Tensor
+    """[N, 3]."""
+    quats: Tensor
+    """[N, 4] w, x, y, z, unnormalised."""
+    scales: Tensor
+    """[N, 3] logarithms."""
+    opacities: Tensor
+    """[N] logits."""
+    sh: Tensor
+    """[N, K, 3], K = (degree + 1)^2; coefficient 0 is the DC."""
+    normals: Tensor
+    """[N, 3]; not used by anything, kept for the round trip."""
+    comments: list[str]
+    """Header lines "comment ..." and "obj_info ..."."""
+
+
+def _property_names(coefficients: int) -> list[str]:
+    rest = [f"f_rest_{i}" for i in range(3 * (coefficients - 1))]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
+    return [*names, "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+
+
+def _read_table(path: Path) -> tuple[list[str], npt.NDArray[np.void]]:
+    comments, properties, count, rows = native_io().read_ply(str(path))
+    return comments, np.frombuffer(rows, dtype=np.dtype(properties), count=count)
+
+
+def read_ply(path: Path | str) -> GaussianPly:
+    """Read Gaussians; properties may come in any order, and normals may be missing.
+
+    Raises:
+        ValueError: the file is damaged or has no such Gaussians; names the file and the reason.
+    """
+    path = Path(path)
+    comments, table = _read_table(path)
+    names = table.dtype.names or ()
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in _REST_TO_COEFFICIENTS:
+        raise ValueError(f"{path}: {rest} f_rest properties fit no SH degree (0, 9, 24 or 45 do)")
+    k = _REST_TO_COEFFICIENTS[rest]
+    missing = [n for n in _property_names(k) if n not in names and n not in ("nx", "ny", "nz")]
+    if missing:
+        raise ValueError(f"{path}: not a Gaussian PLY: the properties {', '.join(missing[:8])} are missing")
+
+    def columns(*wanted: str) -> Tensor:
+        out = np.zeros((len(table), len(wanted)), dtype=np.float32)
+        for i, name in enumerate(wanted):
+            if name in names:
+                out[:, i] = table[name]
+        return torch.from_numpy(out)
+
+    sh = torch.empty(len(table), k, 3)
+    sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
+    for channel in range(3):
+        sh[:, 1:, channel] = columns(*(f"f_rest_{channel * (k - 1) + i}" for i in range(k - 1)))
+    return GaussianPly(
+        means=columns("x", "y", "z"),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        scales=columns("scale_0", "scale_1", "scale_2"),
+        opacities=columns("opacity")[:, 0],
+        sh=sh,
+        normals=columns("nx", "ny", "nz"),
+        comments=comments,
+    )
+
+
+def write_ply(
+    path: Path | str,
+    *,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    normals: Tensor | None = None,
+    offset: npt.NDArray[np.float64] | None = None,
+    comments: list[str] | None = None,
+) -> None:
+    """Write Gaussians in the INRIA layout; the file appears under its name only when it is complete.
+
+    Args:
+        path: file to write; its folder is created.
+        means: [N, 3].
+        quats: [N, 4] w, x, y, z.
+        scales: [N, 3] logarithms.
+        opacities: [N] logits.
+        sh: [N, K, 3], K = 1, 4, 9 or 16.
+        normals: [N, 3]; zero when left out.
+        offset: float64 [3] added to the means in float64; `Capture.offset` restores the capture's own world.
+        comments: header lines, each "comment ..." or "obj_info ...".
+
+    Raises:
+        ValueError: shapes disagree.
+    """
+    n, k = len(means), sh.shape[1] if sh.ndim == 3 else 0
+    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    for name, shape in shapes.items():
+        if tuple(given[name].shape) != shape or k not in _REST_TO_COEFFICIENTS.values():
+            raise ValueError(
+                f"{name} has the shape {list(given[name].shape)}, expected {list(shape)}, K = 1, 4, 9, 16"
+            )
+    names = _property_names(k)
+    rows = np.zeros((n, len(names)), dtype="<f4")
+    rows[:, 0:3] = _moved(means, offset)
+    if normals is not None:
+        rows[:, 3:6] = _array(normals)
+    coefficients = _array(sh)
+    rows[:, 6:9] = coefficients[:, 0]
+    rows[:, 9 : 9 + 3 * (k - 1)] = coefficients[:, 1:].transpose(0, 2, 1).reshape(n, -1)
+    rows[:, -8] = _array(opacities)
+    rows[:, -7:-4] = _array(scales)
+    rows[:, -4:] = _array(quats)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    native_io().write_ply(
+        str(partial), comments or [], [(name, "f4") for name in names], n, rows.view(np.uint8)
+    )
+    os.replace(partial, path)
+
+
+def _array(tensor: Tensor) -> npt.NDArray[np.float32]:
+    return tensor.detach().to("cpu", torch.float32).numpy()
+
+
+def _moved(means: Tensor, offset: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float32]:
+    if offset is None:
+        return _array(means)
+    return (means.detach().cpu().double().numpy() + np.asarray(offset)).astype(np.float32)
+
+
+def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+    """Positions float64 [M, 3] and colours uint8 [M, 3] (grey when the file has none) of a point cloud.
+
+    Raises:
+        ValueError: the file is damaged or has no x, y, z.
+    """
+    _, table = _read_table(Path(path))
+    names = table.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError(f"{path}: the points have no x, y, z")
+    positions = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    if not {"red", "green", "blue"} <= set(names):
+        return positions, np.full((len(table), 3), 128, dtype=np.uint8)
+    colors = np.stack([table[channel] for channel in ("red", "green", "blue")], axis=1)
+    if colors.dtype.kind == "f":
+        colors = np.clip(colors * 255 + 0.5, 0, 255)
+    return positions, colors.astype(np.uint8)

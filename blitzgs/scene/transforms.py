@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras from transforms.json: nerfstudio's single file, or Blender's transforms_train/test.json.
+
+Poses there are camera-to-world with x right, y up, z backwards; ours are world-to-camera with y down, z
+forwards.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blitzgs.scene.cameras import Float64
+from blitzgs.scene.image_files import read_header
+from blitzgs.scene.lens import Lens
+
+_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "OPENCV": ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+    "PINHOLE": ("PINHOLE", ()),
+    "SIMPLE_PINHOLE": ("PINHOLE", ()),
+}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame: its lens is that of the size the file states, its pose world-to-camera float64 [4, 4]."""
+
+    name: str
+    path: Path
+    mask_path: Path | None
+    lens: Lens
+    world_to_camera: Float64
+    is_test: bool | None
+    """Whether the files hold it out; None when they do not say."""
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """What the files of a capture say together."""
+
+    frames: list[Frame]
+    points_path: Path | None
+    is_blender: bool
+
+
+def find_transforms(root: Path) -> list[Path]:
+    """The files to read: transforms.json, else those of Blender's train and test split; may be empty."""
+    if (root / "transforms.json").is_file():
+        return [root / "transforms.json"]
+    files = [root / f"transforms_{part}.json" for part in ("train", "test")]
+    return [path for path in files if path.is_file()]
+
+
+def read_transforms(root: Path) -> Transforms:
+    """Read every frame of a capture.
+
+    Raises:
+        ValueError: a field is missing or makes no sense; names the file, the frame and the field.
+    """
+    frames: list[Frame] = []
+    points_path = None
+    files = find_transforms(root)
+    for path in files:
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            entries = content["frames"]
+            if not isinstance(entries, list):
+                raise TypeError("'frames' is not a list")
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: not a transforms file with a list of frames ({error})") from error
+        if "ply_file_path" in content:
+            points_path = root / content["ply_file_path"]
+        for index, entry in enumerate(entries):
+            try:
+                frames.append(_read_frame(root, path, content, entry))
+            except (KeyError, TypeError, ValueError) as error:
+                reason = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
+                raise ValueError(f"{path}: frame {index}: {reason}") from error
+    return Transforms(frames, points_path, is_blender=files[0].name != "transforms.json")
+
+
+def _read_frame(root: Path, file: Path, content: Mapping[str, Any], entry: Mapping[str, Any]) -> Frame:
+    relative = str(entry["file_path"])
+    path = next((p for s in _SUFFIXES if (p := root / (relative + s)).is_file()), root / relative)
+    mask = root / str(entry["mask_path"]) if "mask_path" in entry else None
+    return Frame(
+        name=str(Path(relative)),
+        path=path,
+        mask_path=mask,
+        lens=_read_lens({**content, **entry}, path),
+        world_to_camera=_read_pose(entry["transform_matrix"]),
+        is_test=_is_test(file, content, relative),
+    )
+
+
+def _is_test(file: Path, content: Mapping[str, Any], relative: str) -> bool | None:
+    if file.name != "transforms.json":
+        return file.name == "transforms_test.json"
+    if "test_filenames" not in content and "val_filenames" not in content:
+        return None
+    return relative in content.get("test_filenames", []) or relative in content.get("val_filenames", [])
+
+
+def _read_pose(matrix: object) -> Float64:
+    camera_to_world = np.asarray(matrix, dtype=np.float64)
+    if camera_to_world.shape not in ((3, 4), (4, 4)):
+        raise ValueError(f"transform_matrix must be 4 x 4, got the shape {camera_to_world.shape}")
+    pose = np.eye(4)
+    rotation = camera_to_world[:3, :3] * np.array([1.0, -1.0, -1.0])
+    rotation = rotation / np.linalg.norm(rotation, axis=0)  # some exporters leave the scale of the rig in
+    if np.isfinite(rotation).all() and not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
+        raise ValueError("transform_matrix is not a rotation and a translation")
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ camera_to_world[:3, 3]
+    return pose
+
+
+def _read_lens(fields: Mapping[str, Any], path: Path) -> Lens:
+    if "w" in fields and "h" in fields:
+        width, height = int(fields["w"]), int(fields["h"])
+    else:
+        header = read_header(path)
+        width, height = header.width, header.height
+    if "fl_x" in fields:
+        fx = float(fields["fl_x"])
+        fy = float(fields.get("fl_y", fx))
+    elif "camera_angle_x" in fields:
+        fx = 0.5 * width / float(np.tan(0.5 * float(fields["camera_angle_x"])))
+        fy = (
+            0.5 * height / float(np.tan(0.5 * float(fields["camera_angle_y"])))
+            if "camera_angle_y" in fields
+            else fx
+        )
+    else:
+        raise ValueError("neither fl_x nor camera_angle_x is given")
+    model = str(fields.get("camera_model", "OPENCV"))
+    if model not in _MODELS:
+        raise ValueError(f"camera_model {model} is not supported; known: {', '.join(_MODELS)}")
+    name, distortion = _MODELS[model]
+    params = [fx, fy, float(fields.get("cx", width / 2)), float(fields.get("cy", height / 2))]
+    params += [float(fields.get(key, 0.0)) for key in distortion]
+    return Lens(name, width, height, tuple(params))

@@ -1,0 +1,99 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "io/byte_reader.h"
+
+#include <algorithm>
+
+namespace blitzgs::io {
+
+namespace {
+constexpr std::uint64_t kBufferBytes = 1 << 18;
+}
+
+ByteReader::ByteReader(std::istream& in, std::string name) : in_(in), name_(std::move(name)) {
+  const auto start = in_.tellg();
+  in_.seekg(0, std::ios::end);
+  const auto end = in_.tellg();
+  in_.seekg(start);
+  if (!in_ || start < 0 || end < start) throw FormatError(name_ + ": cannot be read, or its size is unknown");
+  size_ = static_cast<std::uint64_t>(end - start);
+  buffer_.resize(std::min(size_, kBufferBytes));
+}
+
+void ByteReader::fill() {
+  const std::uint64_t wanted = std::min<std::uint64_t>(buffer_.size(), remaining());
+  in_.read(buffer_.data(), static_cast<std::streamsize>(wanted));
+  if (static_cast<std::uint64_t>(in_.gcount()) != wanted) fail("the file could not be read on");
+  buffer_at_ = 0;
+  buffer_end_ = wanted;
+}
+
+void ByteReader::require(std::uint64_t n, const char* what) const {
+  if (n > remaining()) {
+    fail(std::string("the file ends inside ") + what + " (" + std::to_string(n) + " bytes needed, " +
+         std::to_string(remaining()) + " left)");
+  }
+}
+
+void ByteReader::read_bytes(void* destination, std::uint64_t n, const char* what) {
+  require(n, what);
+  char* out = static_cast<char*>(destination);
+  while (n > 0) {
+    if (buffer_at_ == buffer_end_) fill();
+    const std::uint64_t step = std::min<std::uint64_t>(n, buffer_end_ - buffer_at_);
+    std::memcpy(out, buffer_.data() + buffer_at_, step);
+    out += step;
+    n -= step;
+    buffer_at_ += step;
+    offset_ += step;
+  }
+}
+
+void ByteReader::skip(std::uint64_t n, const char* what) {
+  require(n, what);
+  while (n > 0) {
+    if (buffer_at_ == buffer_end_) fill();
+    const std::uint64_t step = std::min<std::uint64_t>(n, buffer_end_ - buffer_at_);
+    n -= step;
+    buffer_at_ += step;
+    offset_ += step;
+  }
+}
+
+std::string ByteReader::read_c_string(const char* what) {
+  std::string text;
+  while (true) {
+    require(1, what);
+    if (buffer_at_ == buffer_end_) fill();
+    const char* begin = buffer_.data() + buffer_at_;
+    const char* end = buffer_.data() + buffer_end_;
+    const char* nul = std::find(begin, end, '\0');
+    text.append(begin, nul);
+    const std::size_t step = static_cast<std::size_t>(nul - begin) + (nul != end ? 1 : 0);
+    buffer_at_ += step;
+    offset_ += step;
+    if (nul != end) return text;
+  }
+}
+
+std::uint64_t ByteReader::read_count(std::uint64_t min_bytes, const char* what) {
+  const auto count = read<std::uint64_t>(what);
+  check_count(count, min_bytes, what);
+  return count;
+}
+
+void ByteReader::check_count(std::uint64_t count, std::uint64_t min_bytes, const char* what) const {
+  if (count > remaining() / min_bytes) {
+    fail("it claims " + std::to_string(count) + " " + what + " of at least " + std::to_string(min_bytes) +
+         " bytes each, but " + std::to_string(remaining()) + " bytes are left");
+  }
+}
+
+void ByteReader::fail(const std::string& reason) const {
+  throw FormatError(name_ + ": at byte " + std::to_string(offset_) + ": " + reason);
+}
+
+void ByteReader::expect_end() const {
+  if (remaining() > 0) fail(std::to_string(remaining()) + " bytes are left after the last record");
+}
+
+}  // namespace blitzgs::io

@@ -1,0 +1,152 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <ostream>
+
+#include "io/colmap.h"
+
+namespace blitzgs::io {
+
+namespace {
+
+constexpr std::uint64_t kCameraBytes = 4 + 4 + 8 + 8;         // and the parameters
+constexpr std::uint64_t kImageBytes = 4 + 7 * 8 + 4 + 1 + 8;  // empty name, no observations
+constexpr std::uint64_t kPoint2dBytes = 2 * 8 + 8;
+constexpr std::uint64_t kPointBytes = 8 + 3 * 8 + 3 + 8 + 8;  // empty track
+constexpr std::uint64_t kTrackBytes = 4 + 4;
+
+template <class T>
+void put(std::ostream& out, const T& value) {
+  out.write(reinterpret_cast<const char*>(&value), sizeof value);
+}
+
+}  // namespace
+
+std::vector<ColmapCamera> read_cameras_binary(std::istream& in, const std::string& name) {
+  ByteReader reader(in, name);
+  const std::uint64_t n = reader.read_count(kCameraBytes, "cameras");
+  std::vector<ColmapCamera> cameras(n);
+  for (ColmapCamera& camera : cameras) {
+    camera.id = reader.read<std::uint32_t>("a camera id");
+    camera.model = reader.read<std::int32_t>("a camera model id");
+    camera.width = reader.read<std::uint64_t>("a camera width");
+    camera.height = reader.read<std::uint64_t>("a camera height");
+    if (const CameraModel* model = find_camera_model(camera.model)) camera.params.resize(model->num_params);
+    if (const std::string problem = camera_problem(camera); !problem.empty()) reader.fail(problem);
+    reader.read_bytes(camera.params.data(), 8 * camera.params.size(), "camera parameters");
+  }
+  reader.expect_end();
+  return cameras;
+}
+
+ColmapImages read_images_binary(std::istream& in, const std::string& name, bool with_points2d) {
+  ByteReader reader(in, name);
+  const std::uint64_t n = reader.read_count(kImageBytes, "images");
+  ColmapImages images;
+  images.ids.resize(n);
+  images.camera_ids.resize(n);
+  images.quats.resize(4 * n);
+  images.translations.resize(3 * n);
+  images.names.resize(n);
+  images.point2d_offsets.assign(n + 1, 0);
+  for (std::uint64_t i = 0; i < n; ++i) {
+    images.ids[i] = reader.read<std::uint32_t>("an image id");
+    reader.read_bytes(&images.quats[4 * i], 4 * 8, "an image rotation");
+    reader.read_bytes(&images.translations[3 * i], 3 * 8, "an image translation");
+    images.camera_ids[i] = reader.read<std::uint32_t>("the camera id of an image");
+    images.names[i] = reader.read_c_string("an image name");
+    if (images.names[i].empty()) reader.fail("image " + std::to_string(images.ids[i]) + " has no name");
+    const std::uint64_t count = reader.read_count(kPoint2dBytes, "observations");
+    if (!with_points2d) {
+      reader.skip(count * kPoint2dBytes, "observations");
+      continue;
+    }
+    const std::uint64_t begin = images.point3d_ids.size();
+    images.points2d.resize(2 * (begin + count));
+    images.point3d_ids.resize(begin + count);
+    for (std::uint64_t k = begin; k < begin + count; ++k) {
+      reader.read_bytes(&images.points2d[2 * k], 2 * 8, "an observation");
+      images.point3d_ids[k] = reader.read<std::int64_t>("the point id of an observation");
+    }
+    images.point2d_offsets[i + 1] = begin + count;
+  }
+  reader.expect_end();
+  return images;
+}
+
+ColmapPoints read_points_binary(std::istream& in, const std::string& name, bool with_tracks) {
+  ByteReader reader(in, name);
+  const std::uint64_t n = reader.read_count(kPointBytes, "points");
+  ColmapPoints points;
+  points.ids.resize(n);
+  points.positions.resize(3 * n);
+  points.colors.resize(3 * n);
+  points.errors.resize(n);
+  points.track_offsets.assign(n + 1, 0);
+  for (std::uint64_t i = 0; i < n; ++i) {
+    points.ids[i] = reader.read<std::int64_t>("a point id");
+    reader.read_bytes(&points.positions[3 * i], 3 * 8, "a point position");
+    reader.read_bytes(&points.colors[3 * i], 3, "a point colour");
+    points.errors[i] = reader.read<double>("a point error");
+    const std::uint64_t length = reader.read_count(kTrackBytes, "track elements");
+    points.track_offsets[i + 1] = points.track_offsets[i] + length;
+    if (!with_tracks) {
+      reader.skip(length * kTrackBytes, "a track");
+      continue;
+    }
+    points.track_image_ids.resize(points.track_offsets[i + 1]);
+    points.track_point2d_ids.resize(points.track_offsets[i + 1]);
+    for (std::uint64_t k = points.track_offsets[i]; k < points.track_offsets[i + 1]; ++k) {
+      points.track_image_ids[k] = reader.read<std::uint32_t>("the image id of a track element");
+      points.track_point2d_ids[k] = reader.read<std::uint32_t>("the observation of a track element");
+    }
+  }
+  reader.expect_end();
+  return points;
+}
+
+void write_cameras_binary(std::ostream& out, const std::vector<ColmapCamera>& cameras) {
+  check_columns(cameras);
+  put<std::uint64_t>(out, cameras.size());
+  for (const ColmapCamera& camera : cameras) {
+    put(out, camera.id);
+    put<std::int32_t>(out, camera.model);
+    put(out, camera.width);
+    put(out, camera.height);
+    for (const double value : camera.params) put(out, value);
+  }
+}
+
+void write_images_binary(std::ostream& out, const ColmapImages& images) {
+  check_columns(images);
+  put<std::uint64_t>(out, images.ids.size());
+  for (std::size_t i = 0; i < images.ids.size(); ++i) {
+    put(out, images.ids[i]);
+    for (int k = 0; k < 4; ++k) put(out, images.quats[4 * i + k]);
+    for (int k = 0; k < 3; ++k) put(out, images.translations[3 * i + k]);
+    put(out, images.camera_ids[i]);
+    out.write(images.names[i].c_str(), static_cast<std::streamsize>(images.names[i].size() + 1));
+    put(out, images.point2d_offsets[i + 1] - images.point2d_offsets[i]);
+    for (std::uint64_t k = images.point2d_offsets[i]; k < images.point2d_offsets[i + 1]; ++k) {
+      put(out, images.points2d[2 * k]);
+      put(out, images.points2d[2 * k + 1]);
+      put(out, images.point3d_ids[k]);
+    }
+  }
+}
+
+void write_points_binary(std::ostream& out, const ColmapPoints& points) {
+  check_columns(points);
+  put<std::uint64_t>(out, points.ids.size());
+  for (std::size_t i = 0; i < points.ids.size(); ++i) {
+    put(out, points.ids[i]);
+    for (int k = 0; k < 3; ++k) put(out, points.positions[3 * i + k]);
+    out.write(reinterpret_cast<const char*>(&points.colors[3 * i]), 3);
+    put(out, points.errors[i]);
+    put(out, points.track_offsets[i + 1] - points.track_offsets[i]);
+    for (std::uint64_t k = points.track_offsets[i]; k < points.track_offsets[i + 1]; ++k) {
+      put(out, points.track_image_ids[k]);
+      put(out, points.track_point2d_ids[k]);
+    }
+  }
+}
+
+}  // namespace blitzgs::io

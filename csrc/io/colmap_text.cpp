@@ -1,0 +1,145 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <charconv>
+#include <ostream>
+
+#include "io/colmap.h"
+#include "io/text_reader.h"
+
+namespace blitzgs::io {
+
+namespace {
+
+template <class T>
+void put(std::ostream& out, T value) {
+  char text[40];
+  const auto [end, error] = std::to_chars(text, text + sizeof text, value);
+  out.write(text, end - text);
+  static_cast<void>(error);  // 40 characters hold every double and 64-bit integer
+}
+
+template <class T>
+void put_after_blank(std::ostream& out, T value) {
+  out.put(' ');
+  put(out, value);
+}
+
+}  // namespace
+
+std::vector<ColmapCamera> read_cameras_text(std::istream& in, const std::string& name) {
+  TextReader reader(in, name);
+  std::vector<ColmapCamera> cameras;
+  while (reader.next_record()) {
+    ColmapCamera camera;
+    camera.id = reader.number<std::uint32_t>("camera id");
+    const std::string model(reader.token("the camera model"));
+    const CameraModel* known = find_camera_model(model);
+    if (!known) reader.fail("camera " + std::to_string(camera.id) + " has the unknown model " + model);
+    camera.model = known->id;
+    camera.width = reader.number<std::uint64_t>("camera width");
+    camera.height = reader.number<std::uint64_t>("camera height");
+    while (reader.has_token()) camera.params.push_back(reader.number<double>("camera parameter"));
+    if (const std::string problem = camera_problem(camera); !problem.empty()) reader.fail(problem);
+    cameras.push_back(std::move(camera));
+  }
+  return cameras;
+}
+
+ColmapImages read_images_text(std::istream& in, const std::string& name, bool with_points2d) {
+  TextReader reader(in, name);
+  ColmapImages images;
+  images.point2d_offsets.push_back(0);
+  while (reader.next_record()) {
+    images.ids.push_back(reader.number<std::uint32_t>("image id"));
+    for (int k = 0; k < 4; ++k) images.quats.push_back(reader.number<double>("rotation"));
+    for (int k = 0; k < 3; ++k) images.translations.push_back(reader.number<double>("translation"));
+    images.camera_ids.push_back(reader.number<std::uint32_t>("camera id"));
+    images.names.emplace_back(reader.rest());  // a name may have blanks in it
+    if (images.names.back().empty()) {
+      reader.fail("image " + std::to_string(images.ids.back()) + " has no name");
+    }
+    // The observations' line is there even when it is empty; only the last may be missing.
+    if (reader.next_line() && with_points2d) {
+      while (reader.has_token()) {
+        images.points2d.push_back(reader.number<double>("observation x"));
+        images.points2d.push_back(reader.number<double>("observation y"));
+        images.point3d_ids.push_back(reader.number<std::int64_t>("observation point id"));
+      }
+    }
+    images.point2d_offsets.push_back(images.point3d_ids.size());
+  }
+  return images;
+}
+
+ColmapPoints read_points_text(std::istream& in, const std::string& name, bool with_tracks) {
+  TextReader reader(in, name);
+  ColmapPoints points;
+  points.track_offsets.push_back(0);
+  while (reader.next_record()) {
+    points.ids.push_back(reader.number<std::int64_t>("point id"));
+    for (int k = 0; k < 3; ++k) points.positions.push_back(reader.number<double>("coordinate"));
+    for (int k = 0; k < 3; ++k) points.colors.push_back(reader.number<std::uint8_t>("colour (0 to 255)"));
+    points.errors.push_back(reader.number<double>("error"));
+    std::uint64_t length = 0;
+    for (; reader.has_token(); ++length) {
+      const auto image_id = reader.number<std::uint32_t>("track image id");
+      const auto point2d_id = reader.number<std::uint32_t>("track observation");
+      if (!with_tracks) continue;
+      points.track_image_ids.push_back(image_id);
+      points.track_point2d_ids.push_back(point2d_id);
+    }
+    points.track_offsets.push_back(points.track_offsets.back() + length);
+  }
+  return points;
+}
+
+void write_cameras_text(std::ostream& out, const std::vector<ColmapCamera>& cameras) {
+  check_columns(cameras);
+  out << "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: " << cameras.size() << "\n";
+  for (const ColmapCamera& camera : cameras) {
+    put(out, camera.id);
+    out << ' ' << find_camera_model(camera.model)->name;
+    put_after_blank(out, camera.width);
+    put_after_blank(out, camera.height);
+    for (const double value : camera.params) put_after_blank(out, value);
+    out << '\n';
+  }
+}
+
+void write_images_text(std::ostream& out, const ColmapImages& images) {
+  check_columns(images);
+  out << "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
+      << "# Number of images: " << images.ids.size() << "\n";
+  for (std::size_t i = 0; i < images.ids.size(); ++i) {
+    put(out, images.ids[i]);
+    for (int k = 0; k < 4; ++k) put_after_blank(out, images.quats[4 * i + k]);
+    for (int k = 0; k < 3; ++k) put_after_blank(out, images.translations[3 * i + k]);
+    put_after_blank(out, images.camera_ids[i]);
+    out << ' ' << images.names[i] << '\n';
+    for (std::uint64_t k = images.point2d_offsets[i]; k < images.point2d_offsets[i + 1]; ++k) {
+      if (k > images.point2d_offsets[i]) out.put(' ');
+      put(out, images.points2d[2 * k]);
+      put_after_blank(out, images.points2d[2 * k + 1]);
+      put_after_blank(out, images.point3d_ids[k]);
+    }
+    out << '\n';
+  }
+}
+
+void write_points_text(std::ostream& out, const ColmapPoints& points) {
+  check_columns(points);
+  out << "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n# Number of points: "
+      << points.ids.size() << "\n";
+  for (std::size_t i = 0; i < points.ids.size(); ++i) {
+    put(out, points.ids[i]);
+    for (int k = 0; k < 3; ++k) put_after_blank(out, points.positions[3 * i + k]);
+    for (int k = 0; k < 3; ++k) put_after_blank<int>(out, points.colors[3 * i + k]);
+    put_after_blank(out, points.errors[i]);
+    for (std::uint64_t k = points.track_offsets[i]; k < points.track_offsets[i + 1]; ++k) {
+      put_after_blank(out, points.track_image_ids[k]);
+      put_after_blank(out, points.track_point2d_ids[k]);
+    }
+    out << '\n';
+  }
+}
+
+}  // namespace blitzgs::io

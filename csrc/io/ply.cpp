@@ -1,0 +1,287 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "io/ply.h"
+
+#include <algorithm>
+#include <array>
+#include <charconv>
+#include <optional>
+#include <ostream>
+#include <sstream>
+
+namespace blitzgs::io {
+
+namespace {
+
+struct TypeInfo {
+  std::string_view name;
+  std::string_view alias;
+  int bytes;
+};
+constexpr std::array<TypeInfo, 8> kTypes = {{{"char", "int8", 1},
+                                             {"uchar", "uint8", 1},
+                                             {"short", "int16", 2},
+                                             {"ushort", "uint16", 2},
+                                             {"int", "int32", 4},
+                                             {"uint", "uint32", 4},
+                                             {"float", "float32", 4},
+                                             {"double", "float64", 8}}};
+constexpr std::size_t kMaxLine = 1 << 16;
+constexpr std::size_t kMaxProperties = 1 << 12;
+
+enum class Encoding { kAscii, kLittle, kBig };
+
+struct Element {
+  std::string name;
+  std::uint64_t count = 0;
+  std::vector<PlyProperty> properties;
+  bool has_list = false;
+
+  std::uint64_t row_bytes() const {
+    std::uint64_t bytes = 0;
+    for (const PlyProperty& p : properties) bytes += ply_type_bytes(p.type);
+    return bytes;
+  }
+};
+
+std::optional<PlyType> find_type(std::string_view name) {
+  for (std::size_t i = 0; i < kTypes.size(); ++i) {
+    if (name == kTypes[i].name || name == kTypes[i].alias) return static_cast<PlyType>(i);
+  }
+  return std::nullopt;
+}
+
+std::string read_line(ByteReader& reader) {
+  std::string line;
+  for (char c; (c = reader.read<char>("the header")) != '\n';) {
+    if (line.size() == kMaxLine) reader.fail("a header line is longer than 65536 bytes: not a PLY file");
+    line.push_back(c);
+  }
+  if (!line.empty() && line.back() == '\r') line.pop_back();
+  return line;
+}
+
+std::vector<std::string> split(const std::string& line) {
+  std::istringstream stream(line);
+  std::vector<std::string> words;
+  for (std::string word; stream >> word;) words.push_back(word);
+  return words;
+}
+
+struct Header {
+  Encoding encoding = Encoding::kAscii;
+  std::vector<std::string> comments;
+  std::vector<Element> elements;
+};
+
+Encoding parse_format(const ByteReader& reader, const std::vector<std::string>& words,
+                      const std::string& line) {
+  if (words.size() == 3 && words[2] == "1.0") {
+    if (words[1] == "ascii") return Encoding::kAscii;
+    if (words[1] == "binary_little_endian") return Encoding::kLittle;
+    if (words[1] == "binary_big_endian") return Encoding::kBig;
+  }
+  reader.fail("unknown format line '" + line + "'");
+}
+
+Element parse_element(const ByteReader& reader, const std::vector<std::string>& words,
+                      const std::string& line) {
+  Element element;
+  if (words.size() != 3) reader.fail("bad element line '" + line + "'");
+  element.name = words[1];
+  const char* end = words[2].data() + words[2].size();
+  const auto [stop, error] = std::from_chars(words[2].data(), end, element.count);
+  if (error != std::errc() || stop != end) reader.fail("bad element count '" + words[2] + "'");
+  return element;
+}
+
+void parse_property(const ByteReader& reader, const std::vector<std::string>& words, const std::string& line,
+                    Header& header) {
+  if (header.elements.empty()) reader.fail("a property comes before any element: '" + line + "'");
+  Element& element = header.elements.back();
+  if (words.size() == 5 && words[1] == "list") {
+    element.has_list = true;
+    return;
+  }
+  const auto type = words.size() == 3 ? find_type(words[1]) : std::nullopt;
+  if (!type) reader.fail("bad property line '" + line + "'");
+  const auto same = [&](const PlyProperty& p) { return p.name == words[2]; };
+  if (std::any_of(element.properties.begin(), element.properties.end(), same)) {
+    reader.fail("property " + words[2] + " comes twice");
+  }
+  if (element.properties.size() == kMaxProperties) reader.fail("more than 4096 properties");
+  element.properties.push_back({words[2], *type});
+}
+
+Header read_header(ByteReader& reader) {
+  if (read_line(reader) != "ply") reader.fail("the first line is not 'ply'");
+  Header header;
+  bool has_format = false;
+  while (true) {
+    const std::string line = read_line(reader);
+    const std::vector<std::string> words = split(line);
+    const std::string key = words.empty() ? "" : words[0];
+    if (key == "comment" || key == "obj_info") {
+      header.comments.push_back(line);
+    } else if (key == "format") {
+      header.encoding = parse_format(reader, words, line);
+      has_format = true;
+    } else if (key == "element") {
+      header.elements.push_back(parse_element(reader, words, line));
+    } else if (key == "property") {
+      parse_property(reader, words, line, header);
+    } else if (key == "end_header") {
+      if (!has_format) reader.fail("the header has no format line");
+      return header;
+    } else {
+      reader.fail("unknown header line '" + line.substr(0, 80) + "'");
+    }
+  }
+}
+
+std::string read_token(ByteReader& reader) {
+  const auto blank = [](char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; };
+  std::string token;
+  while (reader.remaining() > 0) {
+    const char c = reader.read<char>("a value");
+    if (!blank(c)) {
+      token.push_back(c);
+      if (token.size() > 400) reader.fail("a value of more than 400 characters");
+    } else if (!token.empty()) {
+      return token;
+    }
+  }
+  if (token.empty()) reader.fail("the file ends before its last value");
+  return token;
+}
+
+template <class T>
+void parse_value(ByteReader& reader, std::uint8_t* out) {
+  const std::string token = read_token(reader);
+  T value{};
+  const char* end = token.data() + token.size();
+  const auto [stop, error] = std::from_chars(token.data(), end, value);
+  if (error != std::errc() || stop != end) reader.fail("'" + token.substr(0, 40) + "' is not a valid value");
+  std::memcpy(out, &value, sizeof value);
+}
+
+void parse_value(ByteReader& reader, PlyType type, std::uint8_t* out) {
+  switch (type) {
+    case PlyType::kInt8:
+      return parse_value<std::int8_t>(reader, out);
+    case PlyType::kUint8:
+      return parse_value<std::uint8_t>(reader, out);
+    case PlyType::kInt16:
+      return parse_value<std::int16_t>(reader, out);
+    case PlyType::kUint16:
+      return parse_value<std::uint16_t>(reader, out);
+    case PlyType::kInt32:
+      return parse_value<std::int32_t>(reader, out);
+    case PlyType::kUint32:
+      return parse_value<std::uint32_t>(reader, out);
+    case PlyType::kFloat32:
+      return parse_value<float>(reader, out);
+    case PlyType::kFloat64:
+      return parse_value<double>(reader, out);
+  }
+}
+
+void skip_element(ByteReader& reader, const Element& element, Encoding encoding) {
+  if (element.has_list) reader.fail("element " + element.name + " has lists and comes before the vertices");
+  if (encoding == Encoding::kAscii) {
+    for (std::uint64_t i = 0; i < element.count && !element.properties.empty(); ++i) {
+      for (std::size_t k = 0; k < element.properties.size(); ++k) read_token(reader);
+    }
+  } else if (element.row_bytes() > 0) {
+    reader.check_count(element.count, element.row_bytes(), "rows before the vertices");
+    reader.skip(element.count * element.row_bytes(), "the elements before the vertices");
+  }
+}
+
+void swap_bytes(const Element& vertex, std::vector<std::uint8_t>& rows) {
+  for (auto at = rows.begin(); at != rows.end();) {
+    for (const PlyProperty& property : vertex.properties) {
+      const int bytes = ply_type_bytes(property.type);
+      std::reverse(at, at + bytes);
+      at += bytes;
+    }
+  }
+}
+
+void check_writable(const PlyTable& table) {
+  const std::uint64_t row = table.row_bytes();
+  if (row == 0 || table.rows.size() / row != table.count || table.rows.size() % row != 0) {
+    throw std::invalid_argument("ply: " + std::to_string(table.rows.size()) + " bytes are not " +
+                                std::to_string(table.count) + " rows of " + std::to_string(row));
+  }
+  for (const PlyProperty& p : table.properties) {
+    if (p.name.empty() || p.name.find_first_of(" \t\r\n") != std::string::npos) {
+      throw std::invalid_argument("ply: '" + p.name + "' cannot name a property");
+    }
+  }
+  for (const std::string& line : table.comments) {
+    const bool known = line.starts_with("comment") || line.starts_with("obj_info");
+    if (!known || line.find('\n') != std::string::npos) {
+      throw std::invalid_argument("ply: '" + line + "' is not one comment or obj_info line");
+    }
+  }
+}
+
+}  // namespace
+
+int ply_type_bytes(PlyType type) { return kTypes[static_cast<std::size_t>(type)].bytes; }
+
+std::string_view ply_type_name(PlyType type) { return kTypes[static_cast<std::size_t>(type)].name; }
+
+std::uint64_t PlyTable::row_bytes() const {
+  std::uint64_t bytes = 0;
+  for (const PlyProperty& p : properties) bytes += ply_type_bytes(p.type);
+  return bytes;
+}
+
+PlyTable read_ply(std::istream& in, const std::string& name) {
+  ByteReader reader(in, name);
+  Header header = read_header(reader);
+  const auto vertex = std::find_if(header.elements.begin(), header.elements.end(),
+                                   [](const Element& element) { return element.name == "vertex"; });
+  if (vertex == header.elements.end()) reader.fail("the header has no vertex element");
+  if (vertex->has_list) reader.fail("the vertices have a list property");
+  if (vertex->properties.empty()) reader.fail("the vertices have no properties");
+  for (auto element = header.elements.begin(); element != vertex; ++element) {
+    skip_element(reader, *element, header.encoding);
+  }
+  // In text a value takes a digit and a separator, but the last needs no separator.
+  const bool ascii = header.encoding == Encoding::kAscii;
+  const std::uint64_t min_bytes = ascii ? 2 * vertex->properties.size() - 1 : vertex->row_bytes();
+  reader.check_count(vertex->count, min_bytes, "vertices");
+  PlyTable table{std::move(header.comments), vertex->properties, vertex->count, {}};
+  table.rows.resize(vertex->count * vertex->row_bytes());
+  if (ascii) {
+    std::uint8_t* out = table.rows.data();
+    for (std::uint64_t i = 0; i < table.count; ++i) {
+      for (const PlyProperty& property : table.properties) {
+        parse_value(reader, property.type, out);
+        out += ply_type_bytes(property.type);
+      }
+    }
+    return table;
+  }
+  reader.read_bytes(table.rows.data(), table.rows.size(), "the vertices");
+  if (header.encoding == Encoding::kBig) swap_bytes(*vertex, table.rows);
+  if (vertex + 1 == header.elements.end()) reader.expect_end();
+  return table;
+}
+
+void write_ply(std::ostream& out, const PlyTable& table) {
+  check_writable(table);
+  out << "ply\nformat binary_little_endian 1.0\n";
+  for (const std::string& line : table.comments) out << line << '\n';
+  out << "element vertex " << table.count << '\n';
+  for (const PlyProperty& p : table.properties) {
+    out << "property " << ply_type_name(p.type) << ' ' << p.name << '\n';
+  }
+  out << "end_header\n";
+  out.write(reinterpret_cast<const char*>(table.rows.data()),
+            static_cast<std::streamsize>(table.rows.size()));
+}
+
+}  // namespace blitzgs::io

@@ -1,0 +1,41 @@
+// SPDX-License-Identifier: Apache-2.0
+// PLY: the vertex table of a file, as rows of scalar properties in native byte order.
+//
+// Reads ASCII and binary of either byte order; writes binary little endian. Elements after the vertices are
+// not read; list properties of the vertices are refused. Rows are packed in header order without padding, so
+// a binary little-endian file that has vertices alone is written back byte for byte.
+#pragma once
+#include <cstdint>
+#include <iosfwd>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "io/byte_reader.h"
+
+namespace blitzgs::io {
+
+enum class PlyType : std::uint8_t { kInt8, kUint8, kInt16, kUint16, kInt32, kUint32, kFloat32, kFloat64 };
+int ply_type_bytes(PlyType type);
+std::string_view ply_type_name(PlyType type);  // as in a header: "char", ..., "float", "double"
+
+struct PlyProperty {
+  std::string name;
+  PlyType type;
+};
+
+struct PlyTable {
+  std::vector<std::string> comments;  // whole header lines: "comment ..." and "obj_info ..."
+  std::vector<PlyProperty> properties;
+  std::uint64_t count = 0;
+  std::vector<std::uint8_t> rows;  // count x row_bytes
+
+  std::uint64_t row_bytes() const;
+};
+
+// Throws FormatError with the file, byte offset or header line, and reason.
+PlyTable read_ply(std::istream& in, const std::string& name);
+// Throws std::invalid_argument when the rows do not match the properties, or a name cannot stand in a header.
+void write_ply(std::ostream& out, const PlyTable& table);
+
+}  // namespace blitzgs::io

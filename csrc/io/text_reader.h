@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+// Lines and numbers of untrusted text, independent of the locale.
+#pragma once
+#include <charconv>
+#include <cstdint>
+#include <istream>
+#include <string>
+#include <string_view>
+
+#include "io/byte_reader.h"
+
+namespace blitzgs::io {
+
+class TextReader {
+ public:
+  TextReader(std::istream& in, std::string name) : in_(in), name_(std::move(name)) {
+    if (!in_) throw FormatError(name_ + ": cannot be read");
+  }
+
+  // The next line, without its line break; false at the end of the file.
+  bool next_line();
+  // The same, passing over blank lines and comments (#).
+  bool next_record();
+
+  // The next token of the line; throws naming `what` when the line has no more.
+  std::string_view token(const char* what);
+  bool has_token();
+  // What is left of the line, without surrounding blanks.
+  std::string_view rest();
+
+  template <class T>
+  T number(const char* what) {
+    std::string_view text = token(what);
+    const std::string_view whole = text;
+    if (!text.empty() && text.front() == '+') text.remove_prefix(1);
+    T value{};
+    const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
+    if (error != std::errc() || end != text.data() + text.size()) {
+      fail("'" + std::string(whole.substr(0, 40)) + "' is not a valid " + what);
+    }
+    return value;
+  }
+
+  // Throws FormatError at the current line.
+  [[noreturn]] void fail(const std::string& reason) const;
+
+ private:
+  void skip_blanks();
+
+  std::istream& in_;
+  std::string name_;
+  std::string line_;
+  std::string_view left_;
+  std::uint64_t line_number_ = 0;
+};
+
+}  // namespace blitzgs::io
