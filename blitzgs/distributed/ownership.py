@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which rank composites which tiles: contiguous ranges of equal measured cost (paper §3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+
+# What a tile costs besides the list entries it goes through (its pixels are written and compared with the
+# image), in units of one entry.
+TILE_COST = 8
+# Windows of the loss reach this far: 5 px from an owned pixel, and 5 more for its gradient.
+LOSS_REACH = 10
+
+
+@dataclass(frozen=True)
+class TileRanges:
+    """The tiles of B views of one size, one contiguous range per rank.
+
+    Tile (b, ty, tx) has index (b * tiles_y + ty) * tiles_x + tx; rank m owns [bounds[m], bounds[m + 1]).
+
+    Attributes:
+        bounds: M + 1 ascending tile indices, 0 first and B * tiles_y * tiles_x last.
+        n_views: B.
+        width: image width in pixels.
+        height: image height in pixels.
+        tile_size: tile edge in pixels.
+    """
+
+    bounds: tuple[int, ...]
+    n_views: int
+    width: int
+    height: int
+    tile_size: int = 16
+
+    @property
+    def tiles_x(self) -> int:
+        """Tiles in a row."""
+        return -(-self.width // self.tile_size)
+
+    @property
+    def tiles_per_view(self) -> int:
+        """Tiles of one view, T."""
+        return self.tiles_x * -(-self.height // self.tile_size)
+
+    def of(self, rank: int) -> tuple[int, int]:
+        """Return a rank's [first, one past last) tile."""
+        return self.bounds[rank], self.bounds[rank + 1]
+
+    def halo(self, rank: int) -> list[tuple[int, int]]:
+        """Return the ranges of other ranks' tiles within `LOSS_REACH` pixels of a rank's tiles.
+
+        A little more than those: whole stretches of tiles in the flattened order, never beyond the view.
+        """
+        begin, end = self.of(rank)
+        if begin == end:
+            return []
+        ring = -(-LOSS_REACH // self.tile_size)
+        reach = ring * (self.tiles_x + 1)
+        view_begin = begin // self.tiles_per_view * self.tiles_per_view
+        view_end = -(-end // self.tiles_per_view) * self.tiles_per_view
+        before, after = max(view_begin, begin - reach), min(view_end, end + reach)
+        return [(low, high) for low, high in ((before, begin), (end, after)) if low < high]
+
+    def pixel_rows(self, rank: int, view: int, margin: int = LOSS_REACH) -> tuple[int, int]:
+        """Return the rows [y0, y1) of a view's image that a rank's tiles and a margin around them cover.
+
+        (0, 0) when the rank owns no tile of the view.
+        """
+        first = view * self.tiles_per_view
+        begin = max(self.bounds[rank] - first, 0)
+        end = min(self.bounds[rank + 1] - first, self.tiles_per_view)
+        if begin >= end:
+            return 0, 0
+        y0 = begin // self.tiles_x * self.tile_size - margin
+        y1 = ((end - 1) // self.tiles_x + 1) * self.tile_size + margin
+        return max(y0, 0), min(y1, self.height)
+
+
+class TileOwners:
+    """Divides the tiles of each batch by what they cost at the last visit of each view.
+
+    Every rank holds the same costs and so draws the same borders without a word.
+    """
+
+    def __init__(self, ranks: Ranks) -> None:
+        self.ranks = ranks
+        self._costs: dict[Hashable, Tensor] = {}
+
+    def divide(self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16) -> TileRanges:
+        """Divide the tiles of a batch.
+
+        Args:
+            keys: what tells the B views apart.
+            width: image width in pixels.
+            height: image height in pixels.
+            tile_size: tile edge in pixels.
+
+        Returns:
+            Ranges whose costs differ by at most one tile from an equal share.
+        """
+        unit = TileRanges((0,), len(keys), width, height, tile_size)
+        cost = np.concatenate([self._cost(key, unit.tiles_per_view) for key in keys])
+        return TileRanges(divide(cost, self.ranks.world_size), len(keys), width, height, tile_size)
+
+    def record(self, keys: Sequence[Hashable], tile_work: Tensor) -> None:
+        """Remember what the tiles of a batch cost. Collective; does not wait for the device.
+
+        Args:
+            keys: the B views.
+            tile_work: int32 [B * T], list entries each owned tile went through; 0 for the others' tiles.
+        """
+        if self.ranks.world_size == 1:
+            return
+        work = self.ranks.all_reduce(tile_work.clone())
+        if work.is_cuda:
+            # Read at the next visit of these views, many steps from now.
+            work = torch.empty(work.shape, dtype=work.dtype, pin_memory=True).copy_(work, non_blocking=True)
+        for key, part in zip(keys, work.chunk(len(keys)), strict=True):
+            self._costs[key] = part
+
+    def _cost(self, key: Hashable, tiles: int) -> NDArray[np.float64]:
+        """Cost of each tile of a view: measured at its last visit, else the mean of the views visited."""
+        known = self._costs.get(key)
+        if known is not None and len(known) == tiles:
+            return known.numpy().astype(np.float64) + TILE_COST
+        similar = [cost for cost in self._costs.values() if len(cost) == tiles]
+        # What views share: the far (upper) tiles of oblique ones cost more than the near ones.
+        recent = [cost.numpy().astype(np.float64) for cost in similar[-16:]]
+        return (np.mean(recent, axis=0) if recent else np.zeros(tiles)) + TILE_COST
+
+
+def divide(cost: NDArray[np.float64], parts: int) -> tuple[int, ...]:
+    """Cut a sequence of costs into contiguous parts of nearly equal sums.
+
+    Args:
+        cost: [n], >= 0.
+        parts: how many, M.
+
+    Returns:
+        M + 1 ascending bounds, 0 and n included; each is the one nearest to its share of the total.
+    """
+    ends = np.concatenate(([0.0], np.cumsum(cost)))
+    targets = ends[-1] * np.arange(1, parts) / parts
+    after = np.searchsorted(ends, targets)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(targets - ends[before] < ends[after] - targets, before, after)
+    return (0, *(int(cut) for cut in nearest), len(cost))
+
+
+def cost_balance(cost: NDArray[np.float64], bounds: Sequence[int]) -> float:
+    """Largest part's cost over the mean part's: 1 is perfect."""
+    ends = np.concatenate(([0.0], np.cumsum(cost)))
+    parts = np.diff(ends[list(bounds)])
+    return float(parts.max() / parts.mean()) if ends[-1] > 0 else 1.0
