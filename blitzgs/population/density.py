@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Density control: clone, split and prune Gaussians by the statistics gathered since the last event."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.ops.counter_random import hash_keys, normal
+
+SPLIT_SHRINK = 1.6
+CHILDREN_OF_A_SPLIT = 2
+_ID_MASK = (1 << 63) - 1
+
+
+@dataclass(frozen=True)
+class DensityRules:
+    """What one density event does, with lengths already in the scene's unit.
+
+    Attributes:
+        grad_threshold: mean 2D-mean gradient norm (half-image units) from which a Gaussian is densified.
+        clone_scale: Gaussians with a largest axis up to this are cloned, larger ones split.
+        min_opacity: Gaussians below are pruned.
+        max_screen_radius: pixels; Gaussians larger on screen since the last event are pruned. None: not.
+        max_scale: Gaussians with a larger axis are pruned. None: not.
+        max_gaussians: the event's growth stops here. None: no cap.
+    """
+
+    grad_threshold: float
+    clone_scale: float
+    min_opacity: float
+    max_screen_radius: float | None = None
+    max_scale: float | None = None
+    max_gaussians: int | None = None
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What an event did: candidates that grew, and rows that went."""
+
+    cloned: int
+    split: int
+    pruned: int
+    held_back: int
+
+
+def densify(
+    table: GaussianTable,
+    rules: DensityRules,
+    *,
+    time: int,
+    step: int,
+    seed: int,
+    level_count: int,
+) -> DensityReport:
+    """Run one density event on a table whose rows have all been caught up, and reset its statistics.
+
+    A candidate's mean gradient `grad_sum / grad_count` reaches the threshold. A small one gets a copy; a
+    large one gives way to two children drawn from it, 1.6 times smaller. Children take their parent's level
+    (copy) or the next one (split), fresh moments, and an id that follows from the parent's id, `time` and the
+    child's slot alone, as do
+    their random positions: the outcome does not depend on the order of the rows. Pruning applies to old and
+        new rows;
+    a new row has no screen radius yet.
+
+    Args:
+        table: changed in place; new rows come last.
+        rules: thresholds.
+        time: of the event, in images.
+        step: the optimiser step just taken; new rows stand there.
+        seed: of the run.
+        level_count: number of octree levels K; children stay below.
+
+    Returns:
+        The counts; `held_back` candidates did not grow because of `max_gaussians`.
+    """
+    gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
+    candidates = gradient >= rules.grad_threshold
+    wanted = int(candidates.sum())
+    if rules.max_gaussians is not None and wanted > (room := max(0, rules.max_gaussians - len(table))):
+        candidates = _strongest(gradient, table["id"], candidates, room)
+    small = table["scales"].amax(dim=1) <= math.log(rules.clone_scale)
+    clones = (candidates & small).nonzero().squeeze(1)
+    splits = (candidates & ~small).nonzero().squeeze(1)
+    new = _join(
+        [_copies(table, clones, time, slot=0, level_count=None)]
+        + [
+            _shrunk(_copies(table, splits, time, slot, level_count), seed, time)
+            for slot in range(1, CHILDREN_OF_A_SPLIT + 1)
+        ]
+    )
+    new["last_step"] = torch.full_like(new["birth"], step)
+    new_fine = ~_superfluous(new, None, rules)
+    gone = _superfluous(table.columns, table["max_radii"], rules)
+    old_fine = ~gone
+    old_fine[splits] = False
+    pruned = len(table) - int(old_fine.sum()) - len(splits) + len(new_fine) - int(new_fine.sum())
+    table.keep(old_fine)
+    table.append({name: column[new_fine] for name, column in new.items()})
+    for name in ("grad_sum", "grad_count", "max_radii"):
+        table[name].zero_()
+    grown = len(clones) + len(splits)
+    return DensityReport(cloned=len(clones), split=len(splits), pruned=pruned, held_back=wanted - grown)
+
+
+def child_ids(parents: Tensor, time: int, slot: int) -> Tensor:
+    """Return the ids, int64 [M] in [0, 2^63), of children born of `parents` (int64 [M]) in one event."""
+    return hash_keys(parents, time, slot) & _ID_MASK
+
+
+def _strongest(gradient: Tensor, ids: Tensor, candidates: Tensor, room: int) -> Tensor:
+    """Mask of the `room` candidates with the largest gradient; ties go to the smaller id."""
+    rows = candidates.nonzero().squeeze(1)
+    rows = rows[ids[rows].argsort()]
+    rows = rows[gradient[rows].argsort(descending=True, stable=True)[:room]]
+    chosen = torch.zeros_like(candidates)
+    chosen[rows] = True
+    return chosen
+
+
+def _copies(
+    table: GaussianTable, rows: Tensor, time: int, slot: int, level_count: int | None
+) -> dict[str, Tensor]:
+    """New rows like `rows`; one level finer when `level_count` is given."""
+    parents, level = table["id"][rows], table["level"][rows]
+    if level_count is not None:
+        level = (level.int() + 1).clamp(max=level_count - 1).to(level.dtype)
+    return {name: table[name][rows] for name in PARAMETERS} | {
+        "id": child_ids(parents, time, slot),
+        "parent": parents,
+        "birth": torch.full_like(table["birth"][rows], time),
+        "level": level,
+    }
+
+
+def _shrunk(children: dict[str, Tensor], seed: int, time: int) -> dict[str, Tensor]:
+    """Draw the children's means from their parent's Gaussian and shrink them.
+
+    In float64, so that the rounded result does not depend on how the maths library vectorises.
+    """
+    ids = children["id"]
+    draws = torch.stack([normal(ids, seed, time, axis) for axis in range(3)], dim=1)
+    axes = rotations(children["quats"].double())
+    offset = (axes * (draws * children["scales"].double().exp())[:, None]).sum(2)
+    children["means"] = (children["means"].double() + offset).float()
+    children["scales"] = (children["scales"].double() - math.log(SPLIT_SHRINK)).float()
+    return children
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """Return the rotation matrices [M, 3, 3] of quaternions (w, x, y, z) [M, 4], normalised first."""
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-30)).unbind(1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+
+
+def _superfluous(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRules) -> Tensor:
+    """Mask of the rows to prune: too transparent, or too large on screen or in the world."""
+    logit = math.log(rules.min_opacity / (1.0 - rules.min_opacity)) if rules.min_opacity > 0 else -math.inf
+    mask = rows["opacities"] < logit
+    if rules.max_scale is not None:
+        mask = mask | (rows["scales"].amax(dim=1) > math.log(rules.max_scale))
+    if radii is not None and rules.max_screen_radius is not None:
+        mask = mask | (radii > rules.max_screen_radius)
+    return mask
+
+
+def _join(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

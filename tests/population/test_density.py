@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Density control against a row-by-row reimplementation."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.ops.counter_random import hash_keys, normal
+from blitzgs.population.density import DensityRules, densify, rotations
+
+TIME, STEP, SEED, LEVELS = 1200, 300, 9, 4
+
+
+def random_table(count: int, seed: int = 0) -> GaussianTable:
+    g = torch.Generator().manual_seed(seed)
+    table = GaussianTable.create(
+        {
+            "means": torch.randn(count, 3, generator=g),
+            "quats": torch.randn(count, 4, generator=g),
+            "scales": torch.rand(count, 3, generator=g) * 6 - 7,
+            "opacities": torch.randn(count, generator=g) * 3 - 2,
+            "sh": torch.randn(count, 4, 3, generator=g),
+            "last_step": torch.full((count,), STEP, dtype=torch.int32),
+            "id": torch.randperm(10 * count, generator=g)[:count],
+            "parent": torch.full((count,), -1),
+            "birth": torch.zeros(count, dtype=torch.int32),
+            "level": torch.randint(0, LEVELS, (count,), generator=g, dtype=torch.uint8),
+        }
+    )
+    for name in table:
+        if name.startswith("exp_avg"):
+            table[name].copy_(torch.rand(table[name].shape, generator=g))
+    table["grad_count"].copy_(torch.randint(0, 5, (count,), generator=g))
+    table["grad_sum"].copy_(torch.rand(count, generator=g) * 1e-3 * table["grad_count"])
+    table["max_radii"].copy_(torch.rand(count, generator=g) * 30)
+    return table
+
+
+def brute_force(table: GaussianTable, rules: DensityRules) -> dict[int, dict[str, np.ndarray]]:
+    """Return id -> row after the event, one Gaussian at a time."""
+    rows = [{name: table[name][i].numpy().copy() for name in table} for i in range(len(table))]
+
+    def gradient(row):
+        return np.float32(row["grad_sum"]) / np.float32(max(row["grad_count"], 1))
+
+    def pruned(row, radius):
+        opacity = 1 / (1 + math.exp(-row["opacities"]))
+        size = math.exp(row["scales"].max())
+        return (
+            opacity < rules.min_opacity
+            or (rules.max_scale is not None and size > rules.max_scale)
+            or (rules.max_screen_radius is not None and radius > rules.max_screen_radius)
+        )
+
+    def child(row, slot):
+        parent = int(row["id"])
+        key = int(hash_keys(torch.tensor([parent]), TIME, slot)) & (2**63 - 1)
+        new = {name: value for name, value in row.items() if name in PARAMETERS} | {
+            "id": key,
+            "parent": parent,
+            "birth": TIME,
+            "level": int(row["level"]) if slot == 0 else min(int(row["level"]) + 1, LEVELS - 1),
+            "last_step": STEP,
+        }
+        if slot > 0:
+            draw = np.array([float(normal(torch.tensor([key]), SEED, TIME, axis)) for axis in range(3)])
+            axes = rotations(torch.tensor(row["quats"])[None].double())[0].numpy()
+            new["means"] = row["means"] + axes @ (np.exp(row["scales"].astype(np.float64)) * draw)
+            new["scales"] = np.log(np.exp(row["scales"]) / 1.6)
+        return new
+
+    candidates = [row for row in rows if gradient(row) >= np.float32(rules.grad_threshold)]
+    if rules.max_gaussians is not None:
+        room = max(0, rules.max_gaussians - len(rows))
+        candidates = sorted(candidates, key=lambda row: (-gradient(row), row["id"]))[:room]
+    result, replaced = [], set()
+    for row in candidates:
+        if math.exp(row["scales"].max()) <= rules.clone_scale:
+            result.append(child(row, 0))
+        else:
+            replaced.add(int(row["id"]))
+            result += [child(row, 1), child(row, 2)]
+    result = [row for row in result if not pruned(row, 0)]
+    result += [row for row in rows if int(row["id"]) not in replaced and not pruned(row, row["max_radii"])]
+    return {int(row["id"]): row for row in result}
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        DensityRules(grad_threshold=5e-4, clone_scale=0.05, min_opacity=0.05),
+        DensityRules(5e-4, 0.05, 0.05, max_screen_radius=20.0, max_scale=0.25),
+        DensityRules(5e-4, 0.05, 0.05, max_gaussians=230),
+        DensityRules(5e-4, 0.05, 0.05, max_gaussians=100),
+    ],
+    ids=["plain", "size", "cap", "full"],
+)
+def test_matches_row_by_row(rules):
+    table = random_table(200)
+    before = len(table)
+    expected = brute_force(table, rules)
+    report = densify(table, rules, time=TIME, step=STEP, seed=SEED, level_count=LEVELS)
+    assert sorted(table["id"].tolist()) == sorted(expected)
+    for i, key in enumerate(table["id"].tolist()):
+        for name in (*PARAMETERS, "parent", "birth", "level", "last_step"):
+            np.testing.assert_allclose(table[name][i].numpy(), expected[key][name], rtol=2e-6, atol=1e-6)
+        fresh = key not in range(10 * before)
+        for name in table:
+            if name.startswith("exp_avg"):
+                assert bool(table[name][i].any()) != fresh
+    for name in ("grad_sum", "grad_count", "max_radii"):
+        assert not table[name].any()
+    assert len(table) == before + report.cloned + report.split - report.pruned
+    assert report.split > 0 or rules.max_gaussians == 100
+    if rules.max_gaussians is not None:
+        assert len(table) <= max(rules.max_gaussians, before)
+        assert report.held_back > 0
+
+
+def test_outcome_does_not_depend_on_the_order_of_the_rows():
+    rules = DensityRules(grad_threshold=3e-4, clone_scale=0.05, min_opacity=0.05, max_gaussians=270)
+    straight, shuffled = random_table(200), random_table(200)
+    shuffled.permute(torch.randperm(200, generator=torch.Generator().manual_seed(5)))
+    for table in (straight, shuffled):
+        densify(table, rules, time=TIME, step=STEP, seed=SEED, level_count=LEVELS)
+        table.permute(table["id"].argsort())
+    for name in straight:
+        assert torch.equal(straight[name], shuffled[name]), name
+
+
+def test_split_children_scatter_like_their_parent():
+    table = random_table(1)
+    keep = {name: table[name].repeat(20_000, *[1] * (table[name].dim() - 1)) for name in table}
+    table = GaussianTable(keep | {"id": torch.arange(20_000)})
+    table["opacities"].fill_(0.0)
+    table["grad_sum"].fill_(1.0)
+    table["grad_count"].fill_(1)
+    mean, scales = table["means"][0].double(), table["scales"][0].double().exp()
+    axes = rotations(table["quats"][:1].double())[0]
+    densify(table, DensityRules(0.5, 1e-9, 0.0), time=TIME, step=STEP, seed=SEED, level_count=LEVELS)
+    assert len(table) == 40_000
+    local = (table["means"].double() - mean) @ axes / scales
+    assert local.mean(0).abs().max() < 0.02
+    assert (local.T @ local / 40_000 - torch.eye(3)).abs().max() < 0.03
+
+
+def test_empty_table():
+    table = random_table(0)
+    report = densify(table, DensityRules(1e-4, 0.1, 0.01), time=0, step=1, seed=0, level_count=1)
+    assert len(table) == 0 and report.cloned == report.split == report.pruned == report.held_back == 0
