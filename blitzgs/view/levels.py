@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Octree levels: how fine a Gaussian may be to be worth seeing from a distance (paper Eq. 1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor
+
+# Voxel keys hold 21 bits per axis; with the levels of `measure_levels` the finest grid of this many levels
+# uses them all.
+MAX_LEVELS = 22
+
+
+@dataclass(frozen=True)
+class Levels:
+    """The levels of a scene: level l is for distances around `reference_distance` / `fork`^l.
+
+    Attributes:
+        count: number of levels K.
+        fork: ratio f of neighbouring levels.
+        reference_distance: d_0, in the scene's unit; the distance that level 0 is made for.
+        voxel_size: edge of a level-0 voxel, in the scene's unit.
+    """
+
+    count: int
+    fork: float
+    reference_distance: float
+    voxel_size: float
+
+    def voxel_size_of(self, level: int) -> float:
+        """Return the edge of a voxel of `level`."""
+        return self.voxel_size / self.fork**level
+
+    def farthest(self, level: int) -> float:
+        """Return the largest distance from which `level` is resolvable.
+
+        Eq. 1 rounds log_f(d_0 / d) to the nearest integer, which reaches l up to d = d_0 f^(1/2 - l). Level 0
+        is resolvable from everywhere.
+        """
+        return math.inf if level == 0 else self.reference_distance * self.fork ** (0.5 - level)
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the fields as JSON-able values."""
+        return asdict(self)
+
+
+def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution: float) -> Levels:
+    """Choose the levels of a scene from its SfM points and training cameras.
+
+    d_max and d_min are the 99.9 % and 0.1 % quantiles over cameras of the same quantiles of each camera's
+    point distances; d_0 = d_max and K = max(1, round(log_f(d_max / d_min)) + 1). The box is 1.1 times the
+    largest extent between the 1 % and 99 % coordinate quantiles; level 0 has voxels of box / f^b with
+    b = round(log_2(1 / base_resolution)) - floor(K / 2) + 1.
+
+    Args:
+        points: float64 [M, 3], M >= 1.
+        centres: camera centres, float64 [V, 3], V >= 1.
+        fork: f > 1.
+        base_resolution: finest sensible voxel relative to the box.
+
+    Raises:
+        ValueError: the cloud or the set of cameras is empty, or all points coincide.
+    """
+    if len(points) == 0 or len(centres) == 0:
+        raise ValueError(
+            f"octree levels need points and cameras, got {len(points)} points and {len(centres)} cameras"
+        )
+    far, near = [], []
+    for centre in centres:
+        distances = (points - centre).norm(dim=1).sort().values
+        far.append(_quantile(distances, 0.999))
+        near.append(_quantile(distances, 0.001))
+    d_max = _quantile(torch.stack(far).sort().values, 0.999).item()
+    d_min = _quantile(torch.stack(near).sort().values, 0.001).item()
+    ordered = points.sort(dim=0).values
+    box = 1.1 * (_quantile(ordered, 0.99) - _quantile(ordered, 0.01)).max().item()
+    if not (box > 0 and d_min > 0):
+        raise ValueError(
+            f"octree levels need a spread-out cloud seen from outside its points: the box is {box:g} and the "
+            f"smallest camera distance {d_min:g}"
+        )
+    count = min(MAX_LEVELS, max(1, round(math.log(d_max / d_min, fork)) + 1))
+    base = round(math.log2(1.0 / base_resolution)) - count // 2 + 1
+    return Levels(count=count, fork=fork, reference_distance=d_max, voxel_size=box / fork**base)
+
+
+def _quantile(ordered: Tensor, q: float) -> Tensor:
+    """Linearly interpolated quantile along the first axis of sorted values."""
+    position = q * (len(ordered) - 1)
+    below = math.floor(position)
+    above = min(below + 1, len(ordered) - 1)
+    return ordered[below] + (ordered[above] - ordered[below]) * (position - below)
