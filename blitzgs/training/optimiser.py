@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The optimiser of a table: dense Adam that touches visible rows only, scaled to the batch."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from blitzgs.model import GaussianTable
+from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.training.config import OptimiserConfig
+from blitzgs.training.schedule import Schedule
+
+
+class LazyAdam:
+    """Adam over the rows of a table, batch-scaled as Grendel does: lr sqrt(B), beta^B, eps / sqrt(B).
+
+    Rows that a step does not name fall behind (column `last_step`) and must be caught up before they are
+    read.
+
+    Attributes:
+        lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
+    """
+
+    def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:
+        """Tabulate the run's learning rates on `device`; `extent` is in the unit of the means."""
+        batch = schedule.batch_size
+        self.lr_table: Tensor = schedule.learning_rates(config, extent).to(device)  # type: ignore[call-overload]
+        self._betas = (config.beta1**batch, config.beta2**batch)
+        self._eps = config.eps / math.sqrt(batch)
+        self._sparse = config.sparse
+
+    def catch_up(self, table: GaussianTable, ids: Tensor | None, step: int) -> None:
+        """Bring rows `ids` (int32 [A]; None: all) to the state after `step`."""
+        if self._sparse:
+            return
+        lazy_adam_catch_up_(
+            table.parameters,
+            table.exp_avgs,
+            table.exp_avg_sqs,
+            ids,
+            table["last_step"],
+            self.lr_table,
+            step,
+            *self._betas,
+            self._eps,
+        )
+
+    def step(self, table: GaussianTable, gradients: tuple[Tensor, ...], ids: Tensor, step: int) -> None:
+        """Take step number `step` (from 1) for the rows `ids` (int32 [U]) with their compact gradients."""
+        lazy_adam_step_(
+            table.parameters,
+            table.exp_avgs,
+            table.exp_avg_sqs,
+            gradients,
+            ids,
+            table["last_step"],
+            self.lr_table,
+            step,
+            *self._betas,
+            self._eps,
+            self._sparse,
+        )
