@@ -15,22 +15,22 @@ class DataConfig:
     """Where images come from and which are held out.
 
     Attributes:
+        path: folder of the capture.
         images: image folder inside the capture.
         downscale: integer factor by which images are reduced (1: as they are).
         masks: mask folder inside the capture, or null.
-        split: "every" (each `test_every`-th view is held out), "val" (Mega-NeRF's `val/` layout) or the path
-            of a text file with one held-out image name a line.
-        test_every: see `split`; 0 holds nothing out.
+        split: which views are held out: a number n (every n-th), "val" (Mega-NeRF's `val/` layout), a text
+            file with one image name a line, or "auto": `val/` where there is one, else every 8th.
         cache_bytes: budget for the compressed images held in memory.
         threads: decoder threads.
         prefetch: batches decoded and uploaded ahead.
     """
 
+    path: str = ""
     images: str = "images"
     downscale: int = 1
     masks: str | None = None
-    split: str = "every"
-    test_every: int = 8
+    split: str = "auto"
     cache_bytes: int = 8_000_000_000
     threads: int = 4
     prefetch: int = 3

@@ -147,6 +147,8 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
             pass
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
+    if hint is str and isinstance(value, int) and not isinstance(value, bool):
+        return str(value)
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
@@ -170,7 +172,6 @@ def _check(config: Config) -> None:
             "between 0 and 1",
         ),
         (config.data.downscale >= 1, "data.downscale", config.data.downscale, "1 or more"),
-        (config.data.test_every >= 0, "data.test_every", config.data.test_every, "0 or more"),
         (config.data.threads >= 1, "data.threads", config.data.threads, "1 or more"),
         (config.data.prefetch >= 0, "data.prefetch", config.data.prefetch, "0 or more"),
         (config.lod.fork > 1, "lod.fork", config.lod.fork, "above 1"),
