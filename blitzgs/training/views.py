@@ -66,7 +66,7 @@ class Space:
         """
         if not (math.isfinite(extent) and extent > 0):
             raise ValueError(
-                f"the extent of the scene (1.1 x the largest distance of a training camera from their centre) is "
+                f"the extent of the scene (1.1 x the largest distance of a camera from their centre) is "
                 f"{extent}: training needs cameras at different positions"
             )
         unit = 2.0 ** math.floor(math.log2(extent))

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How good the images are: PSNR, SSIM and (given weights) LPIPS of held-out views, and pictures to look at."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs import pipeline
+from blitzgs.model import GaussianTable
+from blitzgs.pipeline import RenderOptions
+from blitzgs.training.batches import Images
+from blitzgs.training.views import CameraLike, ViewSet
+
+Lpips = Callable[[Tensor, Tensor], Tensor]
+
+
+def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
+    """Return PSNR in dB and SSIM of one view.
+
+    Args:
+        render: float [H, W, 3]; clamped to [0, 1] and not quantised.
+        target: uint8 [H, W, 3].
+        mask: uint8 [H, W], pixels with 0 are left out of both; or None.
+    """
+    render = render.clamp(0.0, 1.0)
+    error = (render - target.float() / 255.0) ** 2
+    counted = torch.ones_like(target[..., 0]) if mask is None else mask
+    samples = 3 * int((counted != 0).sum())
+    mse = error[counted != 0].double().sum().item() / max(1, samples)
+    masks = None if mask is None else mask[None]
+    _, ssim = torch.ops.blitzgs.photometric_fwd(render[None].contiguous(), target[None], masks, 16, 0, -1)
+    psnr = -10.0 * float(torch.tensor(max(mse, 1e-12), dtype=torch.float64).log10())
+    return {"psnr": psnr, "ssim": ssim.item() / max(1, samples)}
+
+
+def load_lpips(path: str | None) -> Lpips | None:
+    """Load a perceptual metric: a TorchScript module (render, target) -> distance, [1, 3, H, W] in [-1, 1].
+
+    Raises:
+        ValueError: the file is missing or not a TorchScript module.
+    """
+    if path is None:
+        return None
+    try:
+        metric: Lpips = torch.jit.load(path, map_location="cpu")
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"log.lpips_weights: {path} is not a readable TorchScript module of LPIPS: {error}"
+        ) from error
+    return metric
+
+
+def render_view(table: GaussianTable, views: ViewSet, index: int, options: RenderOptions) -> Tensor:
+    """Render camera `index` with all Gaussians, float32 [H, W, 3]; the table must be caught up."""
+    render: Tensor = pipeline.forward(table, views.pick([index]), options).renders[0]
+    return render
+
+
+def evaluate(
+    table: GaussianTable,
+    views: ViewSet,
+    cameras: Sequence[CameraLike],
+    images: Images,
+    indices: Sequence[int],
+    options: RenderOptions,
+    folder: Path | None,
+    *,
+    pictures: int = 0,
+    lpips: Lpips | None = None,
+) -> dict[str, Any]:
+    """Render views and compare them with their photographs.
+
+    Args:
+        table: Gaussians, caught up.
+        views: all cameras on the device.
+        cameras: the same, for their names.
+        images: photographs.
+        indices: cameras to evaluate.
+        options: how to render.
+        folder: gets `metrics.json` and the pictures; None: nothing is written.
+        pictures: evenly spaced views of which to write photograph | render | error side by side.
+        lpips: from `load_lpips`.
+
+    Returns:
+        {"psnr": mean, "ssim": mean, ("lpips": mean,) "views": {name: {...}}}; the means are absent without
+        views.
+    """
+    chosen = (
+        {indices[k * len(indices) // pictures] for k in range(pictures)} if indices and pictures else set()
+    )
+    per_view: dict[str, dict[str, float]] = {}
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    for position, index in enumerate(indices):
+        images.prefetch(list(indices[position + 1 : position + 5]))
+        render = render_view(table, views, index, options)
+        target = images.get(index).to(table.device)
+        mask = images.mask(index)
+        metrics = image_metrics(render, target, None if mask is None else mask.to(table.device))
+        if lpips is not None:
+            pair = [
+                image.permute(2, 0, 1)[None].cpu() * 2 - 1
+                for image in (render.clamp(0, 1), target.float() / 255)
+            ]
+            metrics["lpips"] = float(lpips(pair[0], pair[1]))
+        per_view[cameras[index].name] = metrics
+        if folder is not None and index in chosen:
+            write_comparison(folder / (cameras[index].name.replace("/", "_") + ".jpg"), render, target)
+    result: dict[str, Any] = {}
+    for metric in ("psnr", "ssim", "lpips"):
+        values = [view[metric] for view in per_view.values() if metric in view]
+        if values:
+            result[metric] = sum(values) / len(values)
+    result["views"] = per_view
+    if folder is not None:
+        (folder / "metrics.json").write_text(json.dumps(result, indent=1))
+    return result
+
+
+def to_uint8(render: Tensor) -> Tensor:
+    """Quantise an image in [0, 1] to uint8 on the CPU."""
+    return (render.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu()
+
+
+def write_comparison(path: Path, render: Tensor, target: Tensor) -> None:
+    """Write photograph, render and their absolute difference (times 4) side by side."""
+    error = to_uint8((render.clamp(0, 1) - target.float() / 255.0).abs() * 4.0)
+    write_image(path, torch.cat((target.cpu(), to_uint8(render), error), dim=1))
+
+
+def write_image(path: Path, image: Tensor) -> None:
+    """Write an RGB image, uint8 [H, W, 3].
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), image.numpy()[..., ::-1]):
+        raise OSError(f"cannot write the picture {path}")

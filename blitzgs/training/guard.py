@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stops a run that went wrong, saying where: non-finite losses and parameters; and one asked to stop."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Sequence
+from types import FrameType
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.pipeline import Frame
+
+# Ranks agree on stopping this often, in steps: agreeing costs them a synchronisation.
+STOP_INTERVAL = 16
+
+
+class NonFiniteError(RuntimeError):
+    """NaN or infinity appeared; the message names the step, the view and the op or column it came from."""
+
+
+class LossGuard:
+    """Looks at every step's loss: at once on the CPU, one step late on CUDA, where looking means waiting."""
+
+    def __init__(self) -> None:
+        self._pending: tuple[int, Sequence[str], Tensor, torch.cuda.Event] | None = None
+
+    def check(
+        self, step: int, names: Sequence[str], loss: Tensor, table: GaussianTable, frame: Frame
+    ) -> None:
+        """Check the per-view losses, [B], of the views `names` in step `step` (from 1).
+
+        Raises:
+            NonFiniteError: this loss (or, on CUDA, the previous step's) is not finite.
+        """
+        if loss.device.type != "cuda":
+            _check_loss(step, names, loss, table, frame)
+            return
+        previous = self._pending
+        held = torch.empty(loss.shape, dtype=loss.dtype, pin_memory=True)
+        held.copy_(loss, non_blocking=True)
+        copied = torch.cuda.Event()
+        copied.record()
+        self._pending = (step, names, held, copied)
+        if previous is not None:
+            previous[3].synchronize()
+            _check_loss(*previous[:3], table, None)
+
+
+def _check_loss(
+    step: int, names: Sequence[str], loss: Tensor, table: GaussianTable, frame: Frame | None
+) -> None:
+    bad = (~loss.isfinite()).nonzero().flatten().tolist()
+    if bad:
+        views = ", ".join(f"'{names[index]}'" for index in bad)
+        raise NonFiniteError(f"step {step}: the loss of view {views} is not finite; {_origin(table, frame)}")
+
+
+def _origin(table: GaussianTable, frame: Frame | None) -> str:
+    """Say where the first non-finite value sits, walking from the parameters to the image."""
+    if (culprit := _bad_column(table)) is not None:
+        return culprit
+    if frame is not None:
+        for name in ("means2d", "conics", "depths", "opacities", "colors"):
+            if not bool(getattr(frame.rows, name).isfinite().all()):
+                return f"it first appears in op project, output {name}"
+        if not bool(frame.renders.isfinite().all()):
+            return "it first appears in op rasterize, output renders"
+    return "parameters and images are finite: it comes from op photometric"
+
+
+def _bad_column(table: GaussianTable) -> str | None:
+    for name in PARAMETERS:
+        finite = table[name].isfinite().flatten(1).all(1) if table[name].dim() > 1 else table[name].isfinite()
+        if not bool(finite.all()):
+            ids = table["id"][~finite]
+            shown = ", ".join(str(i) for i in ids[:3].tolist())
+            return f"column '{name}' is not finite in {len(ids)} Gaussians (ids {shown}{', ...' * (len(ids) > 3)})"
+    return None
+
+
+def check_table(table: GaussianTable, step: int) -> None:
+    """Check all parameters.
+
+    Raises:
+        NonFiniteError: names the step, the column and the Gaussians.
+    """
+    if (culprit := _bad_column(table)) is not None:
+        raise NonFiniteError(
+            f"step {step}: {culprit}. Lower the learning rates (optimiser.*) or resume from the last checkpoint"
+        )
+
+
+class StopRequest:
+    """Turns SIGTERM and SIGINT into a request that the loop honours between two steps."""
+
+    def __init__(self) -> None:
+        self._signal: int | None = None
+        self._previous: dict[int, object] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._previous[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self._signal is not None:
+            # Asked a second time: stop at once.
+            raise KeyboardInterrupt
+        self._signal = number
+
+    def agreed(self, step: int, ranks: Ranks) -> str | None:
+        """Return the name of the signal when all ranks stop now, after `step` steps; else None."""
+        number = self._signal or 0
+        if ranks.world_size > 1:
+            if step % STOP_INTERVAL:
+                return None
+            number = int(ranks.all_reduce(torch.tensor([number], device=ranks.device), "max"))
+        return signal.Signals(number).name if number else None
