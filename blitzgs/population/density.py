@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.selection import smallest
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
 
@@ -40,7 +42,7 @@ class DensityRules:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What an event did: candidates that grew, and rows that went."""
+    """What an event did on this rank: candidates that grew, rows that went, candidates held back by the cap."""
 
     cloned: int
     split: int
@@ -56,6 +58,7 @@ def densify(
     step: int,
     seed: int,
     level_count: int,
+    ranks: Ranks,
 ) -> DensityReport:
     """Run one density event on a table whose rows have all been caught up, and reset its statistics.
 
@@ -74,15 +77,13 @@ def densify(
         step: the optimiser step just taken; new rows stand there.
         seed: of the run.
         level_count: number of octree levels K; children stay below.
-
-    Returns:
-        The counts; `held_back` candidates did not grow because of `max_gaussians`.
+        ranks: whose tables together make the population; every rank calls this.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = gradient >= rules.grad_threshold
     wanted = int(candidates.sum())
-    if rules.max_gaussians is not None and wanted > (room := max(0, rules.max_gaussians - len(table))):
-        candidates = _strongest(gradient, table["id"], candidates, room)
+    if rules.max_gaussians is not None:
+        candidates = _within_cap(candidates, gradient, table["id"], rules.max_gaussians, ranks)
     small = table["scales"].amax(dim=1) <= math.log(rules.clone_scale)
     clones = (candidates & small).nonzero().squeeze(1)
     splits = (candidates & ~small).nonzero().squeeze(1)
@@ -112,14 +113,17 @@ def child_ids(parents: Tensor, time: int, slot: int) -> Tensor:
     return hash_keys(parents, time, slot) & _ID_MASK
 
 
-def _strongest(gradient: Tensor, ids: Tensor, candidates: Tensor, room: int) -> Tensor:
-    """Mask of the `room` candidates with the largest gradient; ties go to the smaller id."""
+def _within_cap(candidates: Tensor, gradient: Tensor, ids: Tensor, cap: int, ranks: Ranks) -> Tensor:
+    """Keep the candidates of largest gradient (ties to the smaller id), each of which adds one Gaussian."""
+    sizes = torch.tensor([len(ids), int(candidates.sum())], device=ids.device)
+    population, wanted = ranks.all_reduce(sizes).tolist()
+    room = max(0, cap - population)
+    if wanted <= room:
+        return candidates
     rows = candidates.nonzero().squeeze(1)
-    rows = rows[ids[rows].argsort()]
-    rows = rows[gradient[rows].argsort(descending=True, stable=True)[:room]]
-    chosen = torch.zeros_like(candidates)
-    chosen[rows] = True
-    return chosen
+    kept = torch.zeros_like(candidates)
+    kept[rows] = smallest(-gradient[rows], ids[rows], room, ranks)
+    return kept
 
 
 def _copies(

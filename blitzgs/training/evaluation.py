@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good the images are: PSNR, SSIM and (given weights) LPIPS of held-out views, and pictures to look at."""
+"""How good the images are: PSNR, SSIM and (given weights) LPIPS of held-out views, and pictures."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import cv2
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs import pipeline
 from blitzgs.model import GaussianTable
+from blitzgs.ops.photometric import ssim
 from blitzgs.pipeline import RenderOptions
 from blitzgs.training.batches import Images
 from blitzgs.training.views import CameraLike, ViewSet
@@ -35,10 +35,9 @@ def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[s
     counted = torch.ones_like(target[..., 0]) if mask is None else mask
     samples = 3 * int((counted != 0).sum())
     mse = error[counted != 0].double().sum().item() / max(1, samples)
-    masks = None if mask is None else mask[None]
-    _, ssim = torch.ops.blitzgs.photometric_fwd(render[None].contiguous(), target[None], masks, 16, 0, -1)
+    similarity = ssim(render[None], target[None], None if mask is None else mask[None])
     psnr = -10.0 * float(torch.tensor(max(mse, 1e-12), dtype=torch.float64).log10())
-    return {"psnr": psnr, "ssim": ssim.item() / max(1, samples)}
+    return {"psnr": psnr, "ssim": similarity.item()}
 
 
 def load_lpips(path: str | None) -> Lpips | None:

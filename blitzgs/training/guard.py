@@ -78,8 +78,8 @@ def _bad_column(table: GaussianTable) -> str | None:
         finite = table[name].isfinite().flatten(1).all(1) if table[name].dim() > 1 else table[name].isfinite()
         if not bool(finite.all()):
             ids = table["id"][~finite]
-            shown = ", ".join(str(i) for i in ids[:3].tolist())
-            return f"column '{name}' is not finite in {len(ids)} Gaussians (ids {shown}{', ...' * (len(ids) > 3)})"
+            shown = ", ".join(str(i) for i in ids[:3].tolist()) + ", ..." * (len(ids) > 3)
+            return f"column '{name}' is not finite in {len(ids)} Gaussians (ids {shown})"
     return None
 
 
@@ -91,7 +91,7 @@ def check_table(table: GaussianTable, step: int) -> None:
     """
     if (culprit := _bad_column(table)) is not None:
         raise NonFiniteError(
-            f"step {step}: {culprit}. Lower the learning rates (optimiser.*) or resume from the last checkpoint"
+            f"step {step}: {culprit}. Lower the learning rates (optimiser.*) or resume from a checkpoint"
         )
 
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.model import GaussianTable
+from blitzgs.ops.photometric import photometric_fwd_bwd, pixel_counts
 from blitzgs.pipeline import Frame
 from blitzgs.training.config import LossConfig
 
@@ -41,14 +41,17 @@ def loss_terms(
         config: weights.
         length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
     """
-    views, tile = frame.views, frame.options.tile_size
-    count = len(views)
-    l1_sums, ssim_sums = torch.ops.blitzgs.photometric_fwd(frame.renders, targets, masks, tile, 0, -1)
-    samples = _samples(targets, masks).to(l1_sums.dtype)
+    count = len(frame.views)
+    samples = pixel_counts(frame.renders, masks).clamp(min=1)
+    l1_sums, ssim_sums, v_renders = photometric_fwd_bwd(
+        frame.renders,
+        targets,
+        masks,
+        (1.0 - config.ssim) / (samples * count),
+        -config.ssim / (samples * count),
+        frame.options.tile_size,
+    )
     photometric = ((1.0 - config.ssim) * l1_sums - config.ssim * ssim_sums) / samples + config.ssim
-    v_l1 = (1.0 - config.ssim) / (samples * count)
-    v_ssim = -config.ssim / (samples * count)
-    v_renders = torch.ops.blitzgs.photometric_bwd(frame.renders, targets, masks, v_l1, v_ssim, tile, 0, -1)
     scale_reg = None
     if config.scale > 0:
         scale_reg = config.scale / (length_unit * count * _visible(frame).clamp(min=1).to(l1_sums.dtype))
@@ -61,13 +64,6 @@ def scale_term(frame: Frame, table: GaussianTable, length_unit: float) -> Tensor
     views = torch.arange(len(frame.views), device=smallest.device)
     seen = frame.rows.camera_ids[:, None] == views
     return (smallest[:, None] * seen).sum(dim=0) / _visible(frame).clamp(min=1)
-
-
-def _samples(targets: Tensor, masks: Tensor | None) -> Tensor:
-    """Colour values that count, per view [B]; at least 1, so that an all-masked view adds nothing."""
-    if masks is None:
-        return torch.full((targets.shape[0],), targets[0].numel(), device=targets.device)
-    return (3 * (masks != 0).sum(dim=(1, 2))).clamp(min=1)
 
 
 def _visible(frame: Frame) -> Tensor:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.distributed.group import Ranks
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
 from blitzgs.population.density import DensityRules, densify, rotations
@@ -102,7 +103,7 @@ def test_matches_row_by_row(rules):
     table = random_table(200)
     before = len(table)
     expected = brute_force(table, rules)
-    report = densify(table, rules, time=TIME, step=STEP, seed=SEED, level_count=LEVELS)
+    report = densify(table, rules, time=TIME, step=STEP, seed=SEED, level_count=LEVELS, ranks=Ranks())
     assert sorted(table["id"].tolist()) == sorted(expected)
     for i, key in enumerate(table["id"].tolist()):
         for name in (*PARAMETERS, "parent", "birth", "level", "last_step"):
@@ -125,7 +126,7 @@ def test_outcome_does_not_depend_on_the_order_of_the_rows():
     straight, shuffled = random_table(200), random_table(200)
     shuffled.permute(torch.randperm(200, generator=torch.Generator().manual_seed(5)))
     for table in (straight, shuffled):
-        densify(table, rules, time=TIME, step=STEP, seed=SEED, level_count=LEVELS)
+        densify(table, rules, time=TIME, step=STEP, seed=SEED, level_count=LEVELS, ranks=Ranks())
         table.permute(table["id"].argsort())
     for name in straight:
         assert torch.equal(straight[name], shuffled[name]), name
@@ -140,7 +141,15 @@ def test_split_children_scatter_like_their_parent():
     table["grad_count"].fill_(1)
     mean, scales = table["means"][0].double(), table["scales"][0].double().exp()
     axes = rotations(table["quats"][:1].double())[0]
-    densify(table, DensityRules(0.5, 1e-9, 0.0), time=TIME, step=STEP, seed=SEED, level_count=LEVELS)
+    densify(
+        table,
+        DensityRules(0.5, 1e-9, 0.0),
+        time=TIME,
+        step=STEP,
+        seed=SEED,
+        level_count=LEVELS,
+        ranks=Ranks(),
+    )
     assert len(table) == 40_000
     local = (table["means"].double() - mean) @ axes / scales
     assert local.mean(0).abs().max() < 0.02
@@ -149,5 +158,7 @@ def test_split_children_scatter_like_their_parent():
 
 def test_empty_table():
     table = random_table(0)
-    report = densify(table, DensityRules(1e-4, 0.1, 0.01), time=0, step=1, seed=0, level_count=1)
+    report = densify(
+        table, DensityRules(1e-4, 0.1, 0.01), time=0, step=1, seed=0, level_count=1, ranks=Ranks()
+    )
     assert len(table) == 0 and report.cloned == report.split == report.pruned == report.held_back == 0
