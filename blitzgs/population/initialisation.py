@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.model import NO_PARENT, GaussianTable
-from blitzgs.ops.knn import knn_distances
+from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.voxel_keys import voxel_keys
 from blitzgs.view.levels import Levels
 

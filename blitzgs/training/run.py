@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a run: what is in it, and how to open a trained model again."""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+import resource
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import blitzgs
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import GaussianTable
+from blitzgs.scene.capture import Capture, load_capture
+from blitzgs.scene.images import ImageStore
+from blitzgs.training import checkpoint
+from blitzgs.training.config import Config
+from blitzgs.training.config_io import ConfigError, from_dict, load_config, to_dict
+from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.views import Space, ViewSet
+
+CONFIG = "config.yaml"
+CHECKPOINTS = "checkpoints"
+SUMMARY = "summary.json"
+EVALUATION = "evaluation"
+# Sections and fields that a resumed run may change: they decide nothing about the result.
+FREE_FIELDS = ("log", "data.path", "data.cache_bytes", "data.threads", "data.prefetch")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands; saved with every checkpoint.
+
+    Attributes:
+        step: optimiser steps taken.
+        sh_degree: spherical-harmonics degree of the last step.
+        level_count: octree levels K.
+        peak_gaussians: most Gaussians so far.
+        seconds: of training so far, without evaluations.
+    """
+
+    step: int
+    sh_degree: int
+    level_count: int
+    peak_gaussians: int
+    seconds: float
+
+
+@dataclass
+class TrainedModel:
+    """A model read back from a run, caught up and ready to render.
+
+    Attributes:
+        config: of the run.
+        progress: where the run stood.
+        space: how the trained world lies in the capture's.
+        table: this rank's Gaussians.
+    """
+
+    config: Config
+    progress: Progress
+    space: Space
+    table: GaussianTable
+
+
+def open_capture(config: Config) -> tuple[Capture, ImageStore]:
+    """Load the capture that a configuration names, and open its images.
+
+    Raises:
+        ConfigError: `data.path` is not set.
+        FileNotFoundError, ValueError: the capture is incomplete or damaged.
+    """
+    data = config.data
+    if not data.path:
+        raise ConfigError("data.path: no capture given; use --data DIR")
+    capture = load_capture(
+        data.path, images=data.images, downscale=data.downscale, split=data.split, masks=data.masks
+    )
+    return capture, ImageStore(capture, data.cache_bytes, data.threads)
+
+
+def view_set(capture: Capture, space: Space, device: torch.device) -> ViewSet:
+    """Return all cameras of a capture, on the device."""
+    return ViewSet(list(capture.cameras), space, device)
+
+
+def save(folder: Path, table: GaussianTable, progress: Progress, space: Space, config: Config, ranks: Ranks) -> None:
+    """Write a checkpoint of a run; rows that are behind stay behind, so that saving changes nothing."""
+    state = {
+        "progress": dataclasses.asdict(progress),
+        "space": dataclasses.asdict(space),
+        "config": to_dict(config),
+    }
+    checkpoint.save(folder / CHECKPOINTS, table.columns, state, ranks, config.log.keep_checkpoints)
+
+
+def restore(folder: Path, ranks: Ranks) -> tuple[GaussianTable, Progress, Space, Config] | None:
+    """Read the newest sound checkpoint of a run; None when there is none."""
+    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, ranks.device)
+    if loaded is None:
+        return None
+    columns, state = loaded
+    space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
+    return GaussianTable(columns), Progress(**state["progress"]), space, from_dict(state["config"])
+
+
+def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedModel:
+    """Open the newest model of a run for rendering.
+
+    Args:
+        folder: of the run.
+        ranks: the job.
+        data: where the capture is now; None: where it was.
+
+    Raises:
+        FileNotFoundError: the folder is not a run, or holds no checkpoint.
+    """
+    if not (folder / CONFIG).exists():
+        raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG}")
+    restored = restore(folder, ranks)
+    if restored is None:
+        raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
+    table, progress, space, _ = restored
+    config = load_config(folder / CONFIG, [] if data is None else [f"data.path={data}"])
+    optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), space.extent, ranks.device)
+    optimiser.catch_up(table, None, progress.step)
+    return TrainedModel(config, progress, space, table)
+
+
+def check_resumable(saved: Config, wanted: Config) -> None:
+    """Check that a resumed run computes what the checkpoint's run would have.
+
+    Raises:
+        ConfigError: names the first field that differs.
+    """
+    for name, old, new in _differences(to_dict(saved), to_dict(wanted), ""):
+        if not any(name == free or name.startswith(free + ".") for free in FREE_FIELDS):
+            raise ConfigError(
+                f"{name}: the checkpoint was trained with {old!r}, now {new!r}; "
+                "resume with the run's own configuration or start another run"
+            )
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any], where: str) -> list[tuple[str, Any, Any]]:
+    found = []
+    for name in old | new:
+        path, a, b = where + name, old.get(name), new.get(name)
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += _differences(a, b, path + ".")
+        elif a != b:
+            found.append((path, a, b))
+    return found
+
+
+def peak_memory_bytes(device: torch.device) -> int:
+    """Most memory this process has used: on the GPU when there is one, else resident memory."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def versions(device: torch.device) -> dict[str, str]:
+    """Return what the result was made with."""
+    found = {"blitzgs": blitzgs.__version__, "torch": torch.__version__, "python": platform.python_version()}
+    if device.type == "cuda":
+        found |= {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}
+    return found | {"machine": platform.platform()}
