@@ -42,7 +42,7 @@ class DensityRules:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What an event did on this rank: candidates that grew, rows that went, candidates held back by the cap."""
+    """What an event did on this rank; `held_back` candidates did not grow because of the cap."""
 
     cloned: int
     split: int

@@ -22,7 +22,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, from_dict, load_config, to_dict
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
-from blitzgs.training.views import Space, ViewSet
+from blitzgs.training.views import Space
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -84,12 +84,9 @@ def open_capture(config: Config) -> tuple[Capture, ImageStore]:
     return capture, ImageStore(capture, data.cache_bytes, data.threads)
 
 
-def view_set(capture: Capture, space: Space, device: torch.device) -> ViewSet:
-    """Return all cameras of a capture, on the device."""
-    return ViewSet(list(capture.cameras), space, device)
-
-
-def save(folder: Path, table: GaussianTable, progress: Progress, space: Space, config: Config, ranks: Ranks) -> None:
+def save(
+    folder: Path, table: GaussianTable, progress: Progress, space: Space, config: Config, ranks: Ranks
+) -> None:
     """Write a checkpoint of a run; rows that are behind stay behind, so that saving changes nothing."""
     state = {
         "progress": dataclasses.asdict(progress),

@@ -32,7 +32,7 @@ from blitzgs.training.run import Progress
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Event, Schedule
-from blitzgs.training.views import Space, camera_centres, render_options, view_set
+from blitzgs.training.views import Space, ViewSet, camera_centres, render_options
 from blitzgs.view.levels import measure_levels
 
 
@@ -48,7 +48,13 @@ class Trainer:
     progress: Progress
 
     def __init__(
-        self, config: Config, capture: Capture, images: Images, folder: Path, ranks: Ranks, resume: bool = False
+        self,
+        config: Config,
+        capture: Capture,
+        images: Images,
+        folder: Path,
+        ranks: Ranks,
+        resume: bool = False,
     ) -> None:
         """Set a run up.
 
@@ -64,12 +70,20 @@ class Trainer:
             FileExistsError: the folder holds a trained run and `resume` is not set.
             ConfigError: the run to resume was started with another configuration.
         """
-        self.config, self.capture, self.images, self.folder, self.ranks = config, capture, images, folder, ranks
+        self.config, self.capture, self.images, self.folder, self.ranks = (
+            config,
+            capture,
+            images,
+            folder,
+            ranks,
+        )
         self.schedule = Schedule(config.schedule)
         self.space = Space.of(capture.offset, capture.extent)
         self._lpips = load_lpips(config.log.lpips_weights)
         if not resume and any((folder / run.CHECKPOINTS).glob("*")):
-            raise FileExistsError(f"{folder} already holds a run: add --resume to continue it, or choose another --out")
+            raise FileExistsError(
+                f"{folder} already holds a run: add --resume to continue it, or choose another --out"
+            )
         restored = run.restore(folder, ranks) if resume else None
         if restored is None:
             self._initialise()
@@ -80,7 +94,7 @@ class Trainer:
             folder.mkdir(parents=True, exist_ok=True)
             save_config(config, folder / run.CONFIG)
         self._optimiser = LazyAdam(config.optimiser, self.schedule, self.space.extent, ranks.device)
-        self._views = view_set(list(capture.cameras), self.space, ranks.device)
+        self._views = ViewSet(list(capture.cameras), self.space, ranks.device)
         sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
         sampler = BatchSampler(sizes, self.schedule.batch_size, config.seed)
         self._loader = BatchLoader(images, capture.train, sampler, ranks.device, config.data.prefetch)
@@ -106,13 +120,16 @@ class Trainer:
         count = len(table)
         table.keep(torch.arange(count) % self.ranks.world_size == self.ranks.rank)
         self.table = GaussianTable({name: table[name].to(self.ranks.device) for name in table})
-        self.progress = Progress(step=0, sh_degree=0, level_count=levels.count, peak_gaussians=count, seconds=0.0)
+        self.progress = Progress(
+            step=0, sh_degree=0, level_count=levels.count, peak_gaussians=count, seconds=0.0
+        )
 
     def train(self) -> dict[str, Any] | None:
         """Train to the end, evaluate, and write the summary.
 
         Returns:
-            The summary; None when the run was asked to stop early (it then saved a checkpoint to resume from).
+            The summary; None when the run was asked to stop early (it then saved a checkpoint to resume
+            from).
 
         Raises:
             NonFiniteError: a loss or a parameter stopped being finite.
@@ -130,7 +147,12 @@ class Trainer:
                         self._handle(event, step, log)
                     if step < self.schedule.steps and (name := stop.agreed(step, self.ranks)):
                         self._save()
-                        log.event(step * size, "stopped", f"stopped by {name}; continue with --resume", {"signal": name})
+                        log.event(
+                            step * size,
+                            "stopped",
+                            f"stopped by {name}; continue with --resume",
+                            {"signal": name},
+                        )
                         return None
             return self._finish(log)
         finally:
@@ -143,7 +165,12 @@ class Trainer:
             f"{self._population():,} Gaussians on {self.progress.level_count} levels; "
             f"{views['train']} training views, {views['test']} held out"
         )
-        log.event(self.progress.step * self.schedule.batch_size, "start", text, views | run.versions(self.ranks.device))
+        log.event(
+            self.progress.step * self.schedule.batch_size,
+            "start",
+            text,
+            views | run.versions(self.ranks.device),
+        )
 
     def _step(self, step: int, log: RunLog) -> None:
         """Take one optimiser step (from 1)."""
@@ -245,8 +272,13 @@ class Trainer:
         values = torch.tensor(list(dataclasses.astuple(report)), device=self.ranks.device)
         counts = dict(zip(dataclasses.asdict(report), self.ranks.all_reduce(values).tolist(), strict=True))
         total = self._population()
-        self.progress = dataclasses.replace(self.progress, peak_gaussians=max(self.progress.peak_gaussians, total))
-        text = f"density: +{counts['cloned']:,} clones, +{counts['split']:,} splits, -{counts['pruned']:,}: {total:,}"
+        self.progress = dataclasses.replace(
+            self.progress, peak_gaussians=max(self.progress.peak_gaussians, total)
+        )
+        text = (
+            f"density: {counts['cloned']:,} cloned, {counts['split']:,} split, {counts['pruned']:,} pruned; "
+            f"now {total:,}"
+        )
         log.event(event.time, "densify", text, counts | {"gaussians": total})
 
     def _evaluate(self, step: int, log: RunLog) -> dict[str, Any]:

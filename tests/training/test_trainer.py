@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training import run
+from blitzgs.training.config_io import ConfigError
+from blitzgs.training.guard import NonFiniteError
+from blitzgs.training.trainer import Trainer
+from tests.training.tiny import tiny_config, tiny_scene
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def train(folder, *overrides, scale=1.0, resume=False):
+    trainer = Trainer(tiny_config(*overrides), *tiny_scene(scale), folder, Ranks(), resume)
+    return trainer, trainer.train()
+
+
+def assert_same_table(a, b):
+    assert len(a) == len(b)
+    for name in a:
+        assert torch.equal(a[name], b[name]), name
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, *train(folder)
+
+
+def test_training_improves_the_images(whole_run, tmp_path):
+    _, trainer, summary = whole_run
+    _, start = train(tmp_path, "schedule.iterations=1")
+    assert summary["psnr"] > start["psnr"] + 3
+    assert summary["ssim"] > start["ssim"]
+    assert summary["gaussians"] == len(trainer.table)
+    assert trainer.progress.sh_degree == 3
+    assert trainer.table["birth"].max() > 0
+
+
+def test_what_a_run_leaves_behind(whole_run):
+    folder, trainer, summary = whole_run
+    assert json.loads((folder / "summary.json").read_text()) == summary
+    for name in (
+        "psnr",
+        "ssim",
+        "seconds",
+        "images_per_second",
+        "peak_memory_bytes",
+        "config_hash",
+        "versions",
+    ):
+        assert summary[name]
+    assert summary["peak_gaussians"] >= summary["gaussians"]
+    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    assert [r["t"] for r in records if "loss" in r] == [20, 40, 60, 80, 100]
+    assert [r["t"] for r in records if r.get("event") == "densify"] == [20, 40, 60, 80]
+    assert run.load_config(folder / "config.yaml") == trainer.config
+    metrics = json.loads((folder / "evaluation" / "000100" / "metrics.json").read_text())
+    assert list(metrics["views"]) == ["03.png"]
+    assert (folder / "evaluation" / "000100" / "03.png.jpg").stat().st_size > 0
+    model = run.open_model(folder, Ranks())
+    assert_same_table(model.table, trainer.table)
+
+
+def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
+    """50 steps, SIGTERM, resume, 50 more: bit for bit the run that was never stopped."""
+    _, whole, _ = whole_run
+    step = Trainer._step
+
+    def interrupted(self, number, log):
+        step(self, number, log)
+        if number == 50:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Trainer, "_step", interrupted)
+    first, summary = train(tmp_path)
+    assert summary is None and first.progress.step == 50
+    monkeypatch.undo()
+    torch.set_num_threads(2)
+    second, summary = train(tmp_path, resume=True)
+    assert summary is not None
+    assert_same_table(second.table, whole.table)
+    assert second.progress.peak_gaussians == whole.progress.peak_gaussians
+
+
+@pytest.mark.parametrize("power", [-7, 10])
+def test_a_world_scaled_by_a_power_of_two_trains_to_the_same_bits(whole_run, tmp_path, power):
+    _, whole, expected = whole_run
+    scaled, summary = train(tmp_path, scale=2.0**power)
+    assert_same_table(scaled.table, whole.table)
+    assert scaled.space.unit == whole.space.unit * 2.0**power
+    assert summary["psnr"] == expected["psnr"]
+
+
+def test_batches_masks_background_and_sparse_adam(tmp_path):
+    capture, images = tiny_scene()
+    images.masks = [torch.ones(32, 48, dtype=torch.uint8) for _ in images.images]
+    for image, mask in zip(images.images, images.masks, strict=True):
+        mask[:, :24] = 0
+        image[:, :24] = 255
+    images.masks[0] = None
+    config = tiny_config(
+        "schedule.batch_size=4",
+        "schedule.iterations=120",
+        "model.background=[0.2, 0.2, 0.2]",
+        "optimiser.sparse=true",
+        "population.max_gaussians=420",
+    )
+    trainer = Trainer(config, capture, images, tmp_path, Ranks())
+    start = len(trainer.table)
+    summary = trainer.train()
+    assert summary["images"] == 120 and trainer.progress.step == 30
+    assert summary["psnr"] > 15
+    assert max(start, 420) >= trainer.progress.peak_gaussians
+
+
+def test_views_that_see_nothing(tmp_path):
+    capture, images = tiny_scene()
+    for camera in capture.cameras:
+        turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+        camera.world_to_camera = turned @ camera.world_to_camera
+    trainer = Trainer(tiny_config("schedule.iterations=40"), capture, images, tmp_path, Ranks())
+    before = trainer.table["means"].clone()
+    trainer.train()
+    assert torch.equal(trainer.table["means"], before)
+
+
+def test_non_finite_values_stop_the_run_by_name(tmp_path):
+    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+    trainer.table["scales"][7, 1] = float("nan")
+    with pytest.raises(
+        NonFiniteError, match=r"step 20: column 'scales' is not finite in 1 Gaussians \(ids 7\)"
+    ):
+        trainer.train()
+
+
+def test_a_non_finite_loss_names_step_and_view(tmp_path, monkeypatch):
+    from blitzgs.training import trainer as module
+
+    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+    original = module.loss_terms
+
+    def broken(*args):
+        terms = original(*args)
+        return terms._replace(photometric=terms.photometric * float("inf"))
+
+    monkeypatch.setattr(module, "loss_terms", broken)
+    with pytest.raises(
+        NonFiniteError, match=r"step 1: the loss of view '0\d.png' is not finite; .* op photometric"
+    ):
+        trainer.train()
+
+
+def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_run):
+    folder, *_ = whole_run
+    with pytest.raises(FileExistsError, match="add --resume"):
+        train(folder)
+    with pytest.raises(ConfigError, match=r"loss.ssim: the checkpoint was trained with 0.2, now 0.3"):
+        train(folder, "loss.ssim=0.3", resume=True)
+    train(folder, "log.every=50", resume=True)
