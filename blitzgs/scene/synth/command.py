@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The `blitzgs synth` command."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from blitzgs.scene.synth.generate import generate_city
+from blitzgs.scene.synth.options import PRESETS, CityOptions
+
+_HELP = {
+    "extent": "edge of the built-up square, metres",
+    "views": "number of images",
+    "width": "image width, pixels",
+    "height": "image height, pixels",
+    "points_per_view": "feature points looked for per image",
+    "oblique": "fraction of oblique views, 0 to 1",
+    "seed": "of everything random",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of `blitzgs synth` to a parser."""
+    parser.add_argument(
+        "out", type=Path, metavar="DIR", help="folder to create; kept if it holds the same city"
+    )
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="demo", help="base the other flags change (%(default)s)"
+    )
+    for field in fields(CityOptions):
+        parser.add_argument(
+            f"--{field.name.replace('_', '-')}",
+            type=type(field.default),
+            metavar="N" if isinstance(field.default, int) else "X",
+            help=_HELP[field.name],
+        )
+    parser.add_argument("--threads", type=int, metavar="N", help="to render with (all cores)")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace a generated city with other parameters"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Generate the city; returns the exit status."""
+    preset = PRESETS[args.preset]
+    chosen = {}
+    for field in fields(CityOptions):
+        value = getattr(args, field.name)
+        chosen[field.name] = getattr(preset, field.name) if value is None else value
+    console = Console(stderr=True)
+    started = time.monotonic()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("images"),
+        TimeRemainingColumn(),
+    )
+    try:
+        with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+            task = bar.add_task("Photographing the city", total=None)
+            out = generate_city(
+                args.out,
+                **chosen,
+                threads=args.threads,
+                overwrite=args.overwrite,
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
+            )
+    except (ValueError, FileExistsError, ModuleNotFoundError) as error:
+        print(f"blitzgs synth: {error}", file=sys.stderr)
+        return 2
+    size = f"{chosen['views']} images of {chosen['width']} x {chosen['height']}"
+    print(f"{out}: {size}, {time.monotonic() - started:.1f} s")
+    return 0

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What to generate: the parameters of a city and the presets the command line offers."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+# Raised whenever the same parameters would give other files, so that cached cities are made anew.
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class CityOptions:
+    """Parameters of a synthetic city; the same values give the same files.
+
+    Attributes:
+        extent: edge of the built-up square in metres, 60 to 20 000.
+        views: number of images, >= 3.
+        width: image width in pixels, >= 32.
+        height: image height in pixels, >= 32.
+        points_per_view: feature points looked for in each image; the cloud has somewhat fewer in total.
+        oblique: fraction of the views flown obliquely (45°, four headings); the others look straight down.
+        seed: of the layout, the buildings, the flight and the noise.
+    """
+
+    extent: float = 150.0
+    views: int = 48
+    width: int = 480
+    height: int = 320
+    points_per_view: int = 500
+    oblique: float = 0.6
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        limits = {
+            "extent": (60.0, 20_000.0),
+            "views": (3, 1_000_000),
+            "width": (32, 16_384),
+            "height": (32, 16_384),
+            "points_per_view": (1, 100_000),
+            "oblique": (0.0, 1.0),
+            "seed": (0, 2**63 - 1),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"synthetic city: {name} must be between {low} and {high}, got {value}")
+
+    def manifest(self) -> dict[str, float | int]:
+        """Return what decides the content of the files, for the manifest that makes a city reusable."""
+        return {"format_version": FORMAT_VERSION, **asdict(self)}
+
+
+PRESETS = {
+    # Made in well under a minute on two cores: the default scene of `make demo`.
+    "demo": CityOptions(),
+    # A district, minutes to make.
+    "town": CityOptions(extent=420.0, views=240, width=960, height=640, points_per_view=800),
+    # A square kilometre and more than any single image sees.
+    "city": CityOptions(extent=1600.0, views=2400, width=1600, height=1064, points_per_view=1200),
+}

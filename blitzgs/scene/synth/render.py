@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs of the city: primary and shadow rays, materials, sun and sky light, haze."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import cv2
+import numpy as np
+
+from blitzgs.scene.synth import materials, mesh
+from blitzgs.scene.synth.arrays import Bytes, Doubles, Floats, Ints
+from blitzgs.scene.synth.city import build_city
+from blitzgs.scene.synth.flight import View
+from blitzgs.scene.synth.ground import ground_color
+from blitzgs.scene.synth.materials import Points
+from blitzgs.scene.synth.noise import Noise
+from blitzgs.scene.synth.plan import Plan
+from blitzgs.scene.synth.raycast import Hits, RayCaster
+
+# Four samples per pixel on a rotated grid: every row and column of the 4 x 4 subpixels is met once.
+_SAMPLES: Final = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]])
+_RAYS_AT_ONCE: Final = 600_000
+_OFFSET: Final = 0.02  # metres a shadow ray starts off its surface
+
+_SUN: Final = np.array([-0.52, -0.42, 0.74], np.float32) / np.float32(np.linalg.norm([-0.52, -0.42, 0.74]))
+_SUNLIGHT: Final = np.array([2.35, 2.16, 1.82], np.float32)
+_SKYLIGHT: Final = np.array([0.50, 0.60, 0.76], np.float32)
+_BOUNCE: Final = np.array([0.24, 0.22, 0.19], np.float32)
+_HAZE: Final = np.array([0.66, 0.73, 0.80], np.float32)
+
+_PAINTERS: Final = {
+    mesh.FACADE: materials.facade,
+    mesh.CURTAIN: materials.curtain_wall,
+    mesh.GRAVEL: materials.gravel,
+    mesh.TILES: materials.tiles,
+    mesh.METAL: materials.metal,
+    mesh.PLAIN: materials.plain,
+    mesh.SOLAR: materials.solar,
+    mesh.LEAVES: materials.leaves,
+    mesh.PAINT: materials.paint,
+}
+
+
+class City:
+    """The city ready to be photographed; its methods may be called from several threads at once."""
+
+    def __init__(self, plan: Plan) -> None:
+        """Build the geometry and the skylight of `plan`: seconds for a square kilometre."""
+        self.plan = plan
+        self.mesh = build_city(plan)
+        self.caster = RayCaster(self.mesh.triangles)
+        self.noise = Noise(plan.options.seed)
+        self._haze_length = 30 * max(plan.options.extent, 150.0)
+        self._open_sky = self._bake_open_sky()
+
+    def render(self, view: View) -> Bytes:
+        """Return the photograph of a view: sRGB uint8 [height, width, 3]."""
+        image = np.empty((view.height, view.width, 3), np.float32)
+        rows = max(1, _RAYS_AT_ONCE // (view.width * len(_SAMPLES)))
+        for top in range(0, view.height, rows):
+            bottom = min(top + rows, view.height)
+            y, x = np.mgrid[top:bottom, 0 : view.width]
+            corners = np.stack([x, y], -1).reshape(-1, 1, 2)
+            pixels = (corners + _SAMPLES).reshape(-1, 2)
+            # Tone mapping each sample keeps edges against bright surfaces smooth.
+            colors = _tone(self._shade(view, pixels))
+            image[top:bottom] = colors.reshape(bottom - top, view.width, len(_SAMPLES), 3).mean(2)
+        return np.clip(image * 255 + 0.5, 0, 255).astype(np.uint8)
+
+    def hit(self, view: View, pixels: Doubles) -> Hits:
+        """Return what the view sees at pixel positions [R, 2]."""
+        directions = view.directions(pixels).astype(np.float32)
+        origins = np.broadcast_to(view.centre.astype(np.float32), directions.shape)
+        return self.caster.hit(np.ascontiguousarray(origins), directions)
+
+    def _shade(self, view: View, pixels: Doubles) -> Floats:
+        """Return scene-linear RGB [R, 3] of rays through pixel positions [R, 2]."""
+        directions = view.directions(pixels).astype(np.float32)
+        origins = np.ascontiguousarray(np.broadcast_to(view.centre.astype(np.float32), directions.shape))
+        hits = self.caster.hit(origins, directions)
+        color = self._sky(directions)
+        seen = np.flatnonzero(hits.triangle >= 0)
+        if len(seen) == 0:
+            return color
+        direction, distance = directions[seen], hits.distance[seen]
+        position = origins[seen] + distance[:, None] * direction
+        surface = self.mesh.surface[hits.triangle[seen]]
+        material = self.mesh.material[surface]
+        normal = self.mesh.normal[surface]
+        round_ = np.flatnonzero(material == mesh.LEAVES)
+        outward = position[round_] - self.mesh.origin[surface[round_]]
+        outward /= np.square(self.mesh.size[surface[round_]][:, [0, 0, 1]])
+        normal[round_] = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        slant = (normal * direction).sum(1)
+        normal[slant > 0] *= -1
+        # A sample stands for half a pixel; on a slanted surface that is more, taken as the mean of both axes.
+        footprint = distance * np.float32(0.5 / view.focal) / np.sqrt(np.maximum(np.abs(slant), 0.15))
+
+        albedo = self._albedo(surface, material, position, normal, footprint)
+        lit = self._light(position, normal, material) * albedo
+        lit = self._reflect(lit, albedo, material, direction, normal)
+        haze = np.exp(-distance / np.float32(self._haze_length))[:, None]
+        color[seen] = lit * haze + _HAZE * (1 - haze)
+        return color
+
+    def _albedo(
+        self,
+        surface: Ints,
+        material: Ints,
+        position: Floats,
+        normal: Floats,
+        footprint: Floats,
+    ) -> Floats:
+        albedo = np.empty((len(surface), 3), np.float32)
+        ground = np.flatnonzero(material == mesh.GROUND)
+        if len(ground):
+            albedo[ground] = ground_color(self.plan, self.noise, position[ground], footprint[ground])
+        for kind, painter in _PAINTERS.items():
+            index = np.flatnonzero(material == kind)
+            if len(index) == 0:
+                continue
+            s = surface[index]
+            offset = position[index] - self.mesh.origin[s]
+            points = Points(
+                u=(offset * self.mesh.axis_u[s]).sum(1),
+                v=(offset * self.mesh.axis_v[s]).sum(1),
+                size=self.mesh.size[s],
+                position=position[index],
+                normal=normal[index],
+                footprint=footprint[index],
+                color=self.mesh.color[s],
+                numbers=self.mesh.numbers[s],
+            )
+            albedo[index] = painter(points, self.noise)
+        return np.clip(albedo, 0.005, 0.92)
+
+    def _light(self, position: Floats, normal: Floats, material: Ints) -> Floats:
+        """Return the irradiance [R, 3]: sun where no shadow falls, sky by openness, light from the ground."""
+        facing = normal @ _SUN
+        # Light passes through leaves, so crowns are lit a little past their terminator.
+        facing = np.where(material == mesh.LEAVES, 0.75 * facing + 0.25, facing)
+        sunny = np.clip(facing, 0, 1).astype(np.float32)
+        towards = np.flatnonzero(sunny > 0)
+        # Foliage is coarser than its mesh: its rays start further out, or each crown would shade itself.
+        lift = np.where(material[towards] == mesh.LEAVES, np.float32(0.35), np.float32(_OFFSET))
+        origins = position[towards] + lift[:, None] * normal[towards]
+        rays = np.ascontiguousarray(np.broadcast_to(_SUN, origins.shape))
+        sunny[towards[self.caster.occluded(origins, rays)]] = 0
+        openness = self._openness(position + np.float32(1.5) * normal)
+        sky = openness * (0.55 + 0.45 * normal[:, 2])
+        bounce = (0.5 - 0.5 * normal[:, 2]) * (0.4 + 0.6 * openness)
+        light: Floats = sunny[:, None] * _SUNLIGHT + sky[:, None] * _SKYLIGHT + bounce[:, None] * _BOUNCE
+        return light
+
+    def _reflect(
+        self, lit: Floats, albedo: Floats, material: Ints, direction: Floats, normal: Floats
+    ) -> Floats:
+        """Return `lit` with the sky mirrored in curtain walls and solar panels (Schlick's approximation)."""
+        index = np.flatnonzero((material == mesh.CURTAIN) | (material == mesh.SOLAR))
+        if len(index) == 0:
+            return lit
+        d, n = direction[index], normal[index]
+        cosine = np.clip(-(d * n).sum(1), 0, 1)
+        fresnel = 0.08 + 0.92 * (1 - cosine) ** 5
+        mirrored = d + 2 * cosine[:, None] * n
+        # A mirrored ray that goes down meets other buildings, not sky.
+        seen = np.where(mirrored[:, 2:] > 0, self._sky(mirrored), np.float32(0.22))
+        glass = albedo[index].max(1) < 0.45
+        lit[index] += (fresnel * glass)[:, None] * (seen - lit[index])
+        return lit
+
+    def _sky(self, direction: Floats) -> Floats:
+        up = np.clip(direction[:, 2], 0, 1)
+        zenith = np.array([0.22, 0.42, 0.80], np.float32)
+        color: Floats = _HAZE + (zenith - _HAZE) * (1 - (1 - up) ** 3)[:, None]
+        high = np.maximum(up, 0.03)
+        x, y = direction[:, 0] / high, direction[:, 1] / high
+        cloud = np.clip(0.7 * self.noise(x * 0.9, y * 0.9) + 0.4 * self.noise(x * 2.3, y * 2.3) - 0.2, 0, 1)
+        cloud *= np.clip(up * 6, 0, 1)
+        return color + 0.6 * cloud[:, None] * (np.float32(0.95) - color)
+
+    def _bake_open_sky(self) -> Floats:
+        """Return a square map of the sky seen from the ground (cosine-weighted, 0 to 1) over the city."""
+        side = 384
+        self._map_half = np.float32(self.plan.half + 25)
+        line = (np.arange(side, dtype=np.float32) + 0.5) / side * 2 - 1
+        x, y = (a.ravel() * self._map_half for a in np.meshgrid(line, line))
+        origins = np.stack([x, y, np.full_like(x, 0.05)], 1)
+        rng = np.random.default_rng(5)
+        blocked = np.zeros(len(origins), np.float32)
+        rays = 24
+        for k in range(rays):
+            # Cosine-weighted directions on a golden-angle spiral, turned at random per point.
+            radius = np.sqrt((k + 0.5) / rays)
+            angle = 2.399963 * k + rng.uniform(0, 2 * np.pi, len(origins))
+            z = np.full(len(origins), np.sqrt(1 - radius**2))
+            directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1).astype(np.float32)
+            blocked += self.caster.occluded(origins, directions)
+        return cv2.GaussianBlur((1 - blocked / rays).reshape(side, side), (0, 0), 1.3)
+
+    def _openness(self, position: Floats) -> Floats:
+        """Return how much sky is seen [R]: the baked map near the ground, more with height."""
+        side = len(self._open_sky)
+        scale = np.float32(side / 2) / self._map_half
+        i = ((position[:, :2] + self._map_half) * scale).astype(np.int32)
+        inside = ((i >= 0) & (i < side)).all(1)
+        i = np.clip(i, 0, side - 1)
+        low = np.where(inside, self._open_sky[i[:, 1], i[:, 0]], np.float32(1))
+        raised = np.clip(position[:, 2] / 16, 0, 1)
+        openness: Floats = np.maximum(low, 0.35) * (1 - raised) + raised
+        return openness
+
+
+def _tone(linear: Floats) -> Floats:
+    """Return display values [0, 1] of scene-linear colours: a filmic shoulder, then the sRGB curve."""
+    x = np.float32(0.54) * linear
+    filmic = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
+    display: Floats = np.where(
+        filmic < 0.0031308, 12.92 * filmic, 1.055 * np.power(np.maximum(filmic, 1e-6), 1 / 2.4) - 0.055
+    ).astype(np.float32)
+    return display
