@@ -73,7 +73,7 @@ def plan_flight(options: CityOptions) -> list[View]:
         forward = np.array([math.sin(heading), math.cos(heading)])
         # Oblique cameras fly behind what they look at.
         back = height * math.tan(tilt)
-        for position in _lawn_mower(count, 0.85 * options.extent):
+        for position in _lawn_mower(count, max(options.extent - 0.2 * height, 0.5 * options.extent)):
             ground = position + rng.normal(0, 0.01 * height, 2)
             centre = np.array([*(ground - back * forward), height * (1 + rng.normal(0, 0.01))])
             yaw, pitch, roll = np.array([heading, tilt, 0.0]) + rng.normal(0, math.radians(1.2), 3)

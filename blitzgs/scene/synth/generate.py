@@ -47,8 +47,8 @@ def generate_city(
 
     Writes `images/*.jpg`, `sparse/0/*.bin` (a COLMAP model: PINHOLE camera, poses, points with tracks; in
     metres, z up) and `city.json` (the parameters). The folder appears only when complete. The files depend
-    on the parameters alone, not on the number of threads; on another processor or with other library versions single
-    pixels may differ in rounding.
+    on the parameters alone, not on the number of threads; on another processor or with other library versions
+    single pixels may differ in rounding.
 
     Args:
         out: folder to create.

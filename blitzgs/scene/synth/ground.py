@@ -240,10 +240,16 @@ def _fields(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     column = np.floor(u / 95 + cell_random(row, row, 31))
     crop = cell_random(column, row, 37)
     palette = np.array(
-        [[0.15, 0.20, 0.06], [0.33, 0.28, 0.12], [0.20, 0.145, 0.09], [0.19, 0.24, 0.08], [0.38, 0.34, 0.17]],
+        [
+            [0.13, 0.18, 0.06],
+            [0.27, 0.235, 0.12],
+            [0.19, 0.14, 0.09],
+            [0.15, 0.195, 0.075],
+            [0.30, 0.28, 0.16],
+        ],
         np.float32,
     )
-    color = palette[np.minimum((crop * 5).astype(np.int64), 4)]
+    color: Floats = palette[np.minimum((crop * 5).astype(np.int64), 4)]
     turned = cell_random(column, row, 41) > 0.5
     furrows = (stripes(np.where(turned, u, v), 2.6, 0.0, 0.5, footprint) - 0.5) * 0.22
     tone = noise.layers(x, y, footprint, (40.0, 0.08), (9.0, 0.09), (2.0, 0.09), (0.6, 0.10))

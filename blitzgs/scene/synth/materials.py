@@ -60,11 +60,10 @@ def facade(p: Points, noise: Noise) -> Floats:
     below_roof = p.size[:, 1] - row * FLOOR > 2.9
     kind = np.floor(cell_random(seed, seed, 1) * 3)
     half_width = np.float32(0.46) + np.float32(0.11) * kind + 0.25 * (style == BANDED)
-    sill, head = np.float32(0.85), np.float32(2.3)
     is_shop = (row == 0) & (shop > 0)
     half_width = np.where(is_shop, 0.42 * step, half_width)
-    sill = np.where(is_shop, np.float32(0.35), sill)
-    head = np.where(is_shop, np.float32(2.65), head)
+    sill = np.where(is_shop, np.float32(0.35), np.float32(0.85))
+    head = np.where(is_shop, np.float32(2.65), np.float32(2.3))
     wide_enough = (half_width < 0.47 * step) & below_roof
 
     def cover(grow: float) -> Floats:
@@ -126,7 +125,7 @@ def gravel(p: Points, noise: Noise) -> Floats:
 def tiles(p: Points, noise: Noise) -> Floats:
     """Rows of roof tiles, each of its own shade, with moss, a ridge and perhaps skylights."""
     seed, skylights = p.numbers[:, 0], p.numbers[:, 1]
-    course, across = np.float32(0.38), np.float32(0.34)
+    course, across = 0.38, 0.34
     row = np.floor(p.v / course)
     column = np.floor(p.u / across + 0.5 * (row % 2))
     single = (cell_random(column, row, seed) - 0.5) * resolved(0.36, p.footprint)

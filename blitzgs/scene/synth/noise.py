@@ -39,10 +39,8 @@ class Noise:
         for plane, coordinate in zip(maps, (x, y), strict=True):
             scaled = coordinate * np.float32(1 / _LATTICE)
             plane[:count] = (scaled - np.floor(scaled)) * np.float32(_LATTICE * _TEXELS)
-        maps = maps.reshape(2, rows, _ROW)
-        sampled = cv2.remap(
-            self._texture, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        u, v = maps.reshape(2, rows, _ROW)
+        sampled = cv2.remap(self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         values: Floats = sampled.reshape(-1)[:count]
         return values
 

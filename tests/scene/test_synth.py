@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The synthetic city: the same by seed, geometrically right, with something to see in every image."""
+
+import argparse
+import hashlib
+import json
+import os
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("embreex")
+
+from blitzgs.scene.colmap import quats_to_rotations, read_model
+from blitzgs.scene.synth import PRESETS, add_arguments, generate_city, run
+
+SMALL = {"extent": 100.0, "views": 9, "width": 192, "height": 128, "points_per_view": 150}
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory):
+    return generate_city(tmp_path_factory.mktemp("synth") / "city", **SMALL)
+
+
+def digests(folder):
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def test_the_same_bytes_by_seed_for_any_number_of_threads(city, tmp_path):
+    assert digests(generate_city(tmp_path / "again", **SMALL, threads=1)) == digests(city)
+    other = digests(generate_city(tmp_path / "other", **SMALL, seed=1))
+    images = [name for name in other if name.endswith(".jpg")]
+    assert len(images) == 9
+    assert not set(other[n] for n in images) & set(digests(city).values())
+
+
+def test_every_image_shows_something(city):
+    model = read_model(city / "sparse" / "0")
+    assert sorted(p.name for p in (city / "images").iterdir()) == sorted(model.images.names)
+    for name in model.images.names:
+        image = cv2.imread(str(city / "images" / name))
+        assert image.shape == (128, 192, 3)
+        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        assert 60 < gray.mean() < 190 and gray.std() > 20
+        assert (gray > 250).mean() < 0.1 and (gray < 5).mean() < 0.1
+        assert np.unique(image.reshape(-1, 3) // 8, axis=0).shape[0] > 300
+
+
+def test_points_project_onto_their_observations(city):
+    model = read_model(city / "sparse" / "0", points2d=True, tracks=True)
+    focal, _, cx, cy = model.cameras[0].params
+    images, points = model.images, model.points
+    assert len(points.ids) > 300
+    assert points.track_lengths.min() >= 3
+    rotations = quats_to_rotations(images.quats)
+    errors = []
+    for i in range(len(images.ids)):
+        rows = slice(int(images.point2d_offsets[i]), int(images.point2d_offsets[i + 1]))
+        ids = images.point3d_ids[rows]
+        xyz = points.positions[ids[ids > 0] - 1]
+        camera = xyz @ rotations[i].T + images.translations[i]
+        assert (camera[:, 2] > 1).all()
+        pixels = camera[:, :2] / camera[:, 2:] * focal + (cx, cy)
+        errors.append(np.linalg.norm(pixels - images.points2d[rows][ids > 0], axis=1))
+    errors = np.concatenate(errors)
+    assert len(errors) == points.track_lengths.sum()
+    assert 0.1 < np.median(errors) < 1.0
+    assert (errors > 4).mean() < 0.02
+    assert abs(np.average(points.errors, weights=points.track_lengths) - errors.mean()) < 1e-6
+
+
+def test_views_of_the_same_point_look_alike(city):
+    """Poses, images and points agree: around a point's observations the images have the same brightness."""
+    model = read_model(city / "sparse" / "0", points2d=True)
+    images = model.images
+    brightness, ids = [], []
+    for i, name in enumerate(images.names):
+        image = cv2.blur(cv2.imread(str(city / "images" / name), cv2.IMREAD_GRAYSCALE), (5, 5)).astype(float)
+        rows = slice(int(images.point2d_offsets[i]), int(images.point2d_offsets[i + 1]))
+        matched = images.point3d_ids[rows] > 0
+        x, y = images.points2d[rows][matched].astype(int).T
+        brightness.append(image[np.clip(y, 0, 127), np.clip(x, 0, 191)])
+        ids.append(images.point3d_ids[rows][matched])
+    brightness, ids = np.concatenate(brightness), np.concatenate(ids)
+
+    def spread(values):
+        order = np.argsort(ids, kind="stable")
+        same = ids[order][1:] == ids[order][:-1]
+        return np.median(np.abs(np.diff(values[order]))[same])
+
+    assert spread(brightness) < 0.4 * spread(np.random.default_rng(0).permutation(brightness))
+
+
+def test_pycolmap_reads_the_model(city):
+    pycolmap = pytest.importorskip("pycolmap")
+    reconstruction = pycolmap.Reconstruction(str(city / "sparse" / "0"))
+    assert reconstruction.num_reg_images() == 9
+    assert reconstruction.compute_mean_reprojection_error() < 1.5
+    camera = next(iter(reconstruction.cameras.values()))
+    assert camera.model.name == "PINHOLE" and (camera.width, camera.height) == (192, 128)
+    for image in reconstruction.images.values():
+        point = next(p for p in image.points2D if p.has_point3D())
+        assert image.image_id in {
+            e.image_id for e in reconstruction.points3D[point.point3D_id].track.elements
+        }
+
+
+def test_a_finished_city_is_reused_and_nothing_else_is_touched(city, tmp_path):
+    before = (city / "city.json").stat().st_mtime_ns
+    calls = []
+    assert generate_city(city, **SMALL, progress=lambda *a: calls.append(a)) == city
+    assert not calls and (city / "city.json").stat().st_mtime_ns == before
+    with pytest.raises(FileExistsError, match=r"another city \(seed 0, not 5\)"):
+        generate_city(city, **SMALL, seed=5)
+    (tmp_path / "precious.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="holds no generated city"):
+        generate_city(tmp_path, **SMALL, overwrite=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["precious.txt"]
+
+
+def test_overwriting_and_failing_leave_no_half_made_city(tmp_path):
+    tiny = {"extent": 60.0, "views": 3, "width": 48, "height": 32, "points_per_view": 20}
+    out = generate_city(tmp_path / "city", **tiny)
+    (out / "run").mkdir()
+
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate_city(out, **tiny, seed=1, overwrite=True, progress=interrupt)
+    assert json.loads((out / "city.json").read_text())["seed"] == 0
+    generate_city(out, **tiny, seed=1, overwrite=True)
+    assert json.loads((out / "city.json").read_text())["seed"] == 1
+    assert sorted(os.listdir(tmp_path)) == ["city"]
+    assert sorted(os.listdir(out)) == ["city.json", "images", "run", "sparse"]
+
+
+@pytest.mark.parametrize(("name", "value"), [("extent", 10.0), ("views", 2), ("width", 8), ("oblique", 1.5)])
+def test_parameters_out_of_range_are_named(tmp_path, name, value):
+    with pytest.raises(ValueError, match=f"{name} must be between .* got {value}"):
+        generate_city(tmp_path / "x", **{name: value})
+    assert not (tmp_path / "x").exists()
+
+
+def test_command(city, capsys):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    flags = [f"--{key.replace('_', '-')}={value}" for key, value in SMALL.items()]
+    assert run(parser.parse_args([str(city), *flags])) == 0
+    assert "9 images of 192 x 128" in capsys.readouterr().out
+    assert run(parser.parse_args([str(city), "--preset", "town"])) == 2
+    message = capsys.readouterr().err
+    assert "holds another city" in message and f"extent 100.0, not {PRESETS['town'].extent}" in message
