@@ -39,6 +39,8 @@ SplatRow<T> pack_row(const RasterizeInput<T>& in, std::int64_t row) {
   splat.y = in.means2d[2 * row + 1];
   splat.half_height = T(-1);
   splat.cut = T(-1);
+  splat.opacity = T(1);
+  if (!tiles::finite(splat.x) || !tiles::finite(splat.y)) return splat;
   if (!make_ellipse(in.conics + 3 * row, in.opacities[row], &e)) return splat;
   const ConicFactor<T> factor = factor_conic(in.conics + 3 * row);
   const T root = std::sqrt(kScale);

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+import torch
+
+from blitzgs.ops.intersect import intersect, tile_counts
+from tests.ops.splats import Splats, pixel_alphas, random_splats
+
+WIDTH, HEIGHT = 91, 70
+
+
+def listed(splats, width, height, tile_size, **options):
+    """The lists as sets: bool [P, tiles]."""
+    n_cameras = options.pop("n_cameras", 1)
+    rows, offsets = intersect(
+        *splats.rows(), n_cameras=n_cameras, width=width, height=height, tile_size=tile_size, **options
+    )
+    tiles = torch.repeat_interleave(torch.arange(len(offsets) - 1), offsets.diff())
+    result = torch.zeros(len(splats.depths), len(offsets) - 1, dtype=torch.bool)
+    result[rows[: offsets[-1]].long(), tiles] = True
+    assert int(result.sum()) == int(offsets[-1])  # no row twice in a tile
+    return result
+
+
+def by_tile(pixels, tile_size, reduce):
+    """Reduce [P, H, W] over the pixels of each tile to [P, tiles]."""
+    count, height, width = pixels.shape
+    tiles_x, tiles_y = tile_counts(width, height, tile_size)
+    rows = torch.arange(height) // tile_size * tiles_x
+    tiles = (rows[:, None] + torch.arange(width) // tile_size).flatten().expand(count, -1)
+    start = torch.zeros(count, tiles_x * tiles_y, dtype=pixels.dtype)
+    return start.scatter_reduce(1, tiles, pixels.flatten(1), reduce)
+
+
+def extreme_splats(dtype):
+    """Tiny, huge, thin, faint and far-off splats, among ordinary ones."""
+    parts = [
+        random_splats(300, WIDTH, HEIGHT, seed=1),
+        random_splats(150, WIDTH, HEIGHT, smallest=1e-8, largest=1e-2, seed=2),
+        random_splats(150, WIDTH, HEIGHT, smallest=30, largest=1e5, seed=3),
+        random_splats(300, WIDTH, HEIGHT, smallest=0.5, largest=600, seed=4),
+        random_splats(150, WIDTH, HEIGHT, opacity=(1 / 255 * 0.99, 1 / 255 * 1.05), seed=5),
+        random_splats(150, 40 * WIDTH, 40 * HEIGHT, smallest=5, largest=900, seed=6),
+    ]
+    joined = (torch.cat(column) for column in zip(*(vars(p).values() for p in parts), strict=True))
+    return Splats(*joined).to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("tile_size", [4, 16, 23])
+def test_lists_every_tile_with_a_visible_pixel(dtype, tile_size):
+    splats = extreme_splats(dtype)
+    alphas = pixel_alphas(*(t.double() for t in splats.values()[:3]), WIDTH, HEIGHT)
+    needed = by_tile(alphas, tile_size, "amax") >= 1 / 255
+    found = listed(splats, WIDTH, HEIGHT, tile_size)
+    assert needed.sum() > 1000
+    assert not (needed & ~found).any()
+
+
+@pytest.mark.parametrize("tile_size", [4, 16])
+def test_lists_no_tile_beyond_the_ellipse(tile_size):
+    """On some pixel column of a listed tile, between its first and last pixel row, alpha reaches the cut."""
+    splats = random_splats(500, WIDTH, HEIGHT, smallest=0.4, largest=60)
+    found = listed(splats, WIDTH, HEIGHT, tile_size)
+    means, (a, b, c) = splats.means2d.double(), splats.conics.double().T[:, :, None, None]
+    tiles_x, tiles_y = tile_counts(WIDTH, HEIGHT, tile_size)
+    dx = torch.arange(WIDTH)[None, None, :] + 0.5 - means[:, 0, None, None]
+    top = torch.arange(tiles_y)[None, :, None] * tile_size + 0.5 - means[:, 1, None, None]
+    bottom = (torch.arange(1, tiles_y + 1) * tile_size).clamp(max=HEIGHT)[None, :, None] - 0.5
+    bottom = bottom - means[:, 1, None, None]
+    dy = torch.minimum(torch.maximum(-b / c * dx, top), bottom)  # nearest to the centre in each column
+    alpha = splats.opacities.double()[:, None, None] * torch.exp(
+        -0.5 * (a * dx**2 + 2 * b * dx * dy + c * dy**2)
+    )
+    columns = torch.arange(WIDTH) // tile_size
+    best = torch.zeros(len(means), tiles_y, tiles_x, dtype=torch.float64)
+    best.scatter_reduce_(2, columns.expand(*alpha.shape), alpha, "amax")
+    assert (best.flatten(1)[found] * 255).min() > 1 - 1e-3
+    assert found.sum() > 1000
+
+
+def test_lists_are_ordered_by_depth_then_id():
+    splats = random_splats(2000, WIDTH, HEIGHT, cameras=3)
+    splats.depths = (splats.depths * 40).round() / 40  # many ties
+    ids = torch.randperm(2000, generator=torch.Generator().manual_seed(3))
+    for given in (None, ids):
+        rows, offsets = intersect(*splats.rows(), given, n_cameras=3, width=WIDTH, height=HEIGHT)
+        tiebreak = torch.arange(2000) if given is None else given
+        per_image = (len(offsets) - 1) // 3
+        for tile in range(len(offsets) - 1):
+            part = rows[offsets[tile] : offsets[tile + 1]].long()
+            assert (splats.camera_ids[part] == tile // per_image).all()
+            keys = list(zip(splats.depths[part].tolist(), tiebreak[part].tolist(), strict=True))
+            assert keys == sorted(keys)
+
+
+def test_negative_and_float64_depths_keep_their_order():
+    splats = random_splats(400, WIDTH, HEIGHT, largest=60, dtype=torch.float64)
+    splats.depths = torch.randn(400, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 1e3
+    rows, offsets = intersect(*splats.rows(), n_cameras=1, width=WIDTH, height=HEIGHT)
+    for tile in range(len(offsets) - 1):
+        depths = splats.depths[rows[offsets[tile] : offsets[tile + 1]].long()]
+        assert (depths.diff() > 0).all()
+
+
+def test_tile_ranges_are_parts_of_the_whole():
+    splats = random_splats(1500, WIDTH, HEIGHT, cameras=2)
+    options = {"n_cameras": 2, "width": WIDTH, "height": HEIGHT}
+    rows, offsets = intersect(*splats.rows(), **options)
+    n_tiles = len(offsets) - 1
+    for begin, end in [(0, 7), (7, 33), (33, 33), (33, n_tiles)]:
+        part, part_offsets = intersect(*splats.rows(), tile_begin=begin, tile_end=end, **options)
+        assert torch.equal(part, rows[offsets[begin] : offsets[end]])
+        assert torch.equal(part_offsets, offsets.clamp(offsets[begin], offsets[end]) - offsets[begin])
+
+
+def test_does_not_depend_on_threads():
+    splats = random_splats(5000, WIDTH, HEIGHT)
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            results.append(intersect(*splats.rows(), n_cameras=1, width=WIDTH, height=HEIGHT))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r, strict=True))
+
+
+def test_capacity():
+    splats = random_splats(100, WIDTH, HEIGHT)
+    options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
+    rows, offsets = intersect(*splats.rows(), **options)
+    roomy, same_offsets = intersect(*splats.rows(), n_isects=len(rows) + 5, **options)
+    assert len(roomy) == len(rows) + 5
+    assert torch.equal(roomy[: len(rows)], rows)
+    assert torch.equal(offsets, same_offsets)
+    with pytest.raises(RuntimeError, match=f"n_isects is {len(rows) - 1} but there are {len(rows)}"):
+        intersect(*splats.rows(), n_isects=len(rows) - 1, **options)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_rows_that_are_not_finite_touch_nothing(value):
+    base = random_splats(4, WIDTH, HEIGHT)
+    for name, column in [("means2d", 0), ("means2d", 1), ("conics", 0), ("conics", 1), ("conics", 2)]:
+        splats = Splats(*(t.clone() for t in vars(base).values()))
+        getattr(splats, name)[:, column] = value
+        assert not listed(splats, WIDTH, HEIGHT, 16).any()
+    splats = Splats(*(t.clone() for t in vars(base).values()))
+    splats.opacities[:] = value
+    assert not listed(splats, WIDTH, HEIGHT, 16).any()
+
+
+def test_a_conic_rounded_to_a_stripe_covers_its_line():
+    """b^2 >= a c: infinitely long, so it touches the tiles along its axis and no others."""
+    conic = torch.tensor([[0.5, -0.5, 0.5]])  # the diagonal dx = dy
+    splats = Splats(torch.tensor([[8.0, 8.0]]), conic, torch.ones(1), torch.ones(1, 3), torch.ones(1),
+                    torch.zeros(1, dtype=torch.int32))  # fmt: skip
+    found = listed(splats, 64, 64, 16)[0].view(4, 4)
+    assert found.diagonal().all()
+    assert not found[0, 2:].any()
+    assert not found[2:, 0].any()
+
+
+def test_empty_and_one_row():
+    empty = random_splats(0, WIDTH, HEIGHT)
+    rows, offsets = intersect(*empty.rows(), n_cameras=2, width=WIDTH, height=HEIGHT)
+    assert rows.shape == (0,)
+    assert offsets.shape == (2 * 6 * 5 + 1,)
+    assert not offsets.any()
+    one = random_splats(1, WIDTH, HEIGHT)
+    one.means2d[0] = torch.tensor([40.0, 40.0])
+    one.opacities[0] = 0.5
+    rows, offsets = intersect(*one.rows(), n_cameras=1, width=WIDTH, height=HEIGHT)
+    assert len(rows) >= 1
+    assert not rows.any()
+
+
+def test_errors_name_the_value():
+    splats = random_splats(3, WIDTH, HEIGHT)
+    options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
+    with pytest.raises(RuntimeError, match=r"conics must have shape \[3, 3\], got \[3, 2\]"):
+        intersect(splats.means2d, splats.conics[:, :2], *splats.rows()[2:], **options)
+    with pytest.raises(RuntimeError, match="camera_ids must be Int"):
+        intersect(*splats.rows()[:4], splats.camera_ids.long(), **options)
+    with pytest.raises(RuntimeError, match=r"range of the 30 tiles, got \[5, 31\)"):
+        intersect(*splats.rows(), tile_begin=5, tile_end=31, **options)
+    with pytest.raises(RuntimeError, match=r"tile_size must be in \[1, 64\], got 0"):
+        torch.ops.blitzgs.intersect(*splats.rows(), None, 1, WIDTH, HEIGHT, 0, 0, -1, -1)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_opcheck(known):
+    splats = random_splats(20, WIDTH, HEIGHT)
+    n_isects = len(intersect(*splats.rows(), n_cameras=1, width=WIDTH, height=HEIGHT)[0]) if known else -1
+    torch.library.opcheck(
+        torch.ops.blitzgs.intersect, (*splats.rows(), None, 1, WIDTH, HEIGHT, 16, 0, -1, n_isects)
+    )

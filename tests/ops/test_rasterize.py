@@ -1,0 +1,357 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from blitzgs.ops.intersect import intersect, tile_counts
+from blitzgs.ops.rasterize import rasterize
+from tests.ops.splats import Splats, dense_composite, near_a_cut, random_splats
+
+WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def lists(splats, n_cameras=1, width=WIDTH, height=HEIGHT, tile_size=16, **tile_range):
+    return intersect(
+        *splats.rows(), n_cameras=n_cameras, width=width, height=height, tile_size=tile_size, **tile_range
+    )
+
+
+def forward(splats, n_cameras=1, tile_size=16, backgrounds=None, tile_begin=0, tile_end=-1):
+    """All outputs of the op."""
+    tile_lists = lists(splats, n_cameras, tile_size=tile_size)
+    return torch.ops.blitzgs.rasterize_fwd(
+        *splats.values(), backgrounds, *tile_lists, n_cameras, WIDTH, HEIGHT, tile_size, tile_begin, tile_end
+    )
+
+
+def backward(
+    splats, outputs, v_renders, v_alphas=None, n_cameras=1, backgrounds=None, absgrad=True, tiles=(0, -1)
+):
+    renders, transmittances, last_ids, _, aux = outputs
+    return torch.ops.blitzgs.rasterize_bwd(
+        *splats.values(), backgrounds, *lists(splats, n_cameras), renders, transmittances, last_ids, aux, v_renders,
+        v_alphas, n_cameras, WIDTH, HEIGHT, 16, *tiles, absgrad, True,
+    )  # fmt: skip
+
+
+def gradients(splats, renderer, v_renders, v_alphas, backgrounds):
+    """Gradients of sum(v * outputs) with respect to the four inputs and the backgrounds."""
+    leaves = [t.detach().clone().requires_grad_() for t in (*splats.values(), backgrounds)]
+    renders, alphas = renderer(leaves[:4], leaves[4])
+    ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
+    return [leaf.grad for leaf in leaves]
+
+
+@pytest.mark.parametrize("channels", [1, 3, 7])
+@pytest.mark.parametrize(
+    ("dtype", "image_error", "gradient_error"), [(torch.float64, 1e-12, 1e-10), (torch.float32, 2e-6, 1e-5)]
+)
+def test_image_and_gradients_match_the_definition(channels, dtype, image_error, gradient_error):
+    splats = random_splats(180, WIDTH, HEIGHT, channels=channels, cameras=2, dtype=dtype)
+    generator = torch.Generator().manual_seed(1)
+    backgrounds = torch.rand(2, channels, generator=generator, dtype=torch.float64).to(dtype)
+    v_renders = torch.randn(2, HEIGHT, WIDTH, channels, generator=generator, dtype=torch.float64)
+    v_alphas = torch.randn(2, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
+    clear = ~near_a_cut(splats, WIDTH, HEIGHT)
+    v_renders, v_alphas = v_renders * clear[..., None], v_alphas * clear
+    tile_lists = lists(splats, 2)
+
+    def ours(values, background):
+        return rasterize(
+            *values, *tile_lists, n_cameras=2, width=WIDTH, height=HEIGHT, backgrounds=background
+        )
+
+    def dense(values, background):
+        exact = Splats(*values, splats.depths.double(), splats.camera_ids)
+        return dense_composite(exact, WIDTH, HEIGHT, 2, background)
+
+    exact = splats.to(torch.float64)
+    renders, alphas = ours(splats.values(), backgrounds)
+    true_renders, true_alphas = dense(exact.values(), backgrounds.double())
+    assert clear.float().mean() > 0.95
+    assert ((renders - true_renders).abs() * clear[..., None]).max() < image_error
+    assert ((alphas - true_alphas).abs() * clear).max() < image_error
+    found = gradients(splats, ours, v_renders.to(dtype), v_alphas.to(dtype), backgrounds)
+    expected = gradients(exact, dense, v_renders, v_alphas, backgrounds.double())
+    for a, b in zip(found, expected, strict=True):
+        assert (a - b).abs().max() <= gradient_error * b.abs().max()
+
+
+def test_gradcheck():
+    splats = random_splats(8, 9, 8, channels=2, dtype=torch.float64, smallest=2, opacity=(0.1, 0.9), seed=4)
+    tile_lists = lists(splats, width=9, height=8)
+    backgrounds = torch.rand(1, 2, dtype=torch.float64)
+    leaves = [t.requires_grad_() for t in (*splats.values(), backgrounds)]
+
+    def image(*values):
+        return rasterize(*values[:4], *tile_lists, n_cameras=1, width=9, height=8, backgrounds=values[4])
+
+    # Steps small enough that no pixel crosses the cut at 1/255.
+    assert torch.autograd.gradcheck(image, leaves, eps=1e-7, atol=1e-5, rtol=1e-4)
+
+
+def test_absolute_gradients_sum_each_pixels_gradient():
+    splats = random_splats(30, WIDTH, HEIGHT, dtype=torch.float64, smallest=4)
+    v_renders = torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.float64)
+    patch = (slice(None), slice(11, 19), slice(10, 22))  # across a corner of four tiles
+    v_renders[patch] = torch.randn(8, 12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    expected = torch.zeros(30, 2, dtype=torch.float64)
+    outputs = forward(splats)
+    for _, row, column in v_renders.any(-1).nonzero().tolist():
+        one = torch.zeros_like(v_renders)
+        one[0, row, column] = v_renders[0, row, column]
+        expected += backward(splats, outputs, one)[0].abs()
+    found = backward(splats, outputs, v_renders)
+    assert (found[4] > 0).sum() > 10
+    torch.testing.assert_close(found[4], expected, rtol=1e-10, atol=1e-12)
+    assert backward(splats, outputs, v_renders, absgrad=False)[4].shape == (0, 2)
+
+    means2d = splats.means2d.clone().requires_grad_()
+    probe = torch.zeros_like(means2d, requires_grad=True)
+    renders, _ = rasterize(
+        means2d,
+        *splats.values()[1:],
+        *lists(splats),
+        n_cameras=1,
+        width=WIDTH,
+        height=HEIGHT,
+        means2d_abs=probe,
+    )
+    renders.backward(v_renders)
+    assert torch.equal(probe.grad, found[4])
+    assert torch.equal(means2d.grad, found[0])
+
+
+def test_gradient_is_zero_where_alpha_is_clipped():
+    splats = random_splats(1, WIDTH, HEIGHT, smallest=9, largest=10)
+    splats.means2d[0] = torch.tensor([20.5, 20.5])
+    splats.opacities[0] = 0.999
+    outputs = forward(splats)
+    v_renders = torch.zeros(1, HEIGHT, WIDTH, 3)
+    v_renders[0, 20, 20] = 1.0  # right at the centre: clipped
+    v_means, v_conics, v_opacities, v_colors, _ = backward(splats, outputs, v_renders)
+    assert not v_means.any()
+    assert not v_conics.any()
+    assert not v_opacities.any()
+    torch.testing.assert_close(v_colors, torch.full((1, 3), 0.99))
+
+
+def test_thousands_of_layers_stay_accurate():
+    """2300 faint layers over every pixel: as deep as a pixel can be before its transmittance runs out."""
+    splats = random_splats(2300, WIDTH, HEIGHT, smallest=300, largest=900, opacity=(0.0041, 0.0044))
+    splats.means2d = (splats.means2d / 10 + 20).float()
+    v_renders = torch.rand(1, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
+    outputs = forward(splats)
+    assert outputs[2].min() > 2100
+    found = backward(splats, outputs, v_renders)
+    exact = splats.to(torch.float64)
+    expected = backward(exact, forward(exact), v_renders.double())
+    for a, b in zip(found, expected, strict=True):
+        assert (a - b).abs().max() <= 1e-4 * b.abs().max()
+        assert (a - b).norm() <= 2e-5 * b.norm()
+
+
+def test_last_ids_and_tile_work():
+    splats = random_splats(400, WIDTH, HEIGHT, smallest=3, opacity=(0.5, 1.0))
+    rows, offsets = lists(splats)
+    _, transmittances, last_ids, tile_work, _ = forward(splats)
+    tiles_x, _ = tile_counts(WIDTH, HEIGHT, 16)
+    lengths = offsets.diff()
+    assert (tile_work <= lengths).all()
+    assert (tile_work < lengths).any()  # some tile ended early
+    for tile, work in enumerate(tile_work.tolist()):
+        y, x = tile // tiles_x * 16, tile % tiles_x * 16
+        last = last_ids[0, y : y + 16, x : x + 16]
+        assert last.max() <= work
+        # Entries past tile_work change nothing: drop them and render again.
+        shorter = rows[offsets[tile] : offsets[tile] + work]
+        alone = torch.zeros_like(offsets)
+        alone[tile + 1 :] = work
+        again = torch.ops.blitzgs.rasterize_fwd(
+            *splats.values(), None, shorter, alone, 1, WIDTH, HEIGHT, 16, tile, tile + 1
+        )
+        assert torch.equal(again[2][0, y : y + 16, x : x + 16], last)
+        assert again[3][tile] == work
+        # The last composited entry is needed: without it the pixel's transmittance is another.
+        if 0 < work:
+            pixel = (last == last.max()).nonzero()[0]
+            cut = alone.clamp(max=int(last.max()) - 1)
+            less = torch.ops.blitzgs.rasterize_fwd(
+                *splats.values(), None, shorter, cut, 1, WIDTH, HEIGHT, 16, tile, tile + 1
+            )
+            where = (0, y + pixel[0], x + pixel[1])
+            assert less[1][where] > transmittances[where]
+
+
+def test_tile_ranges_make_up_the_whole_image_bit_for_bit():
+    splats = random_splats(900, WIDTH, HEIGHT, cameras=2)
+    backgrounds = torch.rand(2, 3, generator=torch.Generator().manual_seed(0))
+    v_renders = torch.randn(2, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
+    whole = forward(splats, 2, backgrounds=backgrounds)
+    v_whole = backward(splats, whole, v_renders, None, 2, backgrounds)
+    pieces = [
+        forward(splats, 2, backgrounds=backgrounds, tile_begin=a, tile_end=b)
+        for a, b in [(0, 5), (5, 17), (17, 24)]
+    ]
+    for output in range(4):
+        assert torch.equal(sum(piece[output] for piece in pieces), whole[output])
+    for piece in pieces:
+        unowned = piece[1] == 0
+        assert unowned.any()
+        assert not piece[0][unowned].any()
+        assert not piece[2][unowned].any()
+    v_parts = [
+        backward(splats, whole, v_renders, None, 2, backgrounds, tiles=t) for t in [(0, 5), (5, 17), (17, 24)]
+    ]
+    for parts, total in zip(zip(*v_parts, strict=True), v_whole, strict=True):
+        torch.testing.assert_close(sum(parts), total, rtol=1e-4, atol=1e-4 * float(total.abs().max()))
+
+
+def test_public_function_masks_unowned_alphas():
+    splats = random_splats(300, WIDTH, HEIGHT)
+    options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
+    _, whole = rasterize(*splats.values(), *lists(splats), **options)
+    _, first = rasterize(*splats.values(), *lists(splats), **options, tile_begin=0, tile_end=6)
+    _, second = rasterize(*splats.values(), *lists(splats), **options, tile_begin=6, tile_end=12)
+    assert torch.equal(first + second, whole)
+    assert not first[:, 32:].any()
+
+
+def test_batch_position_and_threads_change_no_bit():
+    splats = random_splats(1200, WIDTH, HEIGHT, cameras=3)
+    v_renders = torch.randn(3, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            outputs = forward(splats, 3)
+            results.append((*outputs, *backward(splats, outputs, v_renders, n_cameras=3)))
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+    single = splats.camera_ids == 1
+    alone = Splats(*(t[single] for t in vars(splats).values()))
+    alone.camera_ids = torch.zeros_like(alone.camera_ids)
+    outputs = forward(alone)
+    assert torch.equal(outputs[0][0], results[0][0][1])
+    v_alone = backward(alone, outputs, v_renders[1:2])
+    for a, b in zip(v_alone, results[0][5:], strict=True):
+        assert torch.equal(a, b[single])
+
+
+@pytest.mark.parametrize("tile_size", [5, 8, 32, 64])
+def test_tile_size_only_moves_roundings_of_the_gradient(tile_size):
+    splats = random_splats(500, WIDTH, HEIGHT)
+    outputs = forward(splats)
+    other = forward(splats, tile_size=tile_size)
+    assert torch.equal(outputs[0], other[0])
+    assert torch.equal(outputs[1], other[1])
+
+
+SCALAR_SCRIPT = """
+import sys, torch
+from tests.ops.test_rasterize import scalar_case
+torch.save(scalar_case(), sys.argv[1])
+"""
+
+
+def scalar_case():
+    results = []
+    for channels in (3, 4, 6):
+        splats = random_splats(700, WIDTH, HEIGHT, channels=channels, smallest=0.1, largest=80, seed=channels)
+        v_renders = torch.randn(1, HEIGHT, WIDTH, channels, generator=torch.Generator().manual_seed(1))
+        outputs = forward(splats)
+        results += [*outputs, *backward(splats, outputs, v_renders)]
+    return results
+
+
+def test_scalar_code_gives_the_same_bits(tmp_path):
+    environment = {**os.environ, "BLITZGS_NO_AVX2": "1", "PYTHONPATH": str(ROOT)}
+    path = tmp_path / "scalar.pt"
+    subprocess.run(
+        [sys.executable, "-c", SCALAR_SCRIPT, str(path)], check=True, env=environment, cwd=ROOT, timeout=120
+    )
+    for a, b in zip(torch.load(path), scalar_case(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_zero_rows_and_empty_lists():
+    splats = random_splats(0, WIDTH, HEIGHT)
+    backgrounds = torch.tensor([[0.1, 0.2, 0.3]])
+    outputs = forward(splats, backgrounds=backgrounds)
+    assert torch.equal(outputs[0], backgrounds.expand(1, HEIGHT, WIDTH, 3))
+    assert (outputs[1] == 1).all()
+    assert [t.shape for t in backward(splats, outputs, outputs[0])] == [(0, 2), (0, 3), (0,), (0, 3), (0, 2)]
+    hidden = random_splats(3, WIDTH, HEIGHT)
+    hidden.opacities[:] = 1 / 300
+    outputs = forward(hidden)
+    assert not outputs[0].any()
+    assert not any(t.any() for t in backward(hidden, outputs, torch.ones_like(outputs[0])))
+
+
+def test_a_row_that_is_not_finite_leaves_the_others_alone():
+    splats = random_splats(40, WIDTH, HEIGHT)
+    tile_lists = lists(splats)
+    clean = torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1)
+    victim = int(tile_lists[0][0])
+    others = tile_lists[0] != victim
+    kept = torch.tensor([int(others[: int(end)].sum()) for end in tile_lists[1]])
+    expected = torch.ops.blitzgs.rasterize_fwd(
+        *splats.values(), None, tile_lists[0][others], kept, 1, WIDTH, HEIGHT, 16, 0, -1
+    )
+    assert not torch.equal(clean[0], expected[0])
+    for column in ("means2d", "conics", "opacities"):
+        broken = Splats(*(t.clone() for t in vars(splats).values()))
+        getattr(broken, column)[victim] = float("nan")
+        found = torch.ops.blitzgs.rasterize_fwd(
+            *broken.values(), None, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1
+        )
+        assert torch.equal(found[0], expected[0])
+        outputs = backward_with(broken, tile_lists, found)
+        assert all(torch.isfinite(t).all() for t in outputs)
+
+
+def backward_with(splats, tile_lists, outputs):
+    renders, transmittances, last_ids, _, aux = outputs
+    return torch.ops.blitzgs.rasterize_bwd(
+        *splats.values(), None, *tile_lists, renders, transmittances, last_ids, aux, torch.ones_like(renders),
+        None, 1, WIDTH, HEIGHT, 16, 0, -1, True, True,
+    )  # fmt: skip
+
+
+def test_errors_name_the_value():
+    splats = random_splats(3, WIDTH, HEIGHT)
+    tile_lists = lists(splats)
+    options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
+    with pytest.raises(RuntimeError, match=r"colors must have shape \[3, \*\], got \[2, 3\]"):
+        rasterize(*splats.values()[:3], splats.colors[:2], *tile_lists, **options)
+    with pytest.raises(RuntimeError, match=r"backgrounds must have shape \[1, 3\], got \[2, 3\]"):
+        rasterize(*splats.values(), *tile_lists, **options, backgrounds=torch.zeros(2, 3))
+    with pytest.raises(RuntimeError, match=r"tile_offsets must have shape \[13\], got \[12\]"):
+        rasterize(*splats.values(), tile_lists[0], tile_lists[1][:-1], **options)
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_opcheck(absgrad):
+    splats = random_splats(6, WIDTH, HEIGHT)
+    values = [t.requires_grad_() for t in splats.values()]
+    backgrounds = torch.rand(1, 3, requires_grad=True)
+    probe = torch.zeros(6, 2, requires_grad=True) if absgrad else None
+    tile_lists = lists(splats)
+    arguments = (*values, backgrounds, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1, probe)
+    torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, arguments)
+    with torch.no_grad():
+        outputs = forward(splats)
+        renders, transmittances, last_ids, _, aux = outputs
+        torch.library.opcheck(
+            torch.ops.blitzgs.rasterize_bwd,
+            (*(t.detach() for t in values), None, *tile_lists, renders, transmittances, last_ids, aux, renders, None,
+             1, WIDTH, HEIGHT, 16, 0, -1, absgrad, False),
+        )  # fmt: skip
