@@ -16,9 +16,9 @@ from tests.training.tiny import tiny_config, tiny_scene
 
 
 @pytest.fixture(autouse=True)
-def two_threads():
+def one_thread():
     before = torch.get_num_threads()
-    torch.set_num_threads(2)
+    torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
 
@@ -89,7 +89,7 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     first, summary = train(tmp_path)
     assert summary is None and first.progress.step == 50
     monkeypatch.undo()
-    torch.set_num_threads(2)
+    torch.set_num_threads(1)
     second, summary = train(tmp_path, resume=True)
     assert summary is not None
     assert_same_table(second.table, whole.table)

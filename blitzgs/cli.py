@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: `blitzgs train | eval | render | export | synth`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from blitzgs import __version__
+from blitzgs.distributed.group import MismatchError, Ranks
+from blitzgs.scene import ply
+from blitzgs.scene.synth import command as synth
+from blitzgs.training import run
+from blitzgs.training.checkpoint import CheckpointError
+from blitzgs.training.config_io import load_config, to_dict
+from blitzgs.training.evaluation import evaluate, load_lpips, render_view, to_uint8, write_image
+from blitzgs.training.guard import NonFiniteError
+from blitzgs.training.trainer import Trainer
+from blitzgs.training.views import ViewSet, render_options
+
+# What a user can cause and mend: reported as a message. Anything else is ours and keeps its traceback.
+USER_ERRORS = (ValueError, OSError, CheckpointError, MismatchError, NonFiniteError)
+
+TRAIN_HELP = """\
+Train a model of a capture: a COLMAP model (DIR/sparse/0 and DIR/images) or a transforms.json.
+
+Every field of the configuration is a flag, e.g.
+  blitzgs train --config configs/aerial.yaml --data DIR --out RUN --data.downscale=2 --schedule.scale=0.5
+Times are counted in images; schedule.scale stretches the whole schedule. `blitzgs train --show-config` prints
+the resolved configuration and stops.
+
+RUN gets config.yaml, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. An interrupted run
+(Ctrl-C or SIGTERM) saves a checkpoint; the same command with --resume continues it exactly.
+
+Several processes: torchrun --nproc-per-node=M train.py (the same flags).
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status (1: failed with a message, 2: wrong usage)."""
+    parser = _parser()
+    args, rest = parser.parse_known_args(arguments)
+    if rest and not (args.command == "train" and all(text.startswith("--") and "=" in text for text in rest)):
+        hint = " (configuration fields are written --section.field=value)" if args.command == "train" else ""
+        args.parser.error(f"unrecognized arguments: {' '.join(rest)}{hint}")
+    args.overrides = rest
+    try:
+        status: int = args.run(args)
+    except USER_ERRORS as error:
+        Console(stderr=True, highlight=False).print(
+            f"blitzgs {args.command}: {error}", style="red", markup=False
+        )
+        return 1
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="blitzgs", description="City-scale 3D Gaussian Splatting.")
+    parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    train = _add(commands, "train", _train, "train a model of a capture", TRAIN_HELP)
+    train.add_argument(
+        "--config", type=Path, metavar="YAML", help="configuration file (default: the defaults)"
+    )
+    train.add_argument("--data", metavar="DIR", help="the capture (or --data.path=DIR)")
+    train.add_argument("--out", type=Path, metavar="RUN", help="folder of the run")
+    train.add_argument(
+        "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
+    )
+    train.add_argument("--show-config", action="store_true", help="print the resolved configuration and stop")
+    _add_device(train)
+
+    evaluation = _add(commands, "eval", _eval, "measure the held-out views of a run")
+    _add_run(evaluation)
+    evaluation.add_argument("--split", choices=("test", "train"), default="test", help="views (%(default)s)")
+    evaluation.add_argument("--out", type=Path, metavar="DIR", help="default: RUN/evaluation/SPLIT")
+    evaluation.add_argument(
+        "--pictures", type=int, default=8, metavar="N", help="side-by-side pictures (%(default)s)"
+    )
+    evaluation.add_argument("--lpips", metavar="FILE", help="TorchScript module of LPIPS with its weights")
+
+    render = _add(commands, "render", _render, "render the views of a run to files")
+    _add_run(render)
+    render.add_argument(
+        "--split", choices=("test", "train", "all"), default="test", help="views (%(default)s)"
+    )
+    render.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the images")
+    render.add_argument(
+        "--raw",
+        action="store_true",
+        help="write float32 arrays [H, W, 3] as .npy, not clamped, instead of PNG",
+    )
+
+    export = _add(commands, "export", _export, "write the model of a run to a file other programs read")
+    _add_run(export, needs_data=False)
+    export.add_argument("--ply", type=Path, required=True, metavar="FILE", help="PLY in INRIA's layout")
+
+    city = _add(commands, "synth", synth.run, "generate a synthetic city to train on")
+    synth.add_arguments(city)
+    return parser
+
+
+def _add(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    function: object,
+    summary: str,
+    description: str | None = None,
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name,
+        help=summary,
+        description=description or summary[0].upper() + summary[1:] + ".",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=function, parser=parser)
+    return parser
+
+
+def _add_run(parser: argparse.ArgumentParser, needs_data: bool = True) -> None:
+    parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a run")
+    if needs_data:
+        parser.add_argument("--data", metavar="DIR", help="where the capture is now (default: where it was)")
+    _add_device(parser)
+
+
+def _add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--device", default="auto", help="auto (a GPU when there is one), cpu, cuda or cuda:N (%(default)s)"
+    )
+
+
+def _train(args: argparse.Namespace) -> int:
+    overrides = [*args.overrides]
+    if args.data is not None:
+        overrides.append(f"data.path={json.dumps(str(Path(args.data).resolve()))}")
+    source = args.config
+    if args.resume and source is None and args.out is not None and (args.out / run.CONFIG).exists():
+        source = args.out / run.CONFIG
+    config = load_config(source, overrides)
+    if args.show_config:
+        print(json.dumps(to_dict(config), indent=1))
+        return 0
+    if args.out is None:
+        args.parser.error("the following arguments are required: --out")
+    ranks = Ranks.from_environment(args.device)
+    try:
+        capture, images = run.open_capture(config)
+        summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
+        if summary is not None and ranks.rank == 0:
+            _print_summary(summary, args.out)
+    finally:
+        ranks.close()
+    return 0
+
+
+def _print_summary(summary: dict[str, object], folder: Path) -> None:
+    table = Table(title=str(folder), show_header=False)
+    for name, value in summary.items():
+        if isinstance(value, (int, float)):
+            table.add_row(name, f"{value:,.4f}" if isinstance(value, float) else f"{value:,}")
+    Console().print(table)
+
+
+def _eval(args: argparse.Namespace) -> int:
+    ranks = Ranks.from_environment(args.device)
+    model = run.open_model(args.folder, ranks, args.data)
+    capture, images = run.open_capture(model.config)
+    result = evaluate(
+        model.table,
+        ViewSet(list(capture.cameras), model.space, ranks.device),
+        capture.cameras,
+        images,
+        getattr(capture, args.split),
+        render_options(model.config, model.space, model.progress.sh_degree),
+        args.out or args.folder / run.EVALUATION / args.split,
+        pictures=args.pictures,
+        lpips=load_lpips(args.lpips),
+    )
+    print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
+    return 0
+
+
+def _render(args: argparse.Namespace) -> int:
+    ranks = Ranks.from_environment(args.device)
+    model = run.open_model(args.folder, ranks, args.data)
+    capture, _ = run.open_capture(model.config)
+    views = ViewSet(list(capture.cameras), model.space, ranks.device)
+    options = render_options(model.config, model.space, model.progress.sh_degree)
+    indices = range(len(capture.cameras)) if args.split == "all" else getattr(capture, args.split)
+    args.out.mkdir(parents=True, exist_ok=True)
+    for index in indices:
+        render = render_view(model.table, views, index, options)
+        path = (args.out / capture.cameras[index].name).with_suffix(".npy" if args.raw else ".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if args.raw:
+            np.save(path, render.cpu().numpy())
+        else:
+            write_image(path, to_uint8(render))
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    model = run.open_model(args.folder, Ranks.from_environment(args.device))
+    table, space = model.table, model.space
+    args.ply.parent.mkdir(parents=True, exist_ok=True)
+    ply.write_ply(
+        args.ply,
+        means=table["means"].cpu().double() * space.unit,
+        quats=table["quats"].cpu(),
+        scales=table["scales"].cpu() + math.log(space.unit),
+        opacities=table["opacities"].cpu(),
+        sh=table["sh"].cpu(),
+        offset=np.array(space.offset),
+    )
+    print(f"{args.ply}: {len(table):,} Gaussians, {args.ply.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

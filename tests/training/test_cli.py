@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line from a capture on disk to exported Gaussians, in-process and as torchrun starts it."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.cli import main
+from blitzgs.distributed.group import Ranks
+from blitzgs.scene.ply import read_ply
+from blitzgs.training import run
+from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, write_tiny_capture
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    torch.set_num_threads(1)
+    data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
+    write_tiny_capture(data)
+    flags = [f"--{text}" for text in OVERRIDES]
+    assert main(["train", "--data", str(data), "--out", str(folder), "--schedule.scale=0.4", *flags]) == 0
+    return data, folder
+
+
+def test_train_leaves_a_summary(trained):
+    summary = json.loads((trained[1] / "summary.json").read_text())
+    assert summary["images"] == 40 and summary["psnr"] > 15
+
+
+def test_eval_repeats_the_metrics_of_training(trained, tmp_path, capsys):
+    summary = json.loads((trained[1] / "summary.json").read_text())
+    assert main(["eval", str(trained[1]), "--out", str(tmp_path), "--pictures", "1"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {name: summary[name] for name in ("psnr", "ssim")}
+    assert len(list(tmp_path.glob("*.jpg"))) == 1
+
+
+def test_render_writes_every_view(trained, tmp_path):
+    assert main(["render", str(trained[1]), "--split", "test", "--raw", "--out", str(tmp_path / "raw")]) == 0
+    assert main(["render", str(trained[1]), "--split", "all", "--out", str(tmp_path / "png")]) == 0
+    raw = {path.stem: np.load(path) for path in (tmp_path / "raw").iterdir()}
+    assert len(raw) == 1 and len(list((tmp_path / "png").iterdir())) == 8
+    for name, image in raw.items():
+        assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.float32
+        png = cv2.imread(str(tmp_path / "png" / f"{name}.png"))[..., ::-1]
+        assert np.abs(image.clip(0, 1) * 255 - png).max() <= 0.51
+
+
+def test_export_restores_the_units_of_the_capture(trained, tmp_path):
+    path = tmp_path / "model.ply"
+    assert main(["export", str(trained[1]), "--ply", str(path)]) == 0
+    model, exported = run.open_model(trained[1], Ranks()), read_ply(path)
+    means = model.table["means"].double() * model.space.unit + torch.tensor(model.space.offset)
+    torch.testing.assert_close(exported.means.double(), means, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(exported.scales, model.table["scales"] + math.log(model.space.unit))
+    assert torch.equal(exported.quats, model.table["quats"])
+
+
+def test_torchrun_entry(trained, tmp_path):
+    flags = [f"--{text}" for text in (*OVERRIDES, "schedule.scale=0.02", "log.pictures=0")]
+    command = [sys.executable, "train.py", "--data", str(trained[0]), "--out", str(tmp_path / "r"), *flags]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=None)
+    assert done.returncode == 0, done.stderr
+    assert "psnr" in done.stdout and (tmp_path / "r" / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["train", "--out", "x"], 1, "data.path: no capture given; use --data DIR"),
+        (["train", "--data", "/nowhere", "--out", "x"], 1, "/nowhere"),
+        (
+            ["train", "--data", "d", "--out", "x", "--loss.sim=1"],
+            1,
+            "loss.sim: unknown field; did you mean 'ssim'",
+        ),
+        (["train", "--data", "d", "--out", "x", "--loss.ssim", "1"], 2, "written --section.field=value"),
+        (["train", "--data", "d"], 2, "required: --out"),
+        (["train", "--config", "missing.yaml", "--out", "x"], 1, "missing.yaml: cannot read"),
+        (["eval", "/nowhere"], 1, "/nowhere is not a run"),
+        (["export", "/nowhere", "--ply", "x.ply"], 1, "/nowhere is not a run"),
+        (["eval", "/nowhere", "--fast"], 2, "unrecognized arguments: --fast"),
+    ],
+)
+def test_mistakes_get_a_message(arguments, status, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "300")
+    try:
+        result = main(arguments)
+    except SystemExit as exit_:
+        result = exit_.code
+    assert result == status
+    printed = capsys.readouterr().err
+    assert message in printed and "Traceback" not in printed
+
+
+def test_show_config_and_help(capsys):
+    assert main(["train", "--show-config", "--schedule.batch_size=4"]) == 0
+    assert json.loads(capsys.readouterr().out)["schedule"]["batch_size"] == 4
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    assert "--resume" in capsys.readouterr().out
