@@ -48,10 +48,12 @@ BLITZGS_HD T activate_opacity(T opacity, bool raw) {
 }
 
 // How far from its centre, in standard deviations, a splat of this opacity can reach alpha = 1/255; negative
-// or NaN when it never does.
+// when it never does.
 template <class T>
 BLITZGS_HD T reach(T opacity) {
-  return opacity >= T(kAlphaCut) ? std::sqrt(T(2) * std::log(larger(T(255) * opacity, T(1)))) : T(-1);
+  return opacity >= T(kAlphaCut) && is_finite(opacity)
+             ? std::sqrt(T(2) * std::log(larger(T(255) * opacity, T(1))))
+             : T(-1);
 }
 
 template <class T>
@@ -72,7 +74,7 @@ BLITZGS_HD bool may_be_visible(const Camera<T>& camera, const Vec3<T>& mean, con
                                const ProjectOptions<T>& options) {
   const T sigmas = reach(opacity);
   const ProjectedMean p = project_mean(camera, mean);
-  if (!(sigmas >= T(0)) || !in_depth_range(T(p.z), options)) return false;
+  if (sigmas < T(0) || !in_depth_range(T(p.z), options)) return false;
   T mean2d[2];
   pixel_position(camera, p, mean2d);
   const PixelGradients<T> g = pixel_gradients(camera, p);
@@ -108,7 +110,7 @@ BLITZGS_HD bool project_row(const Camera<T>& camera, const ActiveGaussian<T>& ga
   for (int i = 0; i < 3; ++i) row->conic[i] = splat.conic[i];
   row->opacity = options.antialiased ? gaussian.opacity * compensation(splat) : gaussian.opacity;
   const T sigmas = reach(row->opacity);
-  if (!(sigmas >= T(0)) || !is_finite(splat.conic[0] + splat.conic[1] + splat.conic[2])) return false;
+  if (sigmas < T(0) || !is_finite(splat.conic[0] + splat.conic[1] + splat.conic[2])) return false;
   row->extent[0] = sigmas * std::sqrt(splat.cov_xx);
   row->extent[1] = sigmas * std::sqrt(splat.cov_yy);
   if (options.radius_clip > T(0) && !(larger(row->extent[0], row->extent[1]) > options.radius_clip)) {

@@ -1,0 +1,276 @@
+// SPDX-License-Identifier: Apache-2.0
+// Every derivative of the maths headers against central differences in double, and the forward formulas at
+// the ends of the float range against double.
+#include <functional>
+#include <limits>
+#include <random>
+#include <vector>
+
+#include "common/catch.h"
+#include "math/projection.h"
+#include "math/sh.h"
+#include "project/project_row.h"
+
+using namespace blitzgs;
+using Values = std::vector<double>;
+
+namespace {
+
+Values random_values(int count, unsigned seed, double size = 1.0) {
+  std::mt19937 engine(seed);
+  std::normal_distribution<double> normal(0.0, size);
+  Values values(count);
+  for (double& value : values) value = normal(engine);
+  return values;
+}
+
+double weighted(const Values& values, const Values& weights) {
+  double sum = 0;
+  for (std::size_t i = 0; i < values.size(); ++i) sum += values[i] * weights[i];
+  return sum;
+}
+
+// gradient must be d(weights . f(x)) / dx.
+void require_gradient(const std::function<Values(const Values&)>& f, const Values& x, const Values& weights,
+                      const Values& gradient) {
+  REQUIRE(gradient.size() == x.size());
+  double size = 1e-3;
+  for (const double g : gradient) size = std::max(size, std::fabs(g));
+  for (std::size_t i = 0; i < x.size(); ++i) {
+    const double h = 1e-6 * std::max(1.0, std::fabs(x[i]));
+    Values above = x, below = x;
+    above[i] += h;
+    below[i] -= h;
+    const double numeric = (weighted(f(above), weights) - weighted(f(below), weights)) / (2 * h);
+    INFO("input " << i << ": numeric " << numeric << ", analytic " << gradient[i]);
+    REQUIRE(std::fabs(numeric - gradient[i]) < 1e-7 * size);
+  }
+}
+
+Columns3<double> columns(const double* p) { return {load3(p), load3(p + 3), load3(p + 6)}; }
+
+Values flat(const Columns3<double>& c) {
+  return {c.x.x, c.x.y, c.x.z, c.y.x, c.y.y, c.y.z, c.z.x, c.z.y, c.z.z};
+}
+
+template <class T>
+Camera<T> test_camera() {
+  // A rotation of 30 degrees about y, then a shift.
+  const T c = T(std::sqrt(0.75)), s = T(0.5);
+  const T viewmat[16] = {c, 0, s, T(0.2), 0, 1, 0, T(-0.1), -s, 0, c, T(3), 0, 0, 0, 1};
+  const T K[9] = {100, 0, 40, 0, 110, 30, 0, 0, 1};
+  return make_camera(viewmat, K, 64, 48);
+}
+
+}  // namespace
+
+TEST_CASE("rotation of a quaternion: derivative, zero, very long and very short") {
+  const Values weights = random_values(9, 1);
+  const auto rotate = [](const Values& q) { return flat(rotation_columns(normalize_quaternion(q.data()))); };
+  for (unsigned seed = 2; seed < 6; ++seed) {
+    const Values q = random_values(4, seed, 2.0);
+    Values gradient(4, 0.0);
+    rotation_columns_vjp(normalize_quaternion(q.data()), columns(weights.data()), gradient.data());
+    require_gradient(rotate, q, weights, gradient);
+  }
+  const double zero[4] = {};
+  double v_zero[4] = {};
+  rotation_columns_vjp(normalize_quaternion(zero), columns(weights.data()), v_zero);
+  REQUIRE(flat(rotation_columns(normalize_quaternion(zero))) == Values{1, 0, 0, 0, 1, 0, 0, 0, 1});
+  for (const double v : v_zero) REQUIRE(v == 0.0);
+  for (const float size : {1e-38f, 1e-20f, 1e20f, 1e38f}) {
+    const float q[4] = {0.5f * size, -0.5f * size, 0.5f * size, 0.5f * size};
+    const UnitQuaternion<float> unit = normalize_quaternion(q);
+    REQUIRE(unit.w == Approx(0.5f));
+    REQUIRE(unit.x == Approx(-0.5f));
+    REQUIRE(unit.inverse_norm == Approx(1.0 / size));
+  }
+}
+
+TEST_CASE("scaled axes: derivative") {
+  const Values rotation = random_values(9, 11), scale = random_values(3, 12), weights = random_values(9, 13);
+  Vec3<double> v_scale;
+  Columns3<double> v_rotation;
+  scaled_axes_vjp(columns(rotation.data()), load3(scale.data()), columns(weights.data()), &v_scale,
+                  &v_rotation);
+  require_gradient(
+      [&](const Values& s) { return flat(scaled_axes(columns(rotation.data()), load3(s.data()))); }, scale,
+      weights, {v_scale.x, v_scale.y, v_scale.z});
+  require_gradient([&](const Values& r) { return flat(scaled_axes(columns(r.data()), load3(scale.data()))); },
+                   rotation, weights, flat(v_rotation));
+}
+
+TEST_CASE("spherical harmonics: derivative at every degree") {
+  for (int degree = 0; degree <= kMaxShDegree; ++degree) {
+    const Values direction = random_values(3, 20), weights = random_values(kMaxShBasis, 21);
+    const Vec3<double> v = sh_basis_vjp(degree, load3(direction.data()), weights.data());
+    require_gradient(
+        [&](const Values& d) {
+          Values basis(kMaxShBasis, 0.0);
+          sh_basis(degree, load3(d.data()), basis.data());
+          return basis;
+        },
+        direction, weights, {v.x, v.y, v.z});
+  }
+}
+
+TEST_CASE("conic and compensation: derivative") {
+  for (unsigned seed = 30; seed < 34; ++seed) {
+    const Values rows = random_values(6, seed, 3.0), weights = random_values(4, seed + 10, 10.0);
+    const auto splat_of = [](const Values& m) {
+      const Columns3<double> axes{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+      PixelGradients<double> g{};
+      g.gx = load3(m.data());
+      g.gy = load3(m.data() + 3);
+      return make_splat(g, axes, 0.3);
+    };
+    Vec3<double> v0, v1;
+    splat_vjp(splat_of(rows), weights.data(), weights[3], &v0, &v1);
+    require_gradient(
+        [&](const Values& m) {
+          const Splat<double> s = splat_of(m);
+          return Values{s.conic[0], s.conic[1], s.conic[2], compensation(s)};
+        },
+        rows, weights, {v0.x, v0.y, v0.z, v1.x, v1.y, v1.z});
+  }
+}
+
+TEST_CASE("a splat seen exactly edge-on has finite gradients") {
+  const Columns3<double> axes{{1, 0, 0}, {0, 0, 0}, {0, 0, 0}};
+  const PixelGradients<double> g{{2, 0, 0}, {1, 0, 0}, 0, 0, 1, true, true};
+  const Splat<double> s = make_splat(g, axes, 0.3);
+  REQUIRE(compensation(s) == 0.0);
+  const double v_conic[3] = {1, 2, 3};
+  Vec3<double> v0, v1;
+  splat_vjp(s, v_conic, 5.0, &v0, &v1);
+  REQUIRE(is_finite(v0.x + v0.y + v0.z + v1.x + v1.y + v1.z));
+}
+
+TEST_CASE("a row: derivative with respect to mean, axes and pose") {
+  // Inside the image, and outside of the slopes where the Jacobian is clamped (left, and below).
+  const double means[3][3] = {{0.1, 0.2, -0.3}, {-2.6, 0.1, 0.2}, {0.3, 2.5, 0.4}};
+  for (const auto& mean : means) {
+    for (const bool antialiased : {false, true}) {
+      Values x(mean, mean + 3);
+      const Values axes = random_values(9, 50, 0.7);
+      x.insert(x.end(), axes.begin(), axes.end());
+      const Camera<double> base = test_camera<double>();
+      for (const Vec3<double>& row : {base.row_x, base.row_y, base.row_z, base.translation}) {
+        x.insert(x.end(), {row.x, row.y, row.z});
+      }
+      const auto camera_of = [&](const Values& v) {
+        Camera<double> camera = base;
+        camera.row_x = load3(&v[12]);
+        camera.row_y = load3(&v[15]);
+        camera.row_z = load3(&v[18]);
+        camera.translation = load3(&v[21]);
+        return camera;
+      };
+      ProjectOptions<double> options{64, 48, 16, 0, 1, 0.01, 1e10, 0.3, 0.0, antialiased, false};
+      const auto gaussian_of = [](const Values& v) {
+        ActiveGaussian<double> gaussian{};
+        gaussian.mean = load3(v.data());
+        gaussian.axes = columns(&v[3]);
+        gaussian.opacity = 0.9;
+        return gaussian;
+      };
+      const Values weights = random_values(7, 60, 5.0);
+      const RowGradient<double> v{
+          {weights[0], weights[1]}, {weights[2], weights[3], weights[4]}, weights[5], weights[6]};
+      GaussianGradient<double> gradient{};
+      PoseGradient<double> pose{};
+      project_row_vjp(camera_of(x), gaussian_of(x), options, v, &gradient, &pose);
+      Values expected{gradient.mean.x, gradient.mean.y, gradient.mean.z};
+      for (const double value : flat(gradient.axes)) expected.push_back(value);
+      for (const Vec3<double>& row : {pose.row_x, pose.row_y, pose.row_z, pose.translation}) {
+        expected.insert(expected.end(), {row.x, row.y, row.z});
+      }
+      require_gradient(
+          [&](const Values& values) {
+            Row<double> row{};
+            REQUIRE(project_row(camera_of(values), gaussian_of(values), options, &row));
+            return Values{row.mean2d[0], row.mean2d[1], row.conic[0], row.conic[1],
+                          row.conic[2],  row.depth,     row.opacity};
+          },
+          x, weights, expected);
+    }
+  }
+}
+
+TEST_CASE("elongated and extreme splats keep their float determinant") {
+  const ProjectOptions<double> exact{64, 48, 16, 0, 1, 0.01, 1e10, 0.3, 0.0, true, false};
+  const ProjectOptions<float> rounded{64, 48, 16, 0, 1, 0.01f, 1e10f, 0.3f, 0.0f, true, false};
+  for (const double size : {1e-8, 1e-4, 1.0, 1e4}) {
+    for (const double ratio : {1.0, 1e-4}) {
+      const float quat[4] = {0.7f, 0.2f, -0.4f, 0.5f};
+      const double wide[4] = {quat[0], quat[1], quat[2], quat[3]};
+      const float length = float(size), thin = float(size * ratio);
+      const auto a = activate_gaussian<double>({0.1, 0.2, -0.3}, wide, {length, thin, thin}, 0.9);
+      const auto b = activate_gaussian<float>({0.1f, 0.2f, -0.3f}, quat, {length, thin, thin}, 0.9f);
+      const Camera<double> camera = test_camera<double>();
+      const Camera<float> camera_f = test_camera<float>();
+      const Splat<double> s = make_splat(pixel_gradients(camera, project_mean(camera, a.mean)), a.axes, 0.3);
+      const Splat<float> f =
+          make_splat(pixel_gradients(camera_f, project_mean(camera_f, b.mean)), b.axes, 0.3f);
+      INFO("size " << size << ", ratio " << ratio);
+      REQUIRE(f.root_det * f.magnitude == Approx(s.root_det * s.magnitude).epsilon(1e-5));
+      REQUIRE(f.conic[0] == Approx(s.conic[0]).epsilon(1e-5));
+      REQUIRE(f.conic[1] == Approx(s.conic[1]).epsilon(1e-5).margin(1e-6 * s.conic[0]));
+      REQUIRE(f.conic[2] == Approx(s.conic[2]).epsilon(1e-5));
+      REQUIRE(compensation(f) == Approx(compensation(s)).epsilon(1e-4).margin(1e-7));
+      Row<double> row_exact{};
+      Row<float> row{};
+      REQUIRE(project_row(camera, a, exact, &row_exact) == project_row(camera_f, b, rounded, &row));
+      const RowGradient<float> v{{1, 1}, {1, 1, 1}, 1, 1};
+      GaussianGradient<float> gradient{};
+      project_row_vjp(camera_f, b, rounded, v, &gradient, static_cast<PoseGradient<float>*>(nullptr));
+      for (const Vec3<float>& g : {gradient.mean, gradient.axes.x, gradient.axes.y, gradient.axes.z}) {
+        REQUIRE(is_finite(g.x + g.y + g.z));
+      }
+    }
+  }
+}
+
+TEST_CASE("the cheap test never drops a row that exists") {
+  std::mt19937 engine(7);
+  std::normal_distribution<float> normal;
+  const Camera<float> camera = test_camera<float>();
+  const ProjectOptions<float> options{64, 48, 16, 0, 1, 0.01f, 1e10f, 0.3f, 0.0f, false, false};
+  int exist = 0, spared = 0;
+  for (int i = 0; i < 20000; ++i) {
+    const Vec3<float> mean{3 * normal(engine), 3 * normal(engine), 3 * normal(engine)};
+    const Vec3<float> scale{std::exp(normal(engine) - 2), std::exp(normal(engine) - 2),
+                            std::exp(normal(engine) - 2)};
+    const float quat[4] = {normal(engine), normal(engine), normal(engine), normal(engine)};
+    const float opacity = 1 / (1 + std::exp(-3 * normal(engine)));
+    Row<float> row{};
+    const bool exists = project_row(camera, activate_gaussian(mean, quat, scale, opacity), options, &row);
+    const bool maybe = may_be_visible(camera, mean, scale, opacity, options);
+    REQUIRE((maybe || !exists));
+    exist += exists;
+    spared += !maybe;
+  }
+  REQUIRE(exist > 1000);
+  REQUIRE(spared > 5000);
+}
+
+TEST_CASE("nothing that is not finite becomes a row") {
+  const float bad[] = {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()};
+  const Camera<float> camera = test_camera<float>();
+  const ProjectOptions<float> options{64, 48, 16, 0, 1, 0.01f, 1e10f, 0.3f, 0.0f, false, false};
+  for (const float value : bad) {
+    for (int slot = 0; slot < 11; ++slot) {
+      float p[11] = {0.1f, 0.2f, -0.3f, 1, 0, 0, 0, 0.1f, 0.1f, 0.1f, 0.5f};
+      Row<float> row{};
+      REQUIRE(project_row(camera, activate_gaussian(load3(p), p + 3, load3(p + 7), p[10]), options, &row));
+      p[slot] = value;
+      INFO("slot " << slot);
+      const auto gaussian = activate_gaussian(load3(p), p + 3, load3(p + 7), p[10]);
+      REQUIRE_FALSE(project_row(camera, gaussian, options, &row));
+    }
+    float sh[48] = {};
+    sh[47] = value;
+    REQUIRE(finite_sh(sh, 2));
+    REQUIRE_FALSE(finite_sh(sh, 3));
+  }
+}
