@@ -97,7 +97,7 @@ def test_text_tolerates_blank_lines_carriage_returns_and_a_missing_last_line(tmp
     (tmp_path / "points3D.txt").write_bytes(b"")
     model = colmap.read_model(tmp_path, points2d=True)
     assert model.cameras[0].params.tolist() == [1.5, 2, 2, 1.5]
-    assert model.images.names == ["with blanks.jpg", "b.jpg"]
+    assert model.images.names == ["name with blanks.jpg", "b.jpg"]
     assert model.images.translations[0].tolist() == [0, 0, 1e-3]
 
 

@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from blitzgs.scene import colmap
+from blitzgs.scene.cameras import camera_centers
+from blitzgs.scene.capture import load_capture
+from blitzgs.scene.image_files import apply_orientation, read_header
+from blitzgs.scene.images import ImageStore
+from tests.scene.helpers import shared_data, smooth_image, write_capture, write_image
+
+NAMES = [f"v{i:02d}.png" for i in range(9)]
+
+
+def edit_model(root, change):
+    folder = root / "sparse" / "0"
+    model = colmap.read_model(folder, points2d=True, tracks=True)
+    change(model)
+    colmap.write_model(folder, model)
+
+
+def write_jpeg_with_orientation(path, rgb, orientation):
+    ok, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])
+    assert ok
+    tag = b"MM\0*" + struct.pack(">I", 8) + struct.pack(">HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
+    payload = b"Exif\0\0" + tag
+    segment = b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload
+    path.write_bytes(data.tobytes()[:2] + segment + data.tobytes()[2:])
+
+
+def test_recentred_world_projects_points_where_the_original_does(tmp_path):
+    write_capture(tmp_path, NAMES)
+    edit_model(tmp_path, lambda m: m.images.translations.__iadd__(0))
+    model = colmap.read_model(tmp_path / "sparse" / "0")
+    far = np.array([4.5e5, 5.2e6, 120.0])  # a capture in UTM coordinates
+
+    def move(m):
+        rotations = colmap.quats_to_rotations(m.images.quats)
+        m.images.translations = m.images.translations - np.einsum("nij,j->ni", rotations, far)
+        m.points.positions = m.points.positions + far
+
+    edit_model(tmp_path, move)
+    capture = load_capture(tmp_path)
+    centers = np.stack([c.center for c in capture.cameras])
+    np.testing.assert_allclose(centers.mean(axis=0), 0, atol=1e-8)
+    poses = colmap.world_to_camera(model.images)
+    np.testing.assert_allclose(capture.offset, far + camera_centers(poses).mean(axis=0), rtol=1e-12)
+    for camera in capture.cameras:
+        pose = poses[model.images.names.index(camera.name)]
+        ours = capture.points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        expected = model.points.positions @ pose[:3, :3].T + pose[:3, 3]
+        np.testing.assert_allclose(ours, expected, atol=1e-6)
+
+
+def test_views_are_sorted_and_every_eighth_is_held_out(tmp_path):
+    capture = load_capture(write_capture(tmp_path, NAMES[::-1]))
+    assert [c.name for c in capture.cameras] == NAMES
+    assert (capture.test, capture.train) == ([0, 8], list(range(1, 8)))
+    train = np.stack([capture.cameras[i].center for i in capture.train])
+    distances = np.linalg.norm(train - train.mean(axis=0), axis=1)
+    assert capture.extent == pytest.approx(1.1 * distances.max())
+    assert capture.track_lengths.tolist()[0] == 9 and (capture.errors == -1).all()
+
+
+@pytest.mark.parametrize(("downscale", "size"), [(2, (33, 24)), (3, (22, 16)), (1.7, (38, 28))])
+def test_downscaling_averages_areas_and_scales_each_axis_by_its_own_ratio(tmp_path, downscale, size):
+    capture = load_capture(write_capture(tmp_path, NAMES[:2], width=65, height=48), downscale=downscale)
+    camera = capture.cameras[0]
+    assert (camera.width, camera.height) == size
+    full = load_capture(tmp_path).cameras[0].K
+    np.testing.assert_allclose(camera.K[0], full[0] * size[0] / 65)
+    np.testing.assert_allclose(camera.K[1], full[1] * size[1] / 48)
+    source = cv2.imread(str(tmp_path / "images" / camera.name))[..., ::-1]
+    expected = cv2.resize(source, size, interpolation=cv2.INTER_AREA)
+    np.testing.assert_array_equal(ImageStore(capture).get(0).numpy(), expected)
+
+
+def test_prescaled_folder_is_used_when_it_fits_and_not_otherwise(tmp_path):
+    write_capture(tmp_path, NAMES[:2], width=65, height=48)
+    for name in NAMES[:2]:
+        write_image(tmp_path / "images_2" / name, smooth_image(24, 32, seed=9))
+    capture = load_capture(tmp_path, downscale=2)
+    assert {c.image_path.parent.name for c in capture.cameras} == {"images_2"}
+    assert (capture.cameras[0].width, capture.cameras[0].height) == (32, 24)
+    full = load_capture(tmp_path).cameras[0].K
+    np.testing.assert_allclose(capture.cameras[0].K[0], full[0] * 32 / 65)
+    np.testing.assert_array_equal(ImageStore(capture).get(1).numpy(), smooth_image(24, 32, seed=9))
+
+    write_image(tmp_path / "images_2" / NAMES[1], smooth_image(20, 20))
+    with pytest.warns(UserWarning, match="is 20 x 20, not 1/2 of 65 x 48; downscaling images instead"):
+        capture = load_capture(tmp_path, downscale=2)
+    assert {c.image_path.parent.name for c in capture.cameras} == {"images"}
+    (tmp_path / "images_2" / NAMES[1]).unlink()
+    with pytest.warns(UserWarning, match=f"lacks {NAMES[1]}"):
+        load_capture(tmp_path, downscale=2)
+
+
+def test_images_smaller_than_their_camera_scale_its_matrix(tmp_path):
+    write_capture(tmp_path, NAMES[:2], width=64, height=48)
+    full = load_capture(tmp_path).cameras[0].K
+    write_image(tmp_path / "images" / NAMES[0], smooth_image(24, 32))
+    capture = load_capture(tmp_path)
+    np.testing.assert_allclose(capture.cameras[0].K[:2], full[:2] / 2)
+    assert (capture.cameras[0].width, capture.cameras[1].width) == (32, 64)  # mixed sizes
+
+
+def test_images_that_do_not_fit_their_camera_are_refused(tmp_path):
+    write_capture(tmp_path, NAMES[:2])
+    write_image(tmp_path / "images" / NAMES[1], smooth_image(48, 90))
+    with pytest.raises(ValueError, match=rf"{NAMES[1]} is 90 x 48, which does not fit its camera of 64 x 48"):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_turns_an_image_only_when_its_camera_is_upright(tmp_path, orientation):
+    upright = smooth_image(80, 48)
+    path = tmp_path / "probe.jpg"
+    write_jpeg_with_orientation(path, upright, orientation)
+    assert read_header(path).orientation == orientation
+    stored = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    np.testing.assert_array_equal(apply_orientation(stored, orientation), cv2.imread(str(path)))
+
+    for name, (width, height) in {"asstored": (48, 80), "turned": (80, 48)}.items():
+        root = write_capture(tmp_path / name, ["a.jpg"], width=width, height=height)
+        write_jpeg_with_orientation(root / "images" / "a.jpg", upright, orientation)
+        if name == "turned" and orientation < 5:
+            with pytest.raises(ValueError, match="does not fit its camera"):
+                load_capture(root)
+            continue
+        shown = ImageStore(load_capture(root)).get(0).numpy()
+        assert shown.shape == (height, width, 3)
+        expected = stored if name == "asstored" else cv2.imread(str(path))
+        np.testing.assert_array_equal(shown, expected[..., ::-1])
+    applied = load_capture(tmp_path / "asstored", exif="apply") if orientation < 5 else None
+    if applied is not None:
+        np.testing.assert_array_equal(ImageStore(applied).get(0).numpy(), cv2.imread(str(path))[..., ::-1])
+
+
+def test_masks_are_found_turned_and_shrunk_so_that_mixed_pixels_are_excluded(tmp_path):
+    write_capture(tmp_path, NAMES[:3], width=64, height=48)
+    mask = np.full((48, 64), 255, dtype=np.uint8)
+    mask[:, :17] = 0
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / f"{NAMES[0]}.png"), mask)
+    cv2.imwrite(str(tmp_path / "masks" / "v01.png"), mask)
+    store = ImageStore(load_capture(tmp_path, downscale=2))
+    for index in (0, 1):
+        found = store.mask(index).numpy()
+        assert found.shape == (24, 32) and found.dtype == np.uint8
+        assert not found[:, :9].any() and found[:, 9:].all()
+    assert store.mask(2) is None
+    assert ImageStore(load_capture(tmp_path, masks=False)).mask(0) is None
+    with pytest.raises(FileNotFoundError, match="other: no such folder of masks"):
+        load_capture(tmp_path, masks="other")
+
+
+def test_distorted_captures_become_pinhole_ones(tmp_path):
+    params = [60.0, 60.0, 32.0, 24.0, -0.1, 0.02, 0, 0]
+    write_capture(tmp_path, NAMES[:2], model="OPENCV", params=params)
+    capture = load_capture(tmp_path)
+    camera, store = capture.cameras[0], ImageStore(capture)
+    assert store.get(0).shape == (camera.height, camera.width, 3) and store.mask(0) is None
+    source = cv2.imread(str(tmp_path / "images" / camera.name))[..., ::-1]
+    rays = cv2.initUndistortRectifyMap(
+        np.array([[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]),
+        np.array(params[4:]),
+        np.eye(3),
+        camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
+        (camera.width, camera.height),
+        cv2.CV_32FC1,
+    )
+    expected = cv2.remap(source, *rays, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    assert np.abs(store.get(0).numpy().astype(int) - expected).max() <= 2
+
+    masked = load_capture(tmp_path, undistort="mask")
+    assert masked.cameras[0].width > camera.width
+    mask = ImageStore(masked).mask(0).numpy()
+    assert 0.8 < mask.mean() < 1
+
+
+def test_missing_images_are_named_or_dropped(tmp_path):
+    write_capture(tmp_path, NAMES)
+    (tmp_path / "images" / NAMES[3]).unlink()
+    with pytest.raises(FileNotFoundError, match=f"1 of 9 images are not in .*images: {NAMES[3]}"):
+        load_capture(tmp_path)
+    with pytest.warns(UserWarning, match="dropped"):
+        capture = load_capture(tmp_path, allow_missing=True)
+    assert [c.name for c in capture.cameras] == NAMES[:3] + NAMES[4:]
+
+
+def test_views_and_points_that_are_not_finite_are_dropped_with_a_warning(tmp_path):
+    write_capture(tmp_path, NAMES)
+
+    def damage(model):
+        model.images.quats[2] = 0
+        model.images.translations[4, 1] = np.nan
+        model.points.positions[5, 0] = np.inf
+
+    edit_model(tmp_path, damage)
+    with pytest.warns(UserWarning) as caught:
+        capture = load_capture(tmp_path)
+    messages = " ".join(str(w.message) for w in caught)
+    assert "2 views without a finite pose" in messages and "1 of 20 points are not finite" in messages
+    assert len(capture.cameras) == 7 and len(capture.points) == 19 and len(capture.track_lengths) == 19
+
+    edit_model(tmp_path, lambda m: m.images.quats.fill(np.nan))
+    with pytest.raises(ValueError, match="none of the 9 views has a pose"):
+        load_capture(tmp_path)
+
+
+def test_nothing_to_load_is_said_clearly(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no capture: expected a COLMAP model"):
+        load_capture(tmp_path)
+    with pytest.raises(FileNotFoundError, match="is not a folder"):
+        load_capture(tmp_path / "nowhere")
+    write_capture(tmp_path, NAMES[:2])
+    with pytest.raises(ValueError, match="downscale must be at least 1, got 0.5"):
+        load_capture(tmp_path, downscale=0.5)
+    edit_model(tmp_path, lambda m: m.images.camera_ids.fill(7))
+    with pytest.raises(ValueError, match=f"the cameras of 2 images .first: {NAMES[0]}. are not there"):
+        load_capture(tmp_path)
+
+
+def test_one_camera_gets_an_extent_from_the_points(tmp_path):
+    write_capture(tmp_path, NAMES[:1])
+    with pytest.warns(UserWarning, match="all training cameras are in one place"):
+        capture = load_capture(tmp_path)
+    assert capture.extent == pytest.approx(np.median(np.linalg.norm(capture.points, axis=1)))
+    assert (capture.train, capture.test) == ([0], [])
+
+
+def test_scaling_the_world_by_a_power_of_two_scales_everything_exactly(tmp_path):
+    first = load_capture(write_capture(tmp_path, NAMES))
+
+    def scale(model):
+        model.images.translations *= 1024
+        model.points.positions *= 1024
+
+    edit_model(tmp_path, scale)
+    second = load_capture(tmp_path)
+    assert second.extent == 1024 * first.extent
+    np.testing.assert_array_equal(second.points, 1024 * first.points)
+    for a, b in zip(first.cameras, second.cameras, strict=True):
+        np.testing.assert_array_equal(b.world_to_camera[:3, 3], 1024 * a.world_to_camera[:3, 3])
+
+
+def test_mega_nerf_layout_with_mappings_and_with_two_models(tmp_path):
+    one = write_capture(tmp_path / "one", NAMES)
+    lines = []
+    for i, name in enumerate(NAMES):
+        part = "val" if i in (2, 5) else "train"
+        target = one / part / "rgbs" / f"{i:06d}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        (one / "images" / name).rename(target)
+        lines.append(f"{name},{i:06d}.pt\n")
+    (one / "mappings.txt").write_text("".join(lines))
+    assert load_capture(one).test == [2, 5]
+    assert load_capture(one, split=4).test == [0, 4, 8]
+
+    two = tmp_path / "two"
+    write_capture(two / "train", NAMES[:6])
+    write_capture(two / "val", NAMES[6:8])
+    for part in ("train", "val"):
+        (two / part / "images").rename(two / part / "rgbs")
+    capture = load_capture(two, split="val")
+    assert [capture.cameras[i].name for i in capture.test] == [f"val/{name}" for name in NAMES[6:8]]
+    assert len(capture.train) == 6 and len(capture.points) == 20
+
+
+@pytest.mark.skipif(shared_data() is None, reason="the real captures are not here")
+@pytest.mark.parametrize(
+    ("name", "views", "test", "downscale"), [("sheffield", 172, 22, 2), ("caliterra", 75, 10, 4)]
+)
+def test_real_captures_load_and_decode(name, views, test, downscale):
+    capture = load_capture(shared_data() / name, downscale=downscale)
+    assert (len(capture.cameras), len(capture.test)) == (views, test)
+    store = ImageStore(capture)
+    camera = capture.cameras[3]
+    assert store.get(3).shape == (camera.height, camera.width, 3)
+    # Most of the points that lie in front of a camera within its image were seen by some camera.
+    seen = capture.points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = (seen / seen[:, 2:]) @ camera.K.T
+    inside = (seen[:, 2] > 0) & (pixels[:, :2] >= 0).all(axis=1)
+    inside &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    assert inside.sum() > 1000
+
+
+def test_blender_transforms(tmp_path):
+    frames = []
+    for i in range(3):
+        alpha = np.zeros((20, 30, 4), dtype=np.uint8)
+        alpha[5:10, 5:10] = (10, 20, 30, 255)
+        (tmp_path / "train").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "train" / f"r_{i}.png"), alpha)
+        matrix = np.eye(4)
+        matrix[:3, 3] = [i, 0, 4]
+        frames.append({"file_path": f"./train/r_{i}", "transform_matrix": matrix.tolist()})
+    content = {"camera_angle_x": 0.8, "frames": frames[:2]}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
+    (tmp_path / "transforms_test.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames[2:]}))
+    with pytest.warns(UserWarning, match="no points"):
+        capture = load_capture(tmp_path)
+    assert (capture.train, capture.test, capture.background) == ([0, 1], [2], (1.0, 1.0, 1.0))
+    camera = capture.cameras[0]
+    assert camera.K[0, 0] == pytest.approx(15 / np.tan(0.4)) and camera.K[0, 2] == 15
+    # The camera at z = 4 looks down its own -z, so the origin is 4 in front of it, and world up is image up.
+    origin = camera.world_to_camera @ np.append(-capture.offset, 1)
+    np.testing.assert_allclose(origin[:3], [0, 0, 4], atol=1e-12)
+    above = camera.world_to_camera @ np.append(np.array([0, 1, 0]) - capture.offset, 1)
+    assert above[1] < 0
+    image = ImageStore(capture).get(0)
+    assert image[0, 0].tolist() == [255, 255, 255] and image[6, 6].tolist() == [30, 20, 10]
+    assert len(capture.points) == 100_000
+
+
+def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
+    frames = []
+    (tmp_path / "masks").mkdir()
+    for i in range(4):
+        write_image(tmp_path / "images" / f"f{i}.png", smooth_image(48, 64, i))
+        cv2.imwrite(str(tmp_path / "masks" / f"f{i}.png"), np.zeros((48, 64), dtype=np.uint8))
+        matrix = np.eye(4)
+        matrix[0, 3] = i
+        frame = {"file_path": f"images/f{i}.png", "transform_matrix": matrix.tolist()}
+        frames.append(frame | ({"mask_path": f"masks/f{i}.png"} if i == 1 else {}))
+    (tmp_path / "p.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n1 2 3 9 8 7\n4 5 6 1 2 3\n"
+    )
+    content = {
+        **{"fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "camera_model": "OPENCV"},
+        **{"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0, "frames": frames, "ply_file_path": "p.ply"},
+        **{"train_filenames": [f"images/f{i}.png" for i in (0, 1, 3)], "test_filenames": ["images/f2.png"]},
+    }
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(content))
+    capture = load_capture(tmp_path, masks=False)
+    assert capture.test == [2] and capture.background is None
+    np.testing.assert_allclose(capture.points + capture.offset, [[1, 2, 3], [4, 5, 6]])
+    assert capture.colors.tolist() == [[9, 8, 7], [1, 2, 3]] and capture.track_lengths is None
+    lens = capture.cameras[0].rectification.lens
+    assert lens.model == "FULL_OPENCV" and lens.distortion[:4] == (-0.1, 0.01, 0.001, 0.0)
+    store = ImageStore(capture)
+    assert store.mask(0) is None and not store.mask(1).any()
+
+    content["frames"] = [{"file_path": "images/f0.png"}]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="frame 0: the field 'transform_matrix' is missing"):
+        load_capture(tmp_path)
+    path.write_text('{"frames": 3}')
+    with pytest.raises(ValueError, match="not a transforms file with a list of frames"):
+        load_capture(tmp_path)

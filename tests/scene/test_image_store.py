@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.scene.capture import load_capture
+from blitzgs.scene.images import BoundedCache, ImageStore
+from tests.scene.helpers import smooth_image, write_capture, write_image
+
+NAMES = [f"v{i:02d}.jpg" for i in range(12)]
+IMAGE_BYTES = 3 * 64 * 48
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return load_capture(write_capture(tmp_path, NAMES))
+
+
+def test_images_are_rgb_and_rows_are_slices(tmp_path):
+    write_capture(tmp_path, ["a.png", "b.png"])
+    store = ImageStore(load_capture(tmp_path))
+    image = store.get(1)
+    assert image.dtype == torch.uint8 and not image.is_cuda
+    np.testing.assert_array_equal(image.numpy(), smooth_image(48, 64, seed=1))
+    assert torch.equal(store.get_rows(1, 5, 20), image[5:20]) and store.get_rows(1, 7, 7).shape == (0, 64, 3)
+    with pytest.raises(ValueError, match="rows 5 to 49 are not inside an image of 48 rows"):
+        store.get_rows(1, 5, 49)
+
+
+def test_grey_images_become_rgb(tmp_path):
+    write_capture(tmp_path, ["a.png", "b.png"])
+    grey = smooth_image(48, 64)[..., :1]
+    write_image(tmp_path / "images" / "a.png", grey)
+    np.testing.assert_array_equal(
+        ImageStore(load_capture(tmp_path)).get(0).numpy(), np.repeat(grey, 3, axis=2)
+    )
+
+
+def test_the_same_bits_for_every_budget_thread_count_and_order(capture):
+    ample, tight = (
+        ImageStore(capture),
+        ImageStore(capture, budget_bytes=2000, threads=3, decoded_bytes=IMAGE_BYTES),
+    )
+    first = [ample.get(i).clone() for i in range(12)]
+    tight.prefetch(range(12))
+    for i in [5, 3, 5, 11, 0, 1, 2, 3, 4, 6, 7, 8, 9, 10]:
+        assert torch.equal(tight.get(i), first[i])
+    assert tight._decoded.bytes <= IMAGE_BYTES and tight._files.bytes <= 2000
+
+
+def test_files_are_read_once_within_the_budget(capture):
+    store = ImageStore(capture, decoded_bytes=0)
+    before = [store.get(i).clone() for i in range(12)]
+    for camera in capture.cameras:
+        camera.image_path.unlink()
+    assert all(torch.equal(store.get(i), before[i]) for i in range(12))
+    with pytest.raises(FileNotFoundError, match=NAMES[4]):
+        ImageStore(capture).get(4)
+
+
+def test_prefetch_decodes_ahead_as_far_as_the_budget_goes(capture, monkeypatch):
+    store = ImageStore(capture, decoded_bytes=4 * IMAGE_BYTES, threads=2)
+    made, original = [], ImageStore._make_image
+    monkeypatch.setattr(ImageStore, "_make_image", lambda s, c: made.append(c.name) or original(s, c))
+    store.prefetch(range(12))
+    store.close()
+    assert sorted(made) == NAMES[:4]
+    assert store._decoded.bytes == 4 * IMAGE_BYTES
+
+
+def test_an_image_wanted_by_many_threads_is_decoded_once(capture, monkeypatch):
+    store, calls, gate = ImageStore(capture, threads=4), [], threading.Event()
+    original = ImageStore._make_image
+
+    def slow(self, camera):
+        calls.append(camera.name)
+        gate.wait(5)
+        return original(self, camera)
+
+    monkeypatch.setattr(ImageStore, "_make_image", slow)
+    with ThreadPoolExecutor(8) as pool:
+        results = [pool.submit(store.get, 3) for _ in range(8)]
+        store.prefetch([3])
+        gate.set()
+        assert all(torch.equal(r.result(), store.get(3)) for r in results)
+    assert calls == [NAMES[3]]
+
+
+@pytest.mark.parametrize("kept", [0, 1, 30, 0.5, 0.99])
+def test_truncated_jpegs_are_named_and_never_shown_in_part(capture, kept):
+    path = capture.cameras[2].image_path
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept * len(data)) if isinstance(kept, float) else kept])
+    store = ImageStore(capture)
+    store.prefetch(range(4))
+    with pytest.raises(ValueError, match=f"{NAMES[2]}: (truncated|cannot be decoded)"):
+        store.get(2)
+    with pytest.raises(ValueError, match=NAMES[2]):
+        store.get(2)
+    assert store.get(3).shape == (48, 64, 3)
+
+
+def test_a_jpeg_whose_end_was_zeroed_is_refused(capture):
+    path = capture.cameras[0].image_path
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    with pytest.raises(ValueError, match=f"{NAMES[0]}: truncated JPEG"):
+        ImageStore(capture).get(0)
+
+
+def test_damaged_headers_are_named_at_load(tmp_path):
+    write_capture(tmp_path, NAMES[:3])
+    path = tmp_path / "images" / NAMES[1]
+    data = path.read_bytes()
+    for damaged in (data[:100], b"\xff\xd8", b"not an image", b""):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=NAMES[1]):
+            load_capture(tmp_path)
+
+
+def test_a_file_that_changed_its_size_is_refused(capture):
+    write_image(capture.cameras[0].image_path, smooth_image(20, 30))
+    with pytest.raises(ValueError, match="is 30 x 20 now but was 64 x 48"):
+        ImageStore(capture).get(0)
+
+
+def test_bounded_cache_drops_the_least_recently_used():
+    cache = BoundedCache(10)
+    for key, size in (("a", 4), ("b", 4)):
+        cache.put(key, key, size)
+    assert cache.get("a") == "a"
+    cache.put("c", "c", 4)
+    assert (cache.get("a"), cache.get("b"), cache.get("c"), cache.bytes) == ("a", None, "c", 8)
+    cache.put("a", "a2", 2)
+    assert (cache.get("a"), cache.bytes) == ("a2", 6)
+    cache.put("big", "big", 11)
+    assert cache.get("big") is None and cache.bytes == 6

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+import dataclasses
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+
+from blitzgs.scene.ply import read_ply, read_points, write_ply
+
+
+def gaussians(n: int, degree: int, seed: int = 0) -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    shapes = {
+        "means": (n, 3),
+        "quats": (n, 4),
+        "scales": (n, 3),
+        "opacities": (n,),
+        "sh": (n, (degree + 1) ** 2, 3),
+    }
+    return {name: torch.randn(*shape, generator=g) for name, shape in shapes.items()}
+
+
+def inria_file(path, columns, normals=None, comments=()) -> None:
+    """The layout as INRIA's training code writes it, through plyfile."""
+    n, k = columns["sh"].shape[:2]
+    rest = columns["sh"][:, 1:].transpose(1, 2).reshape(n, -1)  # channel-major
+    parts = [columns["means"], torch.zeros(n, 3) if normals is None else normals, columns["sh"][:, 0], rest]
+    parts += [columns["opacities"][:, None], columns["scales"], columns["quats"]]
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+    names += [f"f_rest_{i}" for i in range(3 * (k - 1))] + ["opacity"]
+    names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    rows = np.empty(n, dtype=[(name, "f4") for name in names])
+    for name, column in zip(names, torch.cat(parts, dim=1).numpy().T, strict=True):
+        rows[name] = column
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")], comments=list(comments)).write(path)
+
+
+@pytest.mark.parametrize("n", [0, 1, 17])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_inria_files_are_read_right_and_written_back_byte_for_byte(tmp_path, degree, n):
+    columns = gaussians(n, degree)
+    if n:
+        columns["means"][0] = torch.tensor([-0.0, float("nan"), float("inf")])
+    inria_file(tmp_path / "in.ply", columns)
+    found = read_ply(tmp_path / "in.ply")
+    for name, expected in columns.items():
+        assert torch.equal(getattr(found, name).nan_to_num(7), expected.nan_to_num(7)), name
+    write_ply(tmp_path / "out.ply", **vars(found))
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
+    write_ply(tmp_path / "direct.ply", **columns)
+    assert (tmp_path / "direct.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
+
+
+def test_comments_and_normals_survive_the_round_trip(tmp_path):
+    columns = gaussians(5, 1)
+    inria_file(tmp_path / "in.ply", columns, normals=torch.randn(5, 3), comments=["made by hand", ""])
+    found = read_ply(tmp_path / "in.ply")
+    assert found.comments[0] == "comment made by hand"
+    write_ply(tmp_path / "out.ply", **vars(found))
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
+
+
+def test_offset_is_added_in_float64(tmp_path):
+    columns = gaussians(4, 0)
+    offset = np.array([123456.789, -2.0, 0.1])
+    write_ply(tmp_path / "a.ply", **columns, offset=offset)
+    expected = (columns["means"].double().numpy() + offset).astype(np.float32)
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").means.numpy(), expected)
+
+
+def test_other_orders_missing_normals_ascii_and_big_endian_are_read(tmp_path):
+    columns = gaussians(6, 1)
+    inria_file(tmp_path / "in.ply", columns)
+    rows = plyfile.PlyData.read(tmp_path / "in.ply")["vertex"].data
+    names = [n for n in reversed(rows.dtype.names) if n not in ("nx", "ny", "nz")]
+    other = np.empty(6, dtype=[(n, "f8" if n == "opacity" else "f4") for n in names])
+    for name in names:
+        other[name] = rows[name]
+    for text, order in ((True, "="), (False, ">"), (False, "<")):
+        element = plyfile.PlyElement.describe(other, "vertex")
+        plyfile.PlyData([element], text=text, byte_order=order).write(tmp_path / "other.ply")
+        found = read_ply(tmp_path / "other.ply")
+        for name, expected in columns.items():
+            assert torch.allclose(getattr(found, name), expected, atol=1e-6), name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d[:-1], "it claims 3 vertices of at least 68 bytes each"),
+        (lambda d: d + b"x", "1 bytes are left after the last record"),
+        (lambda d: d.replace(b"vertex 3", b"vertex 99999999999999999"), "claims 99999999999999999 vertices"),
+        (lambda d: d.replace(b"ply", b"plx", 1), "the first line is not 'ply'"),
+        (lambda d: d.replace(b"1.0", b"2.0"), "unknown format line"),
+        (lambda d: d.replace(b"float opacity", b"half opacity"), "bad property line 'property half opacity'"),
+        (lambda d: d.replace(b"float opacity", b"float opaqueness"), "properties opacity are missing"),
+        (lambda d: d.replace(b"float rot_1", b"float rot_0"), "property rot_0 comes twice"),
+        (lambda d: d.replace(b"end_header", b"the_end"), "unknown header line 'the_end'"),
+        (lambda d: d.replace(b"element vertex", b"element face"), "no vertex element"),
+        (lambda d: b"", "the file ends inside the header"),
+    ],
+)
+def test_damaged_files_are_named_with_the_reason(tmp_path, change, message):
+    inria_file(tmp_path / "in.ply", gaussians(3, 0))
+    bad = tmp_path / "bad.ply"
+    bad.write_bytes(change((tmp_path / "in.ply").read_bytes()))
+    with pytest.raises(ValueError, match=f"bad.ply.*{message}"):
+        read_ply(bad)
+
+
+def test_shapes_are_checked_and_no_file_appears(tmp_path):
+    columns = gaussians(3, 0) | {"quats": torch.zeros(2, 4)}
+    with pytest.raises(ValueError, match=r"quats has the shape \[2, 4\], expected \[3, 4\]"):
+        write_ply(tmp_path / "a.ply", **columns)
+    with pytest.raises(ValueError, match="K = 1, 4, 9 or 16"):
+        write_ply(tmp_path / "a.ply", **(gaussians(3, 0) | {"sh": torch.zeros(3, 5, 3)}))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_point_clouds_with_faces_and_without_colours(tmp_path):
+    rows = np.array(
+        [(1, 2, 3, 10, 20, 30)],
+        dtype=[(n, "f8") for n in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")],
+    )
+    face = np.array([([0, 0, 0],)], dtype=[("vertex_indices", "i4", (3,))])
+    elements = [plyfile.PlyElement.describe(rows, "vertex"), plyfile.PlyElement.describe(face, "face")]
+    plyfile.PlyData(elements).write(tmp_path / "a.ply")
+    positions, colors = read_points(tmp_path / "a.ply")
+    assert positions.tolist() == [[1, 2, 3]] and colors.tolist() == [[10, 20, 30]]
+    plyfile.PlyData([plyfile.PlyElement.describe(rows[["x", "y", "z"]].copy(), "vertex")]).write(
+        tmp_path / "b.ply"
+    )
+    assert read_points(tmp_path / "b.ply")[1].tolist() == [[128, 128, 128]]
+
+
+def test_a_gaussian_ply_is_its_fields():
+    from blitzgs.scene.ply import GaussianPly
+
+    assert {f.name for f in dataclasses.fields(GaussianPly)} == {*gaussians(1, 0), "normals", "comments"}

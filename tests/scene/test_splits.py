@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+from pathlib import Path
+
+import pytest
+
+from blitzgs.scene.splits import split_views
+
+NAMES = ["a/1.jpg", "a/2.jpg", "b/1.jpg", "b/3.jpg"]
+ROOT = Path("/capture")
+PATHS = [ROOT / "images" / name for name in NAMES]
+
+
+@pytest.mark.parametrize(("spec", "test"), [(2, [0, 2]), ("3", [0, 3]), (0, []), ("auto", [0])])
+def test_every_nth(spec, test):
+    train, found = split_views(NAMES, PATHS, ROOT, spec)
+    assert found == test and sorted(train + found) == [0, 1, 2, 3]
+
+
+def test_list_file_matches_names_file_names_and_stems(tmp_path):
+    (tmp_path / "test.txt").write_text("# held out\n\na/1.jpg\n2.jpg  # by file name\n3\n")
+    assert split_views(NAMES, PATHS, tmp_path, "test.txt") == ([2], [0, 1, 3])
+    assert split_views(NAMES, PATHS, ROOT, tmp_path / "test.txt") == ([2], [0, 1, 3])
+
+
+@pytest.mark.parametrize(
+    ("line", "message"), [("1.jpg", "line 1: '1.jpg' names 2 views"), ("9", "names no view of the capture")]
+)
+def test_list_entries_must_name_one_view(tmp_path, line, message):
+    (tmp_path / "test.txt").write_text(line)
+    with pytest.raises(ValueError, match=message):
+        split_views(NAMES, PATHS, tmp_path, "test.txt")
+
+
+def test_val_folder_is_used_when_it_is_there():
+    paths = [ROOT / ("val" if i == 2 else "train") / "rgbs" / f"{i}.jpg" for i in range(4)]
+    assert split_views(NAMES, paths, ROOT, "auto") == ([0, 1, 3], [2])
+    assert split_views(NAMES, paths, ROOT, "val") == ([0, 1, 3], [2])
+    with pytest.raises(ValueError, match="no view's image is in /capture/val"):
+        split_views(NAMES, PATHS, ROOT, "val")
+
+
+def test_specs_that_make_no_sense(tmp_path):
+    with pytest.raises(ValueError, match="must be 0 .none. or at least 2"):
+        split_views(NAMES, PATHS, ROOT, 1)
+    with pytest.raises(ValueError, match="neither a number, 'auto', 'val' nor a file"):
+        split_views(NAMES, PATHS, ROOT, "missing.txt")
+    (tmp_path / "all.txt").write_text("\n".join(NAMES))
+    with pytest.raises(ValueError, match="leaves no training view of 4"):
+        split_views(NAMES, PATHS, tmp_path, "all.txt")
