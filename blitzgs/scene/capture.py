@@ -188,7 +188,7 @@ def _read_colmap(
     unknown = [names[i] for i, c in enumerate(model.images.camera_ids.tolist()) if c not in lenses]
     if unknown:
         raise ValueError(
-            f"{folder}: {len(unknown)} images (first: {unknown[0]}) name a camera that is not there"
+            f"{folder}: the cameras of {len(unknown)} images (first: {unknown[0]}) are not there"
         )
     lens_of = [lenses[c] for c in model.images.camera_ids.tolist()]
     paths = ImageFinder(root, images).find_all(names, lens_of, downscale)

@@ -124,11 +124,11 @@ def write_ply(
     n, k = len(means), sh.shape[1] if sh.ndim == 3 else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    if k not in _REST_TO_COEFFICIENTS.values():
+        raise ValueError(f"sh has the shape {list(sh.shape)}, expected [N, K, 3] with K = 1, 4, 9 or 16")
     for name, shape in shapes.items():
-        if tuple(given[name].shape) != shape or k not in _REST_TO_COEFFICIENTS.values():
-            raise ValueError(
-                f"{name} has the shape {list(given[name].shape)}, expected {list(shape)}, K = 1, 4, 9, 16"
-            )
+        if tuple(given[name].shape) != shape:
+            raise ValueError(f"{name} has the shape {list(given[name].shape)}, expected {list(shape)}")
     names = _property_names(k)
     rows = np.zeros((n, len(names)), dtype="<f4")
     rows[:, 0:3] = _moved(means, offset)
@@ -136,7 +136,7 @@ def write_ply(
         rows[:, 3:6] = _array(normals)
     coefficients = _array(sh)
     rows[:, 6:9] = coefficients[:, 0]
-    rows[:, 9 : 9 + 3 * (k - 1)] = coefficients[:, 1:].transpose(0, 2, 1).reshape(n, -1)
+    rows[:, 9 : 9 + 3 * (k - 1)] = coefficients[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (k - 1))
     rows[:, -8] = _array(opacities)
     rows[:, -7:-4] = _array(scales)
     rows[:, -4:] = _array(quats)

@@ -7,14 +7,32 @@ namespace blitzgs::io {
 
 namespace {
 constexpr std::uint64_t kBufferBytes = 1 << 18;
+
+std::string printable(const std::string& text) {
+  constexpr const char* kHex = "0123456789abcdef";
+  std::string out;
+  for (const char c : text) {
+    const auto byte = static_cast<unsigned char>(c);
+    if (byte >= 0x20 && byte < 0x7f) {
+      out.push_back(c);
+    } else {
+      out += {'\\', 'x', kHex[byte >> 4], kHex[byte & 15]};
+    }
+  }
+  return out;
 }
+
+}  // namespace
+
+FormatError::FormatError(const std::string& place, const std::string& reason)
+    : std::runtime_error(place + ": " + printable(reason)) {}
 
 ByteReader::ByteReader(std::istream& in, std::string name) : in_(in), name_(std::move(name)) {
   const auto start = in_.tellg();
   in_.seekg(0, std::ios::end);
   const auto end = in_.tellg();
   in_.seekg(start);
-  if (!in_ || start < 0 || end < start) throw FormatError(name_ + ": cannot be read, or its size is unknown");
+  if (!in_ || start < 0 || end < start) throw FormatError(name_, "cannot be read, or its size is unknown");
   size_ = static_cast<std::uint64_t>(end - start);
   buffer_.resize(std::min(size_, kBufferBytes));
 }
@@ -89,7 +107,7 @@ void ByteReader::check_count(std::uint64_t count, std::uint64_t min_bytes, const
 }
 
 void ByteReader::fail(const std::string& reason) const {
-  throw FormatError(name_ + ": at byte " + std::to_string(offset_) + ": " + reason);
+  throw FormatError(name_ + ": at byte " + std::to_string(offset_), reason);
 }
 
 void ByteReader::expect_end() const {

@@ -15,10 +15,11 @@ namespace blitzgs::io {
 
 static_assert(std::endian::native == std::endian::little, "the binary formats are little endian");
 
-// What every reader throws: "<file>: <where>: <reason>".
+// What every reader throws: "<file>: <where>: <reason>". The reason may quote the file, so whatever is not
+// printable ASCII in it is shown as \xNN.
 class FormatError : public std::runtime_error {
  public:
-  using std::runtime_error::runtime_error;
+  FormatError(const std::string& place, const std::string& reason);
 };
 
 // Reads a seekable stream from its current position to its end, through a buffer of its own (the records are

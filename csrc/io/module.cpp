@@ -38,6 +38,27 @@ std::vector<T> to_vector(const py::dict& columns, const char* name) {
   return std::vector<T>(column.data(), column.data() + column.size());
 }
 
+// Names are bytes to the file system: whatever is not UTF-8 in them survives in the way of os.fsdecode.
+py::list to_names(const std::vector<std::string>& names) {
+  py::list out;
+  for (const std::string& name : names) {
+    PyObject* text = PyUnicode_DecodeFSDefaultAndSize(name.data(), static_cast<Py_ssize_t>(name.size()));
+    if (!text) throw py::error_already_set();
+    out.append(py::reinterpret_steal<py::object>(text));
+  }
+  return out;
+}
+
+std::vector<std::string> from_names(const py::handle& names) {
+  std::vector<std::string> out;
+  for (const py::handle name : names) {
+    PyObject* bytes = PyUnicode_EncodeFSDefault(name.ptr());
+    if (!bytes) throw py::error_already_set();
+    out.push_back(py::reinterpret_steal<py::bytes>(bytes));
+  }
+  return out;
+}
+
 bool is_text(const std::string& path) { return path.ends_with(".txt"); }
 
 // Runs `read(stream)` on the file without the GIL.
@@ -45,7 +66,7 @@ template <class Read>
 auto from_file(const std::string& path, Read read) {
   py::gil_scoped_release release;
   std::ifstream in(path, std::ios::binary);
-  if (!in) throw io::FormatError(path + ": cannot be opened");
+  if (!in) throw io::FormatError(path, "cannot be opened");
   return read(in);
 }
 
@@ -86,7 +107,7 @@ py::dict read_images(const std::string& path, bool with_points2d) {
   });
   return py::dict("ids"_a = to_array(std::move(images.ids)), "quats"_a = to_array(std::move(images.quats), 4),
                   "translations"_a = to_array(std::move(images.translations), 3),
-                  "camera_ids"_a = to_array(std::move(images.camera_ids)), "names"_a = images.names,
+                  "camera_ids"_a = to_array(std::move(images.camera_ids)), "names"_a = to_names(images.names),
                   "point2d_offsets"_a = to_array(std::move(images.point2d_offsets)),
                   "points2d"_a = to_array(std::move(images.points2d), 2),
                   "point3d_ids"_a = to_array(std::move(images.point3d_ids)));
@@ -125,7 +146,7 @@ void write_images(const std::string& path, const py::dict& columns) {
                                 to_vector<std::uint32_t>(columns, "camera_ids"),
                                 to_vector<double>(columns, "quats"),
                                 to_vector<double>(columns, "translations"),
-                                columns["names"].cast<std::vector<std::string>>(),
+                                from_names(columns["names"]),
                                 to_vector<std::uint64_t>(columns, "point2d_offsets"),
                                 to_vector<double>(columns, "points2d"),
                                 to_vector<std::int64_t>(columns, "point3d_ids")};
@@ -155,15 +176,16 @@ py::tuple read_ply(const std::string& path) {
   auto table = from_file(path, [&](std::istream& in) { return io::read_ply(in, path); });
   py::list properties;
   for (const io::PlyProperty& property : table.properties) {
-    properties.append(py::make_tuple(property.name, kNumpyTypes[static_cast<int>(property.type)]));
+    properties.append(
+        py::make_tuple(to_names({property.name})[0], kNumpyTypes[static_cast<int>(property.type)]));
   }
-  return py::make_tuple(table.comments, properties, table.count, to_array(std::move(table.rows)));
+  return py::make_tuple(to_names(table.comments), properties, table.count, to_array(std::move(table.rows)));
 }
 
-void write_ply(const std::string& path, const std::vector<std::string>& comments,
+void write_ply(const std::string& path, const py::list& comments,
                const std::vector<std::pair<std::string, std::string>>& properties, std::uint64_t count,
                const Column<std::uint8_t>& rows) {
-  io::PlyTable table{comments, {}, count, {}};
+  io::PlyTable table{from_names(comments), {}, count, {}};
   for (const auto& [name, type] : properties) {
     const auto found = std::find(std::begin(kNumpyTypes), std::end(kNumpyTypes), type);
     if (found == std::end(kNumpyTypes)) throw std::invalid_argument("ply: unknown type " + type);

@@ -47,7 +47,7 @@ std::string_view TextReader::rest() {
 }
 
 void TextReader::fail(const std::string& reason) const {
-  throw FormatError(name_ + ": line " + std::to_string(line_number_) + ": " + reason);
+  throw FormatError(name_ + ": line " + std::to_string(line_number_), reason);
 }
 
 }  // namespace blitzgs::io

@@ -14,7 +14,7 @@ namespace blitzgs::io {
 class TextReader {
  public:
   TextReader(std::istream& in, std::string name) : in_(in), name_(std::move(name)) {
-    if (!in_) throw FormatError(name_ + ": cannot be read");
+    if (!in_) throw FormatError(name_, "cannot be read");
   }
 
   // The next line, without its line break; false at the end of the file.

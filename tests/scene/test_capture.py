@@ -34,7 +34,6 @@ def write_jpeg_with_orientation(path, rgb, orientation):
 
 def test_recentred_world_projects_points_where_the_original_does(tmp_path):
     write_capture(tmp_path, NAMES)
-    edit_model(tmp_path, lambda m: m.images.translations.__iadd__(0))
     model = colmap.read_model(tmp_path / "sparse" / "0")
     far = np.array([4.5e5, 5.2e6, 120.0])  # a capture in UTM coordinates
 
@@ -48,7 +47,7 @@ def test_recentred_world_projects_points_where_the_original_does(tmp_path):
     centers = np.stack([c.center for c in capture.cameras])
     np.testing.assert_allclose(centers.mean(axis=0), 0, atol=1e-8)
     poses = colmap.world_to_camera(model.images)
-    np.testing.assert_allclose(capture.offset, far + camera_centers(poses).mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(capture.offset, far + camera_centers(poses).mean(axis=0), atol=1e-8)
     for camera in capture.cameras:
         pose = poses[model.images.names.index(camera.name)]
         ours = capture.points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
@@ -177,9 +176,9 @@ def test_distorted_captures_become_pinhole_ones(tmp_path):
     assert np.abs(store.get(0).numpy().astype(int) - expected).max() <= 2
 
     masked = load_capture(tmp_path, undistort="mask")
-    assert masked.cameras[0].width > camera.width
+    assert masked.cameras[0].width * masked.cameras[0].height > camera.width * camera.height
     mask = ImageStore(masked).mask(0).numpy()
-    assert 0.8 < mask.mean() < 1
+    assert 0.9 < mask.mean() < 1
 
 
 def test_missing_images_are_named_or_dropped(tmp_path):
@@ -329,7 +328,8 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
         frames.append(frame | ({"mask_path": f"masks/f{i}.png"} if i == 1 else {}))
     (tmp_path / "p.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
-        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n1 2 3 9 8 7\n4 5 6 1 2 3\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+        "1 2 3 9 8 7\n4 5 6 1 2 3\n"
     )
     content = {
         **{"fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "camera_model": "OPENCV"},

@@ -66,9 +66,13 @@ def test_prefetch_decodes_ahead_as_far_as_the_budget_goes(capture, monkeypatch):
     made, original = [], ImageStore._make_image
     monkeypatch.setattr(ImageStore, "_make_image", lambda s, c: made.append(c.name) or original(s, c))
     store.prefetch(range(12))
-    store.close()
+    for i in range(4):
+        store.get(i)
     assert sorted(made) == NAMES[:4]
     assert store._decoded.bytes == 4 * IMAGE_BYTES
+    store.close()
+    with pytest.raises(RuntimeError):
+        store.get(5)
 
 
 def test_an_image_wanted_by_many_threads_is_decoded_once(capture, monkeypatch):
