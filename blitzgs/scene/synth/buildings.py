@@ -239,7 +239,7 @@ def tower(b: MeshBuilder, block: Rectangle, height: float, rng: Rng) -> None:
         top = 2 * FLOOR + (height - 2 * FLOOR) * (tier + 1) / tiers
         top = FLOOR * round(top / FLOOR)
         body = (cx - w / 2, cy - d / 2, cx + w / 2, cy + d / 2)
-        b.walls(*body, z, top + 0.8, wall)
+        b.walls(*body, z, top, wall)
         flat_roof(b, *body, top, rng)
         z, w, d = top, w * 0.8, d * 0.8
 

@@ -28,7 +28,7 @@ def build_city(plan: Plan) -> Mesh:
 
 def tower_height(plan: Plan) -> float:
     """Return the greatest height of a tower in metres: taller in larger cities, always below the flight."""
-    return float(np.clip(0.2 * plan.options.extent, 22, 80))
+    return float(np.clip(0.16 * plan.options.extent, 22, 58))
 
 
 def _fill_block(b: MeshBuilder, plan: Plan, i: int, j: int, rng: Rng) -> None:
