@@ -71,13 +71,23 @@ struct SsimTerms {
   T value, by_mean, by_p, by_q;
 };
 
+// On the GPU within 1 ulp.
+template <class T>
+BLITZGS_HD T reciprocal(T x) {
+#ifdef __CUDA_ARCH__
+  return __fdividef(T(1), x);
+#else
+  return T(1) / x;
+#endif
+}
+
 template <class T>
 BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {
   const T c1 = static_cast<T>(0.0001), c2 = static_cast<T>(0.0009);
   const T mean_y = mean_x - e;
   const T energy = mean_x * mean_x + mean_y * mean_y;
-  const T inverse_a = T(1) / (energy + c1);
-  const T inverse_s = T(1) / (p - energy + c2);
+  const T inverse_a = reciprocal(energy + c1);
+  const T inverse_s = reciprocal(p - energy + c2);
   const T u = e * inverse_a, w = (q - e * e) * inverse_s;
   const T luminance = T(1) - e * u, structure = T(1) - w;
   SsimTerms<T> terms;

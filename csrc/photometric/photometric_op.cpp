@@ -120,10 +120,8 @@ std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(const Tensor& renders, co
 }  // namespace
 }  // namespace blitzgs
 
-#ifndef BLITZGS_BACKEND_CUDA
 BLITZGS_REGISTER(m) {
   m.impl("photometric_fwd", TORCH_BOX(&blitzgs::photometric_fwd));
   m.impl("photometric_bwd", TORCH_BOX(&blitzgs::photometric_bwd));
   m.impl("photometric_fwd_bwd", TORCH_BOX(&blitzgs::photometric_fwd_bwd));
 }
-#endif
