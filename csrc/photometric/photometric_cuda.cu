@@ -64,7 +64,8 @@ __device__ bool owns_pixel(const PhotometricArgs<float>& args, bool whole, int v
 
 template <bool kBytes>
 __device__ __forceinline__ float target_at(const PhotometricArgs<float>& args, std::int64_t at) {
-  return kBytes ? static_cast<float>(args.targets_u8[at]) * (1.0f / 255.0f) : args.targets[at];
+  // Rounded before it is subtracted: contracted into the difference, equal pixels would not cancel.
+  return kBytes ? __fmul_rn(static_cast<float>(args.targets_u8[at]), 1.0f / 255.0f) : args.targets[at];
 }
 
 // Adds one input to the open windows of a column; returns the window that it completes.
@@ -250,10 +251,23 @@ __global__ void __launch_bounds__(kThreads, 3)
       for (int q = 0; q < 3; ++q) values[q][i] = inside ? map[q * launch.map_size] : 0.0f;
     }
   };
+  // The output column of this thread, channels interleaved.
+  const int out_channel = threadIdx.x % 3, out_local = threadIdx.x / 3;
+  const bool writes = static_cast<int>(threadIdx.x) < 3 * width;
+  const std::int64_t out_column = image + first_pixel + out_local;
   const int first_row = begin - kSsimRadius - 2;
   const int rounds = kLeadRounds + (end - begin + kRows - 1) / kRows;
   load(first_row);
   for (int round = 0; round < rounds; ++round) {
+    const int top = begin + (round - kLeadRounds) * kRows;
+    float x[kRows], difference[kRows];
+#pragma unroll
+    for (int i = 0; i < kRows; ++i) {
+      if (!writes || top + i < begin || top + i >= end) continue;
+      const std::int64_t at = 3 * (out_column + std::int64_t{top + i} * args.width) + out_channel;
+      x[i] = args.renders[at];
+      difference[i] = x[i] - target_at<kBytes>(args, at);
+    }
 #pragma unroll
     for (int i = 0; i < kRows; ++i) {
 #pragma unroll
@@ -275,19 +289,19 @@ __global__ void __launch_bounds__(kThreads, 3)
       }
     }
     __syncthreads();
-    const int top = begin + (round - kLeadRounds) * kRows;
 #pragma unroll
     for (int i = 0; i < kRows; ++i) {
-      const int row = top + i, flat = threadIdx.x;
-      if (row >= end || flat >= 3 * width) continue;
-      const int c = flat % 3, p = flat / 3, column = first_pixel + p;
-      const std::int64_t at = image + std::int64_t{row} * args.width + column;
-      const float x = args.renders[3 * at + c], difference = x - target_at<kBytes>(args, 3 * at + c);
+      const int row = top + i;
+      if (!writes || row >= end) continue;
+      const std::int64_t at = out_column + std::int64_t{row} * args.width;
       const bool counts = !args.masks || args.masks[at];
-      const float sign = difference > 0 ? 1.0f : (difference < 0 ? -1.0f : 0.0f);
-      const float value = (counts ? weight * sign : 0.0f) + results[0][i][c][p] +
-                          2.0f * fmaf(x, results[1][i][c][p], difference * results[2][i][c][p]);
-      args.v_renders[3 * at + c] = owns_pixel(args, whole, view, row, column) ? value : 0.0f;
+      const float sign = difference[i] > 0 ? 1.0f : (difference[i] < 0 ? -1.0f : 0.0f);
+      const float* result = &results[0][i][out_channel][out_local];
+      constexpr int kMap = kRows * 3 * kOutPitch;
+      const float value = (counts ? weight * sign : 0.0f) + result[0] +
+                          2.0f * fmaf(x[i], result[kMap], difference[i] * result[2 * kMap]);
+      args.v_renders[3 * at + out_channel] =
+          owns_pixel(args, whole, view, row, first_pixel + out_local) ? value : 0.0f;
     }
   }
 }

@@ -59,10 +59,13 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     outputs.v_renders = make_empty(renders, {views, height, width, 3});
   }
   if (sums) {
-    outputs.l1_sums = make_zeros(renders, {views});
-    outputs.ssim_sums = make_zeros(renders, {views});
+    outputs.l1_sums = make_empty(renders, {views});
+    outputs.ssim_sums = make_empty(renders, {views});
   }
-  if (renders.numel() == 0) return outputs;
+  if (renders.numel() == 0) {
+    if (sums) torch::stable::zero_(*outputs.l1_sums), torch::stable::zero_(*outputs.ssim_sums);
+    return outputs;
+  }
 
   DeviceScope scope(renders);
   dispatch_floating(renders, [&](auto zero) {
