@@ -1,4 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """BlitzGS: city-scale 3D Gaussian Splatting, trained in minutes on several GPUs."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from blitzgs.rendering import rasterization
+
 __version__ = "0.1.0"
+__all__ = ["rasterization"]
+
+
+def __getattr__(name: str) -> Any:
+    # Loaded on first use: `blitzgs --help` and the synthetic city need no kernels.
+    if name == "rasterization":
+        from blitzgs.rendering import rasterization
+
+        return rasterization
+    raise AttributeError(f"module 'blitzgs' has no attribute {name!r}")

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.rasterization`: gsplat's call for pinhole 3DGS, over the ops of BlitzGS."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.ops.intersect import intersect
+from blitzgs.ops.project import Rows, project
+from blitzgs.ops.rasterize import rasterize
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    **unsupported: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render N Gaussians into C pinhole views; the argument names, shapes and meta keys are gsplat's.
+
+    The image differs from gsplat's where BlitzGS defines it otherwise: alpha is capped at 0.99 (there: 0.999)
+    and no splat is cut at a number of standard deviations, only where alpha falls below 1/255. Differentiable
+    in means, quats, scales, opacities, colors, viewmats and backgrounds.
+
+    Args:
+        means: [N, 3] in world units, float32, or float64 on the CPU.
+        quats: [N, 4] (w, x, y, z), need not be normalised.
+        scales: [N, 3] standard deviations (after the exponential).
+        opacities: [N] in [0, 1] (after the sigmoid).
+        colors: with `sh_degree`, SH coefficients [N, K, 3]; otherwise values of any channel count, [N, D] or
+            per view [C, N, D].
+        viewmats: [C, 4, 4] world to camera, a rotation and a translation; C <= 32.
+        Ks: [C, 3, 3] intrinsics in px.
+        width: image width in px.
+        height: image height in px.
+        near_plane: Gaussians have z > near_plane, world units.
+        far_plane: Gaussians have z <= far_plane, world units.
+        radius_clip: drop splats that reach no further than this, px.
+        eps2d: variance added to both screen axes, px^2.
+        sh_degree: degree to evaluate, 0 to 3; None when `colors` holds values.
+        packed: whether meta's per-splat tensors hold only what is visible ([nnz, ...]) or all ([C, N, ...],
+            zero where invisible). The image is the same.
+        tile_size: edge of a tile in px, 1 to 64. The image is the same.
+        backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
+        render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
+        sparse_grad: only False is supported.
+        absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
+        rasterize_mode: "classic" or "antialiased".
+        channel_chunk: accepted and not needed: any channel count is rendered in one pass.
+        distributed: only False is supported.
+        camera_model: only "pinhole" is supported.
+        segmented: accepted and not needed: it selects a sort in gsplat, never the result.
+        covars: only None is supported.
+        unsupported: any further argument of gsplat; only None, False and "pinhole" pass.
+
+    Returns:
+        Images [C, H, W, D] (depth last), alphas [C, H, W, 1], and meta: camera_ids, gaussian_ids (None unless
+        packed; ordered by Gaussian, then view), radii, means2d, depths, conics, opacities, tile_width,
+        tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets (int64), width, height, tile_size,
+        n_cameras. `meta["means2d"]` takes `retain_grad()`.
+
+    Raises:
+        ValueError: an argument that is not supported or does not fit, by name.
+        RuntimeError: a wrong shape or dtype that a kernel found.
+    """
+    _reject_unsupported(
+        {
+            "sparse_grad": sparse_grad,
+            "distributed": distributed,
+            "covars": covars,
+            "camera_model": camera_model,
+            **unsupported,
+        }
+    )
+    _check(means, colors, viewmats, sh_degree, render_mode, rasterize_mode, backgrounds)
+    shaded = "RGB" in render_mode
+    sh = colors if sh_degree is not None and shaded else None
+    if sh_degree is None and shaded:
+        opacities = _hide_non_finite(opacities, colors)
+    rows = project(
+        means,
+        quats,
+        scales,
+        opacities,
+        sh,
+        viewmats,
+        Ks,
+        width,
+        height,
+        tile_size=tile_size,
+        sh_degree=sh_degree or 0,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        eps2d=eps2d,
+        radius_clip=radius_clip,
+        antialiased=rasterize_mode == "antialiased",
+        raw=False,
+    )
+    n_cameras = viewmats.shape[0]
+    cameras, gaussians = rows.camera_ids.long(), rows.gaussian_ids.long()
+    means2d = rows.means2d if packed else _dense(rows.means2d, cameras, gaussians, n_cameras, len(means))
+    row_means2d = means2d if packed else means2d[cameras, gaussians]
+    grid: dict[str, Any] = {
+        "n_cameras": n_cameras,
+        "width": width,
+        "height": height,
+        "tile_size": tile_size,
+    }
+    isect_rows, tile_offsets = intersect(
+        row_means2d,
+        rows.conics,
+        rows.opacities,
+        rows.depths,
+        rows.camera_ids,
+        n_isects=int(rows.counts[2]),
+        **grid,
+    )
+    renders, alphas = rasterize(
+        row_means2d,
+        rows.conics,
+        rows.opacities,
+        _channels(rows, colors, cameras, gaussians, render_mode, sh_degree),
+        isect_rows,
+        tile_offsets,
+        backgrounds=_background_channels(backgrounds, render_mode),
+        means2d_abs=_absolute_gradient_probe(means2d, cameras, gaussians, packed) if absgrad else None,
+        **grid,
+    )
+    alphas = alphas[..., None]
+    if render_mode.endswith("ED"):
+        renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
+    meta = _meta(
+        rows, means2d, isect_rows, tile_offsets, packed, len(means), n_cameras, width, height, tile_size
+    )
+    return renders, alphas, meta
+
+
+def _reject_unsupported(arguments: dict[str, Any]) -> None:
+    for name, value in arguments.items():
+        if value is not None and value is not False and value != "pinhole":
+            raise ValueError(f"blitzgs.rasterization does not support {name}={value!r}; leave it out")
+
+
+def _check(
+    means: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    sh_degree: int | None,
+    render_mode: str,
+    rasterize_mode: str,
+    backgrounds: Tensor | None,
+) -> None:
+    if render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
+    if rasterize_mode not in ("classic", "antialiased"):
+        raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', got {rasterize_mode!r}")
+    if means.dim() != 2 or viewmats.dim() != 3:
+        raise ValueError(
+            f"means must be [N, 3] and viewmats [C, 4, 4] (leading batch dimensions are not supported), got "
+            f"{list(means.shape)} and {list(viewmats.shape)}"
+        )
+    N, C = means.shape[0], viewmats.shape[0]
+    if sh_degree is not None:
+        if colors.dim() != 3 or colors.shape[0] != N or colors.shape[2] != 3:
+            raise ValueError(
+                f"colors must be SH coefficients [N, K, 3] with N = {N} when sh_degree is given (per-view "
+                f"coefficients are not supported), got {list(colors.shape)}"
+            )
+    elif colors.shape[:-1] not in ((N,), (C, N)):
+        raise ValueError(
+            f"colors must be [N, D] or [C, N, D] with N = {N}, C = {C}, got {list(colors.shape)}"
+        )
+    if backgrounds is not None and "RGB" in render_mode and backgrounds.shape != (C, colors.shape[-1]):
+        raise ValueError(
+            f"backgrounds must be [C, D] = {[C, colors.shape[-1]]}, got {list(backgrounds.shape)}"
+        )
+
+
+def _hide_non_finite(opacities: Tensor, colors: Tensor) -> Tensor:
+    """Zero the opacity of Gaussians with a NaN or infinite value, so that it spreads to no pixel."""
+    finite = colors.detach().isfinite().all(dim=-1)
+    if finite.dim() == 2:
+        finite = finite.all(dim=0)
+    return torch.where(finite, opacities, torch.zeros_like(opacities))
+
+
+def _dense(values: Tensor, cameras: Tensor, gaussians: Tensor, n_cameras: int, n: int) -> Tensor:
+    """Scatter row values [P, ...] to [C, N, ...], zero where a view does not see a Gaussian."""
+    zeros = values.new_zeros(n_cameras, n, *values.shape[1:])
+    return zeros.index_put((cameras, gaussians), values)
+
+
+def _channels(
+    rows: Rows, colors: Tensor, cameras: Tensor, gaussians: Tensor, render_mode: str, sh_degree: int | None
+) -> Tensor:
+    """Return what is composited, per row [P, D]."""
+    depths = rows.depths[:, None]
+    if "RGB" not in render_mode:
+        return depths
+    if sh_degree is not None:
+        values = rows.colors
+    elif colors.dim() == 2:
+        values = colors[gaussians]
+    else:
+        values = colors[cameras, gaussians]
+    return values if render_mode == "RGB" else torch.cat([values, depths], dim=1)
+
+
+def _background_channels(backgrounds: Tensor | None, render_mode: str) -> Tensor | None:
+    if backgrounds is None or "RGB" not in render_mode:
+        return None
+    if render_mode == "RGB":
+        return backgrounds
+    return torch.cat([backgrounds, torch.zeros_like(backgrounds[:, :1])], dim=1)
+
+
+def _absolute_gradient_probe(means2d: Tensor, cameras: Tensor, gaussians: Tensor, packed: bool) -> Tensor:
+    """Return zeros [P, 2] whose gradient, the absolute sums, is stored as `means2d.absgrad` in backward."""
+    probe = torch.zeros_like(means2d, requires_grad=True)
+    probe.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient))
+    return probe * 1.0 if packed else probe[cameras, gaussians]
+
+
+def _meta(
+    rows: Rows,
+    means2d: Tensor,
+    isect_rows: Tensor,
+    tile_offsets: Tensor,
+    packed: bool,
+    n: int,
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> dict[str, Any]:
+    cameras, gaussians = rows.camera_ids.long(), rows.gaussian_ids.long()
+    tile_width, tile_height = -(-width // tile_size), -(-height // tile_size)
+    per_row = {
+        "radii": rows.radii,
+        "depths": rows.depths,
+        "conics": rows.conics,
+        "opacities": rows.opacities,
+        "tiles_per_gauss": rows.tiles_touched,
+    }
+    if not packed:
+        per_row = {k: _dense(v, cameras, gaussians, n_cameras, n) for k, v in per_row.items()}
+    entries = isect_rows.long()
+    return {
+        "camera_ids": cameras if packed else None,
+        "gaussian_ids": gaussians if packed else None,
+        "means2d": means2d,
+        **per_row,
+        "tile_width": tile_width,
+        "tile_height": tile_height,
+        "isect_ids": _isect_ids(rows.depths[entries], tile_offsets, tile_width * tile_height),
+        "flatten_ids": isect_rows if packed else (cameras * n + gaussians)[entries].int(),
+        "isect_offsets": tile_offsets[:-1].reshape(n_cameras, tile_height, tile_width),
+        "width": width,
+        "height": height,
+        "tile_size": tile_size,
+        "n_cameras": n_cameras,
+        "n_batches": 1,
+    }
+
+
+def _isect_ids(depths: Tensor, tile_offsets: Tensor, n_tiles: int) -> Tensor:
+    """Return gsplat's sort keys, int64 [I]: camera | tile | float32 depth bits, from high to low."""
+    counts = tile_offsets[1:] - tile_offsets[:-1]
+    index = torch.arange(len(counts), device=counts.device)
+    tile_bits = n_tiles.bit_length()
+    keys = (index // n_tiles << tile_bits) | index % n_tiles
+    tiles = keys.repeat_interleave(counts, output_size=len(depths))
+    return (tiles << 32) | depths.detach().float().view(torch.int32).long()

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What must hold for every image, whatever its values: symmetries, limits and special cases."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import blitzgs
+from blitzgs.reference.gaussians import rotation_matrices
+from tests.helpers import PARAMETERS, random_scene, relative_error
+
+GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
+seeds = st.integers(0, 10**6)
+quickly = settings(max_examples=5, deadline=None, derandomize=True)
+
+
+def image_of(scene, **options):
+    return blitzgs.rasterization(*scene.arguments(), **{"sh_degree": scene.sh_degree, **options})[0]
+
+
+def select(scene, index):
+    for name in GAUSSIANS:
+        setattr(scene, name, getattr(scene, name)[index])
+    return scene
+
+
+@quickly
+@given(seed=seeds)
+def test_the_order_of_the_gaussians_does_not_matter(seed):
+    scene = random_scene(n=90, seed=seed)
+    order = torch.randperm(90, generator=torch.Generator().manual_seed(seed))
+    shuffled = select(random_scene(n=90, seed=seed), order)
+    assert torch.equal(image_of(scene), image_of(shuffled))
+
+
+@quickly
+@given(seed=seeds)
+def test_world_and_cameras_move_together(seed):
+    scene = random_scene(n=60, seed=seed, dtype=torch.float64)
+    scene.sh_degree, scene.colors = None, scene.colors[:, 0].abs()
+    before = image_of(scene)
+    generator = torch.Generator().manual_seed(seed)
+    quat = torch.randn(1, 4, generator=generator, dtype=torch.float64)
+    R = rotation_matrices(quat)[0]
+    shift = torch.randn(3, generator=generator, dtype=torch.float64) * 5
+    scene.means = scene.means @ R.T + shift
+    scene.quats = multiply_quaternions(quat / quat.norm(), scene.quats)
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3], motion[:3, 3] = R, shift
+    scene.viewmats = scene.viewmats @ motion.inverse()
+    assert (image_of(scene) - before).abs().median() < 1e-13
+    assert ((image_of(scene) - before).abs() > 1e-10).double().mean() < 0.002  # flips at the cuts
+
+
+def multiply_quaternions(p, q):
+    (a, b, c, d), (w, x, y, z) = p.unbind(1), q.unbind(1)
+    return torch.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        dim=1,
+    )
+
+
+@quickly
+@given(seed=seeds, exponent=st.integers(-20, 20))
+def test_a_world_scaled_by_a_power_of_two_gives_the_same_bits(seed, exponent):
+    scene = random_scene(n=60, seed=seed)
+    before = image_of(scene, near_plane=0.25)
+    factor = 2.0**exponent
+    scene.means, scene.scales = scene.means * factor, scene.scales * factor
+    scene.viewmats[:, :3, 3] *= factor
+    assert torch.equal(image_of(scene, near_plane=0.25 * factor, far_plane=math.inf), before)
+
+
+@quickly
+@given(seed=seeds)
+def test_the_image_is_linear_in_the_background(seed):
+    scene = random_scene(n=60, seed=seed, dtype=torch.float64)
+    backgrounds = torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    black, alphas, _ = blitzgs.rasterization(*scene.arguments(), sh_degree=3)
+    colored = image_of(scene, backgrounds=backgrounds)
+    assert torch.allclose(colored, black + (1 - alphas) * backgrounds[:, None, None], atol=1e-14)
+
+
+@quickly
+@given(seed=seeds, tile_size=st.sampled_from([4, 8, 16, 32, 64]))
+def test_tiles_change_no_bit(seed, tile_size):
+    scene = random_scene(n=60, seed=seed, width=45, height=33)
+    assert torch.equal(image_of(scene, tile_size=tile_size), image_of(scene))
+
+
+def test_views_together_equal_views_alone():
+    scene = random_scene(n=80, cameras=4).leaves()
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(4, scene.height, scene.width, 3, generator=generator)
+    together = image_of(scene)
+    (together * weights).sum().backward()
+    gradients = {name: getattr(scene, name).grad for name in PARAMETERS}
+    viewmats, Ks = scene.viewmats.detach(), scene.Ks
+    sums = {name: torch.zeros_like(getattr(scene, name)) for name in GAUSSIANS}
+    for view in range(4):
+        single = random_scene(n=80, cameras=4).leaves()
+        single.viewmats, single.Ks = viewmats[view : view + 1], Ks[view : view + 1]
+        image = image_of(single)
+        assert torch.equal(image[0], together[view])
+        (image[0] * weights[view]).sum().backward()
+        for name in GAUSSIANS:
+            sums[name] += getattr(single, name).grad
+    for name in GAUSSIANS:
+        assert relative_error(gradients[name], sums[name]) < 1e-6, name
+
+
+def test_transparent_gaussians_change_no_bit():
+    scene = random_scene(n=60)
+    without = image_of(select(random_scene(n=60), torch.arange(0, 60, 2)))
+    scene.opacities[1::2] = 0.0
+    leaves = scene.leaves()
+    image = image_of(leaves)
+    assert torch.equal(image, without)
+    image.sum().backward()
+    assert all((getattr(leaves, name).grad[1::2] == 0).all() for name in GAUSSIANS)
+
+
+def test_opacity_one_is_capped():
+    scene = random_scene(n=1, cameras=1, dtype=torch.float64)
+    scene.means[:], scene.scales[:], scene.opacities[:] = 0.0, 3.0, 1.0
+    _, alphas, _ = blitzgs.rasterization(*scene.arguments(), sh_degree=3)
+    assert alphas.max().item() == pytest.approx(0.99, abs=1e-12)
+
+
+def test_one_gaussian_by_hand():
+    K = torch.tensor([[[20.0, 0, 4.5], [0, 20.0, 3.5], [0, 0, 1]]], dtype=torch.float64)
+    render, alpha, _ = blitzgs.rasterization(
+        torch.tensor([[0.0, 0, 2]], dtype=torch.float64),
+        torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
+        torch.full((1, 3), 0.1, dtype=torch.float64),
+        torch.tensor([0.8], dtype=torch.float64),
+        torch.tensor([[0.5, 1.0]], dtype=torch.float64),
+        torch.eye(4, dtype=torch.float64)[None],
+        K,
+        9,
+        7,
+    )
+    variance = (20 / 2 * 0.1) ** 2 + 0.3
+    for y in range(7):
+        for x in range(9):
+            a = 0.8 * math.exp(-0.5 * ((x - 4) ** 2 + (y - 3) ** 2) / variance)
+            a = a if a >= 1 / 255 else 0.0
+            assert alpha[0, y, x, 0].item() == pytest.approx(a, abs=1e-12)
+            assert render[0, y, x].tolist() == pytest.approx([0.5 * a, a], abs=1e-12)
+
+
+@pytest.mark.parametrize("n, cameras", [(0, 2), (0, 1), (3, 0)])
+@pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED"])
+@pytest.mark.parametrize("packed", [True, False])
+def test_empty_input_gives_the_background_and_zero_gradients(n, cameras, render_mode, packed):
+    scene = random_scene(n=n, cameras=cameras).leaves()
+    backgrounds = torch.full((cameras, 3), 0.25)
+    renders, alphas, meta = blitzgs.rasterization(
+        *scene.arguments(), sh_degree=3, backgrounds=backgrounds, render_mode=render_mode, packed=packed
+    )
+    assert renders.shape == (cameras, scene.height, scene.width, 3 if render_mode == "RGB" else 4)
+    assert (renders[..., :3] == 0.25).all() and (alphas == 0).all() and (renders[..., 3:] == 0).all()
+    renders.sum().backward()
+    assert scene.means.grad is None or (scene.means.grad == 0).all()
+
+
+def test_gaussians_behind_and_at_the_near_plane_are_not_drawn():
+    scene = random_scene(n=4, cameras=1)
+    scene.viewmats = torch.eye(4)[None]
+    near = 0.5
+    scene.means = torch.tensor([[0.0, 0, -2], [0, 0, 0], [0, 0, near], [0, 0, near + 1e-3]])
+    scene.scales[:] = 0.05
+    leaves = scene.leaves()
+    image = image_of(leaves, near_plane=near)
+    alone = image_of(select(scene, torch.tensor([3])), near_plane=near)
+    assert torch.equal(image, alone) and image.abs().sum() > 0
+    image.sum().backward()
+    assert leaves.means.grad.isfinite().all() and (leaves.means.grad[:3] == 0).all()
+
+
+def test_a_shifted_principal_point_shifts_the_image():
+    scene = random_scene(n=60, cameras=1, dtype=torch.float64, scale=0.05)
+    wide, high = 64, 48
+    scene.width, scene.height = wide, high
+    scene.Ks[:, 0, 0] = scene.Ks[:, 1, 1] = 40.0
+    scene.Ks[:, 0, 2], scene.Ks[:, 1, 2] = 32.0, 24.0
+    whole = image_of(scene)
+    # A window of the image is the same camera with its principal point moved, even outside of the window.
+    for x0, y0, w, h in [(0, 0, 20, 18), (30, 10, 24, 30), (40, 30, 20, 18)]:
+        scene.width, scene.height = w, h
+        scene.Ks[:, 0, 2], scene.Ks[:, 1, 2] = 32.0 - x0, 24.0 - y0
+        window = image_of(scene)
+        # Splats whose centre lies far outside of the window may be linearised elsewhere.
+        difference = (window - whole[:, y0 : y0 + h, x0 : x0 + w]).abs()
+        assert difference.median() < 1e-13 and difference.max() < 0.02

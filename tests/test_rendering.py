@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.rasterization` against the float64 reference: images, gradients, modes, meta, errors."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import blitzgs
+from tests.helpers import PARAMETERS, image_error, random_scene, reference_images, relative_error
+
+IMAGE_BOUND = {torch.float32: 1e-5, torch.float64: 1e-10}
+GRADIENT_BOUND = {torch.float32: 1e-4, torch.float64: 1e-10}
+DTYPES = [torch.float32, torch.float64]
+
+
+def rasterize_scene(scene, **options):
+    return blitzgs.rasterization(*scene.arguments(), **{"sh_degree": scene.sh_degree, **options})
+
+
+def require_accurate(scene, backgrounds=None, **options):
+    """Image, alpha and every gradient within the bounds, away from the cut pixels."""
+    dtype = scene.means.dtype
+    leaves = scene.leaves()
+    if backgrounds is not None:
+        backgrounds = backgrounds.to(dtype).requires_grad_()
+    renders, alphas, _ = rasterize_scene(leaves, backgrounds=backgrounds, **options)
+    expected = reference_images(
+        leaves,
+        backgrounds,
+        render_mode=options.get("render_mode", "RGB"),
+        antialiased=options.get("rasterize_mode") == "antialiased",
+    )
+    images = torch.stack([reference.image for reference in expected])
+    coverage = torch.stack([reference.alpha for reference in expected])[..., None]
+    cut = torch.stack([reference.cut for reference in expected])
+    assert image_error(renders, images, cut) <= IMAGE_BOUND[dtype] * max(1.0, images.abs().max().item())
+    assert image_error(alphas, coverage, cut) <= IMAGE_BOUND[dtype]
+
+    generator = torch.Generator().manual_seed(3)
+    weights = torch.randn(images.shape, generator=generator, dtype=torch.float64) * ~cut[..., None]
+    alpha_weights = torch.randn(coverage.shape, generator=generator, dtype=torch.float64) * ~cut[..., None]
+    inputs = [getattr(leaves, name) for name in PARAMETERS] + ([] if backgrounds is None else [backgrounds])
+
+    def gradients(image, alpha):
+        loss = (image.double() * weights).sum() + (alpha.double() * alpha_weights).sum()
+        return torch.autograd.grad(loss, inputs, allow_unused=True, materialize_grads=True)
+
+    names = [*PARAMETERS, "backgrounds"]
+    pairs = zip(names, gradients(renders, alphas), gradients(images, coverage), strict=False)
+    for name, actual, reference in pairs:
+        assert relative_error(actual, reference) <= GRADIENT_BOUND[dtype], name
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("render_mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+def test_every_mode_against_the_reference(dtype, rasterize_mode, render_mode):
+    backgrounds = torch.tensor([[0.2, 0.5, 0.9], [1.0, 0.0, 0.3]]) if "RGB" in render_mode else None
+    scene = random_scene(n=60, width=24, height=20, dtype=dtype)
+    require_accurate(scene, backgrounds, rasterize_mode=rasterize_mode, render_mode=render_mode)
+
+
+@pytest.mark.parametrize("channels, per_view", [(1, False), (2, True), (3, True), (5, False), (33, False)])
+def test_values_of_any_channel_count(channels, per_view):
+    scene = random_scene(n=60)
+    scene.sh_degree = None
+    generator = torch.Generator().manual_seed(9)
+    values = torch.rand(2, 60, channels, generator=generator)
+    scene.colors = values if per_view else values[0]
+    renders, _, _ = rasterize_scene(scene)
+    for view in range(2):
+        scene_of_view = random_scene(n=60)
+        scene_of_view.sh_degree = None
+        scene_of_view.colors = values[view] if per_view else values[0]
+        reference = reference_images(scene_of_view)[view]
+        assert image_error(renders[view], reference.image, reference.cut) <= 1e-5
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 120),
+    scale=st.floats(0.01, 0.6),
+    degree=st.integers(0, 3),
+    width=st.integers(1, 48),
+    height=st.integers(1, 40),
+)
+def test_random_scenes_against_the_reference(seed, n, scale, degree, width, height):
+    scene = random_scene(n=n, seed=seed, cameras=1, scale=scale, width=width, height=height)
+    scene.sh_degree = degree
+    require_accurate(scene)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_absgrad_and_the_gradient_of_means2d(packed):
+    scene = random_scene(n=25, cameras=1, width=12, height=9, dtype=torch.float64).leaves()
+    renders, _, meta = rasterize_scene(scene, packed=packed, absgrad=True)
+    meta["means2d"].retain_grad()
+    reference = reference_images(scene)[0]
+    weights = torch.randn(9, 12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    (renders[0] * weights).sum().backward()
+    signed = torch.zeros(25, 2, dtype=torch.float64)
+    absolute = torch.zeros_like(signed)
+    for pixel in (reference.image * weights).sum(dim=-1).reshape(-1):
+        gradient = torch.autograd.grad(pixel, reference.splats.means2d, retain_graph=True)[0]
+        signed[reference.splats.ids] += gradient
+        absolute[reference.splats.ids] += gradient.abs()
+    actual, actual_absolute = meta["means2d"].grad, meta["means2d"].absgrad
+    rows = (meta["gaussian_ids"],) if packed else (slice(None),)
+    actual, actual_absolute = (t if packed else t[0] for t in (actual, actual_absolute))
+    assert relative_error(actual, signed[rows]) < 1e-10
+    assert relative_error(actual_absolute, absolute[rows]) < 1e-10
+
+
+def test_packed_and_dense_meta_say_the_same():
+    scene = random_scene(n=50, cameras=3)
+    scene.means[::2] *= 6.0  # some are seen by no view
+    image, alpha, packed = rasterize_scene(scene, packed=True)
+    dense_image, dense_alpha, dense = rasterize_scene(scene, packed=False)
+    assert torch.equal(image, dense_image) and torch.equal(alpha, dense_alpha)
+    cameras, gaussians = packed["camera_ids"], packed["gaussian_ids"]
+    assert 0 < len(cameras) < 150
+    assert dense["camera_ids"] is None and dense["gaussian_ids"] is None
+    for name, shape in {
+        "radii": (3, 50, 2),
+        "means2d": (3, 50, 2),
+        "depths": (3, 50),
+        "conics": (3, 50, 3),
+        "opacities": (3, 50),
+        "tiles_per_gauss": (3, 50),
+    }.items():
+        assert dense[name].shape == shape, name
+        assert torch.equal(dense[name][cameras, gaussians], packed[name]), name
+    rows = cameras * 50 + gaussians
+    assert torch.equal(dense["flatten_ids"].long(), rows[packed["flatten_ids"].long()])
+    assert torch.equal(dense["isect_ids"], packed["isect_ids"])
+    invisible = torch.ones(3, 50, dtype=torch.bool)
+    invisible[cameras, gaussians] = False
+    assert (dense["radii"][invisible] == 0).all()
+
+
+def test_meta_lists_are_sorted_and_consistent():
+    scene = random_scene(n=90, cameras=2, width=50, height=37)
+    _, _, meta = rasterize_scene(scene, tile_size=8)
+    assert (meta["tile_width"], meta["tile_height"]) == (7, 5)
+    assert meta["isect_offsets"].shape == (2, 5, 7)
+    assert meta["tiles_per_gauss"].sum() == len(meta["flatten_ids"]) == len(meta["isect_ids"])
+    keys = meta["isect_ids"]
+    assert (keys[1:] >= keys[:-1]).all()
+    bits = (7 * 5).bit_length()
+    tile, camera = (keys >> 32) & ((1 << bits) - 1), keys >> (32 + bits)
+    assert torch.equal(camera, meta["camera_ids"][meta["flatten_ids"].long()])
+    starts = meta["isect_offsets"].reshape(2, -1)
+    for c in range(2):
+        for t in (0, 17, 34):
+            assert ((camera < c) | ((camera == c) & (tile < t))).sum() == starts[c, t]
+    for name in ("width", "height", "tile_size", "n_cameras"):
+        assert meta[name] == {"width": 50, "height": 37, "tile_size": 8, "n_cameras": 2}[name]
+
+
+def test_a_value_that_is_not_finite_spreads_to_no_pixel():
+    scene = random_scene(n=30, cameras=1)
+    scene.sh_degree = None
+    scene.colors = torch.rand(30, 3)
+    scene.opacities[4] = 0.0
+    expected, _, _ = rasterize_scene(scene)
+    scene.opacities[4] = 0.9
+    scene.colors[4, 1] = torch.nan
+    leaves = scene.leaves()
+    actual, _, _ = rasterize_scene(leaves)
+    assert torch.equal(actual, expected)
+    actual.sum().backward()
+    assert all(getattr(leaves, name).grad.isfinite().all() for name in PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"sparse_grad": True}, "does not support sparse_grad=True"),
+        ({"distributed": True}, "does not support distributed=True"),
+        ({"camera_model": "fisheye"}, "does not support camera_model='fisheye'"),
+        ({"with_ut": True}, "does not support with_ut=True"),
+        ({"covars": torch.zeros(1)}, "does not support covars="),
+        ({"radial_coeffs": torch.zeros(1)}, "does not support radial_coeffs="),
+        ({"render_mode": "N"}, "render_mode must be one of"),
+        ({"rasterize_mode": "fast"}, "rasterize_mode must be"),
+        ({"sh_degree": None}, "colors must be"),
+        (
+            {"sh_degree": None, "colors": torch.zeros(3, 4)},
+            r"colors must be \[N, D\] or \[C, N, D\] with N = 4",
+        ),
+        ({"colors": torch.zeros(2, 4, 16, 3)}, "per-view coefficients are not supported"),
+        ({"means": torch.zeros(1, 4, 3)}, "leading batch dimensions are not supported"),
+        ({"backgrounds": torch.zeros(2, 3)}, r"backgrounds must be \[C, D\]"),
+    ],
+)
+def test_what_is_not_supported_is_refused_by_name(options, message):
+    scene = random_scene(n=4, cameras=1)
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height")
+    arguments = {**dict(zip(names, scene.arguments(), strict=True)), "sh_degree": 3, **options}
+    with pytest.raises(ValueError, match=message):
+        blitzgs.rasterization(**arguments)
+
+
+def test_arguments_without_effect_are_accepted():
+    scene = random_scene(n=10, cameras=1)
+    plain, _, _ = rasterize_scene(scene)
+    same, _, _ = rasterize_scene(
+        scene, channel_chunk=8, segmented=True, camera_model="pinhole", with_ut=False
+    )
+    assert torch.equal(plain, same)
