@@ -1,0 +1,105 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "io/ply.h"
+
+#include <sstream>
+
+#include "common/catch.h"
+
+using namespace blitzgs::io;
+
+namespace {
+
+PlyTable some_table() {
+  PlyTable table{{"comment by hand"}, {{"x", PlyType::kFloat32}, {"n", PlyType::kUint8}}, 3, {}};
+  for (std::uint8_t i = 0; i < 15; ++i) table.rows.push_back(i);
+  return table;
+}
+
+std::string written(const PlyTable& table) {
+  std::ostringstream out;
+  write_ply(out, table);
+  return out.str();
+}
+
+PlyTable parsed(const std::string& bytes) {
+  std::istringstream in(bytes);
+  return read_ply(in, "f");
+}
+
+bool refused(const std::string& bytes) {
+  try {
+    parsed(bytes);
+    return false;
+  } catch (const FormatError&) {
+    return true;
+  }
+}
+
+}  // namespace
+
+TEST_CASE("a PLY table survives, and so do its bytes") {
+  const std::string bytes = written(some_table());
+  const PlyTable found = parsed(bytes);
+  REQUIRE(found.count == 3);
+  REQUIRE(found.rows == some_table().rows);
+  REQUIRE(found.comments == some_table().comments);
+  REQUIRE(found.properties[1].name == "n");
+  REQUIRE(written(found) == bytes);
+}
+
+TEST_CASE("ASCII and big-endian PLY give the rows of the little-endian one") {
+  const std::string header = "element vertex 2\r\nproperty short a\r\nproperty float64 b\r\nend_header\r\n";
+  const PlyTable text = parsed("ply\r\nformat ascii 1.0\r\n" + header + "1 -2.5\r\n-3 1e10");
+  std::string big = "ply\r\nformat binary_big_endian 1.0\r\n" + header;
+  big += std::string("\x00\x01\xc0\x04\x00\x00\x00\x00\x00\x00", 10);
+  big += std::string("\xff\xfd\x42\x02\xa0\x5f\x20\x00\x00\x00", 10);
+  REQUIRE(parsed(big).rows == text.rows);
+  REQUIRE(text.rows.size() == 20);
+}
+
+TEST_CASE("elements around the vertices are passed over") {
+  const std::string header =
+      "ply\nformat ascii 1.0\nelement camera 2\nproperty float f\nelement vertex 1\nproperty int x\n"
+      "element face 1\nproperty list uchar int vertex_indices\nend_header\n";
+  const PlyTable table = parsed(header + "1.5\n2.5\n7\n3 0 0 0\n");
+  REQUIRE(table.rows == std::vector<std::uint8_t>{7, 0, 0, 0});
+}
+
+TEST_CASE("every truncation of a PLY file is refused, and wrong bytes are never worse") {
+  const std::string bytes = written(some_table());
+  for (std::size_t n = 0; n < bytes.size(); ++n) REQUIRE(refused(bytes.substr(0, n)));
+  int refusals = 0;
+  for (std::size_t at = 0; at < bytes.size(); ++at) {
+    for (const int value : {0, 10, 32, 57, 128, 255}) {
+      std::string damaged = bytes;
+      damaged[at] = static_cast<char>(value);
+      refusals += refused(damaged);
+    }
+  }
+  REQUIRE(refusals > 100);
+}
+
+TEST_CASE("a PLY count beyond the file is refused before anything is allocated") {
+  for (const char* format : {"ascii", "binary_little_endian"}) {
+    for (const char* count : {"4", "18446744073709551615", "9223372036854775807"}) {
+      const std::string head = std::string("ply\nformat ") + format + " 1.0\nelement vertex " + count;
+      REQUIRE(refused(head + "\nproperty float x\nend_header\n1 2"));
+      REQUIRE(refused(head + "\nend_header\n1 2"));
+    }
+  }
+  REQUIRE(
+      refused("ply\nformat binary_little_endian 1.0\nelement a 18446744073709551615\nproperty double q\n"
+              "element vertex 1\nproperty float x\nend_header\n1234"));
+}
+
+TEST_CASE("tables that cannot stand in a file are not written") {
+  PlyTable table = some_table();
+  table.rows.pop_back();
+  REQUIRE_THROWS_AS(written(table), std::invalid_argument);
+  table = some_table();
+  table.properties[0].name = "two words";
+  REQUIRE_THROWS_AS(written(table), std::invalid_argument);
+  table = some_table();
+  table.comments = {"comment a\nend_header"};
+  REQUIRE_THROWS_AS(written(table), std::invalid_argument);
+}
