@@ -27,7 +27,7 @@ from blitzgs.training.trainer import Trainer
 from blitzgs.training.views import ViewSet, render_options
 
 # What a user can cause and mend: reported as a message. Anything else is ours and keeps its traceback.
-USER_ERRORS = (ValueError, OSError, CheckpointError, MismatchError, NonFiniteError)
+USER_ERRORS = (ValueError, OSError, ImportError, CheckpointError, MismatchError, NonFiniteError)
 
 TRAIN_HELP = """\
 Train a model of a capture: a COLMAP model (DIR/sparse/0 and DIR/images) or a transforms.json.

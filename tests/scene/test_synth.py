@@ -150,6 +150,5 @@ def test_command(city, capsys):
     flags = [f"--{key.replace('_', '-')}={value}" for key, value in SMALL.items()]
     assert run(parser.parse_args([str(city), *flags])) == 0
     assert "9 images of 192 x 128" in capsys.readouterr().out
-    assert run(parser.parse_args([str(city), "--preset", "town"])) == 2
-    message = capsys.readouterr().err
-    assert "holds another city" in message and f"extent 100.0, not {PRESETS['town'].extent}" in message
+    with pytest.raises(FileExistsError, match=f"another city .*extent 100.0, not {PRESETS['town'].extent}"):
+        run(parser.parse_args([str(city), "--preset", "town"]))

@@ -34,6 +34,7 @@ def test_noise_tiles_and_is_standardised():
     assert abs(values.mean()) < 0.02 and abs(values.std() - 1) < 0.02
     np.testing.assert_allclose(noise(x - 64, y + 128), values, atol=0.05)
     assert np.abs(noise(x, y) - noise(x + np.float32(0.01), y)).max() < 0.2
+    assert noise(x[:0], y[:0]).shape == (0,)
 
 
 def test_cell_random_is_uniform_and_depends_on_every_argument():

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import fields
 from pathlib import Path
@@ -48,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Generate the city; returns the exit status."""
+    """Generate the city; returns the exit status. Raises what `generate_city` raises."""
     preset = PRESETS[args.preset]
     chosen = {}
     for field in fields(CityOptions):
@@ -63,19 +62,15 @@ def run(args: argparse.Namespace) -> int:
         TextColumn("images"),
         TimeRemainingColumn(),
     )
-    try:
-        with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-            task = bar.add_task("Photographing the city", total=None)
-            out = generate_city(
-                args.out,
-                **chosen,
-                threads=args.threads,
-                overwrite=args.overwrite,
-                progress=lambda done, total: bar.update(task, completed=done, total=total),
-            )
-    except (ValueError, FileExistsError, ModuleNotFoundError) as error:
-        print(f"blitzgs synth: {error}", file=sys.stderr)
-        return 2
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("Photographing the city", total=None)
+        out = generate_city(
+            args.out,
+            **chosen,
+            threads=args.threads,
+            overwrite=args.overwrite,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
     size = f"{chosen['views']} images of {chosen['width']} x {chosen['height']}"
     print(f"{out}: {size}, {time.monotonic() - started:.1f} s")
     return 0

@@ -34,6 +34,8 @@ class Noise:
     def __call__(self, x: Floats, y: Floats) -> Floats:
         """Return the noise at positions x, y [R] in units of its wavelength."""
         count = len(x)
+        if count == 0:  # cv2 has no empty images
+            return np.zeros(0, np.float32)
         rows = -(-count // _ROW)
         maps = np.zeros((2, rows * _ROW), np.float32)
         for plane, coordinate in zip(maps, (x, y), strict=True):
