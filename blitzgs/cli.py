@@ -16,6 +16,7 @@ from rich.table import Table
 
 from blitzgs import __version__
 from blitzgs.distributed.group import MismatchError, Ranks
+from blitzgs.distributed.ownership import TileOwners
 from blitzgs.scene import ply
 from blitzgs.scene.synth import command as synth
 from blitzgs.training import run
@@ -40,7 +41,8 @@ the resolved configuration and stops.
 RUN gets config.yaml, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. An interrupted run
 (Ctrl-C or SIGTERM) saves a checkpoint; the same command with --resume continues it exactly.
 
-Several processes: torchrun --nproc-per-node=M train.py (the same flags).
+Several processes share the work with torchrun --nproc-per-node=M train.py (the same flags). With --resume and
+--max-restarts=K, a job that loses a process continues from its last checkpoint.
 """
 
 
@@ -152,14 +154,11 @@ def _train(args: argparse.Namespace) -> int:
         return 0
     if args.out is None:
         args.parser.error("the following arguments are required: --out")
-    ranks = Ranks.from_environment(args.device)
-    try:
-        capture, images = run.open_capture(config)
+    with Ranks.from_environment(args.device, config.ranks.timeout_seconds) as ranks:
+        capture, images = run.open_capture(config, ranks)
         summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
         if summary is not None and ranks.rank == 0:
             _print_summary(summary, args.out)
-    finally:
-        ranks.close()
     return 0
 
 
@@ -172,45 +171,54 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
 
 
 def _eval(args: argparse.Namespace) -> int:
-    ranks = Ranks.from_environment(args.device)
-    model = run.open_model(args.folder, ranks, args.data)
-    capture, images = run.open_capture(model.config)
-    result = evaluate(
-        model.table,
-        ViewSet(list(capture.cameras), model.space, ranks.device),
-        capture.cameras,
-        images,
-        getattr(capture, args.split),
-        render_options(model.config, model.space, model.progress.sh_degree),
-        args.out or args.folder / run.EVALUATION / args.split,
-        pictures=args.pictures,
-        lpips=load_lpips(args.lpips),
-    )
-    print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
+    with Ranks.from_environment(args.device) as ranks:
+        model = run.open_model(args.folder, ranks, args.data)
+        capture, images = run.open_capture(model.config, ranks)
+        result = evaluate(
+            model.table,
+            ViewSet(list(capture.cameras), model.space, ranks.device),
+            capture.cameras,
+            images,
+            getattr(capture, args.split),
+            render_options(model.config, model.space, model.progress.sh_degree),
+            args.out or args.folder / run.EVALUATION / args.split,
+            TileOwners(ranks),
+            pictures=args.pictures,
+            lpips=load_lpips(args.lpips),
+        )
+        if ranks.rank == 0:
+            print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
     return 0
 
 
 def _render(args: argparse.Namespace) -> int:
-    ranks = Ranks.from_environment(args.device)
-    model = run.open_model(args.folder, ranks, args.data)
-    capture, _ = run.open_capture(model.config)
-    views = ViewSet(list(capture.cameras), model.space, ranks.device)
-    options = render_options(model.config, model.space, model.progress.sh_degree)
-    indices = range(len(capture.cameras)) if args.split == "all" else getattr(capture, args.split)
-    args.out.mkdir(parents=True, exist_ok=True)
-    for index in indices:
-        render = render_view(model.table, views, index, options)
-        path = (args.out / capture.cameras[index].name).with_suffix(".npy" if args.raw else ".png")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if args.raw:
-            np.save(path, render.cpu().numpy())
-        else:
-            write_image(path, to_uint8(render))
+    with Ranks.from_environment(args.device) as ranks:
+        model = run.open_model(args.folder, ranks, args.data)
+        capture, _ = run.open_capture(model.config, ranks)
+        views = ViewSet(list(capture.cameras), model.space, ranks.device)
+        options = render_options(model.config, model.space, model.progress.sh_degree)
+        indices = range(len(capture.cameras)) if args.split == "all" else getattr(capture, args.split)
+        owners = TileOwners(ranks)
+        args.out.mkdir(parents=True, exist_ok=True)
+        for position, index in enumerate(indices):
+            # The ranks take turns at writing.
+            render = render_view(model.table, views, index, options, owners, position % ranks.world_size)
+            if render is None:
+                continue
+            path = (args.out / capture.cameras[index].name).with_suffix(".npy" if args.raw else ".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if args.raw:
+                np.save(path, render.cpu().numpy())
+            else:
+                write_image(path, to_uint8(render))
     return 0
 
 
 def _export(args: argparse.Namespace) -> int:
-    model = run.open_model(args.folder, Ranks.from_environment(args.device))
+    ranks = Ranks.from_environment(args.device)
+    if ranks.world_size > 1:
+        raise ValueError("export writes one file from one process: run it without torchrun")
+    model = run.open_model(args.folder, ranks)
     table, space = model.table, model.space
     args.ply.parent.mkdir(parents=True, exist_ok=True)
     ply.write_ply(

@@ -3,8 +3,8 @@
 
 `forward` goes from the active Gaussians through projection, tile intersection and compositing to a `Frame`;
 `backward` returns along the same route from image gradients to the gradients of the visible Gaussians alone.
-Nothing
-here is as long as the table: cost follows what the views see.
+Nothing here is as long as the table: cost follows what the views see. On several ranks an exchange of the
+projected rows sits between projection and intersection, and its reverse between their gradients.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs.distributed.exchange import Route, Splats, count_by_view, plan_route, send, send_back
+from blitzgs.distributed.ownership import Share
 from blitzgs.model import GaussianTable
 from blitzgs.ops.project import Rows
 
@@ -79,11 +81,15 @@ class Frame(NamedTuple):
     Attributes:
         views: the views.
         options: the options.
-        rows: the projected Gaussians, P rows.
+        rows: this rank's projected Gaussians, P rows.
+        splats: what was composited: the rows, or those that reached this rank's tiles in the exchange.
+        share: who composites which tiles; None: one rank does all.
+        route: of the exchange.
+        visible: int64 [B], Gaussians visible in each view, over all ranks.
         backgrounds: [B, 3]; None: black.
-        isect_rows: int32 [I], rows by tile, front to back.
+        isect_rows: int32 [I], splats by tile, front to back.
         tile_offsets: int64 [B * T + 1].
-        renders: [B, H, W, 3].
+        renders: [B, H, W, 3]; pixels of other ranks' tiles are zero.
         transmittances: [B, H, W], share of the background that shows.
         last_ids: int32 [B, H, W], for the backward pass.
         tile_work: int32 [B * T], list entries each tile went through.
@@ -93,6 +99,10 @@ class Frame(NamedTuple):
     views: Views
     options: RenderOptions
     rows: Rows
+    splats: Splats
+    share: Share | None
+    route: Route | None
+    visible: Tensor
     backgrounds: Tensor | None
     isect_rows: Tensor
     tile_offsets: Tensor
@@ -116,7 +126,11 @@ class Gradients(NamedTuple):
 
 
 def forward(
-    table: GaussianTable, views: Views, options: RenderOptions, active: Active | None = None
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: Active | None = None,
+    share: Share | None = None,
 ) -> Frame:
     """Render views of a table whose active rows are up to date.
 
@@ -125,9 +139,12 @@ def forward(
         views: at most `MAX_VIEWS` views.
         options: how to render.
         active: rows and views to consider; None: all.
+        share: who composites which tiles; every rank of the job calls this with its table. None: render all
+            of the views from this table alone.
 
     Returns:
-        The frame; its images do not depend on the order of the table's rows, nor on inactive rows.
+        The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
+        ranks shared the work.
     """
     active = active or Active()
     count = len(views)
@@ -138,19 +155,41 @@ def forward(
             options.antialiased, True,
         )
     )  # fmt: skip
-    ids = table["id"][rows.gaussian_ids]
+    splats = Splats(
+        rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
+        table["id"][rows.gaussian_ids],
+    )  # fmt: skip
+    route, n_isects, tiles = None, int(rows.counts[2]), (0, -1)
+    if share is None:
+        visible = count_by_view(rows.camera_ids, count)
+    else:
+        route, tiles = plan_route(splats, share.ranges, share.ranks), share.tiles
+        splats = send(splats, route, share.ranks, share.half)
+        n_isects, visible = route.n_isects, route.visible
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
-        rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, ids, count, views.width,
-        views.height, options.tile_size, 0, -1, int(rows.counts[2]),
+        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids, count,
+        views.width, views.height, options.tile_size, *tiles, n_isects,
     )  # fmt: skip
     backgrounds = None
     if any(options.background):
         backgrounds = torch.tensor(options.background, device=table.device).repeat(count, 1)
     composited = torch.ops.blitzgs.rasterize_fwd(
-        rows.means2d, rows.conics, rows.opacities, rows.colors, backgrounds, isect_rows, tile_offsets, count,
-        views.width, views.height, options.tile_size, 0, -1,
+        splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
+        count, views.width, views.height, options.tile_size, *tiles,
     )  # fmt: skip
-    return Frame(views, options, rows, backgrounds, isect_rows, tile_offsets, *composited)
+    return Frame(
+        views,
+        options,
+        rows,
+        splats,
+        share,
+        route,
+        visible,
+        backgrounds,
+        isect_rows,
+        tile_offsets,
+        *composited,
+    )
 
 
 def backward(
@@ -161,16 +200,20 @@ def backward(
     Args:
         table: the table that was rendered, unchanged since.
         frame: from `forward`.
-        v_renders: gradient of the loss by the images, [B, H, W, 3].
+        v_renders: gradient of the loss by the images, [B, H, W, 3]; this rank's tiles matter.
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
     """
-    views, options, rows = frame.views, frame.options, frame.rows
-    v_means2d, v_conics, v_opacities, v_colors, _ = torch.ops.blitzgs.rasterize_bwd(
-        rows.means2d, rows.conics, rows.opacities, rows.colors, frame.backgrounds, frame.isect_rows,
+    views, options, rows, splats, share = frame.views, frame.options, frame.rows, frame.splats, frame.share
+    tiles = (0, -1) if share is None else share.tiles
+    *row_gradients, _ = torch.ops.blitzgs.rasterize_bwd(
+        splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
         frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders, None,
-        len(views), views.width, views.height, options.tile_size, 0, -1, False, options.deterministic,
+        len(views), views.width, views.height, options.tile_size, *tiles, False, options.deterministic,
     )  # fmt: skip
+    if share is not None and frame.route is not None:
+        row_gradients = send_back(row_gradients, frame.route, share.ranks, share.half)
+    v_means2d, v_conics, v_opacities, v_colors = row_gradients
     *parameters, _ = torch.ops.blitzgs.project_bwd(
         *table.parameters, views.viewmats, views.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
         views.width, views.height, options.sh_degree, options.eps2d, options.antialiased, True, v_means2d,

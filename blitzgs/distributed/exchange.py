@@ -52,6 +52,7 @@ class Route(NamedTuple):
         received: rows from each rank.
         n_rows: P, rows before the exchange.
         n_isects: row-tile intersections among the rows received.
+        visible: int64 [B], rows of each view before the exchange, over all ranks.
     """
 
     rows: Tensor
@@ -59,6 +60,7 @@ class Route(NamedTuple):
     received: list[int]
     n_rows: int
     n_isects: int
+    visible: Tensor
 
 
 def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks) -> Route:
@@ -79,7 +81,10 @@ def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks) -> Route:
         ranges.height,
         ranges.tile_size,
     )
-    sent, received = torch.stack((counts, ranks.exchange_counts(counts))).tolist()
+    # What every rank needs to know of the others rides along, so that one exchange is enough.
+    seen = count_by_view(splats.camera_ids, ranges.n_views).expand(ranks.world_size, -1)
+    arriving = ranks.exchange_counts(torch.cat((counts, seen), 1))
+    sent, received = torch.stack((counts, arriving[:, :2])).tolist()
     rows_sent = [rows for rows, _ in sent]
     return Route(
         rows=route_rows(masks, rows_sent),
@@ -87,7 +92,13 @@ def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks) -> Route:
         received=[rows for rows, _ in received],
         n_rows=len(masks),
         n_isects=sum(isects for _, isects in received),
+        visible=arriving[:, 2:].sum(0),
     )
+
+
+def count_by_view(camera_ids: Tensor, n_views: int) -> Tensor:
+    """Count the rows of each view, int64 [B], without waiting for the device."""
+    return torch.stack([(camera_ids == view).sum() for view in range(n_views)])
 
 
 def send(splats: Splats, route: Route, ranks: Ranks, half: bool = False) -> Splats:

@@ -107,9 +107,12 @@ class Ranks:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Leave the job; when an error is on its way out, tell the other ranks what it was."""
-        if error is not None and self.watchdog is not None:
+        if error is None:
+            self.close()
+        elif self.watchdog is not None:
+            # The group is left standing: taking it down could wait for ranks that are no longer there.
             self.watchdog.report_failure(f"{type(error).__name__}: {error}")
-        self.close()
+            self.watchdog.stop()
 
     def close(self) -> None:
         """Leave the job. Safe to call twice."""

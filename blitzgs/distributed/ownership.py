@@ -69,6 +69,14 @@ class TileRanges:
         before, after = max(view_begin, begin - reach), min(view_end, end + reach)
         return [(low, high) for low, high in ((before, begin), (end, after)) if low < high]
 
+    def pixel_mask(self, rank: int, device: torch.device) -> Tensor:
+        """Mark the pixels of a rank's tiles, bool [B, H, W]."""
+        begin, end = self.of(rank)
+        tiles = torch.arange(self.n_views * self.tiles_per_view, device=device)
+        owned = ((tiles >= begin) & (tiles < end)).view(self.n_views, -1, self.tiles_x)
+        pixels = owned.repeat_interleave(self.tile_size, 1).repeat_interleave(self.tile_size, 2)
+        return pixels[:, : self.height, : self.width]
+
     def pixel_rows(self, rank: int, view: int, margin: int = LOSS_REACH) -> tuple[int, int]:
         """Return the rows [y0, y1) of a view's image that a rank's tiles and a margin around them cover.
 
@@ -82,6 +90,26 @@ class TileRanges:
         y0 = begin // self.tiles_x * self.tile_size - margin
         y1 = ((end - 1) // self.tiles_x + 1) * self.tile_size + margin
         return max(y0, 0), min(y1, self.height)
+
+
+@dataclass(frozen=True)
+class Share:
+    """Who composites what in one rendering.
+
+    Attributes:
+        ranks: the job; all its ranks render together.
+        ranges: the tiles of each.
+        half: exchange splats in half precision (see `blitzgs.distributed.exchange.send`).
+    """
+
+    ranks: Ranks
+    ranges: TileRanges
+    half: bool = False
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """This rank's [first, one past last) tile."""
+        return self.ranges.of(self.ranks.rank)
 
 
 class TileOwners:

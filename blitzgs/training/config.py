@@ -169,6 +169,22 @@ class PopulationConfig:
 
 
 @dataclass(frozen=True)
+class RanksConfig:
+    """How several processes share a run; nothing here changes its result beyond rounding.
+
+    Attributes:
+        timeout_seconds: a rank that does not show up at a collective for this long ends the job.
+        half_exchange: exchange projected Gaussians in half precision (faster on slow links, less exact).
+        max_imbalance: Gaussians move between ranks when the largest shard exceeds the smallest by this
+            factor.
+    """
+
+    timeout_seconds: float = 120.0
+    half_exchange: bool = False
+    max_imbalance: float = 1.1
+
+
+@dataclass(frozen=True)
 class LogConfig:
     """What a run reports.
 
@@ -202,5 +218,6 @@ class Config:
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     population: PopulationConfig = field(default_factory=PopulationConfig)
+    ranks: RanksConfig = field(default_factory=RanksConfig)
     log: LogConfig = field(default_factory=LogConfig)
     seed: int = 0

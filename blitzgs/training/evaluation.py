@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from blitzgs import pipeline
+from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.pixels import collect_images
 from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import ssim
 from blitzgs.pipeline import RenderOptions
@@ -57,10 +59,35 @@ def load_lpips(path: str | None) -> Lpips | None:
     return metric
 
 
-def render_view(table: GaussianTable, views: ViewSet, index: int, options: RenderOptions) -> Tensor:
-    """Render camera `index` with all Gaussians, float32 [H, W, 3]; the table must be caught up."""
-    render: Tensor = pipeline.forward(table, views.pick([index]), options).renders[0]
-    return render
+def render_view(
+    table: GaussianTable,
+    views: ViewSet,
+    index: int,
+    options: RenderOptions,
+    owners: TileOwners,
+    destination: int = 0,
+) -> Tensor | None:
+    """Render camera `index` with all Gaussians of all ranks; every rank calls this.
+
+    Args:
+        table: this rank's Gaussians, caught up.
+        views: all cameras.
+        index: of the camera.
+        options: how to render.
+        owners: divides the tiles among the ranks.
+        destination: rank that gets the image.
+
+    Returns:
+        float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
+    """
+    picked, ranks = views.pick([index]), owners.ranks
+    if ranks.world_size == 1:
+        return pipeline.forward(table, picked, options).renders[0]
+    ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
+    frame = pipeline.forward(table, picked, options, share=Share(ranks, ranges))
+    owners.record([index], frame.tile_work)
+    collect_images(frame.renders, ranges, ranks, destination)
+    return frame.renders[0] if ranks.rank == destination else None
 
 
 def evaluate(
@@ -71,36 +98,44 @@ def evaluate(
     indices: Sequence[int],
     options: RenderOptions,
     folder: Path | None,
+    owners: TileOwners,
     *,
     pictures: int = 0,
     lpips: Lpips | None = None,
 ) -> dict[str, Any]:
-    """Render views and compare them with their photographs.
+    """Render views and compare them with their photographs; the ranks take turns at comparing.
 
     Args:
-        table: Gaussians, caught up.
+        table: this rank's Gaussians, caught up.
         views: all cameras on the device.
         cameras: the same, for their names.
         images: photographs.
         indices: cameras to evaluate.
         options: how to render.
         folder: gets `metrics.json` and the pictures; None: nothing is written.
+        owners: divides the tiles among the ranks; all of them call this.
         pictures: evenly spaced views of which to write photograph | render | error side by side.
         lpips: from `load_lpips`.
 
     Returns:
         {"psnr": mean, "ssim": mean, ("lpips": mean,) "views": {name: {...}}}; the means are absent without
-        views.
+        views. The same on every rank.
     """
+    ranks = owners.ranks
     chosen = (
         {indices[k * len(indices) // pictures] for k in range(pictures)} if indices and pictures else set()
     )
     per_view: dict[str, dict[str, float]] = {}
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
+    own = list(indices[ranks.rank :: ranks.world_size])
     for position, index in enumerate(indices):
-        images.prefetch(list(indices[position + 1 : position + 5]))
-        render = render_view(table, views, index, options)
+        turn, destination = divmod(position, ranks.world_size)
+        if destination == 0:
+            images.prefetch(own[turn : turn + 4])
+        render = render_view(table, views, index, options, owners, destination)
+        if render is None:
+            continue
         target = images.get(index).to(table.device)
         mask = images.mask(index)
         metrics = image_metrics(render, target, None if mask is None else mask.to(table.device))
@@ -113,13 +148,15 @@ def evaluate(
         per_view[cameras[index].name] = metrics
         if folder is not None and index in chosen:
             write_comparison(folder / (cameras[index].name.replace("/", "_") + ".jpg"), render, target)
+    found = {name: view for part in ranks.all_gather_object(per_view) for name, view in part.items()}
+    per_view = {cameras[index].name: found[cameras[index].name] for index in indices}
     result: dict[str, Any] = {}
     for metric in ("psnr", "ssim", "lpips"):
         values = [view[metric] for view in per_view.values() if metric in view]
         if values:
             result[metric] = sum(values) / len(values)
     result["views"] = per_view
-    if folder is not None:
+    if folder is not None and ranks.rank == 0:
         (folder / "metrics.json").write_text(json.dumps(result, indent=1))
     return result
 

@@ -8,9 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs.distributed.pixels import exchange_halo
 from blitzgs.model import GaussianTable
-from blitzgs.ops.photometric import photometric_fwd_bwd, pixel_counts
+from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.pipeline import Frame
+from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 
 
@@ -29,32 +31,36 @@ class LossTerms(NamedTuple):
     scale_reg: Tensor | None
 
 
-def loss_terms(
-    frame: Frame, targets: Tensor, masks: Tensor | None, config: LossConfig, length_unit: float
-) -> LossTerms:
+def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: float) -> LossTerms:
     """Compare rendered views with their photographs.
+
+    On several ranks each compares its own tiles; the losses are those of all ranks together.
 
     Args:
         frame: rendered batch of B views.
-        targets: uint8 [B, H, W, 3].
-        masks: uint8 [B, H, W], 0 = pixel left out; or None.
+        batch: their photographs.
         config: weights.
         length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
     """
-    count = len(frame.views)
-    samples = pixel_counts(frame.renders, masks).clamp(min=1)
+    count, share = len(frame.views), frame.share
+    if share is not None:
+        exchange_halo(frame.renders, share.ranges, share.ranks)
+    samples = batch.samples
     l1_sums, ssim_sums, v_renders = photometric_fwd_bwd(
         frame.renders,
-        targets,
-        masks,
+        batch.targets,
+        batch.masks,
         (1.0 - config.ssim) / (samples * count),
         -config.ssim / (samples * count),
         frame.options.tile_size,
+        *((0, -1) if share is None else share.tiles),
     )
+    if share is not None:
+        l1_sums, ssim_sums = share.ranks.all_reduce(torch.stack((l1_sums, ssim_sums)))
     photometric = ((1.0 - config.ssim) * l1_sums - config.ssim * ssim_sums) / samples + config.ssim
     scale_reg = None
     if config.scale > 0:
-        scale_reg = config.scale / (length_unit * count * _visible(frame).clamp(min=1).to(l1_sums.dtype))
+        scale_reg = config.scale / (length_unit * count * frame.visible.clamp(min=1).to(l1_sums.dtype))
     return LossTerms(photometric, v_renders, scale_reg)
 
 
@@ -62,11 +68,20 @@ def scale_term(frame: Frame, table: GaussianTable, length_unit: float) -> Tensor
     """Return L_scale of each view, float32 [B]: the mean smallest axis of the Gaussians visible in it."""
     smallest = table["scales"][frame.rows.gaussian_ids].amin(dim=1).exp() / length_unit
     views = torch.arange(len(frame.views), device=smallest.device)
-    seen = frame.rows.camera_ids[:, None] == views
-    return (smallest[:, None] * seen).sum(dim=0) / _visible(frame).clamp(min=1)
+    sums = (smallest[:, None] * (frame.rows.camera_ids[:, None] == views)).sum(dim=0)
+    if frame.share is not None:
+        frame.share.ranks.all_reduce(sums)
+    return sums / frame.visible.clamp(min=1)
 
 
-def _visible(frame: Frame) -> Tensor:
-    """Gaussians visible in each view, int64 [B], without waiting for the device."""
-    views = torch.arange(len(frame.views), device=frame.renders.device)
-    return (frame.rows.camera_ids[:, None] == views).sum(dim=0)
+def batch_psnr(frame: Frame, batch: Batch) -> Tensor:
+    """Return the PSNR of a batch over all its pixels that count, in dB."""
+    error = (frame.renders.clamp(0, 1) - batch.targets.float() / 255.0) ** 2
+    counted = torch.ones_like(error[..., 0], dtype=torch.bool) if batch.masks is None else batch.masks != 0
+    if frame.share is not None:
+        ranks, ranges = frame.share.ranks, frame.share.ranges
+        counted &= ranges.pixel_mask(ranks.rank, error.device)
+    total = error[counted].sum()
+    if frame.share is not None:
+        frame.share.ranks.all_reduce(total)
+    return -10.0 * (total / batch.samples.sum()).clamp(min=1e-12).log10()

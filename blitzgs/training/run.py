@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import platform
 import resource
 from dataclasses import dataclass
@@ -29,7 +30,10 @@ CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
 EVALUATION = "evaluation"
 # Sections and fields that a resumed run may change: they decide nothing about the result.
-FREE_FIELDS = ("log", "data.path", "data.cache_bytes", "data.threads", "data.prefetch")
+FREE_FIELDS = ("log", "ranks", "data.path", "data.cache_bytes", "data.threads", "data.prefetch")
+
+# Fields that may differ between the hosts of a job.
+HOST_FIELDS = ("data.path", "data.cache_bytes", "data.threads")
 
 
 @dataclass(frozen=True)
@@ -68,8 +72,10 @@ class TrainedModel:
     table: GaussianTable
 
 
-def open_capture(config: Config) -> tuple[Capture, ImageStore]:
+def open_capture(config: Config, ranks: Ranks) -> tuple[Capture, ImageStore]:
     """Load the capture that a configuration names, and open its images.
+
+    The processes of one host share the budget for images in memory.
 
     Raises:
         ConfigError: `data.path` is not set.
@@ -81,7 +87,53 @@ def open_capture(config: Config) -> tuple[Capture, ImageStore]:
     capture = load_capture(
         data.path, images=data.images, downscale=data.downscale, split=data.split, masks=data.masks
     )
-    return capture, ImageStore(capture, data.cache_bytes, data.threads)
+    return capture, ImageStore(capture, data.cache_bytes // ranks.local_world_size, data.threads)
+
+
+def check_alike(config: Config, capture: Capture, ranks: Ranks) -> None:
+    """Check that all ranks run the same code with the same configuration on the same capture.
+
+    Raises:
+        MismatchError: on every rank, naming the field and the ranks.
+    """
+    if ranks.world_size == 1:
+        return
+    fields = {
+        f"configuration field {name}": value
+        for name, value in _flatten(to_dict(config))
+        if name not in HOST_FIELDS
+    }
+    ranks.compare_across_ranks(
+        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture)} | fields
+    )
+
+
+def code_fingerprint() -> str:
+    """Version of the package and a digest of its sources and kernels."""
+    digest = hashlib.sha256()
+    root = Path(blitzgs.__file__).parent
+    for path in sorted([*root.rglob("*.py"), *root.glob("_lib/libblitzgs_*.so")]):
+        digest.update(str(path.relative_to(root)).encode())
+        digest.update(path.read_bytes())
+    return f"{blitzgs.__version__}+{digest.hexdigest()[:12]}"
+
+
+def capture_fingerprint(capture: Capture) -> str:
+    """Digest of the cameras, the points and the split."""
+    digest = hashlib.sha256()
+    for camera in capture.cameras:
+        digest.update(f"{camera.name} {camera.width} {camera.height}".encode())
+        digest.update(camera.K.tobytes() + camera.world_to_camera.tobytes())
+    digest.update(capture.points.tobytes() + capture.colors.tobytes())
+    digest.update(repr((capture.train, capture.test)).encode())
+    return digest.hexdigest()[:12]
+
+
+def _flatten(fields: dict[str, Any], where: str = "") -> list[tuple[str, object]]:
+    flat: list[tuple[str, object]] = []
+    for name, value in fields.items():
+        flat += _flatten(value, f"{where}{name}.") if isinstance(value, dict) else [(where + name, value)]
+    return flat
 
 
 def save(

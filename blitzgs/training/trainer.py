@@ -14,11 +14,13 @@ from torch import Tensor
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.ops.density_stats import density_stats_
 from blitzgs.pipeline import Frame
 from blitzgs.population.density import DensityRules, densify
 from blitzgs.population.initialisation import octree_gaussians
+from blitzgs.population.redistribution import redistribute
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run
 from blitzgs.training.batches import Batch, BatchLoader, Images
@@ -26,7 +28,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
 from blitzgs.training.evaluation import evaluate, load_lpips
 from blitzgs.training.guard import LossGuard, StopRequest, check_table
-from blitzgs.training.loss import LossTerms, loss_terms, scale_term
+from blitzgs.training.loss import LossTerms, batch_psnr, loss_terms, scale_term
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_log import RunLog
@@ -69,6 +71,7 @@ class Trainer:
         Raises:
             FileExistsError: the folder holds a trained run and `resume` is not set.
             ConfigError: the run to resume was started with another configuration.
+            MismatchError: the ranks differ in configuration, code or capture.
         """
         self.config, self.capture, self.images, self.folder, self.ranks = (
             config,
@@ -77,6 +80,7 @@ class Trainer:
             folder,
             ranks,
         )
+        run.check_alike(config, capture, ranks)
         self.schedule = Schedule(config.schedule)
         self.space = Space.of(capture.offset, capture.extent)
         self._lpips = load_lpips(config.log.lpips_weights)
@@ -95,9 +99,18 @@ class Trainer:
             save_config(config, folder / run.CONFIG)
         self._optimiser = LazyAdam(config.optimiser, self.schedule, self.space.extent, ranks.device)
         self._views = ViewSet(list(capture.cameras), self.space, ranks.device)
-        sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
-        sampler = BatchSampler(sizes, self.schedule.batch_size, config.seed)
-        self._loader = BatchLoader(images, capture.train, sampler, ranks.device, config.data.prefetch)
+        sizes = [(camera.width, camera.height) for camera in capture.cameras]
+        sampler = BatchSampler([sizes[i] for i in capture.train], self.schedule.batch_size, config.seed)
+        self._owners = TileOwners(ranks)
+        self._loader = BatchLoader(
+            images,
+            sizes,
+            capture.train,
+            sampler,
+            ranks.device,
+            config.data.prefetch,
+            self._owners if ranks.world_size > 1 else None,
+        )
         self._guard = LossGuard()
         self._length_unit = self.space.extent * config.loss.scale_reference
         self._seconds_paused = 0.0
@@ -179,8 +192,12 @@ class Trainer:
         views = self._views.pick(batch.indices)
         degree = self.schedule.sh_degree(begin, config.model.sh_degree)
         self._optimiser.catch_up(self.table, None, step - 1)
-        frame = pipeline.forward(self.table, views, render_options(config, self.space, degree))
-        terms = loss_terms(frame, batch.targets, batch.masks, config.loss, self._length_unit)
+        share = None
+        if batch.ranges is not None:
+            share = Share(self.ranks, batch.ranges, config.ranks.half_exchange)
+        frame = pipeline.forward(self.table, views, render_options(config, self.space, degree), share=share)
+        self._owners.record(batch.indices, frame.tile_work)
+        terms = loss_terms(frame, batch, config.loss, self._length_unit)
         names = [self.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, terms.photometric, self.table, frame)
         report = None
@@ -219,15 +236,13 @@ class Trainer:
     def _measure(self, frame: Frame, batch: Batch, terms: LossTerms) -> dict[str, float]:
         """Return the batch's total loss and PSNR."""
         scale = scale_term(frame, self.table, self._length_unit)
-        error = (frame.renders.clamp(0, 1) - batch.targets.float() / 255.0) ** 2
-        if batch.masks is not None:
-            error = error[batch.masks != 0]
         loss = (terms.photometric + self.config.loss.scale * scale).mean()
+        visible = self.ranks.all_reduce(frame.rows.counts[:1].to(self.ranks.device))
         return {
             "loss": loss.item(),
             "l_scale": scale.mean().item(),
-            "psnr": -10.0 * error.mean().clamp(min=1e-12).log10().item(),
-            "visible": float(frame.rows.counts[0]),
+            "psnr": batch_psnr(frame, batch).item(),
+            "visible": float(visible.item()),
         }
 
     def _log_step(self, report: dict[str, float], step: int, log: RunLog) -> None:
@@ -271,6 +286,8 @@ class Trainer:
         )
         values = torch.tensor(list(dataclasses.astuple(report)), device=self.ranks.device)
         counts = dict(zip(dataclasses.asdict(report), self.ranks.all_reduce(values).tolist(), strict=True))
+        if redistribute(self.table, self.ranks, self.config.ranks.max_imbalance):
+            counts["redistributed"] = 1
         total = self._population()
         self.progress = dataclasses.replace(
             self.progress, peak_gaussians=max(self.progress.peak_gaussians, total)
@@ -293,7 +310,8 @@ class Trainer:
             self.images,
             self.capture.test or self.capture.train,
             render_options(self.config, self.space, self.progress.sh_degree),
-            self.folder / run.EVALUATION / f"{images:06d}" if self.ranks.rank == 0 else None,
+            self.folder / run.EVALUATION / f"{images:06d}",
+            TileOwners(self.ranks),
             pictures=self.config.log.pictures,
             lpips=self._lpips,
         )

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
-from rank_harness import run_ranks
 
 from blitzgs.distributed.exchange import Splats, exchange, plan_route, send, send_back
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.halo import exchange_halo
 from blitzgs.distributed.ownership import TileRanges
+from blitzgs.distributed.pixels import exchange_halo
+from tests.distributed.rank_harness import run_ranks
 
 WIDTH, HEIGHT, CAMERAS = 100, 60, 2
 TILES = CAMERAS * 7 * 4

@@ -4,9 +4,9 @@ import time
 
 import pytest
 import torch
-from rank_harness import RankError, run_ranks
 
 from blitzgs.distributed.group import MismatchError, Ranks
+from tests.distributed.rank_harness import RankError, run_ranks
 
 
 def _collectives(ranks):

@@ -3,10 +3,10 @@ from fractions import Fraction
 
 import pytest
 import torch
-from rank_harness import run_ranks
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import mass_prefix, sampling_keys, smallest
+from tests.distributed.rank_harness import run_ranks
 
 ALONE = Ranks()
 

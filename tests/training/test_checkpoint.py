@@ -3,9 +3,7 @@ import json
 import os
 import resource
 import signal
-import sys
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,9 +11,7 @@ from safetensors.torch import load_file
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import checkpoint
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "distributed"))
-from rank_harness import CONTEXT, RankError, run_ranks  # noqa: E402
+from tests.distributed.rank_harness import CONTEXT, RankError, run_ranks
 
 ALONE = Ranks()
 POINTS = [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered pixels around a rank's tiles, fetched from their owners, so that windowed losses are exact."""
+"""Rendered pixels on the move: a ring around a rank's tiles for the loss, whole images for evaluation."""
 
 from __future__ import annotations
 
@@ -24,9 +24,31 @@ def exchange_halo(renders: Tensor, ranges: TileRanges, ranks: Ranks) -> None:
     """
     if ranks.world_size == 1:
         return
+    wanted = [ranges.halo(rank) for rank in range(ranks.world_size)]
+    _fetch(renders, wanted, ranges, ranks)
+
+
+def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destination: int) -> None:
+    """Bring all pixels of a rendering to one rank, in place there; they arrive bit for bit.
+
+    Args:
+        renders: [B, H, W, C], contiguous; valid in this rank's tiles.
+        ranges: who owns which tiles.
+        ranks: the job.
+        destination: the rank whose `renders` is complete afterwards.
+    """
+    if ranks.world_size == 1:
+        return
+    begin, end = ranges.of(destination)
+    elsewhere = [(low, high) for low, high in ((0, begin), (end, ranges.bounds[-1])) if low < high]
+    _fetch(renders, [elsewhere if r == destination else [] for r in range(ranks.world_size)], ranges, ranks)
+
+
+def _fetch(renders: Tensor, wanted: list[list[tuple[int, int]]], ranges: TileRanges, ranks: Ranks) -> None:
+    """Give each rank the tiles it wants, from their owners, in place."""
     me, everyone = ranks.rank, range(ranks.world_size)
-    outgoing = [_overlap(ranges.halo(other), ranges.of(me)) for other in everyone]
-    incoming = [_overlap(ranges.halo(me), ranges.of(other)) for other in everyone]
+    outgoing = [_overlap(wanted[other], ranges.of(me)) for other in everyone]
+    incoming = [_overlap(wanted[me], ranges.of(other)) for other in everyone]
     flat = renders.view(-1, renders.shape[-1])
     pixels_out = _pixels(outgoing, ranges, renders.device)
     pixels_in = _pixels(incoming, ranges, renders.device)

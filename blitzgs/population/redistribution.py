@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keeps the shards of a model equally long: rows move, with everything known about them (paper §3.1)."""
+
+from __future__ import annotations
+
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.sharding import global_positions, imbalance, shard_sizes
+from blitzgs.model import GaussianTable
+
+
+def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = 1.1) -> bool:
+    """Deal the rows anew when the shards have become unequal: position p of the global order to rank p mod M.
+
+    Collective: every rank calls it. All columns move; the order of the rows is the global order.
+
+    Args:
+        table: this rank's shard, changed in place.
+        ranks: the job.
+        max_imbalance: largest over smallest shard up to which nothing happens; 0 deals in any case.
+
+    Returns:
+        Whether rows were dealt.
+    """
+    if ranks.world_size == 1:
+        return False
+    sizes = shard_sizes(len(table), ranks)
+    if imbalance(sizes) <= max_imbalance:
+        return False
+    mine = global_positions(sizes, ranks.rank) % ranks.world_size
+    table.exchange(mine.to(table.device), ranks)
+    # Rows arrive by source rank; put them into the global order.
+    positions = torch.cat([global_positions(sizes, source) for source in range(ranks.world_size)])
+    arrived = positions[positions % ranks.world_size == ranks.rank]
+    table.permute(arrived.argsort().to(table.device))
+    return True
