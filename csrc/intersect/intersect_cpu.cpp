@@ -169,6 +169,12 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
     const std::int64_t end = piece_start(in.n_rows, pieces, piece + 1);
     spans[piece].reserve(2 * (end - begin));
     for (std::int64_t i = begin; i < end; ++i) {
+      // Depth order jumps about in memory: fetch a few rows ahead.
+      const std::int64_t ahead = rows[std::min(i + 8, end - 1)].row;
+      __builtin_prefetch(in.means2d + 2 * ahead);
+      __builtin_prefetch(in.conics + 3 * ahead);
+      __builtin_prefetch(in.opacities + ahead);
+      __builtin_prefetch(in.camera_ids + ahead);
       for_each_span(in, rows[i].row, [&](std::int64_t first, std::int32_t count) {
         spans[piece].push_back({rows[i].row, count, first});
         for (std::int32_t tile = 0; tile < count; ++tile) ++counts[first + tile];

@@ -173,6 +173,7 @@ void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const std::in
       const std::int32_t* list = in.isect_rows + in.tile_offsets[tile];
       const std::int32_t length = used[tile - in.grid.tile_begin];
       for (std::int32_t entry = 0; entry < length; ++entry, partial += width) {
+        __builtin_prefetch(sums + static_cast<std::int64_t>(list[std::min(entry + 8, length - 1)]) * width);
         const std::int64_t row = list[entry];
         if (row < begin || row >= end) continue;
         T* sum = sums + row * width;
