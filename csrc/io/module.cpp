@@ -8,9 +8,12 @@
 #include <algorithm>
 #include <fstream>
 #include <memory>
+#include <span>
+#include <string_view>
 
 #include "io/colmap.h"
 #include "io/ply.h"
+#include "io/qoi.h"
 
 namespace py = pybind11;
 using namespace py::literals;  // NOLINT
@@ -195,6 +198,29 @@ void write_ply(const std::string& path, const py::list& comments,
   to_file(path, [&](std::ostream& out) { io::write_ply(out, table); });
 }
 
+py::bytes encode_qoi(const Column<std::uint8_t>& rgb) {
+  if (rgb.ndim() != 3 || rgb.shape(2) != 3) throw std::invalid_argument("qoi: the image must be [H, W, 3]");
+  const io::QoiSize size{static_cast<std::uint32_t>(rgb.shape(1)), static_cast<std::uint32_t>(rgb.shape(0))};
+  std::vector<std::uint8_t> file;
+  {
+    py::gil_scoped_release release;
+    file = io::encode_qoi(rgb.data(), size);
+  }
+  return py::bytes(reinterpret_cast<const char*>(file.data()), file.size());
+}
+
+py::array_t<std::uint8_t> decode_qoi(const py::bytes& data) {
+  const std::string_view view = data;
+  const std::span file(reinterpret_cast<const std::uint8_t*>(view.data()), view.size());
+  const io::QoiSize size = io::qoi_size(file);
+  py::array_t<std::uint8_t> rgb({static_cast<py::ssize_t>(size.height), static_cast<py::ssize_t>(size.width),
+                                 static_cast<py::ssize_t>(3)});
+  std::uint8_t* out = rgb.mutable_data();
+  py::gil_scoped_release release;
+  io::decode_qoi(file, out);
+  return rgb;
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_io, m) {
@@ -207,6 +233,8 @@ PYBIND11_MODULE(_io, m) {
   m.def("write_cameras", &write_cameras, "path"_a, "cameras"_a);
   m.def("write_images", &write_images, "path"_a, "columns"_a);
   m.def("write_points", &write_points, "path"_a, "columns"_a);
+  m.def("encode_qoi", &encode_qoi, "rgb"_a);
+  m.def("decode_qoi", &decode_qoi, "data"_a);
   m.def("read_ply", &read_ply, "path"_a);
   m.def("write_ply", &write_ply, "path"_a, "comments"_a, "properties"_a, "count"_a, "rows"_a);
 }
