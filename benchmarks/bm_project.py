@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time of projection, forward and backward, against the bytes it has to move.
+
+python benchmarks/bm_project.py [--device cuda] [--gaussians 4000000] [--views 1 4]
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import torch
+from scenes import BenchmarkScene, aerial
+from timing import copy_bandwidth, median_ms
+from torch import Tensor
+
+from blitzgs.ops.project import Rows
+
+CULL_BYTES = 4 * (3 + 3 + 1)  # mean, scales, opacity: read for every Gaussian
+VISIBLE_BYTES = 4 * (4 + 48)  # quaternion, SH: read for the visible ones
+ROW_BYTES = 4 * (1 + 1 + 2 + 3 + 1 + 1 + 3 + 2 + 1)  # written
+ROW_GRADIENT_BYTES = 4 * (2 + 3 + 1 + 3)  # read backward
+GRADIENT_BYTES = 4 * 59  # parameters read and gradients written backward, each
+
+
+def arguments(scene: BenchmarkScene, active_ids: Tensor | None = None) -> tuple[Any, ...]:
+    raw = scene.raw()
+    return (
+        *raw.values(), scene.viewmats, scene.Ks, active_ids, None, scene.width, scene.height, 16, 3, 0.01,
+        1e10, 0.3, 0.0, False, True,
+    )  # fmt: skip
+
+
+def backward_arguments(scene: BenchmarkScene, rows: Rows) -> tuple[Any, ...]:
+    v = [torch.randn_like(getattr(rows, name)) for name in ("means2d", "conics", "opacities", "colors")]
+    return (
+        *scene.raw().values(), scene.viewmats, scene.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
+        scene.width, scene.height, 3, 0.3, False, True, v[0], v[1], None, v[2], v[3], None, False,
+    )  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--gaussians", type=int, default=1_000_000)
+    parser.add_argument("--views", type=int, nargs="+", default=[1, 4])
+    parser.add_argument("--repeats", type=int, default=10)
+    args = parser.parse_args()
+    bandwidth = copy_bandwidth(args.device, 2048 if args.device == "cuda" else 256)
+    print(f"{args.gaussians} Gaussians, {args.device}, copy {bandwidth:.0f} GB/s")
+    for views in args.views:
+        scene = aerial(args.gaussians, args.device, views=views)
+        forward = arguments(scene)
+        rows = Rows(*torch.ops.blitzgs.project_fwd(*forward))
+        visible, n_rows, _ = rows.counts.tolist()
+
+        def report(name: str, milliseconds: float, megabytes: float, n_rows: int = n_rows) -> None:
+            floor = megabytes / bandwidth
+            each = 1e6 * milliseconds / max(n_rows, 1)
+            print(f"  {name:32s} {milliseconds:9.3f} ms  {each:7.1f} ns a row  byte floor {floor:.3f} ms")
+
+        print(f"{views} view(s): {visible} visible, {n_rows} rows")
+        moved = VISIBLE_BYTES * visible + ROW_BYTES * n_rows
+        time = median_ms(torch.ops.blitzgs.project_fwd, [forward], args.repeats)
+        report("forward, all candidates", time, (CULL_BYTES * args.gaussians + moved) / 1e6)
+        time = median_ms(torch.ops.blitzgs.project_fwd, [arguments(scene, rows.visible_ids)], args.repeats)
+        report("forward, the visible given", time, (CULL_BYTES * visible + moved) / 1e6)
+        time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, rows)], args.repeats)
+        report("backward", time, (2 * GRADIENT_BYTES * visible + ROW_GRADIENT_BYTES * n_rows) / 1e6)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs at the ends of every range: finite images and gradients, and the reference's image."""
+
+import math
+
+import pytest
+import torch
+
+import blitzgs
+from blitzgs.reference import composite, project_splats
+from tests.helpers import PARAMETERS, Scene, image_error, random_scene, reference_images, relative_error
+
+BACKENDS = [
+    pytest.param(("cpu", torch.float64), id="cpu-float64"),
+    pytest.param(("cpu", torch.float32), id="cpu-float32"),
+    pytest.param(
+        ("cuda", torch.float32),
+        id="cuda-float32",
+        marks=[
+            pytest.mark.cuda,
+            pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+        ],
+    ),
+]
+
+
+def uniform(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+
+def facing_scene(n: int, width: int, height: int, seed: int = 0, focal: float = 30.0) -> Scene:
+    """One camera at the origin that looks along +z at n Gaussians spread over its image at depths 2 to 4."""
+    scene = random_scene(n=n, cameras=1, width=width, height=height, seed=seed, dtype=torch.float64)
+    scene.viewmats = torch.eye(4, dtype=torch.float64)[None]
+    scene.Ks[:, 0, 0], scene.Ks[:, 1, 1] = focal, focal
+    z = uniform(n, seed=seed + 1, low=2.0, high=4.0)
+    pixels = uniform(n, 2, seed=seed + 2) * torch.tensor([width, height])
+    scene.means = torch.stack(
+        [
+            (pixels[:, 0] - scene.Ks[0, 0, 2]) / focal * z,
+            (pixels[:, 1] - scene.Ks[0, 1, 2]) / focal * z,
+            z,
+        ],
+        dim=1,
+    )
+    return scene
+
+
+def any_scale() -> Scene:
+    scene = facing_scene(60, 32, 24)
+    scene.scales = 10.0 ** uniform(60, 3, seed=5, low=-8.0, high=4.0)
+    return scene
+
+
+# Not round, or the true gradient of the quaternions is zero and its relative error means nothing.
+NEARLY_ROUND = torch.tensor([1.0, 1.3, 0.8], dtype=torch.float64)
+
+
+def nearly_round_of_each_size() -> Scene:
+    scene = facing_scene(65, 32, 24)
+    scene.scales = (10.0 ** torch.linspace(-8, 4, 65, dtype=torch.float64))[:, None] * NEARLY_ROUND
+    return scene
+
+
+def any_quaternion() -> Scene:
+    scene = facing_scene(40, 32, 24)
+    length = (10.0 ** torch.linspace(-37, 37, 40, dtype=torch.float64))[:, None]
+    scene.quats = torch.nn.functional.normalize(scene.quats, dim=1) * length
+    scene.quats[::5] = 0.0
+    return scene
+
+
+def any_opacity() -> Scene:
+    scene = facing_scene(48, 32, 24)
+    ends = [0.0, 1e-30, 1e-12, 1e-3, 0.99 / 255, 1.01 / 255, 1 - 1e-3, 1 - 1e-6, 1.0, 1.0, 1.0, 1.0]
+    scene.opacities = torch.tensor(ends * 4, dtype=torch.float64)
+    return scene
+
+
+def around_the_near_plane() -> Scene:
+    scene = facing_scene(48, 32, 24)
+    factors = torch.tensor([-100.0, -1.0, 0.0, 0.5, 1 - 1e-6, 1 + 1e-6, 1 + 1e-3, 1.1, 2, 10, 100, 300])
+    scene.means *= (0.01 * factors.repeat(4).double() / scene.means[:, 2])[:, None]
+    scene.scales *= 1e-2
+    return scene
+
+
+def far_off_screen() -> Scene:
+    scene = facing_scene(60, 32, 24)
+    scene.means[:40, :2] *= 10.0 ** uniform(40, 1, seed=6, low=0.0, high=6.0)
+    scene.scales[20:40] *= 10.0 ** uniform(20, 1, seed=7, low=0.0, high=4.0)
+    return scene
+
+
+def elongated() -> Scene:
+    scene = facing_scene(40, 32, 24)
+    scene.scales = torch.tensor([1.0, 1e-4, 1e-4], dtype=torch.float64).repeat(40, 1)
+    scene.scales *= 10.0 ** uniform(40, 1, seed=8, low=-2.0, high=1.0)
+    return scene
+
+
+def focal_length(focal: float) -> Scene:
+    scene = facing_scene(40, 32, 24, focal=focal)
+    scene.scales *= 30.0 / focal
+    return scene
+
+
+def far_from_the_origin() -> Scene:
+    scene = facing_scene(50, 32, 24)
+    shift = torch.tensor([1e6, -3e5, 2e6], dtype=torch.float64)
+    scene.means += shift
+    scene.viewmats[0, :3, 3] = -shift
+    return scene
+
+
+def one_tile(n: int) -> Scene:
+    """Every Gaussian covers the whole image; the depths are apart by more than rounding, in any order."""
+    scene = facing_scene(n, 4, 4, focal=40.0)
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(9))
+    z = 2.0 * 100.0 ** (order.double() / n)
+    scene.means *= (z / scene.means[:, 2])[:, None]
+    scene.scales = 0.2 * z[:, None] * NEARLY_ROUND
+    scene.opacities = 0.02 + 0.03 * scene.opacities
+    return scene
+
+
+def deep(n: int) -> Scene:
+    """Each layer takes little: two thousand are composited before a pixel ends."""
+    scene = facing_scene(n, 3, 2)
+    z = torch.linspace(2.0, 1e3, n, dtype=torch.float64)
+    scene.means = torch.stack([torch.zeros_like(z), torch.zeros_like(z), z], dim=1)
+    scene.scales = z[:, None] * NEARLY_ROUND
+    scene.opacities[:] = 0.0045
+    return scene
+
+
+def image_of_size(width: int, height: int) -> Scene:
+    scene = facing_scene(20, width, height)
+    scene.scales *= 4.0
+    return scene
+
+
+# Name: (scene, error bound in float32 as a share of the largest value). Needles longer than the image and
+# larger than it by orders of magnitude lose digits in a float conic; 1e-4 is still below one step of 8 bits.
+SCENES = {
+    "scales 1e-8 to 1e4, each axis": (any_scale, 1e-3),
+    "scales 1e-8 to 1e4, nearly round": (nearly_round_of_each_size, 2e-5),
+    "quaternions zero and 1e-37 to 1e37": (any_quaternion, 2e-5),
+    "opacity to 0 and to 1": (any_opacity, 2e-5),
+    "around the near plane": (around_the_near_plane, 1e-4),
+    "far off-screen": (far_off_screen, 1e-4),
+    "elongated 1 : 1e4": (elongated, 1e-3),
+    "focal length 10": (lambda: focal_length(10.0), 2e-5),
+    "focal length 1e5": (lambda: focal_length(1e5), 2e-5),
+    "1e6 from the origin": (far_from_the_origin, 2e-5),
+    "20 000 on one tile": (lambda: one_tile(20_000), 5e-5),
+    "4 000 layers": (lambda: deep(4_000), 5e-5),
+    "1 x 1 image": (lambda: image_of_size(1, 1), 2e-5),
+    "2500 x 1 image": (lambda: image_of_size(2500, 1), 2e-5),
+    "1 x 2500 image": (lambda: image_of_size(1, 2500), 2e-5),
+}
+
+
+def require_finite_and_correct(scene: Scene, backend: tuple[str, torch.dtype], bound: float) -> None:
+    device, dtype = backend
+    if dtype == torch.float64:
+        bound = 1e-9
+    # The reference sees the inputs as rounded to the backend's dtype.
+    rounded = scene.to(dtype).to(torch.float64).leaves()
+    reference = reference_images(rounded)[0]
+    leaves = scene.to(dtype, device).leaves()
+    renders, alphas, _ = blitzgs.rasterization(*leaves.arguments(), sh_degree=3)
+    size = max(1.0, reference.image.detach().abs().max().item())
+    assert image_error(renders[0], reference.image, reference.cut, most_cut=0.5) <= bound * size
+    assert image_error(alphas[0, ..., 0], reference.alpha, reference.cut, most_cut=0.5) <= bound
+
+    weights = uniform(*reference.image.shape, seed=11) * ~reference.cut[..., None]
+    (renders[0].double().cpu() * weights).sum().backward()
+    (reference.image * weights).sum().backward()
+    for name in PARAMETERS:
+        actual, expected = getattr(leaves, name).grad, getattr(rounded, name).grad
+        assert actual.isfinite().all(), name
+        if dtype == torch.float64:
+            assert relative_error(actual, expected) <= 1e-6, name
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", SCENES)
+def test_extremes(name, backend):
+    make_scene, bound = SCENES[name]
+    require_finite_and_correct(make_scene(), backend, bound)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("make_scene", [lambda: one_tile(1_000_000), lambda: deep(100_000)])
+def test_a_million_on_one_tile_and_a_hundred_thousand_layers(make_scene, backend):
+    require_finite_and_correct(make_scene(), backend, 1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS[1:])
+def test_an_image_of_16k_by_16k_in_windows(backend):
+    device, dtype = backend
+    size, window = 16_384, 64
+    scene = facing_scene(400, size, size, focal=16_384.0).to(dtype)
+    on_device = scene.to(dtype, device)
+    whole, _, _ = blitzgs.rasterization(*on_device.arguments(), sh_degree=3)
+    assert whole.isfinite().all()
+    options = {"near_plane": 0.01, "far_plane": 1e10, "eps2d": 0.3, "antialiased": False, "sh_degree": 3}
+    arguments = [t[0] if t.dim() == 3 and len(t) == 1 else t for t in scene.to(torch.float64).arguments()[:7]]
+    splats = project_splats(*arguments, size, size, **options)
+    for x0, y0 in ((0, 0), (size - window, size - window), (8000, 5000)):
+        means2d = splats.means2d - torch.tensor([x0, y0])
+        expected = composite(
+            means2d, splats.conics, splats.opacities, splats.colors, splats.depths, window, window
+        )
+        actual = whole[0, y0 : y0 + window, x0 : x0 + window]
+        assert expected.values.abs().max() > 0
+        # A float has 1e-3 px of a position at 16k.
+        assert image_error(actual, expected.values, expected.cut) <= 1e-4
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rows_of_nan_spread_nowhere(backend):
+    device, dtype = backend
+    scene = random_scene(n=200).to(dtype, device)
+    bad = torch.arange(0, 200, 3, device=device)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        getattr(scene, name)[bad] = math.nan
+    leaves = scene.leaves()
+    renders, alphas, _ = blitzgs.rasterization(*leaves.arguments(), sh_degree=3)
+    good = torch.ones(200, dtype=torch.bool, device=device)
+    good[bad] = False
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        setattr(scene, name, getattr(scene, name)[good])
+    clean, clean_alphas, _ = blitzgs.rasterization(*scene.arguments(), sh_degree=3)
+    assert torch.equal(renders, clean) and torch.equal(alphas, clean_alphas)
+    renders.sum().backward()
+    for name in PARAMETERS:
+        assert getattr(leaves, name).grad.isfinite().all(), name
+    assert (leaves.means.grad[bad] == 0).all() and (leaves.means.grad[good] != 0).any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_nothing_visible_and_nothing_at_all(backend):
+    device, dtype = backend
+    for n in (0, 30):
+        scene = random_scene(n=n).to(dtype, device)
+        scene.means[:, 1] += 1e4
+        leaves = scene.leaves()
+        renders, alphas, _ = blitzgs.rasterization(*leaves.arguments(), sh_degree=3)
+        assert (renders == 0).all() and (alphas == 0).all()
+        renders.sum().backward()
+        assert (leaves.means.grad == 0).all()
