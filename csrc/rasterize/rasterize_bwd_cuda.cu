@@ -1,0 +1,460 @@
+// SPDX-License-Identifier: Apache-2.0
+// The gradient of compositing. A warp walks its subtile's list from the back, a lane a pixel, so the pixel's
+// state is a transmittance and one number (what lies behind, dotted with the pixel's gradient), and nothing but
+// the final transmittance has to be kept from the forward pass. Per entry and pixel that leaves two numbers:
+// the weight alpha T and g = dL/d(ln alpha). Sixteen entries at a time, the warp transposes them through shared
+// memory, and each lane then sums for one entry over half of the pixels: the weights against the pixels'
+// gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic follow.
+#include <cub/device/device_radix_sort.cuh>
+#include <algorithm>
+#include <string>
+
+#include "rasterize/tile_batch.cuh"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+struct BackwardArguments {
+  const PackedRow* rows;
+  ChannelChunk chunk;
+  const float* backgrounds;
+  const std::int32_t* isect_rows;
+  const std::int64_t* tile_offsets;
+  TileGrid grid;
+  RasterizeSaved<float> saved;
+  PackedGradient* row_gradients;    // [P], added to atomically, or null
+  PackedGradient* entry_gradients;  // [I], written once each (deterministic)
+};
+
+inline constexpr int kGroup = 16;              // entries transposed at a time
+inline constexpr int kGroupStride = 32 + 1;    // float2 per entry; odd, so that columns spread over the banks
+
+template <int TILE, bool DETERMINISTIC>
+struct BackwardShared {
+  static constexpr int kBatch = DETERMINISTIC ? 64 : TILE * TILE < 256 ? TILE * TILE : 256;
+  static constexpr int kWarps = Tile<TILE>::kWarps;
+  EntryBatch<TILE, kBatch> batch;
+  std::int32_t row[kBatch];
+  float4 v_render[kWarps][32];
+  float2 group[kWarps][kGroup * kGroupStride];  // weight, g
+  PackedGradient partial[DETERMINISTIC ? kWarps : 1][DETERMINISTIC ? kBatch : 1];
+  int last;
+};
+
+__device__ __forceinline__ void add_quad(float* address, float a, float b, float c, float d) {
+#if __CUDA_ARCH__ >= 900
+  asm volatile("red.relaxed.gpu.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(address), "f"(a), "f"(b), "f"(c),
+               "f"(d)
+               : "memory");
+#else
+  atomicAdd(address, a);
+  atomicAdd(address + 1, b);
+  atomicAdd(address + 2, c);
+  atomicAdd(address + 3, d);
+#endif
+}
+
+__device__ __forceinline__ float add_halves(float value) {
+  return value + __shfl_xor_sync(kFullWarp, value, kGroup);
+}
+
+// Sums of one entry over pixels: weights times v_render, moments of g about the subtile's centre, and
+// |gradient of the mean|.
+template <int CHANNELS>
+struct EntrySums {
+  float color[CHANNELS] = {};
+  float g = 0.f, gx = 0.f, gy = 0.f, gxx = 0.f, gxy = 0.f, gyy = 0.f;
+  float abs_x = 0.f, abs_y = 0.f;
+};
+
+struct EntryShape {
+  float x, y, l11, l21, l22, log2_opacity;
+};
+
+// The two pixel rows of this half of the subtile.
+template <int CHANNELS, bool ABSOLUTE>
+__device__ __forceinline__ EntrySums<CHANNELS> sum_half(const float2* group, const float4* v_render,
+                                                        const EntryShape& shape, float centre_x, float centre_y,
+                                                        int half) {
+  EntrySums<CHANNELS> sums;
+#pragma unroll
+  for (int y = 0; y < 2; ++y) {
+    const float offset_y = static_cast<float>(2 * half + y) - 1.5f;
+    float g0 = 0.f, g1 = 0.f, g2 = 0.f;
+#pragma unroll
+    for (int x = 0; x < kSubtileWidth; ++x) {
+      const int pixel = half * 16 + y * kSubtileWidth + x;
+      const float offset_x = static_cast<float>(x) - 3.5f;
+      const float2 value = group[pixel];
+      const float4 v = v_render[pixel];
+#pragma unroll
+      for (int k = 0; k < CHANNELS; ++k) sums.color[k] += value.x * channel(v, k);
+      g0 += value.y;
+      g1 += value.y * offset_x;
+      g2 += value.y * (offset_x * offset_x);
+      if constexpr (ABSOLUTE) {
+        const float dx = centre_x + offset_x - shape.x, dy = centre_y + offset_y - shape.y;
+        const float u = shape.l11 * dx + shape.l21 * dy, w = shape.l22 * dy;
+        sums.abs_x += fabsf(value.y * (shape.l11 * u));
+        sums.abs_y += fabsf(value.y * (shape.l21 * u + shape.l22 * w));
+      }
+    }
+    sums.g += g0;
+    sums.gx += g1;
+    sums.gxx += g2;
+    sums.gy += g0 * offset_y;
+    sums.gxy += g1 * offset_y;
+    sums.gyy += g0 * (offset_y * offset_y);
+  }
+  return sums;
+}
+
+// Moments about the subtile's centre to gradients of the row.
+template <int CHANNELS, bool ABSOLUTE>
+__device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, const EntryShape& shape,
+                                                 float centre_x, float centre_y) {
+  const float x = centre_x - shape.x, y = centre_y - shape.y;
+  const float mx = s.gx + x * s.g, my = s.gy + y * s.g;
+  const float mxx = s.gxx + x * (2.f * s.gx + x * s.g);
+  const float mxy = s.gxy + x * s.gy + y * (s.gx + x * s.g);
+  const float myy = s.gyy + y * (2.f * s.gy + y * s.g);
+  const float a = kInverseScale2 * shape.l11 * shape.l11, b = kInverseScale2 * shape.l11 * shape.l21;
+  const float c = kInverseScale2 * (shape.l21 * shape.l21 + shape.l22 * shape.l22);
+  PackedGradient gradient;
+  gradient.quads[0] = {a * mx + b * my, b * mx + c * my, -0.5f * mxx, -mxy};
+  gradient.quads[1] = {-0.5f * myy, s.g * exp2_approx(-shape.log2_opacity), s.color[0], s.color[1]};
+  gradient.quads[2] = {s.color[2], CHANNELS > 3 ? s.color[CHANNELS - 1] : 0.f,
+                       ABSOLUTE ? kInverseScale2 * s.abs_x : 0.f, ABSOLUTE ? kInverseScale2 * s.abs_y : 0.f};
+  return gradient;
+}
+
+// Sums the group's entries and hands the results on. my_entry: the batch entry of group slot lane % 16.
+template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
+__device__ __forceinline__ void flush_group(BackwardShared<TILE, DETERMINISTIC>& shared,
+                                            const BackwardArguments& args, const Pixel& pixel, int warp, int lane,
+                                            int filled, int my_entry) {
+  __syncwarp();
+  const int slot = lane % kGroup, half = lane / kGroup;
+  const float4 place = shared.batch.place[my_entry];
+  const float2 rest = shared.batch.rest[my_entry];
+  const EntryShape shape{place.x, place.y, place.z, place.w, rest.x, rest.y};
+  const float centre_x = static_cast<float>(pixel.left + kSubtileWidth / 2);
+  const float centre_y = static_cast<float>(pixel.top + kSubtileHeight / 2);
+  EntrySums<CHANNELS> sums = sum_half<CHANNELS, ABSOLUTE>(shared.group[warp] + slot * kGroupStride,
+                                                          shared.v_render[warp], shape, centre_x, centre_y, half);
+#pragma unroll
+  for (int k = 0; k < CHANNELS; ++k) sums.color[k] = add_halves(sums.color[k]);
+  sums.g = add_halves(sums.g);
+  sums.gx = add_halves(sums.gx);
+  sums.gy = add_halves(sums.gy);
+  sums.gxx = add_halves(sums.gxx);
+  sums.gxy = add_halves(sums.gxy);
+  sums.gyy = add_halves(sums.gyy);
+  if constexpr (ABSOLUTE) {
+    sums.abs_x = add_halves(sums.abs_x);
+    sums.abs_y = add_halves(sums.abs_y);
+  }
+  const PackedGradient gradient = finish<CHANNELS, ABSOLUTE>(sums, shape, centre_x, centre_y);
+  if (slot < filled) {
+    if constexpr (DETERMINISTIC) {
+      float4* target = shared.partial[warp][my_entry].quads;
+      target[half] = half ? gradient.quads[1] : gradient.quads[0];
+      if (half == 0) target[2] = gradient.quads[2];
+    } else {
+      float* target = reinterpret_cast<float*>(args.row_gradients + shared.row[my_entry]);
+      const float4 quad = half ? gradient.quads[1] : gradient.quads[0];
+      add_quad(target + 4 * half, quad.x, quad.y, quad.z, quad.w);
+      if constexpr (CHANNELS > 3 || ABSOLUTE) {
+        const float4 tail = gradient.quads[2];
+        if (half == 0) add_quad(target + 8, tail.x, tail.y, tail.z, tail.w);
+      } else {
+        if (half == 0) atomicAdd(target + 8, gradient.quads[2].x);
+      }
+    }
+  }
+  __syncwarp();
+}
+
+// One pixel's state while its list is walked from the back.
+template <int CHANNELS>
+struct BackwardPixel {
+  float transmittance;  // in front of the entries walked so far
+  float behind;         // v . (what lies behind, background included)
+  float v[CHANNELS];
+  int last;
+
+  __device__ __forceinline__ float2 add(float log2_a, bool touched, const float4& row_color) {
+    const float raw = exp2_approx(log2_a);
+    const float alpha = touched ? fminf(raw, static_cast<float>(kAlphaMax)) : 0.f;
+    const float inverse = reciprocal_approx(1.f - alpha);
+    transmittance *= inverse;
+    const float weight = alpha * transmittance;
+    float dot = 0.f;
+#pragma unroll
+    for (int k = 0; k < CHANNELS; ++k) dot = __fmaf_rn(v[k], channel(row_color, k), dot);
+    const float v_alpha = __fmaf_rn(transmittance, dot, -behind * inverse);
+    if (touched) behind = __fmaf_rn(weight, dot, behind);
+    const bool clipped = raw > static_cast<float>(kAlphaMax);
+    return {weight, touched && !clipped ? v_alpha * alpha : 0.f};
+  }
+};
+
+template <int TILE, int CHANNELS, bool DETERMINISTIC>
+__device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(BackwardShared<TILE, DETERMINISTIC>& shared,
+                                                               const BackwardArguments& args, const Pixel& pixel,
+                                                               int camera, int warp, int lane) {
+  BackwardPixel<CHANNELS> state;
+  state.last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
+  state.transmittance = pixel.inside ? args.saved.transmittances[pixel.index] : 1.f;
+  float open = 0.f;  // gradient of the final transmittance
+  if (pixel.inside && args.saved.v_alphas && args.chunk.first == 0) open = -args.saved.v_alphas[pixel.index];
+#pragma unroll
+  for (int k = 0; k < CHANNELS; ++k) {
+    const bool present = pixel.inside && k < args.chunk.count;
+    state.v[k] = present ? args.saved.v_renders[pixel.index * args.chunk.n_channels + args.chunk.first + k] : 0.f;
+    if (present && args.backgrounds) {
+      open += state.v[k] * args.backgrounds[camera * args.chunk.n_channels + args.chunk.first + k];
+    }
+  }
+  state.behind = open * state.transmittance;
+  shared.v_render[warp][lane] = {state.v[0], state.v[1], state.v[2], CHANNELS > 3 ? state.v[CHANNELS - 1] : 0.f};
+  return state;
+}
+
+template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
+__global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 1024 / (TILE * TILE) : 1)
+    backward_kernel(const BackwardArguments args) {
+  using Shared = BackwardShared<TILE, DETERMINISTIC>;
+  constexpr int kBatch = Shared::kBatch;
+  extern __shared__ __align__(16) unsigned char shared_bytes[];
+  Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);
+  const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
+  const TilePlace tile = locate_tile<TILE>(args.grid);
+  const std::int64_t start = args.tile_offsets[tile.tile];
+  if (args.tile_offsets[tile.tile + 1] == start) return;
+  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, warp, lane);
+
+  if (thread == 0) shared.last = 0;
+  BackwardPixel<CHANNELS> state =
+      start_pixel<TILE, CHANNELS, DETERMINISTIC>(shared, args, pixel, tile.camera, warp, lane);
+  const int warp_last = __reduce_max_sync(kFullWarp, state.last);
+  __syncthreads();
+  if (lane == 0) atomicMax(&shared.last, warp_last);
+  __syncthreads();
+  const int count = shared.last;
+
+  for (int base = (count - 1) / kBatch * kBatch; base >= 0 && count > 0; base -= kBatch) {
+    __syncthreads();
+    const bool present = thread < kBatch && base + thread < count;
+    const std::int32_t row = present ? args.isect_rows[start + base + thread] : -1;
+    if (thread < kBatch) shared.row[thread] = row;
+    shared.batch.load(args.rows, args.chunk, row, tile, thread);
+    if constexpr (DETERMINISTIC) {
+      float4* mine = shared.partial[warp][0].quads;
+      for (int i = lane; i < 3 * kBatch; i += 32) mine[i] = {0.f, 0.f, 0.f, 0.f};
+    }
+    __syncthreads();
+
+    int filled = 0, my_entry = 0;
+    for (int word = shared.batch.kWords - 1; word >= 0; --word) {
+      const int first = base + word * 32;
+      if (first >= warp_last) continue;
+      std::uint32_t bits = shared.batch.hits[warp][word];
+      if (warp_last - first < 32) bits &= (1u << (warp_last - first)) - 1u;
+      while (bits) {
+        const int bit = 31 - __clz(bits);
+        bits ^= 1u << bit;
+        const int entry = word * 32 + bit;
+        const float4 place = shared.batch.place[entry];
+        const float2 rest = shared.batch.rest[entry];
+        const float power = log2_alpha(place.z, place.w, rest.x, rest.y, pixel.centre_x - place.x,
+                                       pixel.centre_y - place.y);
+        const bool touched = power >= kLog2Cut && base + entry < state.last;
+        if (!__any_sync(kFullWarp, touched)) continue;
+        shared.group[warp][filled * kGroupStride + lane] = state.add(power, touched, shared.batch.color[entry]);
+        if (lane % kGroup == filled) my_entry = entry;
+        if (++filled == kGroup) {
+          flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, pixel, warp, lane, filled, my_entry);
+          filled = 0;
+        }
+      }
+    }
+    if (filled > 0) {
+      flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, pixel, warp, lane, filled, my_entry);
+    }
+    if constexpr (DETERMINISTIC) {
+      __syncthreads();
+      for (int i = thread; i < 3 * kBatch && base + i / 3 < count; i += TILE * TILE) {
+        float4 sum = shared.partial[0][0].quads[i];
+        for (int other = 1; other < Shared::kWarps; ++other) {
+          const float4 part = shared.partial[other][0].quads[i];
+          sum = {sum.x + part.x, sum.y + part.y, sum.z + part.z, sum.w + part.w};
+        }
+        args.entry_gradients[start + base].quads[i] = sum;
+      }
+    }
+  }
+}
+
+__global__ void unpack_kernel(const PackedGradient* packed, std::int64_t n, ChannelChunk chunk,
+                              RasterizeGradients<float> out) {
+  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
+  if (i >= n) return;
+  const float4 a = packed[i].quads[0], b = packed[i].quads[1], c = packed[i].quads[2];
+  const float color[4] = {b.z, b.w, c.x, c.y};
+  float* v_color = out.v_colors + i * chunk.n_channels + chunk.first;
+  for (int k = 0; k < chunk.count; ++k) v_color[k] = color[k];
+  const bool add = chunk.first > 0;  // later channels add to what the first ones gave
+  const auto store = [add](float* address, float value) { *address = add ? *address + value : value; };
+  store(out.v_means2d + 2 * i, a.x);
+  store(out.v_means2d + 2 * i + 1, a.y);
+  store(out.v_conics + 3 * i, a.z);
+  store(out.v_conics + 3 * i + 1, a.w);
+  store(out.v_conics + 3 * i + 2, b.x);
+  store(out.v_opacities + i, b.y);
+  if (out.v_means2d_abs) {
+    out.v_means2d_abs[2 * i] = c.z;
+    out.v_means2d_abs[2 * i + 1] = c.w;
+  }
+}
+
+__global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
+  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
+  if (i < n) values[i] = static_cast<std::int32_t>(i);
+}
+
+// Adds each row's entries in the order of the list of all tiles.
+__global__ void sum_entries_kernel(const std::int32_t* sorted_rows, const std::int32_t* entries, std::int64_t n,
+                                   const PackedGradient* entry_gradients, PackedGradient* row_gradients) {
+  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
+  if (i >= 3 * n) return;
+  const int quad = static_cast<int>(i % 3);
+  std::int64_t at = i / 3;
+  const std::int32_t row = sorted_rows[at];
+  if (at > 0 && sorted_rows[at - 1] == row) return;
+  float4 sum{0.f, 0.f, 0.f, 0.f};
+  for (; at < n && sorted_rows[at] == row; ++at) {
+    const float4 part = entry_gradients[entries[at]].quads[quad];
+    sum = {sum.x + part.x, sum.y + part.y, sum.z + part.z, sum.w + part.w};
+  }
+  row_gradients[row].quads[quad] = sum;
+}
+
+template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
+void launch_backward(const BackwardArguments& args, CudaStream stream) {
+  const auto kernel = backward_kernel<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>;
+  constexpr int kBytes = sizeof(BackwardShared<TILE, DETERMINISTIC>);
+  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_bwd");
+  const auto tiles = static_cast<unsigned>(args.grid.tile_end - args.grid.tile_begin);
+  kernel<<<tiles, TILE * TILE, kBytes, stream>>>(args);
+  check_launch("rasterize_bwd");
+}
+
+template <int TILE>
+void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream stream) {
+  if constexpr (TILE == 16) {
+    if (args.entry_gradients) {
+      launch_backward<TILE, 4, true, true>(args, stream);
+      return;
+    }
+  }
+  if (absolute) {
+    launch_backward<TILE, 4, true, false>(args, stream);
+  } else if (args.chunk.count == 4) {
+    launch_backward<TILE, 4, false, false>(args, stream);
+  } else {
+    launch_backward<TILE, 3, false, false>(args, stream);
+  }
+}
+
+// Which entries belong to each row, in order.
+struct EntriesByRow {
+  std::int32_t* rows;
+  std::int32_t* entries;
+};
+
+EntriesByRow sort_entries(const std::int32_t* isect_rows, std::int64_t n, std::int64_t n_rows,
+                          Workspace& workspace, CudaStream stream) {
+  if (n > INT32_MAX) {
+    throw std::runtime_error(
+        "blitzgs::rasterize_bwd: deterministic gradients hold at most 2^31 - 1 intersections, got " +
+        std::to_string(n) + "; render fewer views at once or set deterministic=False");
+  }
+  int bits = 1;
+  while (bits < 31 && (std::int64_t{1} << bits) < n_rows) ++bits;
+  EntriesByRow sorted{workspace.allocate<std::int32_t>(n), workspace.allocate<std::int32_t>(n)};
+  auto* order = workspace.allocate<std::int32_t>(n);
+  iota_kernel<<<blocks_for(n, 256), 256, 0, stream>>>(order, n);
+  check_launch("rasterize_bwd");
+  std::size_t bytes = 0;
+  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, isect_rows, sorted.rows, order, sorted.entries, n, 0, bits,
+                                        stream),
+        "rasterize_bwd");
+  void* scratch = workspace.allocate_bytes(bytes);
+  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_rows, sorted.rows, order, sorted.entries, n, 0, bits,
+                                        stream),
+        "rasterize_bwd");
+  return sorted;
+}
+
+void check_supported(const RasterizeInput<float>& in, bool absolute, bool deterministic) {
+  const int size = in.grid.tile_size;
+  if (size != 16 && (deterministic || (size != 8 && size != 32))) {
+    throw std::runtime_error(
+        "blitzgs::rasterize_bwd: tile_size must be 16 (or 8 or 32 without deterministic) on CUDA, got " +
+        std::to_string(size));
+  }
+  if (absolute && in.n_channels > 4) {
+    throw std::runtime_error("blitzgs::rasterize_bwd: absgrad takes at most 4 channels on CUDA, got " +
+                             std::to_string(in.n_channels));
+  }
+}
+
+}  // namespace
+
+template <>
+void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
+                          std::int64_t n_isects, const void* aux, bool deterministic,
+                          const RasterizeGradients<float>& gradients, Workspace& workspace, CudaStream stream) {
+  if (in.n_rows == 0) return;
+  const bool absolute = gradients.v_means2d_abs != nullptr;
+  check_supported(in, absolute, deterministic);
+  const bool empty = n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin;
+  const std::size_t row_bytes = static_cast<std::size_t>(in.n_rows) * sizeof(PackedGradient);
+  auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(row_bytes));
+  EntriesByRow sorted{};
+  PackedGradient* entries = nullptr;
+  const std::size_t entry_bytes = static_cast<std::size_t>(n_isects) * sizeof(PackedGradient);
+  if (deterministic && !empty) {
+    entries = static_cast<PackedGradient*>(workspace.allocate_bytes(entry_bytes));
+    sorted = sort_entries(in.isect_rows, n_isects, in.n_rows, workspace, stream);
+  }
+  for (int first = 0; first < in.n_channels; first += 4) {
+    const ChannelChunk chunk{in.n_channels <= 4 ? aux_colors(aux, in.n_rows) : nullptr, in.colors, in.n_channels,
+                             first, std::min(4, in.n_channels - first)};
+    check(cudaMemsetAsync(packed, 0, row_bytes, stream), "rasterize_bwd");
+    if (!empty) {
+      if (entries) check(cudaMemsetAsync(entries, 0, entry_bytes, stream), "rasterize_bwd");
+      const BackwardArguments args{aux_rows(aux),   chunk,   in.backgrounds, in.isect_rows,
+                                   in.tile_offsets, in.grid, saved,          packed,
+                                   entries};
+      if (in.grid.tile_size == 8) {
+        dispatch_backward<8>(args, absolute, stream);
+      } else if (in.grid.tile_size == 16) {
+        dispatch_backward<16>(args, absolute, stream);
+      } else {
+        dispatch_backward<32>(args, absolute, stream);
+      }
+      if (entries) {
+        sum_entries_kernel<<<blocks_for(3 * n_isects, 256), 256, 0, stream>>>(sorted.rows, sorted.entries, n_isects,
+                                                                             entries, packed);
+        check_launch("rasterize_bwd");
+      }
+    }
+    unpack_kernel<<<blocks_for(in.n_rows, 256), 256, 0, stream>>>(packed, in.n_rows, chunk, gradients);
+    check_launch("rasterize_bwd");
+  }
+}
+
+}  // namespace blitzgs::cuda
