@@ -80,8 +80,8 @@ namespace cpu {
 template <class T>
 void project_count(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&, CudaStream);
 template <class T>
-void project_emit(const ProjectInputs<T>&, const ProjectPlan&, const ProjectOutputs<T>&, Workspace&,
-                  CudaStream);
+void project_emit(const ProjectInputs<T>&, const ProjectPlan&, const ProjectCounts&, const ProjectOutputs<T>&,
+                  Workspace&, CudaStream);
 // scale_reg [B] or null: adds scale_reg[b] * d(min_j s_j) for each row in view b (the paper's L_scale).
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
@@ -91,8 +91,8 @@ namespace cuda {
 template <class T>
 void project_count(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&, CudaStream);
 template <class T>
-void project_emit(const ProjectInputs<T>&, const ProjectPlan&, const ProjectOutputs<T>&, Workspace&,
-                  CudaStream);
+void project_emit(const ProjectInputs<T>&, const ProjectPlan&, const ProjectCounts&, const ProjectOutputs<T>&,
+                  Workspace&, CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
                  const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);

@@ -172,8 +172,8 @@ void project_count(const ProjectInputs<T>& in, const ProjectPlan& plan, ProjectC
 }
 
 template <class T>
-void project_emit(const ProjectInputs<T>& in, const ProjectPlan& plan, const ProjectOutputs<T>& out,
-                  Workspace&, CudaStream) {
+void project_emit(const ProjectInputs<T>& in, const ProjectPlan& plan, const ProjectCounts&,
+                  const ProjectOutputs<T>& out, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const std::int64_t blocks = project_blocks(in.n_candidates);
   out.row_offsets[plan.visible_before[blocks]] = static_cast<std::int32_t>(plan.rows_before[blocks]);
@@ -220,8 +220,8 @@ void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const Proj
 #define BLITZGS_INSTANTIATE(T)                                                                             \
   template void project_count<T>(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&,  \
                                  CudaStream);                                                              \
-  template void project_emit<T>(const ProjectInputs<T>&, const ProjectPlan&, const ProjectOutputs<T>&,     \
-                                Workspace&, CudaStream);                                                   \
+  template void project_emit<T>(const ProjectInputs<T>&, const ProjectPlan&, const ProjectCounts&,         \
+                                const ProjectOutputs<T>&, Workspace&, CudaStream);                         \
   template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&, \
                                const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
 BLITZGS_INSTANTIATE(float)

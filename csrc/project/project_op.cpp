@@ -157,7 +157,7 @@ ForwardTensors project_fwd(const Tensor& means, const Tensor& quats, const Tenso
                                  mutable_data<T>(out[8]),
                                  mutable_data<std::int32_t>(out[9]),
                                  mutable_data<std::int32_t>(out[10])};
-    backend::project_emit(in, plan, rows, scope.workspace, scope.stream);
+    backend::project_emit(in, plan, counts, rows, scope.workspace, scope.stream);
   });
   Tensor sizes = torch::stable::new_empty(p.means, {3}, ScalarType::Long, std::nullopt,
                                           torch::stable::Device(torch::headeronly::DeviceType::CPU));
@@ -234,9 +234,7 @@ BackwardTensors project_bwd(const Tensor& means, const Tensor& quats, const Tens
 }  // namespace
 }  // namespace blitzgs
 
-#ifndef BLITZGS_BACKEND_CUDA
 BLITZGS_REGISTER(m) {
   m.impl("project_fwd", TORCH_BOX(&blitzgs::project_fwd));
   m.impl("project_bwd", TORCH_BOX(&blitzgs::project_bwd));
 }
-#endif
