@@ -7,7 +7,6 @@
 #include "common/op.h"
 #include "common/tile_grid_op.h"
 
-#ifndef BLITZGS_BACKEND_CUDA
 namespace blitzgs {
 namespace {
 
@@ -72,4 +71,3 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) { m.impl("intersect", TORCH_BOX(&blitzgs::intersect)); }
-#endif

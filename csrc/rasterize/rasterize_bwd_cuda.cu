@@ -32,7 +32,7 @@ inline constexpr int kGroupStride = 32 + 1;    // float2 per entry; odd, so that
 
 template <int TILE, bool DETERMINISTIC>
 struct BackwardShared {
-  static constexpr int kBatch = DETERMINISTIC ? 64 : TILE * TILE < 256 ? TILE * TILE : 256;
+  static constexpr int kBatch = DETERMINISTIC ? (TILE == 32 ? 32 : 64) : TILE * TILE < 256 ? TILE * TILE : 256;
   static constexpr int kWarps = Tile<TILE>::kWarps;
   EntryBatch<TILE, kBatch> batch;
   std::int32_t row[kBatch];
@@ -353,13 +353,9 @@ void launch_backward(const BackwardArguments& args, CudaStream stream) {
 
 template <int TILE>
 void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream stream) {
-  if constexpr (TILE == 16) {
-    if (args.entry_gradients) {
-      launch_backward<TILE, 4, true, true>(args, stream);
-      return;
-    }
-  }
-  if (absolute) {
+  if (args.entry_gradients) {
+    launch_backward<TILE, 4, true, true>(args, stream);
+  } else if (absolute) {
     launch_backward<TILE, 4, true, false>(args, stream);
   } else if (args.chunk.count == 4) {
     launch_backward<TILE, 4, false, false>(args, stream);
@@ -398,12 +394,11 @@ EntriesByRow sort_entries(const std::int32_t* isect_rows, std::int64_t n, std::i
   return sorted;
 }
 
-void check_supported(const RasterizeInput<float>& in, bool absolute, bool deterministic) {
+void check_supported(const RasterizeInput<float>& in, bool absolute) {
   const int size = in.grid.tile_size;
-  if (size != 16 && (deterministic || (size != 8 && size != 32))) {
-    throw std::runtime_error(
-        "blitzgs::rasterize_bwd: tile_size must be 16 (or 8 or 32 without deterministic) on CUDA, got " +
-        std::to_string(size));
+  if (size != 8 && size != 16 && size != 32) {
+    throw std::runtime_error("blitzgs::rasterize_bwd: tile_size must be 8, 16 or 32 on CUDA, got " +
+                             std::to_string(size));
   }
   if (absolute && in.n_channels > 4) {
     throw std::runtime_error("blitzgs::rasterize_bwd: absgrad takes at most 4 channels on CUDA, got " +
@@ -419,7 +414,7 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
                           const RasterizeGradients<float>& gradients, Workspace& workspace, CudaStream stream) {
   if (in.n_rows == 0) return;
   const bool absolute = gradients.v_means2d_abs != nullptr;
-  check_supported(in, absolute, deterministic);
+  check_supported(in, absolute);
   const bool empty = n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin;
   const std::size_t row_bytes = static_cast<std::size_t>(in.n_rows) * sizeof(PackedGradient);
   auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(row_bytes));

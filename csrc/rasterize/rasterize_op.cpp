@@ -7,7 +7,6 @@
 #include "common/op.h"
 #include "common/tile_grid_op.h"
 
-#ifndef BLITZGS_BACKEND_CUDA
 namespace blitzgs {
 namespace {
 
@@ -152,4 +151,3 @@ BLITZGS_REGISTER(m) {
   m.impl("rasterize_fwd", TORCH_BOX(&blitzgs::rasterize_fwd));
   m.impl("rasterize_bwd", TORCH_BOX(&blitzgs::rasterize_bwd));
 }
-#endif

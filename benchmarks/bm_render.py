@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Render forward and backward on CUDA, against gsplat in the same run when it is installed.
+
+    python benchmarks/bm_render.py [--scenes aerial1 aerial4 aerial16 garden] [--repeats 30]
+
+Gradients for every parameter; SH degree 3, float32. Ours: the ops of the training step in order (project,
+intersect, rasterize and their gradients, in compact rows). gsplat: `rasterization` and autograd, packed and
+not. Each figure is a median over repeats of CUDA event times; memory is the peak above the inputs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from scenes import BenchmarkScene, aerial, garden_like
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401
+
+ops = torch.ops.blitzgs
+TILE_SIZE = 16
+SCENES: dict[str, Callable[[], BenchmarkScene]] = {
+    "aerial1": lambda: aerial(1_000_000, "cuda"),
+    "aerial4": lambda: aerial(4_000_000, "cuda"),
+    "aerial16": lambda: aerial(16_000_000, "cuda"),
+    "garden": lambda: garden_like(device="cuda"),
+}
+
+
+class OurRender:
+    """The ops of a training step between parameters and image, by stage."""
+
+    def __init__(self, scene: BenchmarkScene) -> None:
+        raw = scene.raw()
+        self.scene = scene
+        self.parameters = [raw[k].contiguous() for k in ("means", "quats", "scales", "opacities", "sh")]
+        self.cameras = [scene.viewmats, scene.Ks]
+        self.grid = (len(scene.viewmats), scene.width, scene.height, TILE_SIZE, 0, -1)
+
+    def project(self) -> None:
+        """Run the projection."""
+        s = self.scene
+        self.rows = ops.project_fwd(
+            *self.parameters, *self.cameras, None, None, s.width, s.height, TILE_SIZE, 3, 0.01, 1e10, 0.3,
+            0.0, False, True,
+        )  # fmt: skip
+
+    def intersect(self) -> None:
+        """List the rows of each tile."""
+        r = self.rows
+        count = int(r[11][2])
+        self.lists = ops.intersect(r[4], r[5], r[7], r[6], r[1], None, *self.grid, count)
+
+    def rasterize(self) -> None:
+        """Composite the tiles."""
+        r = self.rows
+        self.splats = (r[4], r[5], r[7], r[8], None, *self.lists)
+        self.saved = ops.rasterize_fwd(*self.splats, *self.grid)
+
+    def rasterize_backward(self, v_renders: Tensor) -> None:
+        """Differentiate the compositing."""
+        renders, rest, last, _, aux = self.saved
+        self.v_rows = ops.rasterize_bwd(
+            *self.splats, renders, rest, last, aux, v_renders, None, *self.grid, False, False
+        )
+
+    def project_backward(self) -> None:
+        """Differentiate the projection, to compact rows."""
+        r, s = self.rows, self.scene
+        v_means2d, v_conics, v_opacities, v_colors, _ = self.v_rows
+        self.gradients = ops.project_bwd(
+            *self.parameters, *self.cameras, r[1], r[2], r[3], s.width, s.height, 3, 0.3, False, True,
+            v_means2d, v_conics, None, v_opacities, v_colors, None, False,
+        )  # fmt: skip
+
+    def forward(self) -> Tensor:
+        """Return the image [B, H, W, 3]."""
+        self.project()
+        self.intersect()
+        self.rasterize()
+        return self.saved[0]
+
+    def backward(self, v_renders: Tensor) -> None:
+        """Differentiate, dropping what the forward pass kept as soon as it is used."""
+        self.rasterize_backward(v_renders)
+        del self.saved, self.splats, self.lists
+        self.project_backward()
+        del self.rows, self.v_rows, self.gradients
+
+
+class GsplatRender:
+    """The same work by gsplat."""
+
+    def __init__(self, scene: BenchmarkScene, packed: bool) -> None:
+        from gsplat import rasterization
+
+        self.rasterization, self.packed, self.scene = rasterization, packed, scene
+        s = scene
+        self.parameters = [
+            t.detach().clone().requires_grad_() for t in (s.means, s.quats, s.scales, s.opacities, s.sh)
+        ]
+
+    def forward(self) -> Tensor:
+        """Return the image [B, H, W, 3]."""
+        s = self.scene
+        self.image, _, _ = self.rasterization(
+            *self.parameters, s.viewmats, s.Ks, s.width, s.height, sh_degree=3, packed=self.packed
+        )
+        return self.image
+
+    def backward(self, v_renders: Tensor) -> None:
+        """Differentiate through autograd."""
+        torch.autograd.grad(self.image, self.parameters, v_renders)
+        del self.image
+
+
+def event_times(steps: list[Callable[[], Any]], repeats: int, warmup: int = 5) -> list[float]:
+    """Return the median ms of each step when they run in order."""
+    samples: list[list[float]] = [[] for _ in steps]
+    for repeat in range(warmup + repeats):
+        events = [torch.cuda.Event(enable_timing=True) for _ in range(len(steps) + 1)]
+        events[0].record()
+        for step, event in zip(steps, events[1:], strict=True):
+            step()
+            event.record()
+        torch.cuda.synchronize()
+        if repeat >= warmup:
+            for sample, begin, end in zip(samples, events, events[1:], strict=False):
+                sample.append(begin.elapsed_time(end))
+    return [statistics.median(sample) for sample in samples]
+
+
+def measure(render: OurRender | GsplatRender, v_renders: Tensor, repeats: int) -> dict[str, float]:
+    """Return ms of forward, backward and both, and peak GB above what is allocated now."""
+    torch.cuda.synchronize()
+    torch.cuda.empty_cache()
+    before = torch.cuda.memory_allocated()
+    torch.cuda.reset_peak_memory_stats()
+    forward, backward = event_times([render.forward, lambda: render.backward(v_renders)], repeats)
+    peak = (torch.cuda.max_memory_allocated() - before) / 1e9
+    return {"forward": forward, "backward": backward, "total": forward + backward, "peak_gb": peak}
+
+
+def stages(render: OurRender, v_renders: Tensor, repeats: int) -> dict[str, float]:
+    """Return ms of each stage."""
+    names = ["project", "intersect", "rasterize", "rasterize_backward", "project_backward"]
+    steps = [getattr(render, n) if n != "rasterize_backward" else lambda: render.rasterize_backward(v_renders)
+             for n in names]  # fmt: skip
+    return dict(zip(names, event_times(steps, repeats), strict=True))
+
+
+def run(name: str, repeats: int) -> dict[str, Any]:
+    """Measure one scene; prints as it goes."""
+    scene = SCENES[name]()
+    g = torch.Generator(device="cuda").manual_seed(1)
+    v = torch.randn(len(scene.viewmats), scene.height, scene.width, 3, generator=g, device="cuda") * 1e-3
+    ours = OurRender(scene)
+    result: dict[str, Any] = {"scene": scene.name, "blitzgs": measure(ours, v, repeats)}
+    image = ours.forward()
+    result["visible"], result["rows"], result["intersections"] = ours.rows[11].tolist()
+    result["stages"] = stages(ours, v, repeats)
+    result["composited_share"] = float(ours.saved[3].sum()) / max(1, result["intersections"])
+    del ours.saved, ours.splats, ours.lists, ours.rows, ours.v_rows, ours.gradients
+    try:
+        import gsplat  # noqa: F401
+    except ImportError:
+        return result
+    for packed in (False, True):
+        theirs = GsplatRender(scene, packed)
+        label = "gsplat packed" if packed else "gsplat"
+        result[label] = measure(theirs, v, repeats)
+        result[label]["image_difference"] = float((theirs.forward().detach() - image).abs().mean())
+        del theirs
+    return result
+
+
+def main() -> None:
+    """Measure the scenes asked for, print a table, optionally write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
+    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    results = []
+    for name in args.scenes:
+        result = run(name, args.repeats)
+        results.append(result)
+        print(f"{result['scene']}: {result['visible']} visible, {result['rows']} rows, "
+              f"{result['intersections']} intersections, {result['composited_share']:.2f} of them looked at")  # fmt: skip
+        print("  " + "  ".join(f"{k} {v:.3f}" for k, v in result["stages"].items()))
+        for label in ("blitzgs", "gsplat", "gsplat packed"):
+            if label in result:
+                r = result[label]
+                print(f"  {label:14s} forward {r['forward']:7.3f}  backward {r['backward']:7.3f}  "
+                      f"total {r['total']:7.3f} ms  peak {r['peak_gb']:.2f} GB  "
+                      f"x{r['total'] / result['blitzgs']['total']:.2f}", flush=True)  # fmt: skip
+        torch.cuda.empty_cache()
+    if args.json:
+        args.json.write_text(json.dumps(results, indent=1))
+
+
+if __name__ == "__main__":
+    main()

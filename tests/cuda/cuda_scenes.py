@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs of the CUDA tests: a crowded little scene, and the ops run on either device."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401
+
+ops = torch.ops.blitzgs
+
+
+class Scene:
+    """N random Gaussians before B cameras that look at them."""
+
+    def __init__(self, n: int = 3000, views: int = 2, width: int = 150, height: int = 100, seed: int = 0):
+        g = torch.Generator().manual_seed(seed)
+        self.width, self.height, self.degree = width, height, 3
+        self.means = torch.rand(n, 3, generator=g) * 4 - 2
+        self.quats = torch.randn(n, 4, generator=g)
+        self.scales = torch.randn(n, 3, generator=g) * 0.8 - 3.2
+        self.opacities = torch.randn(n, generator=g) * 2
+        self.sh = torch.randn(n, 16, 3, generator=g) * 0.3
+        self.viewmats = torch.stack([_viewmat(0.3 * b, 5.0) for b in range(views)])
+        K = torch.tensor([[1.2 * width, 0, 0.47 * width], [0, 1.3 * width, 0.52 * height], [0, 0, 1]])
+        self.Ks = K.expand(views, 3, 3).contiguous()
+
+    def parameters(self, device: str, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+        names = ("means", "quats", "scales", "opacities", "sh", "viewmats", "Ks")
+        return [getattr(self, name).to(device, dtype) for name in names]
+
+    def project(self, device: str, dtype: torch.dtype = torch.float32, **changes: Any) -> tuple[Tensor, ...]:
+        options = {"near_plane": 0.1, "far_plane": 1e10, "eps2d": 0.3, "radius_clip": 0.0}
+        options |= {"antialiased": False, "raw": True, "active_ids": None, "active_views": None} | changes
+        ids, views = (options.pop(k) for k in ("active_ids", "active_views"))
+        return ops.project_fwd(
+            *self.parameters(device, dtype), ids, views, self.width, self.height, 16, self.degree,
+            *options.values(),
+        )  # fmt: skip
+
+    def grid(self, tile_size: int = 16, begin: int = 0, end: int = -1) -> tuple[int, ...]:
+        return (len(self.Ks), self.width, self.height, tile_size, begin, end)
+
+
+def _viewmat(angle: float, distance: float) -> Tensor:
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, 0, s, 0], [0, 1.0, 0, 0], [-s, 0, c, distance], [0, 0, 0, 1]])
+
+
+def relative_error(value: Tensor, expected: Tensor) -> float:
+    """Return |value - expected| / |expected| over all elements; NaN never passes a comparison with it."""
+    expected = expected.double().cpu()
+    return float((value.double().cpu() - expected).norm() / expected.norm().clamp(min=1e-30))

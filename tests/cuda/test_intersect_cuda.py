@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Intersection on CUDA: the CPU's lists, in the exact order."""
+
+import pytest
+import torch
+from cuda_scenes import Scene, ops
+
+
+def lists(rows, grid, device, ids=None, count=-1):
+    means2d, conics, depths, opacities = (rows[i].to(device) for i in (4, 5, 6, 7))
+    entries, offsets = ops.intersect(
+        means2d, conics, opacities, depths, rows[1].to(device), ids if ids is None else ids.to(device),
+        *grid, count,
+    )  # fmt: skip
+    return entries.cpu(), offsets.cpu()
+
+
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
+@pytest.mark.parametrize("with_ids", [False, True])
+def test_lists_match_the_cpu(scene, tile_size, with_ids):
+    rows = list(scene.project("cpu"))
+    rows[6] = (rows[6] * 8).round() / 8  # many equal depths
+    ids = None
+    if with_ids:
+        ids = torch.randperm(len(rows[0]), generator=torch.Generator().manual_seed(0))
+    grid = scene.grid(tile_size)
+    entries, offsets = lists(rows, grid, "cuda", ids)
+    expected, expected_offsets = lists(rows, grid, "cpu", ids)
+    different = 0
+    for tile in range(len(offsets) - 1):
+        ours = entries[offsets[tile] : offsets[tile + 1]].tolist()
+        theirs = expected[expected_offsets[tile] : expected_offsets[tile + 1]].tolist()
+        different += len(set(ours) ^ set(theirs))  # a boundary may round either way
+        common = set(ours) & set(theirs)
+        assert [r for r in ours if r in common] == [r for r in theirs if r in common]
+    assert different <= 1e-4 * len(expected)
+
+
+def test_more_tiles_than_16_bits_hold():
+    scene = Scene(500, views=2, width=4600, height=4100)
+    rows = scene.project("cpu")
+    entries, offsets = lists(rows, scene.grid(), "cuda")
+    assert len(offsets) - 1 > 65536
+    assert torch.equal(entries, lists(rows, scene.grid(), "cpu")[0])
+
+
+def test_tile_ranges_cut_the_whole(scene):
+    rows = scene.project("cpu")
+    entries, offsets = lists(rows, scene.grid(), "cuda")
+    tiles = len(offsets) - 1
+    cuts = [0, 17, 18, 60, tiles]
+    for begin, end in zip(cuts, cuts[1:], strict=False):
+        part, part_offsets = lists(rows, scene.grid(16, begin, end), "cuda")
+        assert torch.equal(part, entries[offsets[begin] : offsets[end]])
+        sizes, part_sizes = offsets.diff(), part_offsets.diff()
+        assert torch.equal(part_sizes[begin:end], sizes[begin:end])
+        assert not part_sizes[:begin].any() and not part_sizes[end:].any()
+
+
+def test_capacity_beyond_the_count(scene):
+    rows = scene.project("cpu")
+    entries, offsets = lists(rows, scene.grid(), "cuda")
+    more, more_offsets = lists(rows, scene.grid(), "cuda", count=len(entries) + 1000)
+    assert torch.equal(more_offsets, offsets)
+    assert torch.equal(more[: len(entries)], entries)
+
+
+def test_a_long_run_of_equal_depths():
+    scene = Scene(4000, views=1)
+    rows = list(scene.project("cpu"))
+    rows[6] = torch.ones_like(rows[6])
+    ids = torch.randperm(len(rows[0]), generator=torch.Generator().manual_seed(3))
+    entries, offsets = lists(rows, scene.grid(), "cuda", ids)
+    for tile in range(len(offsets) - 1):
+        order = ids[entries[offsets[tile] : offsets[tile + 1]].long()]
+        assert (order.diff() > 0).all()
+
+
+def test_no_rows(scene):
+    rows = [t[:0] for t in scene.project("cpu")]
+    entries, offsets = lists(rows, scene.grid(), "cuda")
+    assert len(entries) == 0 and not offsets.any()

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projection on CUDA against the CPU kernel."""
+
+import pytest
+import torch
+from cuda_scenes import Scene, ops, relative_error
+
+NAMES = "gaussian_ids camera_ids visible_ids row_offsets means2d conics depths opacities colors".split()
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_rows_match_the_cpu(degree, antialiased):
+    scene = Scene(5000, views=3)
+    scene.degree = degree
+    expected = scene.project("cpu", antialiased=antialiased)
+    rows = scene.project("cuda", antialiased=antialiased)
+    assert torch.equal(rows[11], expected[11])
+    for i in range(4):
+        assert torch.equal(rows[i].cpu(), expected[i]), NAMES[i]
+    for i in range(4, 9):
+        assert relative_error(rows[i], expected[i]) < 1e-6, NAMES[i]
+    assert (rows[9].cpu() - expected[9]).abs().max() <= 1
+    assert (rows[10].cpu() != expected[10]).float().mean() < 1e-3
+
+
+def test_active_rows_and_views(scene):
+    g = torch.Generator().manual_seed(1)
+    ids = torch.arange(0, 3000, 3, dtype=torch.int32)
+    views = torch.randint(0, 4, (len(ids),), generator=g, dtype=torch.int32)
+    expected = scene.project("cpu", active_ids=ids, active_views=views)
+    rows = scene.project("cuda", active_ids=ids.cuda(), active_views=views.cuda())
+    for i in range(4):
+        assert torch.equal(rows[i].cpu(), expected[i]), NAMES[i]
+
+
+def test_a_row_does_not_depend_on_the_others(scene):
+    whole = scene.project("cuda")
+    ids = torch.arange(1, 3000, 7, dtype=torch.int32, device="cuda")
+    part = scene.project("cuda", active_ids=ids)
+    kept = torch.isin(whole[0], ids)
+    for i in (0, 1, 4, 5, 6, 7, 8, 9, 10):
+        assert torch.equal(whole[i][kept], part[i]), i
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gradients_match_float64(scene, degree, antialiased):
+    scene.degree = degree
+    rows = scene.project("cpu", antialiased=antialiased)
+    g = torch.Generator().manual_seed(2)
+    shapes = [rows[i].shape for i in (4, 5, 6, 7, 8)]
+    v = [torch.randn(shape, generator=g) for shape in shapes]
+    regularizer = torch.tensor([0.5, -2.0])
+
+    def backward(device, dtype):
+        p = scene.parameters(device, dtype)
+        structure = [rows[i].to(device) for i in (1, 2, 3)]
+        gradients = [t.to(device, dtype) for t in (*v, regularizer)]
+        return ops.project_bwd(
+            *p, *structure, scene.width, scene.height, degree, 0.3, antialiased, True, *gradients, True
+        )
+
+    expected, gradients = backward("cpu", torch.float64), backward("cuda", torch.float32)
+    for name, value, target in zip("means quats scales opacities sh viewmats".split(), gradients, expected,
+                                   strict=True):  # fmt: skip
+        assert value.shape == target.shape
+        assert relative_error(value, target) < 1e-5, name
+
+
+@pytest.mark.parametrize("case", ["none", "behind", "nan", "no views"])
+def test_nothing_visible(case):
+    scene = Scene(0 if case == "none" else 100)
+    if case == "behind":
+        scene.means[:, 2] = -100.0
+    if case == "nan":
+        scene.means[:] = float("nan")
+    if case == "no views":
+        scene.viewmats, scene.Ks = scene.viewmats[:0], scene.Ks[:0]
+    rows = scene.project("cuda")
+    assert rows[11].tolist() == [0, 0, 0]
+    assert rows[3].tolist() == [0]
+    gradients = ops.project_bwd(
+        *scene.parameters("cuda"), *(rows[i] for i in (1, 2, 3)), 150, 100, 3, 0.3, False, True,
+        *(rows[i] for i in (4, 5, 6, 7, 8)), None, True,
+    )  # fmt: skip
+    assert gradients[0].shape == (0, 3)
+    assert not gradients[5].any()
+
+
+def test_rows_with_nan_vanish_and_spread_nowhere(scene):
+    clean = scene.project("cuda")
+    broken = Scene()
+    for k, name in enumerate(("means", "quats", "scales", "opacities", "sh")):
+        getattr(broken, name)[k::50] = float("nan")
+    bad = torch.zeros(3000, dtype=torch.bool)
+    for k in range(5):
+        bad[k::50] = True
+    rows = broken.project("cuda")
+    kept = ~bad.cuda()[clean[0].long()]
+    for i in (0, 1, 4, 5, 6, 7, 8, 9, 10):
+        assert torch.equal(rows[i], clean[i][kept])

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rasterisation on CUDA against the CPU kernel in float64, on the same rows and lists."""
+
+import pytest
+import torch
+from cuda_scenes import Scene, ops, relative_error
+
+# Where rounding decides whether a row takes part, the images differ by up to about alpha = 1/255.
+CUT_SHARE = 2e-3
+
+
+class Job:
+    """Rows and lists of a scene, and its rasterisation on either device."""
+
+    def __init__(self, scene: Scene, channels: int, tile_size: int = 16, begin: int = 0, end: int = -1):
+        g = torch.Generator().manual_seed(5)
+        rows = scene.project("cpu")
+        self.grid = scene.grid(tile_size, begin, end)
+        self.splats = [rows[4], rows[5], rows[7], torch.rand(len(rows[0]), channels, generator=g)]
+        self.backgrounds = torch.rand(len(scene.Ks), channels, generator=g)
+        means2d, conics, opacities, _ = self.splats
+        self.lists = ops.intersect(means2d, conics, opacities, rows[6], rows[1], None, *self.grid, -1)
+
+    def inputs(self, device, dtype):
+        moved = [t.to(device, dtype) for t in (*self.splats, self.backgrounds)]
+        return [*moved, *(t.to(device) for t in self.lists)]
+
+    def forward(self, device, dtype=torch.float32):
+        return ops.rasterize_fwd(*self.inputs(device, dtype), *self.grid)
+
+    def backward(self, device, dtype, saved, v_renders, v_alphas, absgrad, deterministic):
+        renders, rest, last, _, aux = saved
+        v = [t.to(device, dtype) for t in (v_renders, v_alphas)]
+        return ops.rasterize_bwd(
+            *self.inputs(device, dtype), renders, rest, last, aux, *v, *self.grid, absgrad, deterministic
+        )
+
+
+def close_images(job):
+    """Both devices' forward results, and the pixels that lie on no cut [B, H, W]."""
+    exact = job.forward("cpu", torch.float64)
+    ours = job.forward("cuda")
+    error = (ours[0].cpu().double() - exact[0]).abs().amax(dim=-1)
+    decided = (error <= 2e-5) & (ours[2].cpu() == exact[2])
+    assert torch.isfinite(ours[0]).all()
+    assert (~decided).float().mean() < CUT_SHARE
+    assert error.max() < 0.02
+    return exact, ours, decided
+
+
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 9])
+def test_image_matches_float64(scene, channels, tile_size):
+    exact, ours, decided = close_images(Job(scene, channels, tile_size))
+    assert (ours[1].cpu() - exact[1])[decided].abs().max() < 2e-5
+    same_work = ours[3].cpu() == exact[3]
+    assert same_work.float().mean() > 0.9
+
+
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 9])
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_gradients_match_float64(scene, channels, tile_size, deterministic, absgrad):
+    if absgrad and channels > 4:
+        pytest.skip("absgrad takes at most 4 channels on CUDA")
+    job = Job(scene, channels, tile_size)
+    exact, ours, decided = close_images(job)
+    g = torch.Generator().manual_seed(6)
+    v_renders = torch.randn(exact[0].shape, generator=g) * decided[..., None]
+    v_alphas = torch.randn(decided.shape, generator=g) * decided
+    expected = job.backward("cpu", torch.float64, exact, v_renders, v_alphas, absgrad, True)
+    gradients = job.backward("cuda", torch.float32, ours, v_renders, v_alphas, absgrad, deterministic)
+    for name, value, target in zip("means2d conics opacities colors abs".split(), gradients, expected,
+                                   strict=True):  # fmt: skip
+        assert value.shape == target.shape
+        assert relative_error(value, target) < 1e-4, name
+
+
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
+def test_deterministic_gradients_repeat(scene, tile_size):
+    job = Job(scene, 3, tile_size)
+    saved = job.forward("cuda")
+    g = torch.Generator().manual_seed(7)
+    v = torch.randn(saved[0].shape, generator=g), torch.randn(saved[1].shape, generator=g)
+    first = job.backward("cuda", torch.float32, saved, *v, True, True)
+    for _ in range(3):
+        again = job.backward("cuda", torch.float32, saved, *v, True, True)
+        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_tile_ranges_are_the_image_bit_for_bit(scene):
+    whole = Job(scene, 3).forward("cuda")
+    tiles = len(whole[3])
+    total = torch.zeros_like(whole[0])
+    work = torch.zeros_like(whole[3])
+    cuts = [0, 11, 12, 70, tiles]
+    for begin, end in zip(cuts, cuts[1:], strict=False):
+        part = Job(scene, 3, 16, begin, end).forward("cuda")
+        total += part[0]
+        work += part[3]
+    assert torch.equal(total, whole[0])
+    assert torch.equal(work, whole[3])
+
+
+def test_empty_lists_give_the_background(scene):
+    scene.means[:, 2] = -100.0
+    job = Job(scene, 3)
+    saved = job.forward("cuda")
+    expected = job.backgrounds[:, None, None, :].expand(-1, scene.height, scene.width, -1)
+    assert torch.equal(saved[0].cpu(), expected)
+    assert (saved[1] == 1).all() and not saved[2].any()
+    v = torch.ones_like(saved[0]), torch.ones_like(saved[1])
+    for gradient in job.backward("cuda", torch.float32, saved, *v, True, False):
+        assert gradient.shape[0] == 0
+
+
+def test_a_hundred_thousand_layers():
+    n = 100_000
+    scene = Scene(4, views=1, width=16, height=16)
+    job = Job(scene, 3)
+    job.splats = [torch.full((n, 2), 8.0), torch.tensor([[0.02, 0.0, 0.02]]).repeat(n, 1),
+                  torch.full((n,), 0.0042), torch.rand(n, 3)]  # fmt: skip
+    job.lists = [torch.arange(n, dtype=torch.int32), torch.tensor([0, n])]
+    exact, ours, decided = close_images(job)
+    v = torch.ones_like(exact[0]) * decided[..., None], torch.zeros_like(exact[1])
+    expected = job.backward("cpu", torch.float64, exact, *v, False, True)
+    gradients = job.backward("cuda", torch.float32, ours, *v, False, False)
+    for value, target in zip(gradients[:4], expected[:4], strict=True):
+        assert relative_error(value, target) < 1e-3
