@@ -119,7 +119,7 @@ def test_a_hundred_thousand_layers():
     n = 100_000
     scene = Scene(4, views=1, width=16, height=16)
     job = Job(scene, 3)
-    job.splats = [torch.full((n, 2), 8.0), torch.tensor([[0.02, 0.0, 0.02]]).repeat(n, 1),
+    job.splats = [torch.tensor([[7.3, 8.6]]).repeat(n, 1), torch.tensor([[0.02, 0.0, 0.02]]).repeat(n, 1),
                   torch.full((n,), 0.0042), torch.rand(n, 3)]  # fmt: skip
     job.lists = [torch.arange(n, dtype=torch.int32), torch.tensor([0, n])]
     exact, ours, decided = close_images(job)
