@@ -182,7 +182,9 @@ def run(name: str, repeats: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure the scenes asked for, print a table, optionally write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--json", type=Path)

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows are sorted by depth once (32-bit keys, P of them); their entries are written in that order with the tile
-// as a key, 16 bits where the tiles of the launch fit, and a stable radix sort over just the bits in use brings
-// each tile's entries together without disturbing their order. Compiled without FMA contraction
+// Rows are sorted by depth once (32-bit keys, P of them); their entries are written in that order with the
+// tile as a key, 16 bits where the tiles of the launch fit, and a stable radix sort over just the bits in use
+// brings each tile's entries together without disturbing their order. Compiled without FMA contraction
 // (cmake/cuda.cmake), as the projection is: both count the same tiles.
+#include <thrust/iterator/counting_iterator.h>
+#include <thrust/iterator/transform_iterator.h>
 #include <cub/device/device_radix_sort.cuh>
 #include <cub/device/device_reduce.cuh>
 #include <cub/device/device_scan.cuh>
-#include <thrust/iterator/counting_iterator.h>
-#include <thrust/iterator/transform_iterator.h>
 
 #include <cuda/std/functional>
 
@@ -56,7 +56,8 @@ __global__ void count_kernel(const Input in, std::int32_t* counts) {
 }
 
 // Depths as unsigned integers in the same order, and the rows' indices.
-__global__ void depth_keys_kernel(const Input in, std::uint32_t* keys, std::int32_t* rows, std::int32_t* counts) {
+__global__ void depth_keys_kernel(const Input in, std::uint32_t* keys, std::int32_t* rows,
+                                  std::int32_t* counts) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
   if (i >= in.n_rows) return;
   const std::uint32_t bits = __float_as_uint(in.depths[i]);
@@ -160,7 +161,8 @@ __global__ void fill_tail_kernel(const std::int64_t* total, std::int64_t capacit
 
 // tile_offsets[t] = first entry whose tile is >= t.
 template <class Key>
-__global__ void tile_offsets_kernel(const Key* keys, std::int64_t n, TileGrid grid, std::int64_t* tile_offsets) {
+__global__ void tile_offsets_kernel(const Key* keys, std::int64_t n, TileGrid grid,
+                                    std::int64_t* tile_offsets) {
   const std::int64_t tile = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
   if (tile > grid.count()) return;
   std::int64_t wanted = tile < grid.tile_end ? tile : grid.tile_end;
@@ -181,10 +183,12 @@ template <class Key, class Value>
 void sort_pairs(const Key* keys, Key* sorted_keys, const Value* values, Value* sorted_values, std::int64_t n,
                 int bits, Workspace& workspace, CudaStream stream) {
   std::size_t bytes = 0;
-  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, sorted_keys, values, sorted_values, n, 0, bits, stream),
+  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, sorted_keys, values, sorted_values, n, 0, bits,
+                                        stream),
         "intersect");
   void* scratch = workspace.allocate_bytes(bytes);
-  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys, sorted_keys, values, sorted_values, n, 0, bits, stream),
+  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys, sorted_keys, values, sorted_values, n, 0, bits,
+                                        stream),
         "intersect");
 }
 
@@ -223,17 +227,17 @@ void list_entries(const Input& in, const DepthOrder& order, std::int64_t capacit
   auto* keys = workspace.allocate<Key>(capacity);
   auto* sorted_keys = workspace.allocate<Key>(capacity);
   auto* entries = workspace.allocate<std::int32_t>(capacity);
-  emit_kernel<<<blocks_for(in.n_rows, kThreads), kThreads, 0, stream>>>(in, order.rows, order.offsets, capacity, keys,
-                                                                      entries);
+  emit_kernel<<<blocks_for(in.n_rows, kThreads), kThreads, 0, stream>>>(in, order.rows, order.offsets,
+                                                                        capacity, keys, entries);
   check_launch("intersect");
-  fill_tail_kernel<<<64, kThreads, 0, stream>>>(order.offsets + in.n_rows, capacity, static_cast<Key>(n_tiles), keys,
-                                               entries);
+  fill_tail_kernel<<<64, kThreads, 0, stream>>>(order.offsets + in.n_rows, capacity,
+                                                static_cast<Key>(n_tiles), keys, entries);
   check_launch("intersect");
   int bits = 1;
   while ((std::int64_t{1} << bits) <= n_tiles) ++bits;
   sort_pairs(keys, sorted_keys, entries, isect_rows, capacity, bits, workspace, stream);
-  tile_offsets_kernel<<<blocks_for(in.grid.count() + 1, kThreads), kThreads, 0, stream>>>(sorted_keys, capacity,
-                                                                                        in.grid, tile_offsets);
+  tile_offsets_kernel<<<blocks_for(in.grid.count() + 1, kThreads), kThreads, 0, stream>>>(
+      sorted_keys, capacity, in.grid, tile_offsets);
   check_launch("intersect");
 }
 
@@ -248,8 +252,8 @@ std::int64_t count_intersections<float>(const Input& in, Workspace& workspace, C
   check_launch("intersect");
   std::size_t bytes = 0;
   const auto sum = [&](void* scratch) {
-    return cub::DeviceReduce::Reduce(scratch, bytes, counts, total, in.n_rows, ::cuda::std::plus<std::int64_t>{},
-                                     std::int64_t{0}, stream);
+    return cub::DeviceReduce::Reduce(scratch, bytes, counts, total, in.n_rows,
+                                     ::cuda::std::plus<std::int64_t>{}, std::int64_t{0}, stream);
   };
   check(sum(nullptr), "intersect");
   check(sum(workspace.allocate_bytes(bytes)), "intersect");
@@ -264,7 +268,8 @@ std::int64_t intersect<float>(const Input& in, std::int64_t capacity, std::int32
                               std::int64_t* tile_offsets, Workspace& workspace, CudaStream stream) {
   const std::int64_t n_tiles = in.grid.tile_end - in.grid.tile_begin;
   if (in.n_rows == 0 || capacity == 0 || n_tiles <= 0) {
-    check(cudaMemsetAsync(tile_offsets, 0, (in.grid.count() + 1) * sizeof(std::int64_t), stream), "intersect");
+    check(cudaMemsetAsync(tile_offsets, 0, (in.grid.count() + 1) * sizeof(std::int64_t), stream),
+          "intersect");
     return capacity;
   }
   const DepthOrder order = order_by_depth(in, workspace, stream);

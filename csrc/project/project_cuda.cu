@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Compiled without FMA contraction (cmake/cuda.cmake): counting and emitting project the same row in two kernels,
-// and must get the same bits.
+// Compiled without FMA contraction (cmake/cuda.cmake): counting and emitting project the same row in two
+// kernels, and must get the same bits.
 #include <cub/block/block_reduce.cuh>
 #include <cub/block/block_scan.cuh>
 #include <cub/device/device_scan.cuh>
@@ -19,7 +19,8 @@ using Inputs = ProjectInputs<float>;
 // The cameras of a launch in shared memory; the caller synchronises.
 __device__ void load_cameras(const Inputs& in, Camera<float>* cameras) {
   for (int view = threadIdx.x; view < in.n_views; view += blockDim.x) {
-    cameras[view] = make_camera(in.viewmats + 16 * view, in.Ks + 9 * view, in.options.width, in.options.height);
+    cameras[view] =
+        make_camera(in.viewmats + 16 * view, in.Ks + 9 * view, in.options.width, in.options.height);
   }
 }
 
@@ -38,8 +39,7 @@ __device__ void load_quat(const Inputs& in, std::int64_t id, float* quat) {
 __device__ ActiveGaussian<float> load_gaussian(const Inputs& in, std::int64_t id) {
   float quat[4];
   load_quat(in, id, quat);
-  return activate_gaussian(load3(in.means + 3 * id), quat,
-                           activate_scale(in.scales + 3 * id, in.options.raw),
+  return activate_gaussian(load3(in.means + 3 * id), quat, activate_scale(in.scales + 3 * id, in.options.raw),
                            activate_opacity(in.opacities[id], in.options.raw));
 }
 
@@ -47,8 +47,8 @@ __device__ std::int32_t tiles_of(const Row<float>& row, const ProjectOptions<flo
   return count_tiles(row.mean2d, row.conic, row.opacity, o.width, o.height, o.tile_size);
 }
 
-// The views that see a candidate, and the tiles its rows touch. Reads the mean first, then scale and opacity, then
-// the quaternion and SH, each only if what came before leaves the candidate visible.
+// The views that see a candidate, and the tiles its rows touch. Reads the mean first, then scale and opacity,
+// then the quaternion and SH, each only if what came before leaves the candidate visible.
 __device__ std::uint32_t visible_views(const Inputs& in, const Camera<float>* cameras, std::int64_t candidate,
                                        std::int64_t* tiles) {
   const std::int64_t id = candidate_id(in, candidate);
@@ -212,7 +212,8 @@ __device__ RowGradient<float> load_row_gradient(const ProjectRowGradients<float>
 }
 
 template <int DEGREE>
-__global__ void __launch_bounds__(128) backward_kernel(const BackwardInputs args, const ProjectGradients<float> out) {
+__global__ void __launch_bounds__(128)
+    backward_kernel(const BackwardInputs args, const ProjectGradients<float> out) {
   __shared__ Camera<float> cameras[kMaxViews];
   load_cameras(args.in, cameras);
   __syncthreads();
@@ -237,21 +238,23 @@ __global__ void __launch_bounds__(128) backward_kernel(const BackwardInputs args
     project_row_vjp(cameras[view], gaussian, in.options, load_row_gradient(args.v, r), &gradient, no_pose);
     if (has_colors) {
       const float v_color[3] = {args.v.colors[3 * r], args.v.colors[3 * r + 1], args.v.colors[3 * r + 2]};
-      row_color_vjp(cameras[view], gaussian.mean, sh.values, DEGREE, v_color, v_sh.values, &gradient.mean, no_pose);
+      row_color_vjp(cameras[view], gaussian.mean, sh.values, DEGREE, v_color, v_sh.values, &gradient.mean,
+                    no_pose);
     }
     if (args.scale_reg) axis_weight += args.scale_reg[view];
   }
   float v_quat[4];
-  activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
-                        ParameterGradients<float>{out.means + 3 * u, v_quat, out.scales + 3 * u, out.opacities + u});
+  activate_gaussian_vjp(
+      gaussian, in.options.raw, gradient, axis_weight,
+      ParameterGradients<float>{out.means + 3 * u, v_quat, out.scales + 3 * u, out.opacities + u});
   reinterpret_cast<float4*>(out.quats)[u] = {v_quat[0], v_quat[1], v_quat[2], v_quat[3]};
   if (!out.sh) return;
   float* target = out.sh + stride * u;
   if (stride == Coefficients::kCount && stride % 4 == 0) {
 #pragma unroll
     for (int i = 0; i < Coefficients::kCount / 4; ++i) {
-      reinterpret_cast<float4*>(target)[i] = {v_sh.values[4 * i], v_sh.values[4 * i + 1], v_sh.values[4 * i + 2],
-                                              v_sh.values[4 * i + 3]};
+      reinterpret_cast<float4*>(target)[i] = {v_sh.values[4 * i], v_sh.values[4 * i + 1],
+                                              v_sh.values[4 * i + 2], v_sh.values[4 * i + 3]};
     }
   } else {
 #pragma unroll
@@ -298,13 +301,15 @@ __global__ void __launch_bounds__(kThreads) pose_kernel(const BackwardInputs arg
 }
 
 // partial is in the order rotation rows (9), translation (3).
-__global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks, int n_views, float* v_viewmats) {
+__global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks, int n_views,
+                                    float* v_viewmats) {
   const int view = blockIdx.x, i = threadIdx.x;
   const int row = i / 4, column = i % 4;
   double sum = 0;
   const int source = column < 3 ? 3 * row + column : 9 + row;
   if (row < 3) {
-    for (std::int64_t block = 0; block < n_blocks; ++block) sum += partial[(block * n_views + view) * 12 + source];
+    for (std::int64_t block = 0; block < n_blocks; ++block)
+      sum += partial[(block * n_views + view) * 12 + source];
   }
   v_viewmats[16 * view + i] = static_cast<float>(sum);
 }
@@ -327,8 +332,8 @@ void dispatch_degree(const Inputs& in, const F& f) {
 }  // namespace
 
 template <>
-void project_count<float>(const Inputs& in, const ProjectPlan& plan, ProjectCounts* counts, Workspace& workspace,
-                          CudaStream stream) {
+void project_count<float>(const Inputs& in, const ProjectPlan& plan, ProjectCounts* counts,
+                          Workspace& workspace, CudaStream stream) {
   *counts = {};
   const std::int64_t blocks = project_blocks(in.n_candidates);
   if (blocks == 0 || in.n_views == 0) return;
@@ -357,7 +362,8 @@ void project_emit<float>(const Inputs& in, const ProjectPlan& plan, const Projec
   list_rows_kernel<<<blocks, kThreads, 0, stream>>>(in, plan, out);
   check_launch("project_fwd");
   dispatch_degree(in, [&](auto degree) {
-    emit_kernel<degree.value><<<blocks_for(counts.rows, kThreads), kThreads, 0, stream>>>(in, out, counts.rows);
+    emit_kernel<degree.value>
+        <<<blocks_for(counts.rows, kThreads), kThreads, 0, stream>>>(in, out, counts.rows);
   });
   check_launch("project_fwd");
 }

@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // The gradient of compositing. A warp walks its subtile's list from the back, a lane a pixel, so the pixel's
-// state is a transmittance and one number (what lies behind, dotted with the pixel's gradient), and nothing but
-// the final transmittance has to be kept from the forward pass. Per entry and pixel that leaves two numbers:
-// the weight alpha T and g = dL/d(ln alpha). Sixteen entries at a time, the warp transposes them through shared
-// memory, and each lane then sums for one entry over half of the pixels: the weights against the pixels'
-// gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic follow.
-#include <cub/device/device_radix_sort.cuh>
+// state is a transmittance and one number (what lies behind, dotted with the pixel's gradient), and nothing
+// but the final transmittance has to be kept from the forward pass. Per entry and pixel that leaves two
+// numbers: the weight alpha T and g = dL/d(ln alpha). Sixteen entries at a time, the warp transposes them
+// through shared memory, and each lane then sums for one entry over half of the pixels: the weights against
+// the pixels' gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic
+// follow.
 #include <algorithm>
+#include <cub/device/device_radix_sort.cuh>
 #include <string>
 
 #include "rasterize/tile_batch.cuh"
@@ -27,12 +28,14 @@ struct BackwardArguments {
   PackedGradient* entry_gradients;  // [I], written once each (deterministic)
 };
 
-inline constexpr int kGroup = 16;              // entries transposed at a time
-inline constexpr int kGroupStride = 32 + 1;    // float2 per entry; odd, so that columns spread over the banks
+inline constexpr int kGroup = 16;            // entries transposed at a time
+inline constexpr int kGroupStride = 32 + 1;  // float2 per entry; odd, so that columns spread over the banks
 
 template <int TILE, bool DETERMINISTIC>
 struct BackwardShared {
-  static constexpr int kBatch = DETERMINISTIC ? (TILE == 32 ? 32 : 64) : TILE * TILE < 256 ? TILE * TILE : 256;
+  static constexpr int kBatch = DETERMINISTIC       ? (TILE == 32 ? 32 : 64)
+                                : TILE * TILE < 256 ? TILE * TILE
+                                                    : 256;
   static constexpr int kWarps = Tile<TILE>::kWarps;
   EntryBatch<TILE, kBatch> batch;
   std::int32_t row[kBatch];
@@ -44,8 +47,8 @@ struct BackwardShared {
 
 __device__ __forceinline__ void add_quad(float* address, float a, float b, float c, float d) {
 #if __CUDA_ARCH__ >= 900
-  asm volatile("red.relaxed.gpu.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(address), "f"(a), "f"(b), "f"(c),
-               "f"(d)
+  asm volatile("red.relaxed.gpu.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(address), "f"(a), "f"(b),
+               "f"(c), "f"(d)
                : "memory");
 #else
   atomicAdd(address, a);
@@ -75,8 +78,8 @@ struct EntryShape {
 // The two pixel rows of this half of the subtile.
 template <int CHANNELS, bool ABSOLUTE>
 __device__ __forceinline__ EntrySums<CHANNELS> sum_half(const float2* group, const float4* v_render,
-                                                        const EntryShape& shape, float centre_x, float centre_y,
-                                                        int half) {
+                                                        const EntryShape& shape, float centre_x,
+                                                        float centre_y, int half) {
   EntrySums<CHANNELS> sums;
 #pragma unroll
   for (int y = 0; y < 2; ++y) {
@@ -132,8 +135,8 @@ __device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, c
 // Sums the group's entries and hands the results on. my_entry: the batch entry of group slot lane % 16.
 template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
 __device__ __forceinline__ void flush_group(BackwardShared<TILE, DETERMINISTIC>& shared,
-                                            const BackwardArguments& args, const Pixel& pixel, int warp, int lane,
-                                            int filled, int my_entry) {
+                                            const BackwardArguments& args, const Pixel& pixel, int warp,
+                                            int lane, int filled, int my_entry) {
   __syncwarp();
   const int slot = lane % kGroup, half = lane / kGroup;
   const float4 place = shared.batch.place[my_entry];
@@ -141,8 +144,8 @@ __device__ __forceinline__ void flush_group(BackwardShared<TILE, DETERMINISTIC>&
   const EntryShape shape{place.x, place.y, place.z, place.w, rest.x, rest.y};
   const float centre_x = static_cast<float>(pixel.left + kSubtileWidth / 2);
   const float centre_y = static_cast<float>(pixel.top + kSubtileHeight / 2);
-  EntrySums<CHANNELS> sums = sum_half<CHANNELS, ABSOLUTE>(shared.group[warp] + slot * kGroupStride,
-                                                          shared.v_render[warp], shape, centre_x, centre_y, half);
+  EntrySums<CHANNELS> sums = sum_half<CHANNELS, ABSOLUTE>(
+      shared.group[warp] + slot * kGroupStride, shared.v_render[warp], shape, centre_x, centre_y, half);
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) sums.color[k] = add_halves(sums.color[k]);
   sums.g = add_halves(sums.g);
@@ -202,8 +205,9 @@ struct BackwardPixel {
 
 template <int TILE, int CHANNELS, bool DETERMINISTIC>
 __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(BackwardShared<TILE, DETERMINISTIC>& shared,
-                                                               const BackwardArguments& args, const Pixel& pixel,
-                                                               int camera, int warp, int lane) {
+                                                               const BackwardArguments& args,
+                                                               const Pixel& pixel, int camera, int warp,
+                                                               int lane) {
   BackwardPixel<CHANNELS> state;
   state.last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
   state.transmittance = pixel.inside ? args.saved.transmittances[pixel.index] : 1.f;
@@ -212,13 +216,15 @@ __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(BackwardShared<TI
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) {
     const bool present = pixel.inside && k < args.chunk.count;
-    state.v[k] = present ? args.saved.v_renders[pixel.index * args.chunk.n_channels + args.chunk.first + k] : 0.f;
+    state.v[k] =
+        present ? args.saved.v_renders[pixel.index * args.chunk.n_channels + args.chunk.first + k] : 0.f;
     if (present && args.backgrounds) {
       open += state.v[k] * args.backgrounds[camera * args.chunk.n_channels + args.chunk.first + k];
     }
   }
   state.behind = open * state.transmittance;
-  shared.v_render[warp][lane] = {state.v[0], state.v[1], state.v[2], CHANNELS > 3 ? state.v[CHANNELS - 1] : 0.f};
+  shared.v_render[warp][lane] = {state.v[0], state.v[1], state.v[2],
+                                 CHANNELS > 3 ? state.v[CHANNELS - 1] : 0.f};
   return state;
 }
 
@@ -268,14 +274,16 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 1024 / (TILE * TILE) 
         const int entry = word * 32 + bit;
         const float4 place = shared.batch.place[entry];
         const float2 rest = shared.batch.rest[entry];
-        const float power = log2_alpha(place.z, place.w, rest.x, rest.y, pixel.centre_x - place.x,
-                                       pixel.centre_y - place.y);
+        const float power =
+            log2_alpha(place.z, place.w, rest.x, rest.y, pixel.centre_x - place.x, pixel.centre_y - place.y);
         const bool touched = power >= kLog2Cut && base + entry < state.last;
         if (!__any_sync(kFullWarp, touched)) continue;
-        shared.group[warp][filled * kGroupStride + lane] = state.add(power, touched, shared.batch.color[entry]);
+        shared.group[warp][filled * kGroupStride + lane] =
+            state.add(power, touched, shared.batch.color[entry]);
         if (lane % kGroup == filled) my_entry = entry;
         if (++filled == kGroup) {
-          flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, pixel, warp, lane, filled, my_entry);
+          flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, pixel, warp, lane, filled,
+                                                               my_entry);
           filled = 0;
         }
       }
@@ -325,8 +333,9 @@ __global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
 }
 
 // Adds each row's entries in the order of the list of all tiles.
-__global__ void sum_entries_kernel(const std::int32_t* sorted_rows, const std::int32_t* entries, std::int64_t n,
-                                   const PackedGradient* entry_gradients, PackedGradient* row_gradients) {
+__global__ void sum_entries_kernel(const std::int32_t* sorted_rows, const std::int32_t* entries,
+                                   std::int64_t n, const PackedGradient* entry_gradients,
+                                   PackedGradient* row_gradients) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
   if (i >= 3 * n) return;
   const int quad = static_cast<int>(i % 3);
@@ -384,12 +393,12 @@ EntriesByRow sort_entries(const std::int32_t* isect_rows, std::int64_t n, std::i
   iota_kernel<<<blocks_for(n, 256), 256, 0, stream>>>(order, n);
   check_launch("rasterize_bwd");
   std::size_t bytes = 0;
-  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, isect_rows, sorted.rows, order, sorted.entries, n, 0, bits,
-                                        stream),
+  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, isect_rows, sorted.rows, order, sorted.entries, n, 0,
+                                        bits, stream),
         "rasterize_bwd");
   void* scratch = workspace.allocate_bytes(bytes);
-  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_rows, sorted.rows, order, sorted.entries, n, 0, bits,
-                                        stream),
+  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_rows, sorted.rows, order, sorted.entries, n, 0,
+                                        bits, stream),
         "rasterize_bwd");
   return sorted;
 }
@@ -411,7 +420,8 @@ void check_supported(const RasterizeInput<float>& in, bool absolute) {
 template <>
 void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
                           std::int64_t n_isects, const void* aux, bool deterministic,
-                          const RasterizeGradients<float>& gradients, Workspace& workspace, CudaStream stream) {
+                          const RasterizeGradients<float>& gradients, Workspace& workspace,
+                          CudaStream stream) {
   if (in.n_rows == 0) return;
   const bool absolute = gradients.v_means2d_abs != nullptr;
   check_supported(in, absolute);
@@ -426,14 +436,13 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
     sorted = sort_entries(in.isect_rows, n_isects, in.n_rows, workspace, stream);
   }
   for (int first = 0; first < in.n_channels; first += 4) {
-    const ChannelChunk chunk{in.n_channels <= 4 ? aux_colors(aux, in.n_rows) : nullptr, in.colors, in.n_channels,
-                             first, std::min(4, in.n_channels - first)};
+    const ChannelChunk chunk{in.n_channels <= 4 ? aux_colors(aux, in.n_rows) : nullptr, in.colors,
+                             in.n_channels, first, std::min(4, in.n_channels - first)};
     check(cudaMemsetAsync(packed, 0, row_bytes, stream), "rasterize_bwd");
     if (!empty) {
       if (entries) check(cudaMemsetAsync(entries, 0, entry_bytes, stream), "rasterize_bwd");
-      const BackwardArguments args{aux_rows(aux),   chunk,   in.backgrounds, in.isect_rows,
-                                   in.tile_offsets, in.grid, saved,          packed,
-                                   entries};
+      const BackwardArguments args{aux_rows(aux), chunk, in.backgrounds, in.isect_rows, in.tile_offsets,
+                                   in.grid,       saved, packed,         entries};
       if (in.grid.tile_size == 8) {
         dispatch_backward<8>(args, absolute, stream);
       } else if (in.grid.tile_size == 16) {
@@ -442,8 +451,8 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
         dispatch_backward<32>(args, absolute, stream);
       }
       if (entries) {
-        sum_entries_kernel<<<blocks_for(3 * n_isects, 256), 256, 0, stream>>>(sorted.rows, sorted.entries, n_isects,
-                                                                             entries, packed);
+        sum_entries_kernel<<<blocks_for(3 * n_isects, 256), 256, 0, stream>>>(sorted.rows, sorted.entries,
+                                                                              n_isects, entries, packed);
         check_launch("rasterize_bwd");
       }
     }

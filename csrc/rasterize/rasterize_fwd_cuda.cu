@@ -93,8 +93,8 @@ __global__ void __launch_bounds__(TILE* TILE) forward_kernel(const ForwardArgume
         const int entry = word * 32 + __ffs(bits) - 1;
         const float4 place = batch.place[entry];
         const float2 rest = batch.rest[entry];
-        const float power = log2_alpha(place.z, place.w, rest.x, rest.y, pixel.centre_x - place.x,
-                                       pixel.centre_y - place.y);
+        const float power =
+            log2_alpha(place.z, place.w, rest.x, rest.y, pixel.centre_x - place.x, pixel.centre_y - place.y);
         state.add(power, batch.color[entry], base + entry);
       }
     }
@@ -102,10 +102,10 @@ __global__ void __launch_bounds__(TILE* TILE) forward_kernel(const ForwardArgume
 
   if (pixel.inside) {
     float* render = args.out.renders + pixel.index * args.chunk.n_channels + args.chunk.first;
-    const float* background = args.backgrounds ? args.backgrounds +
-                                                     static_cast<std::int64_t>(tile.camera) * args.chunk.n_channels +
-                                                     args.chunk.first
-                                               : nullptr;
+    const float* background =
+        args.backgrounds ? args.backgrounds + static_cast<std::int64_t>(tile.camera) * args.chunk.n_channels +
+                               args.chunk.first
+                         : nullptr;
 #pragma unroll
     for (int k = 0; k < CHANNELS; ++k) {
       if (k >= args.chunk.count) break;
@@ -158,15 +158,18 @@ void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput
   if (in.grid.tile_end <= in.grid.tile_begin) return;
   float4* colors = in.n_channels <= 4 ? const_cast<float4*>(aux_colors(aux, in.n_rows)) : nullptr;
   if (in.n_rows > 0) {
-    pack_rows_kernel<<<blocks_for(in.n_rows, 256), 256, 0, stream>>>(in, static_cast<PackedRow*>(aux), colors);
+    pack_rows_kernel<<<blocks_for(in.n_rows, 256), 256, 0, stream>>>(in, static_cast<PackedRow*>(aux),
+                                                                     colors);
     check_launch("pack_rows");
   }
   for (int first = 0; first < in.n_channels; first += 4) {
-    const ForwardArguments args{
-        aux_rows(aux),   {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},
-        in.backgrounds,  in.isect_rows,
-        in.tile_offsets, in.grid,
-        out};
+    const ForwardArguments args{aux_rows(aux),
+                                {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},
+                                in.backgrounds,
+                                in.isect_rows,
+                                in.tile_offsets,
+                                in.grid,
+                                out};
     if (in.grid.tile_size == 8) {
       launch_forward<8>(args, stream);
     } else if (in.grid.tile_size == 16) {

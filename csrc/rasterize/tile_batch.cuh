@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the CUDA rasteriser's forward and backward share: packed rows, the arithmetic of alpha, and how a block
-// reads a batch of its tile's list.
+// What the CUDA rasteriser's forward and backward share: packed rows, the arithmetic of alpha, and how a
+// block reads a batch of its tile's list.
 //
 // A block is a tile, a warp an 8x4 subtile of it, a lane a pixel. The block fetches the list in batches; each
 // thread tests its entry against every subtile, and the ballots of those tests tell each warp which entries
@@ -30,7 +30,8 @@ struct __align__(32) PackedRow {
   float dy_per_dx;  // and along a column
 };
 
-// Gradients of one row: v_mean2d x y, v_conic a b | v_conic c, v_opacity, v_color 0 1 | v_color 2 3, v_abs x y.
+// Gradients of one row: v_mean2d x y, v_conic a b | v_conic c, v_opacity, v_color 0 1 | v_color 2 3, v_abs x
+// y.
 struct __align__(16) PackedGradient {
   float4 quads[3];
 };
@@ -74,8 +75,8 @@ __device__ __forceinline__ float reciprocal_approx(float x) {
   return y;
 }
 
-// log2 of the unclipped alpha at offset (dx, dy) = pixel - mean. Written out with the fused operations, because
-// forward and backward must agree bit by bit on which pixels a row touches.
+// log2 of the unclipped alpha at offset (dx, dy) = pixel - mean. Written out with the fused operations,
+// because forward and backward must agree bit by bit on which pixels a row touches.
 __device__ __forceinline__ float log2_alpha(float l11, float l21, float l22, float log2_opacity, float dx,
                                             float dy) {
   const float u = __fmaf_rn(l11, dx, __fmul_rn(l21, dy));
@@ -92,10 +93,10 @@ struct Tile {
 
 // Where a thread's pixel lies.
 struct Pixel {
-  int x, y;             // in the image
-  int left, top;        // of the subtile
-  bool inside;          // of the image
-  std::int64_t index;   // (camera, y, x) flattened
+  int x, y;            // in the image
+  int left, top;       // of the subtile
+  bool inside;         // of the image
+  std::int64_t index;  // (camera, y, x) flattened
   float centre_x, centre_y;
 };
 
@@ -116,7 +117,8 @@ __device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid) {
 }
 
 template <int TILE>
-__device__ __forceinline__ Pixel locate_pixel(const TileGrid& grid, const TilePlace& place, int warp, int lane) {
+__device__ __forceinline__ Pixel locate_pixel(const TileGrid& grid, const TilePlace& place, int warp,
+                                              int lane) {
   Pixel pixel;
   pixel.left = place.left + warp % Tile<TILE>::kColumns * kSubtileWidth;
   pixel.top = place.top + warp / Tile<TILE>::kColumns * kSubtileHeight;
