@@ -68,12 +68,14 @@ def plan_flight(options: CityOptions) -> list[View]:
     per_heading = [oblique // 4 + (k < oblique % 4) for k in range(4)]
     passes: list[tuple[str, float, float, int]] = [("nadir", 0.0, 0.0, options.views - oblique)]
     passes += [(f"oblique_{'nesw'[k]}", k * math.pi / 2, TILT, n) for k, n in enumerate(per_heading)]
+    # The outermost images reach half a footprint past their centre: up to the edge of the city.
+    flown = max(options.extent - 0.6 * height, 0.5 * options.extent)
     views: list[View] = []
     for label, heading, tilt, count in passes:
         forward = np.array([math.sin(heading), math.cos(heading)])
         # Oblique cameras fly behind what they look at.
         back = height * math.tan(tilt)
-        for position in _lawn_mower(count, max(options.extent - 0.2 * height, 0.5 * options.extent)):
+        for position in _lawn_mower(count, flown):
             ground = position + rng.normal(0, 0.01 * height, 2)
             centre = np.array([*(ground - back * forward), height * (1 + rng.normal(0, 0.01))])
             yaw, pitch, roll = np.array([heading, tilt, 0.0]) + rng.normal(0, math.radians(1.2), 3)

@@ -24,7 +24,7 @@ class CityOptions:
     """
 
     extent: float = 150.0
-    views: int = 48
+    views: int = 60
     width: int = 480
     height: int = 320
     points_per_view: int = 500
