@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The images of a capture: kept compressed in memory under a budget, decoded ahead by a thread pool.
 
-Two bounded caches, both dropping what was used longest ago: compressed images and decoded ones. The compressed
-form is the file itself where the file is the image. Where it is not (it must be undistorted or downscaled), that
-is done once and the result kept as QOI, which is lossless: for an image of 1.9 megapixels decoding it takes 16 ms
-at full size and 1 ms at a quarter, where decoding, undistorting and averaging the JPEG again takes 22 and 16 ms,
-and PNG 46 and 3 ms. Nothing is written to disk. What comes out does not depend on budgets, threads or order.
+Two bounded caches, both dropping what was used longest ago: compressed images and decoded ones. The
+compressed form is the file itself where the file is the image. Where it is not (it must be undistorted or
+downscaled), that is done once and the result kept as QOI, which is lossless: for an image of 1.9 megapixels
+decoding it takes 16 ms at full size and 1 ms at a quarter, where decoding, undistorting and averaging the JPEG
+again takes 22 and 16 ms, and PNG 46 and 3 ms. Nothing is written to disk. What comes out depends neither on
+budgets nor on threads or order.
 """
 
 from __future__ import annotations
@@ -140,6 +141,16 @@ class ImageStore:
                 return
             if self._decoded.get(("image", index)) is None:
                 self._submit("image", index)
+
+    @property
+    def compressed_bytes(self) -> int:
+        """Memory now held by compressed images."""
+        return self._packed.bytes
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Memory now held by decoded images and masks."""
+        return self._decoded.bytes
 
     def close(self) -> None:
         """Stop the threads; decoding that has not begun is dropped."""

@@ -48,7 +48,7 @@ def test_the_same_bits_for_every_budget_thread_count_and_order(capture):
     tight.prefetch(range(12))
     for i in [5, 3, 5, 11, 0, 1, 2, 3, 4, 6, 7, 8, 9, 10]:
         assert torch.equal(tight.get(i), first[i])
-    assert tight._decoded.bytes <= IMAGE_BYTES and tight._packed.bytes <= 2000
+    assert tight.decoded_bytes <= IMAGE_BYTES and tight.compressed_bytes <= 2000
 
 
 def test_files_are_read_once_within_the_budget(capture):
@@ -73,7 +73,7 @@ def test_prepared_images_are_made_once_and_kept_without_loss(tmp_path, monkeypat
     for i in (2, 0, 1, 1):
         assert torch.equal(store.get(i), first[i])
     assert made == NAMES[:3]
-    assert 0 < store._packed.bytes <= sum(image.numel() // 3 * 4 + 22 for image in first)
+    assert 0 < store.compressed_bytes <= sum(image.numel() // 3 * 4 + 22 for image in first)
 
 
 def test_prefetch_decodes_ahead_as_far_as_the_budget_goes(capture, monkeypatch):
@@ -84,7 +84,7 @@ def test_prefetch_decodes_ahead_as_far_as_the_budget_goes(capture, monkeypatch):
     for i in range(4):
         store.get(i)
     assert sorted(made) == [0, 1, 2, 3]
-    assert store._decoded.bytes == 4 * IMAGE_BYTES
+    assert store.decoded_bytes == 4 * IMAGE_BYTES
     store.close()
     with pytest.raises(RuntimeError):
         store.get(5)

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures to look at: saving images, and a render beside its photograph and its error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+UInt8 = npt.NDArray[np.uint8]
+
+_LABELS = ("render", "photograph", "error")
+_BAR = 24
+_GAP = 4
+
+
+def to_uint8(image: Tensor) -> UInt8:
+    """Quantise an image to uint8 [H, W, 3]: floats are clamped to [0, 1] and rounded, uint8 stays."""
+    image = image.detach().cpu()
+    if image.dtype != torch.uint8:
+        image = (image.float().nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    return np.asarray(image.numpy())
+
+
+def save_image(path: Path | str, image: Tensor) -> None:
+    """Write an RGB image, float [H, W, 3] in [0, 1] or uint8; the suffix (.png, .jpg) chooses the format.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        written = cv2.imwrite(str(path), np.ascontiguousarray(to_uint8(image)[..., ::-1]))
+    except cv2.error as error:
+        raise OSError(f"cannot write the picture {path}: {error}") from error
+    if not written:
+        raise OSError(f"cannot write the picture {path}")
+
+
+def error_map(render: Tensor, target: Tensor, mask: Tensor | None = None, full: float = 0.25) -> Tensor:
+    """Mean absolute error over the channels as colours from dark blue (0) to red (`full` and more).
+
+    Args:
+        render: float [H, W, 3].
+        target: float or uint8 [H, W, 3].
+        mask: uint8 [H, W]; pixels with 0 become grey; or None.
+        full: the error, in [0, 1], shown in the last colour.
+
+    Returns:
+        uint8 RGB [H, W, 3] on the CPU.
+    """
+    truth = target.cpu().float() / 255 if target.dtype == torch.uint8 else target.cpu().float()
+    error = (render.detach().cpu().float().clamp(0, 1) - truth).abs().mean(dim=-1)
+    levels = to_uint8(error / full)
+    colors = np.ascontiguousarray(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1])
+    if mask is not None:
+        colors[mask.cpu().numpy() == 0] = 128
+    return torch.from_numpy(colors)
+
+
+def strip(images: Sequence[Tensor], labels: Sequence[str]) -> Tensor:
+    """Images of one height side by side, each under its label; uint8 RGB [H + bar, W, 3]."""
+    if len({image.shape[0] for image in images}) != 1 or len(images) != len(labels):
+        shapes = [list(image.shape) for image in images]
+        raise ValueError(f"a strip needs images of one height and a label for each, got {shapes}, {labels}")
+    panels: list[UInt8] = []
+    for image, label in zip(images, labels, strict=True):
+        pixels = to_uint8(image)
+        panel = np.full((pixels.shape[0] + _BAR, pixels.shape[1], 3), 255, dtype=np.uint8)
+        panel[_BAR:] = pixels
+        cv2.putText(panel, label, (6, _BAR - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+        panels += [panel, np.full((panel.shape[0], _GAP, 3), 255, dtype=np.uint8)]
+    return torch.from_numpy(np.concatenate(panels[:-1], axis=1))
+
+
+def save_comparison(path: Path | str, render: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
+    """Write render | photograph | error of one view.
+
+    Args:
+        path: file to write.
+        render: float [H, W, 3].
+        target: float or uint8 [H, W, 3].
+        mask: uint8 [H, W] of the pixels that count, or None.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    save_image(path, strip([render, target, error_map(render, target, mask)], _LABELS))
