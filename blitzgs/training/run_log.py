@@ -76,14 +76,15 @@ class RunLog:
                 f"{t:>7,}/{self._total:,} images  {text}  ETA {int(seconds) // 60}:{int(seconds) % 60:02}"
             )
 
-    def event(self, t: int, kind: str, text: str, values: Mapping[str, Any]) -> None:
-        """Record something that happened at time `t`, and print `text`."""
+    def event(self, t: int, kind: str, values: Mapping[str, Any], text: str | None = None) -> None:
+        """Record something that happened at time `t`; print `text` if given."""
         self._write({"t": t, "event": kind, **values})
         if self._board is not None:
             for name, value in values.items():
                 if isinstance(value, (int, float)):
                     self._board.add_scalar(f"{kind}/{name}", value, t)
-        self.console.print(f"{t:>7,} {text}")
+        if text is not None:
+            self.console.print(f"{t:>7,} {text}", soft_wrap=True)
 
     def close(self) -> None:
         """Flush and end the progress display."""

@@ -160,12 +160,8 @@ class Trainer:
                         self._handle(event, step, log)
                     if step < self.schedule.steps and (name := stop.agreed(step, self.ranks)):
                         self._save()
-                        log.event(
-                            step * size,
-                            "stopped",
-                            f"stopped by {name}; continue with --resume",
-                            {"signal": name},
-                        )
+                        text = f"stopped by {name}; continue with --resume"
+                        log.event(step * size, "stopped", {"signal": name}, text)
                         return None
             return self._finish(log)
         finally:
@@ -178,12 +174,8 @@ class Trainer:
             f"{self._population():,} Gaussians on {self.progress.level_count} levels; "
             f"{views['train']} training views, {views['test']} held out"
         )
-        log.event(
-            self.progress.step * self.schedule.batch_size,
-            "start",
-            text,
-            views | run.versions(self.ranks.device),
-        )
+        values = views | run.versions(self.ranks.device)
+        log.event(self.progress.step * self.schedule.batch_size, "start", values, text)
 
     def _step(self, step: int, log: RunLog) -> None:
         """Take one optimiser step (from 1)."""
@@ -292,11 +284,7 @@ class Trainer:
         self.progress = dataclasses.replace(
             self.progress, peak_gaussians=max(self.progress.peak_gaussians, total)
         )
-        text = (
-            f"density: {counts['cloned']:,} cloned, {counts['split']:,} split, {counts['pruned']:,} pruned; "
-            f"now {total:,}"
-        )
-        log.event(event.time, "densify", text, counts | {"gaussians": total})
+        log.event(event.time, "densify", counts | {"gaussians": total})
 
     def _evaluate(self, step: int, log: RunLog) -> dict[str, Any]:
         """Evaluate the held-out views (the training views when there are none)."""
@@ -317,7 +305,7 @@ class Trainer:
         )
         means = {name: value for name, value in metrics.items() if name != "views"}
         text = "evaluation: " + "  ".join(f"{name} {value:.4f}" for name, value in means.items())
-        log.event(images, "evaluation", text, means)
+        log.event(images, "evaluation", means, text)
         self._clock += time.monotonic() - paused
         return means
 
