@@ -73,13 +73,8 @@ class Trainer:
             ConfigError: the run to resume was started with another configuration.
             MismatchError: the ranks differ in configuration, code or capture.
         """
-        self.config, self.capture, self.images, self.folder, self.ranks = (
-            config,
-            capture,
-            images,
-            folder,
-            ranks,
-        )
+        self.config, self.capture, self.images = config, capture, images
+        self.folder, self.ranks = folder, ranks
         run.check_alike(config, capture, ranks)
         self.schedule = Schedule(config.schedule)
         self.space = Space.of(capture.offset, capture.extent)
@@ -92,8 +87,12 @@ class Trainer:
         if restored is None:
             self._initialise()
         else:
-            self.table, self.progress, self.space, saved = restored
+            self.table, self.progress, space, saved = restored
             run.check_resumable(saved, config)
+            if space != self.space:
+                raise ValueError(
+                    f"{config.data.path} is not the capture of the run in {folder}: its cameras differ"
+                )
         if ranks.rank == 0:
             folder.mkdir(parents=True, exist_ok=True)
             save_config(config, folder / run.CONFIG)
@@ -113,7 +112,6 @@ class Trainer:
         )
         self._guard = LossGuard()
         self._length_unit = self.space.extent * config.loss.scale_reference
-        self._seconds_paused = 0.0
 
     def _initialise(self) -> None:
         """Make the first Gaussians from the capture's points; each rank keeps its share."""
