@@ -6,6 +6,16 @@
 #include <torch/csrc/stable/library.h>
 
 STABLE_TORCH_LIBRARY(blitzgs, m) {
+  // The active set: blocks of consecutive rows with bounds, culled against the views.
+  m.def("morton_keys(Tensor points) -> Tensor");
+  m.def(
+      "update_block_bounds_(Tensor(a!) bounds, Tensor? ids, Tensor means, Tensor scales, Tensor[] moments, "
+      "Tensor? last_step, Tensor? table) -> ()");
+  m.def(
+      "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
+      "Tensor? table, Tensor viewmats, Tensor Ks, int width, int height, float near_plane, float far_plane, "
+      "float eps2d) -> (Tensor active_ids, Tensor active_views)");
+
   // Projection: parameters to screen-space rows, ordered by (Gaussian, view).
   m.def(
       "project_fwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "

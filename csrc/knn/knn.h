@@ -16,6 +16,7 @@
 
 #include "common/host_device.h"
 #include "common/stream.h"
+#include "math/morton.h"
 
 namespace blitzgs {
 
@@ -52,40 +53,6 @@ std::int64_t plan_knn_levels(std::int32_t n, KnnTree<T>& tree) {
     total += count;
   } while (count > 1);
   return total;
-}
-
-struct MortonFrame {
-  double low[3];
-  double cells_per_unit;  // 2^21 cells along the longest axis
-};
-
-BLITZGS_HD std::uint64_t spread_bits(std::uint64_t x) {
-  x &= 0x1fffff;
-  x = (x | x << 32) & 0x1f00000000ffffULL;
-  x = (x | x << 16) & 0x1f0000ff0000ffULL;
-  x = (x | x << 8) & 0x100f00f00f00f00fULL;
-  x = (x | x << 4) & 0x10c30c30c30c30c3ULL;
-  x = (x | x << 2) & 0x1249249249249249ULL;
-  return x;
-}
-
-template <class T>
-BLITZGS_HD bool is_finite_point(const T* p) {
-  const T sum = p[0] * T(0) + p[1] * T(0) + p[2] * T(0);
-  return sum == T(0);
-}
-
-// All ones for a point that is not finite: it sorts last.
-template <class T>
-BLITZGS_HD std::uint64_t morton_code(const T* p, const MortonFrame& frame) {
-  if (!is_finite_point(p)) return ~std::uint64_t{0};
-  std::uint64_t code = 0;
-  for (int axis = 0; axis < 3; ++axis) {
-    const double cell = (static_cast<double>(p[axis]) - frame.low[axis]) * frame.cells_per_unit;
-    const double clamped = cell > 0 ? (cell < 2097151.0 ? cell : 2097151.0) : 0.0;
-    code |= spread_bits(static_cast<std::uint64_t>(clamped)) << axis;
-  }
-  return code;
 }
 
 // Box of node i of a level: of 8 points (level 0) or 8 boxes of the level below.

@@ -8,38 +8,13 @@
 
 namespace blitzgs::cpu {
 
-namespace {
-
-template <class T>
-MortonFrame frame_of(const T* points, std::int32_t n) {
-  MortonFrame frame{{0, 0, 0}, 0};
-  double high[3] = {0, 0, 0};
-  bool first = true;
-  for (std::int64_t i = 0; i < n; ++i) {
-    const T* p = points + 3 * i;
-    if (!is_finite_point(p)) continue;
-    for (int axis = 0; axis < 3; ++axis) {
-      const double x = p[axis];
-      frame.low[axis] = first ? x : std::min(frame.low[axis], x);
-      high[axis] = first ? x : std::max(high[axis], x);
-    }
-    first = false;
-  }
-  double extent = 0;
-  for (int axis = 0; axis < 3; ++axis) extent = std::max(extent, high[axis] - frame.low[axis]);
-  frame.cells_per_unit = extent > 0 ? 2097152.0 / extent : 0.0;
-  return frame;
-}
-
-}  // namespace
-
 template <class T>
 void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspace& workspace, CudaStream) {
   std::fill_n(distances, std::int64_t{n} * k, std::numeric_limits<T>::infinity());
   if (n == 0) return;
   using Entry = std::pair<std::uint64_t, std::int32_t>;
   Entry* entries = workspace.allocate<Entry>(n);
-  const MortonFrame frame = frame_of(points, n);
+  const MortonFrame frame = morton_frame_of(points, n);
   parallel_for(0, n, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       entries[i] = {morton_code(points + 3 * i, frame), static_cast<std::int32_t>(i)};

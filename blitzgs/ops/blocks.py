@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The active set of a step, found over blocks of consecutive rows with conservative bounds."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+BLOCK_ROWS = 256
+
+
+class PendingSteps(NamedTuple):
+    """Optimiser state that says where rows may still drift to before they are caught up.
+
+    Attributes:
+        exp_avg_means: first moment of the means, float32 [N, 3].
+        exp_avg_sq_means: second moment of the means, float32 [N, 3].
+        exp_avg_scales: first moment of the log scales, float32 [N, 3].
+        exp_avg_sq_scales: second moment of the log scales, float32 [N, 3].
+        last_step: int32 [N], step each row's state stands at.
+        table: float64 [S + 1, 11], from `blitzgs.ops.lazy_adam.schedule_table`.
+    """
+
+    exp_avg_means: Tensor
+    exp_avg_sq_means: Tensor
+    exp_avg_scales: Tensor
+    exp_avg_sq_scales: Tensor
+    last_step: Tensor
+    table: Tensor
+
+
+def morton_keys(points: Tensor) -> Tensor:
+    """Return each point's position along the Morton curve of the cloud's bounding cube.
+
+    Args:
+        points: float32 [N, 3].
+
+    Returns:
+        int64 [N]; 2^63 - 1 for a point that is not finite.
+
+    Raises:
+        RuntimeError: wrong shape or dtype.
+    """
+    return torch.ops.blitzgs.morton_keys(points)
+
+
+@torch.no_grad()
+def update_block_bounds_(
+    bounds: Tensor, ids: Tensor | None, means: Tensor, scales: Tensor, pending: PendingSteps | None = None
+) -> None:
+    """Recompute the bounds of the blocks that hold the rows `ids` (None: of all blocks), in place.
+
+    Args:
+        bounds: float32 [ceil(N / 256), 7]: lowest and highest corner of where the means can be, largest
+            standard deviation.
+        ids: int32 [U], rows that changed.
+        means: float32 [N, 3].
+        scales: float32 [N, 3], logarithms of the standard deviations.
+        pending: where rows may drift before they are caught up; None: they stay.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    torch.ops.blitzgs.update_block_bounds_(bounds, ids, means, scales, *_pending_arguments(pending))
+
+
+def cull_blocks(
+    bounds: Tensor,
+    means: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    eps2d: float = 0.3,
+    pending: PendingSteps | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Return the rows that may show in at least one of B views, without reading those of blocks outside.
+
+    Conservative: every row that projection would emit is in the set, whatever of its pending steps has been
+    taken by then. Only rows that provably miss a view are dropped from it (csrc/blocks/blocks.h).
+
+    Args:
+        bounds: from `update_block_bounds_`, of the same rows.
+        means: float32 [N, 3].
+        scales: float32 [N, 3], logarithms of the standard deviations.
+        viewmats: float32 [B, 4, 4], world to camera, B <= 32.
+        Ks: float32 [B, 3, 3], pixels.
+        width: pixels.
+        height: pixels.
+        near_plane: rows at z <= near_plane are not seen.
+        far_plane: rows at z > far_plane are not seen.
+        eps2d: screen-space blur, pixels squared.
+        pending: as given to `update_block_bounds_`.
+
+    Returns:
+        (active_ids int32 [A] ascending, active_views int32 [A]: bit v set when view v may see the row).
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, or more than 32 views.
+    """
+    return torch.ops.blitzgs.cull_blocks(
+        bounds,
+        means,
+        scales,
+        *_pending_arguments(pending),
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane,
+        far_plane,
+        eps2d,
+    )
+
+
+def _pending_arguments(pending: PendingSteps | None) -> tuple[list[Tensor], Tensor | None, Tensor | None]:
+    return ([], None, None) if pending is None else (list(pending[:4]), pending.last_step, pending.table)
+
+
+@torch.library.register_fake("blitzgs::morton_keys")
+def _(points: Tensor) -> Tensor:
+    return points.new_empty(points.shape[0], dtype=torch.int64)
+
+
+@torch.library.register_fake("blitzgs::update_block_bounds_")
+def _(*_args: object) -> None:
+    return None
+
+
+@torch.library.register_fake("blitzgs::cull_blocks")
+def _(bounds: Tensor, *_args: object) -> tuple[Tensor, Tensor]:
+    count = torch.library.get_ctx().new_dynamic_size()
+    return bounds.new_empty(count, dtype=torch.int32), bounds.new_empty(count, dtype=torch.int32)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work follows the active set: the rows of a table that a batch of views may see."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from blitzgs.model import GaussianTable
+from blitzgs.ops.blocks import BLOCK_ROWS, PendingSteps, cull_blocks, morton_keys, update_block_bounds_
+
+
+def morton_order(means: Tensor) -> Tensor:
+    """Return the permutation (int64 [N]) that puts neighbours in space next to each other.
+
+    Rows on the same spot of the curve keep their order; rows that are not finite come last.
+
+    Args:
+        means: float32 [N, 3].
+    """
+    return torch.sort(morton_keys(means), stable=True).indices
+
+
+class BlockIndex:
+    """Bounds of blocks of 256 consecutive rows of one table, kept true while an optimiser moves the rows.
+
+    Build a new index whenever rows were added, removed or reordered; sort the table by `morton_order` first,
+    or blocks are large and nothing is saved (the active set is right in any order).
+    """
+
+    def __init__(self, table: GaussianTable, schedule: Tensor | None = None) -> None:
+        """Bound every block of the table.
+
+        Args:
+            table: the rows.
+            schedule: of the lazy optimiser, from `blitzgs.ops.lazy_adam.schedule_table`, when steps may be
+                pending; None: rows stand where they are.
+        """
+        self._schedule = schedule
+        count = -(-len(table) // BLOCK_ROWS)
+        self._bounds = torch.empty(count, 7, dtype=torch.float32, device=table.device)
+        self.update(table, None)
+
+    def active(
+        self,
+        table: GaussianTable,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        near_plane: float,
+        far_plane: float,
+        eps2d: float = 0.3,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the rows that may show (int32 [A], ascending) and their views (int32 [A], one bit each).
+
+        The result depends on each row's own state alone, neither on the order of the rows nor on how they are
+        divided among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
+        """
+        return cull_blocks(
+            self._bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
+            eps2d, self._pending(table),
+        )  # fmt: skip
+
+    def update(self, table: GaussianTable, ids: Tensor | None) -> None:
+        """Take note that the optimiser stepped the rows `ids` (int32 [U]; None: any row may have changed).
+
+        Catching rows up needs no update: the bounds hold all that a row can become by it.
+        """
+        update_block_bounds_(self._bounds, ids, table["means"], table["scales"], self._pending(table))
+
+    def _pending(self, table: GaussianTable) -> PendingSteps | None:
+        if self._schedule is None:
+            return None
+        return PendingSteps(
+            table["exp_avg.means"],
+            table["exp_avg_sq.means"],
+            table["exp_avg.scales"],
+            table["exp_avg_sq.scales"],
+            table["last_step"],
+            self._schedule,
+        )

@@ -1,0 +1,233 @@
+// SPDX-License-Identifier: Apache-2.0
+// The active set of a step: which rows of the table some view may see, found without reading the others.
+//
+// The table is kept in Morton order, so 256 consecutive rows are neighbours: a block. A block's bounds hold
+// every place its Gaussians can be and every size they can have while their optimiser debt is pending: a row
+// that is not touched moves along a straight line, by at most m / sqrt(v) times the tail of the schedule
+// (lazy_adam.h), so its mean lies between two corners and its log scales between two values.
+//
+// A box of means with axes up to sigma is dropped from a view iff it lies behind the near plane, beyond the
+// far plane, or beyond one image border by more than a splat can reach: half-width of alpha >= 1/255 is at
+// most sqrt(2 ln 255) sqrt(|J row|^2 sigma^2 + eps2d) pixels, with |J row| <= f / z max |row_x - u row_z|
+// over the clamped slopes u. Multiplied by z each is a linear inequality n . p + d + k sigma >= 0, which a
+// box fails only if its farthest corner does. Blocks are tested first, then the rows of the blocks that are
+// left, by the same inequalities on the row's own line. Blocks get twice the rounding slack, so the result is
+// the set of rows that pass their own test: it does not depend on how rows are grouped.
+//
+// Conservative: every row that projection would emit is in the set (tests/view/test_blocks.py).
+// O(N / 256 + rows of the blocks that are left) per view.
+#pragma once
+#include <cfloat>
+#include <cmath>
+#include <cstdint>
+
+#include "common/host_device.h"
+#include "common/stream.h"
+#include "math/morton.h"
+
+namespace blitzgs {
+
+constexpr int kBlockRows = 256;
+constexpr int kBlockBounds = 7;  // lowest corner, highest corner, largest sigma
+constexpr int kMaxViews = 32;
+constexpr int kPlanes = 6;
+constexpr int kScheduleColumns = 11;  // of the table in lazy_adam.h: 0 = tail of the means, 2 = of the scales
+
+BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
+
+// Where rows are and where pending steps may take them. Moments null: nothing is pending.
+struct BlockRows {
+  const float *means, *scales;  // [N, 3], scales logarithmic
+  const float *exp_avg_means, *exp_avg_sq_means, *exp_avg_scales, *exp_avg_sq_scales;
+  const std::int32_t* last_step;  // [N]
+  const double* table;            // [S + 1, 11]
+  std::int64_t n;
+};
+
+// A box of means and the largest standard deviation in it; empty while low > high.
+struct SweptBox {
+  float low[3], high[3], sigma;
+};
+
+BLITZGS_HD SweptBox empty_box() {
+  return {{FLT_MAX, FLT_MAX, FLT_MAX}, {-FLT_MAX, -FLT_MAX, -FLT_MAX}, 0.0f};
+}
+
+// The drift a row still has coming, enlarged by its rounding.
+BLITZGS_HD float pending_drift(float m, float v, float tail) {
+  return m == 0.0f || !(v > 0.0f) ? 0.0f : m / std::sqrt(v) * tail * 1.00001f;
+}
+
+// Everything a row can be. Rows that are not finite are never seen: they give an empty box.
+BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, std::int64_t row) {
+  SweptBox box = empty_box();
+  float mean_tail = 0.0f, scale_tail = 0.0f;
+  if (rows.exp_avg_means) {
+    const double* entry = rows.table + static_cast<std::int64_t>(rows.last_step[row]) * kScheduleColumns;
+    mean_tail = static_cast<float>(entry[0]);
+    scale_tail = static_cast<float>(entry[2]);
+  }
+  SweptBox swept;
+  float largest = -FLT_MAX, check = 0.0f;
+  for (int axis = 0; axis < 3; ++axis) {
+    const std::int64_t at = 3 * row + axis;
+    const float mean = rows.means[at], scale = rows.scales[at];
+    float drift = 0.0f, growth = 0.0f;
+    if (rows.exp_avg_means) {
+      drift = pending_drift(rows.exp_avg_means[at], rows.exp_avg_sq_means[at], mean_tail);
+      growth = pending_drift(rows.exp_avg_scales[at], rows.exp_avg_sq_scales[at], scale_tail);
+    }
+    const float end = mean - drift, shrunk = scale - growth;
+    swept.low[axis] = mean < end ? mean : end;
+    swept.high[axis] = mean < end ? end : mean;
+    largest = scale > largest ? scale : largest;
+    largest = shrunk > largest ? shrunk : largest;
+    check += (end - end) + (shrunk - shrunk);
+  }
+  if (!(check == 0.0f)) return box;
+  swept.sigma = std::exp(largest) * 1.00001f;
+  return swept;
+}
+
+BLITZGS_HD void extend(SweptBox& box, const SweptBox& other) {
+  for (int axis = 0; axis < 3; ++axis) {
+    box.low[axis] = other.low[axis] < box.low[axis] ? other.low[axis] : box.low[axis];
+    box.high[axis] = other.high[axis] > box.high[axis] ? other.high[axis] : box.high[axis];
+  }
+  box.sigma = other.sigma > box.sigma ? other.sigma : box.sigma;
+}
+
+BLITZGS_HD void store_box(const SweptBox& box, float* bounds) {
+  for (int axis = 0; axis < 3; ++axis) bounds[axis] = box.low[axis], bounds[3 + axis] = box.high[axis];
+  bounds[6] = box.sigma;
+}
+
+BLITZGS_HD SweptBox load_box(const float* bounds) {
+  return {{bounds[0], bounds[1], bounds[2]}, {bounds[3], bounds[4], bounds[5]}, bounds[6]};
+}
+
+// n . p + d + k sigma >= 0 for whatever a view can see.
+struct CullPlane {
+  float n[3], d, k;
+};
+
+struct CullView {
+  CullPlane planes[kPlanes];
+};
+
+struct CullCamera {
+  const float *viewmats, *Ks;  // [B, 4, 4], [B, 3, 3]
+  int width, height;
+  float near_plane, far_plane, eps2d;
+};
+
+BLITZGS_HD CullPlane make_plane(const double* row, double offset, double factor, const double* row_z,
+                                double offset_z, double factor_z, double k) {
+  CullPlane plane;
+  for (int axis = 0; axis < 3; ++axis) {
+    plane.n[axis] = static_cast<float>(factor * row[axis] + factor_z * row_z[axis]);
+  }
+  plane.d = static_cast<float>(factor * offset + factor_z * offset_z);
+  plane.k = static_cast<float>(k);
+  return plane;
+}
+
+// Largest |row - u row_z| over the clamped slopes u in [low, high]: convex in u, so at an end.
+BLITZGS_HD double largest_gradient(const double* row, const double* row_z, double low, double high) {
+  double squares[2] = {0, 0};
+  for (int axis = 0; axis < 3; ++axis) {
+    const double a = row[axis] - low * row_z[axis], b = row[axis] - high * row_z[axis];
+    squares[0] += a * a;
+    squares[1] += b * b;
+  }
+  return std::sqrt(squares[0] > squares[1] ? squares[0] : squares[1]);
+}
+
+BLITZGS_HD CullView make_cull_view(const CullCamera& camera, int view) {
+  const float* m = camera.viewmats + 16 * view;
+  const float* K = camera.Ks + 9 * view;
+  double rows[3][3], t[3];
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) rows[i][j] = m[4 * i + j];
+    t[i] = m[4 * i + 3];
+  }
+  const double kReach = 3.34;  // > sqrt(2 ln 255)
+  CullView cull;
+  const double zero[3] = {0, 0, 0};
+  cull.planes[0] = make_plane(rows[2], t[2], 1.0, zero, 1.0, -camera.near_plane, 0.0);
+  cull.planes[1] = make_plane(rows[2], t[2], -1.0, zero, 1.0, camera.far_plane, 0.0);
+  const double sizes[2] = {static_cast<double>(camera.width), static_cast<double>(camera.height)};
+  const double blur = kReach * std::sqrt(static_cast<double>(camera.eps2d)) + 1.0;  // and a pixel to spare
+  for (int axis = 0; axis < 2; ++axis) {
+    const double focal = K[4 * axis], centre = K[3 * axis + 2], size = sizes[axis];
+    const double low = (-centre - 0.15 * size) / focal, high = (size - centre + 0.15 * size) / focal;
+    const double k = kReach * std::fabs(focal) * largest_gradient(rows[axis], rows[2], low, high) * 1.00001;
+    cull.planes[2 + 2 * axis] = make_plane(rows[axis], t[axis], focal, rows[2], t[2], centre + blur, k);
+    cull.planes[3 + 2 * axis] =
+        make_plane(rows[axis], t[axis], -focal, rows[2], t[2], size - centre + blur, k);
+  }
+  return cull;
+}
+
+// Whether a view may see something of the box. slack: share of each term that rounding may have eaten.
+BLITZGS_HD bool may_see(const CullView& view, const SweptBox& box, float slack) {
+  float centre[3], half[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    centre[axis] = 0.5f * box.low[axis] + 0.5f * box.high[axis];
+    half[axis] = 0.5f * box.high[axis] - 0.5f * box.low[axis];
+    if (half[axis] < 0.0f) return false;  // empty
+    half[axis] += slack * (std::fabs(centre[axis]) + half[axis]);
+  }
+  for (int i = 0; i < kPlanes; ++i) {
+    const CullPlane& plane = view.planes[i];
+    float value = plane.d + slack * std::fabs(plane.d) + plane.k * box.sigma;
+    for (int axis = 0; axis < 3; ++axis) {
+      value += plane.n[axis] * centre[axis] + std::fabs(plane.n[axis]) * half[axis];
+    }
+    if (value < 0.0f) return false;
+  }
+  return true;
+}
+
+constexpr float kRowSlack = 4e-6f, kBlockSlack = 8e-6f;
+
+BLITZGS_HD std::uint32_t views_of(const CullView* views, int count, std::uint32_t candidates,
+                                  const SweptBox& box, float slack) {
+  std::uint32_t mask = 0;
+  for (int view = 0; view < count; ++view) {
+    if ((candidates >> view & 1u) && may_see(views[view], box, slack)) mask |= 1u << view;
+  }
+  return mask;
+}
+
+// What cull_count leaves for cull_emit: the blocks that are left, ascending, the views of their rows, and the
+// active rows before each.
+struct CullPlan {
+  std::int32_t* blocks;        // [count]
+  std::uint32_t* masks;        // [count, 256]
+  std::int64_t* rows_before;   // [count + 1]
+  std::int64_t* device_count;  // CUDA: where `count` lies
+  std::int64_t count, total;   // blocks left (CPU), active rows
+};
+
+namespace cpu {
+void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
+// ids null: every block. Otherwise the blocks of these rows.
+void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
+                         Workspace&, CudaStream);
+void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
+                CullPlan& plan, Workspace&, CudaStream);
+void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views, Workspace&,
+               CudaStream);
+}  // namespace cpu
+namespace cuda {
+void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
+void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
+                         Workspace&, CudaStream);
+void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
+                CullPlan& plan, Workspace&, CudaStream);
+void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views, Workspace&,
+               CudaStream);
+}  // namespace cuda
+
+}  // namespace blitzgs

@@ -1,0 +1,128 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "blocks/blocks.h"
+
+#include <tuple>
+
+#include "common/op.h"
+
+namespace blitzgs {
+namespace {
+
+// The row columns, checked and kept alive for the call.
+struct HeldRows {
+  std::vector<Tensor> held;
+  BlockRows rows{};
+};
+
+const float* hold_column(const char* op, const char* name, const Tensor& column, std::int64_t n,
+                         HeldRows& held) {
+  check_dtype(op, name, column, ScalarType::Float);
+  check_shape(op, name, column, {n, 3});
+  held.held.push_back(as_contiguous(column));
+  return data<float>(held.held.back());
+}
+
+// moments: empty, or exp_avg and exp_avg_sq of the means, then of the scales.
+HeldRows hold_rows(const char* op, const Tensor& means, const Tensor& scales,
+                   const std::vector<Tensor>& moments, const std::optional<Tensor>& last_step,
+                   const std::optional<Tensor>& table) {
+  HeldRows held;
+  const std::int64_t n = means.size(0);
+  STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "blitzgs::", op, ": at most 2^31 rows, got ", n);
+  held.rows.n = n;
+  held.rows.means = hold_column(op, "means", means, n, held);
+  held.rows.scales = hold_column(op, "scales", scales, n, held);
+  const bool pending = !moments.empty();
+  STD_TORCH_CHECK(pending ? moments.size() == 4 && last_step && table : !last_step && !table, "blitzgs::", op,
+                  ": pending steps need four moments, last_step and table together; got ", moments.size(),
+                  " moments");
+  if (!pending) return held;
+  held.rows.exp_avg_means = hold_column(op, "exp_avg of means", moments[0], n, held);
+  held.rows.exp_avg_sq_means = hold_column(op, "exp_avg_sq of means", moments[1], n, held);
+  held.rows.exp_avg_scales = hold_column(op, "exp_avg of scales", moments[2], n, held);
+  held.rows.exp_avg_sq_scales = hold_column(op, "exp_avg_sq of scales", moments[3], n, held);
+  check_dtype(op, "last_step", *last_step, ScalarType::Int);
+  check_shape(op, "last_step", *last_step, {n});
+  check_dtype(op, "table", *table, ScalarType::Double);
+  check_shape(op, "table", *table, {-1, kScheduleColumns});
+  held.held.push_back(as_contiguous(*last_step));
+  held.rows.last_step = data<std::int32_t>(held.held.back());
+  held.held.push_back(as_contiguous(*table));
+  held.rows.table = data<double>(held.held.back());
+  return held;
+}
+
+void check_bounds(const char* op, const Tensor& bounds, std::int64_t rows) {
+  check_dtype(op, "bounds", bounds, ScalarType::Float);
+  check_shape(op, "bounds", bounds, {blocks_of(rows), kBlockBounds});
+  STD_TORCH_CHECK(bounds.is_contiguous(), "blitzgs::", op, ": bounds must be contiguous");
+}
+
+Tensor morton_keys(const Tensor& points) {
+  check_dtype("morton_keys", "points", points, ScalarType::Float);
+  check_shape("morton_keys", "points", points, {-1, 3});
+  const Tensor rows = as_contiguous(points);
+  Tensor keys = make_empty(rows, {rows.size(0)}, ScalarType::Long);
+  DeviceScope scope(rows);
+  backend::morton_keys(data<float>(rows), rows.size(0), mutable_data<std::int64_t>(keys), scope.workspace,
+                       scope.stream);
+  return keys;
+}
+
+void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, const Tensor& means,
+                          const Tensor& scales, const std::vector<Tensor>& moments,
+                          const std::optional<Tensor>& last_step, const std::optional<Tensor>& table) {
+  const char* op = "update_block_bounds_";
+  const HeldRows held = hold_rows(op, means, scales, moments, last_step, table);
+  check_bounds(op, bounds, held.rows.n);
+  std::optional<Tensor> ids;
+  if (ids_in) {
+    check_dtype(op, "ids", *ids_in, ScalarType::Int);
+    check_shape(op, "ids", *ids_in, {-1});
+    ids = as_contiguous(*ids_in);
+  }
+  DeviceScope scope(bounds);
+  backend::update_block_bounds(held.rows, data_or_null<std::int32_t>(ids), ids ? ids->size(0) : 0,
+                               mutable_data<float>(bounds), scope.workspace, scope.stream);
+}
+
+std::tuple<Tensor, Tensor> cull_blocks(const Tensor& bounds, const Tensor& means, const Tensor& scales,
+                                       const std::vector<Tensor>& moments,
+                                       const std::optional<Tensor>& last_step,
+                                       const std::optional<Tensor>& table, const Tensor& viewmats_in,
+                                       const Tensor& Ks_in, std::int64_t width, std::int64_t height,
+                                       double near_plane, double far_plane, double eps2d) {
+  const char* op = "cull_blocks";
+  const HeldRows held = hold_rows(op, means, scales, moments, last_step, table);
+  check_bounds(op, bounds, held.rows.n);
+  check_dtype(op, "viewmats", viewmats_in, ScalarType::Float);
+  check_shape(op, "viewmats", viewmats_in, {-1, 4, 4});
+  const std::int64_t views = viewmats_in.size(0);
+  STD_TORCH_CHECK(views <= kMaxViews, "blitzgs::", op, ": at most ", kMaxViews, " views at once, got ",
+                  views);
+  check_dtype(op, "Ks", Ks_in, ScalarType::Float);
+  check_shape(op, "Ks", Ks_in, {views, 3, 3});
+  const Tensor viewmats = as_contiguous(viewmats_in), Ks = as_contiguous(Ks_in);
+  const CullCamera camera{data<float>(viewmats),          data<float>(Ks),
+                          static_cast<int>(width),        static_cast<int>(height),
+                          static_cast<float>(near_plane), static_cast<float>(far_plane),
+                          static_cast<float>(eps2d)};
+  DeviceScope scope(bounds);
+  CullPlan plan{};
+  backend::cull_count(held.rows, data<float>(bounds), camera, static_cast<int>(views), plan, scope.workspace,
+                      scope.stream);
+  Tensor active_ids = make_empty(bounds, {plan.total}, ScalarType::Int);
+  Tensor active_views = make_empty(bounds, {plan.total}, ScalarType::Int);
+  backend::cull_emit(plan, mutable_data<std::int32_t>(active_ids), mutable_data<std::int32_t>(active_views),
+                     scope.workspace, scope.stream);
+  return {active_ids, active_views};
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) {
+  m.impl("morton_keys", TORCH_BOX(&blitzgs::morton_keys));
+  m.impl("update_block_bounds_", TORCH_BOX(&blitzgs::update_block_bounds_));
+  m.impl("cull_blocks", TORCH_BOX(&blitzgs::cull_blocks));
+}

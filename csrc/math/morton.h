@@ -1,0 +1,74 @@
+// SPDX-License-Identifier: Apache-2.0
+// Morton (Z-order) codes: points that follow each other along the curve lie close together.
+#pragma once
+#include <algorithm>
+#include <cstdint>
+
+#include "common/host_device.h"
+
+namespace blitzgs {
+
+struct MortonFrame {
+  double low[3];
+  double cells_per_unit;  // 2^21 cells along the longest axis
+};
+
+BLITZGS_HD std::uint64_t spread_bits(std::uint64_t x) {
+  x &= 0x1fffff;
+  x = (x | x << 32) & 0x1f00000000ffffULL;
+  x = (x | x << 16) & 0x1f0000ff0000ffULL;
+  x = (x | x << 8) & 0x100f00f00f00f00fULL;
+  x = (x | x << 4) & 0x10c30c30c30c30c3ULL;
+  x = (x | x << 2) & 0x1249249249249249ULL;
+  return x;
+}
+
+template <class T>
+BLITZGS_HD bool is_finite_point(const T* p) {
+  const T sum = p[0] * T(0) + p[1] * T(0) + p[2] * T(0);
+  return sum == T(0);
+}
+
+// All ones for a point that is not finite: it sorts last.
+template <class T>
+BLITZGS_HD std::uint64_t morton_code(const T* p, const MortonFrame& frame) {
+  if (!is_finite_point(p)) return ~std::uint64_t{0};
+  std::uint64_t code = 0;
+  for (int axis = 0; axis < 3; ++axis) {
+    const double cell = (static_cast<double>(p[axis]) - frame.low[axis]) * frame.cells_per_unit;
+    const double clamped = cell > 0 ? (cell < 2097151.0 ? cell : 2097151.0) : 0.0;
+    code |= spread_bits(static_cast<std::uint64_t>(clamped)) << axis;
+  }
+  return code;
+}
+
+// The frame of a cloud from its corners.
+BLITZGS_HD MortonFrame make_morton_frame(const double* low, const double* high) {
+  MortonFrame frame{{low[0], low[1], low[2]}, 0.0};
+  double extent = 0;
+  for (int axis = 0; axis < 3; ++axis) {
+    extent = high[axis] - low[axis] > extent ? high[axis] - low[axis] : extent;
+  }
+  frame.cells_per_unit = extent > 0 ? 2097152.0 / extent : 0.0;
+  return frame;
+}
+
+// Host: the frame around all finite points.
+template <class T>
+MortonFrame morton_frame_of(const T* points, std::int64_t n) {
+  double low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
+  bool first = true;
+  for (std::int64_t i = 0; i < n; ++i) {
+    const T* p = points + 3 * i;
+    if (!is_finite_point(p)) continue;
+    for (int axis = 0; axis < 3; ++axis) {
+      const double x = p[axis];
+      low[axis] = first ? x : std::min(low[axis], x);
+      high[axis] = first ? x : std::max(high[axis], x);
+    }
+    first = false;
+  }
+  return make_morton_frame(low, high);
+}
+
+}  // namespace blitzgs

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import pytest
+import torch
+
+from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.ops.blocks import morton_keys
+from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
+from blitzgs.ops.project import project
+from blitzgs.view.blocks import BlockIndex, morton_order
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
+WIDTH, HEIGHT, NEAR, FAR = 160, 120, 0.2, 60.0
+
+
+def make_table(n=3000, device="cpu", seed=0):
+    """Gaussians of every size on a plain with towers; a few are not finite."""
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    means = (draw(n, 3) - 0.5) * torch.tensor([80.0, 80.0, 10.0])
+    scales = torch.log(10 ** (4 * draw(n, 3) - 3.5))
+    means[5, 1], scales[9, 0], means[11] = math.nan, math.inf, -math.inf
+    rows = {
+        "means": means,
+        "quats": draw(n, 4) - 0.5,
+        "scales": scales,
+        "opacities": 6 * draw(n) - 3,
+        "sh": draw(n, 1, 3),
+        "last_step": torch.zeros(n, dtype=torch.int32),
+        "id": torch.arange(n),
+        "parent": torch.full((n,), -1),
+        "birth": torch.zeros(n, dtype=torch.int32),
+        "level": torch.zeros(n, dtype=torch.uint8),
+    }
+    table = GaussianTable.create({name: column.to(device) for name, column in rows.items()})
+    table.permute(morton_order(table["means"]))
+    return table
+
+
+def make_views(count=4, device="cpu", seed=1):
+    """Cameras over the plain, looking down at all angles; principal points off centre, unequal focals."""
+    generator = torch.Generator().manual_seed(seed)
+    viewmats, Ks = torch.eye(4).repeat(count, 1, 1), torch.eye(3).repeat(count, 1, 1)
+    for b in range(count):
+        rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator))
+        rotation *= torch.linalg.det(rotation).sign()
+        centre = (torch.rand(3, generator=generator) - 0.5) * torch.tensor([60.0, 60.0, 20.0])
+        viewmats[b, :3, :3], viewmats[b, :3, 3] = rotation, -rotation @ centre
+        Ks[b, 0, 0], Ks[b, 1, 1] = 60.0 + 400 * b, 90.0 + 300 * b
+        Ks[b, 0, 2], Ks[b, 1, 2] = 0.5 * WIDTH - 60 * (b % 2), 0.5 * HEIGHT + 90 * (b % 3 == 1)
+    return viewmats.to(device), Ks.to(device)
+
+
+def seen(table, viewmats, Ks):
+    """(row, view) pairs that projection emits when it looks at every row."""
+    rows = project(
+        *(table[name] for name in PARAMETERS), viewmats, Ks, WIDTH, HEIGHT, near_plane=NEAR, far_plane=FAR
+    )  # fmt: skip
+    return set(zip(rows.gaussian_ids.tolist(), rows.camera_ids.tolist(), strict=True))
+
+
+def allowed(active):
+    """The (row, view) pairs of an active set."""
+    pairs = zip(active[0].tolist(), active[1].tolist(), strict=True)
+    return {(row, view) for row, mask in pairs for view in range(32) if mask >> view & 1}
+
+
+def active_of(index, table, viewmats, Ks):
+    return index.active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("seed", range(4))
+def test_no_visible_row_is_missed_and_most_others_are_dropped(device, seed):
+    table = make_table(device=device, seed=seed)
+    viewmats, Ks = make_views(device=device, seed=seed + 10)
+    active = active_of(BlockIndex(table), table, viewmats, Ks)
+    expected, got = seen(table, viewmats, Ks), allowed(active)
+    assert len(expected) > 20
+    assert expected <= got
+    assert len(got) < 0.5 * 4 * len(table)
+    ids = active[0].long()
+    assert (ids[1:] > ids[:-1]).all() and active[0].dtype == active[1].dtype == torch.int32
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_set_does_not_depend_on_the_order_of_the_rows(device):
+    table = make_table(device=device)
+    viewmats, Ks = make_views(device=device)
+    sorted_set = allowed(active_of(BlockIndex(table), table, viewmats, Ks))
+    persistent = {(int(table["id"][row]), view) for row, view in sorted_set}
+    table.permute(torch.randperm(len(table), generator=torch.Generator().manual_seed(3)).to(device))
+    shuffled = allowed(active_of(BlockIndex(table), table, viewmats, Ks))
+    assert {(int(table["id"][row]), view) for row, view in shuffled} == persistent
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_rows_of_culled_blocks_are_not_read(device):
+    """Rows of blocks behind the camera may become anything: without an update of the bounds nobody looks."""
+    table = make_table(12_000, device)
+    _, Ks = make_views(count=1, device=device)
+    viewmats = torch.eye(4, device=device)[None]
+    viewmats[0, :3, :3] = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # at the origin, along +x
+    index = BlockIndex(table)
+    before = active_of(index, table, viewmats, Ks)
+    behind = (index._bounds[:, 3] < 0).repeat_interleave(256)[: len(table)]
+    assert len(before[0]) > 0 and behind.sum() > 2000
+    table["means"][behind] = torch.tensor([5.0, 0.0, 0.0], device=device)
+    after = active_of(index, table, viewmats, Ks)
+    assert torch.equal(before[0], after[0]) and torch.equal(before[1], after[1])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_nothing_is_missed_while_thousands_of_steps_are_pending(device):
+    """Only what the set names is caught up and stepped; dense Adam decides what is really visible."""
+    steps, beta1, beta2, eps = 2000, 0.9, 0.999, 1e-15
+    table = make_table(500, device)
+    rates = torch.full((steps + 1, 6), 1e-3, device=device)
+    rates[:, 0] = 0.05  # means travel far
+    rates[:, 2] = 0.02
+    schedule = schedule_table(rates, beta1, beta2)
+    index = BlockIndex(table, schedule)
+    columns = [[table[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)]
+    generator = torch.Generator().manual_seed(5)
+    views = [make_views(2, device, seed=seed) for seed in range(20)]
+    crossed = 0
+    for step in range(1, steps + 1):
+        viewmats, Ks = views[step * 7 % len(views)]
+        ids, _ = active_of(index, table, viewmats, Ks)
+        if step % 100 == 0:
+            dense = {name: table[name].clone() for name in table}
+            lazy_adam_catch_up_(
+                *([dense[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)), None,
+                dense["last_step"], rates, step - 1, beta1, beta2, eps,
+            )  # fmt: skip
+            expected = {row for row, _ in seen(dense, viewmats, Ks)}
+            assert expected <= set(ids.tolist())
+            crossed += len({row for row, _ in seen(table, viewmats, Ks)} ^ expected)
+        ids = ids[torch.rand(len(ids), generator=generator).to(device) < 0.5]  # the rest turns out invisible
+        grads = [torch.randn((len(ids), *p.shape[1:]), generator=generator).to(device) for p in columns[0]]
+        lazy_adam_step_(*columns, grads, ids, table["last_step"], rates, step, beta1, beta2, eps)
+        index.update(table, ids)
+    assert crossed > 0  # pending drift really moved rows across the views' borders
+    assert int(table["last_step"].min()) < steps - 20
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_bounds_follow_the_rows_that_were_stepped(device):
+    table = make_table(device=device)
+    index = BlockIndex(table)
+    viewmats, Ks = make_views(count=1, device=device)
+    centre, axis = viewmats[0, :3, :3].T @ -viewmats[0, :3, 3], viewmats[0, 2, :3]
+    hidden = [
+        row for row in range(len(table)) if row not in active_of(index, table, viewmats, Ks)[0].tolist()
+    ]
+    moved = torch.tensor(hidden[::400], dtype=torch.int32, device=device)
+    table["means"][moved.long()] = centre + 2 * axis
+    table["scales"][moved.long()] = -2.0
+    index.update(table, moved)
+    assert set(moved.tolist()) <= set(active_of(index, table, viewmats, Ks)[0].tolist())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_morton_order_keeps_neighbours_together(device):
+    points = torch.rand(4096, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    points[3] = math.nan
+    order = morton_order(points)
+    assert torch.equal(order.sort().values, torch.arange(4096, device=device))
+    assert int(order[-1]) == 3
+    steps = points[order[:-1]].diff(dim=0).norm(dim=1).mean()
+    assert steps < 0.2 * points[:3].diff(dim=0).norm(dim=1).mean()
+    same = torch.zeros(5, 3, device=device)
+    assert morton_order(same).tolist() == list(range(5))
+    assert morton_keys(points)[3] == 2**63 - 1
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("n", [0, 1, 256, 257])
+def test_odd_sizes(device, n):
+    table = make_table(3000, device)
+    table.keep(torch.arange(len(table), device=device) < n)
+    viewmats, Ks = make_views(device=device)
+    assert seen(table, viewmats, Ks) <= allowed(active_of(BlockIndex(table), table, viewmats, Ks))
+
+
+def test_errors_name_the_value():
+    table = make_table()
+    index = BlockIndex(table)
+    viewmats, Ks = make_views(33)
+    with pytest.raises(RuntimeError, match="at most 32 views at once, got 33"):
+        active_of(index, table, viewmats, Ks)
+    table.keep(torch.arange(len(table)) < 100)
+    with pytest.raises(RuntimeError, match=r"bounds must have shape \[1, 7\], got \[12, 7\]"):
+        active_of(index, table, *make_views(1))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_opcheck(device):
+    table = make_table(600, device)
+    viewmats, Ks = make_views(2, device)
+    bounds = BlockIndex(table)._bounds
+    schedule = schedule_table(torch.ones(5, 6, device=device), 0.9, 0.999)
+    moments = [
+        table[name] for name in ("exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales")
+    ]
+    columns = (table["means"], table["scales"], moments, table["last_step"], schedule)
+    torch.library.opcheck(torch.ops.blitzgs.morton_keys, (table["means"],))
+    torch.library.opcheck(torch.ops.blitzgs.update_block_bounds_, (bounds, None, *columns))
+    torch.library.opcheck(
+        torch.ops.blitzgs.cull_blocks, (bounds, *columns, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR, 0.3)
+    )
