@@ -18,11 +18,12 @@ from blitzgs import __version__
 from blitzgs.distributed.group import MismatchError, Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.scene import ply
+from blitzgs.scene.pictures import save_image
 from blitzgs.scene.synth import command as synth
 from blitzgs.training import run
 from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.config_io import load_config, to_dict
-from blitzgs.training.evaluation import evaluate, load_lpips, render_view, to_uint8, write_image
+from blitzgs.training.evaluation import evaluate, load_lpips, render_view
 from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.views import ViewSet, render_options
@@ -210,7 +211,7 @@ def _render(args: argparse.Namespace) -> int:
             if args.raw:
                 np.save(path, render.cpu().numpy())
             else:
-                write_image(path, to_uint8(render))
+                save_image(path, render)
     return 0
 
 

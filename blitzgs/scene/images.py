@@ -4,9 +4,9 @@
 Two bounded caches, both dropping what was used longest ago: compressed images and decoded ones. The
 compressed form is the file itself where the file is the image. Where it is not (it must be undistorted or
 downscaled), that is done once and the result kept as QOI, which is lossless: for an image of 1.9 megapixels
-decoding it takes 16 ms at full size and 1 ms at a quarter, where decoding, undistorting and averaging the JPEG
-again takes 22 and 16 ms, and PNG 46 and 3 ms. Nothing is written to disk. What comes out depends neither on
-budgets nor on threads or order.
+decoding it takes 16 ms at full size and 1 ms at a quarter, where decoding, undistorting and averaging the
+JPEG again takes 22 and 16 ms, and PNG 46 and 3 ms. Nothing is written to disk. What comes out depends neither
+on budgets nor on threads or order.
 """
 
 from __future__ import annotations

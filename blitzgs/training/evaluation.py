@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import torch
 from torch import Tensor
 
@@ -18,6 +17,7 @@ from blitzgs.distributed.pixels import collect_images
 from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import ssim
 from blitzgs.pipeline import RenderOptions
+from blitzgs.scene.pictures import save_comparison
 from blitzgs.training.batches import Images
 from blitzgs.training.views import CameraLike, ViewSet
 
@@ -114,7 +114,7 @@ def evaluate(
         options: how to render.
         folder: gets `metrics.json` and the pictures; None: nothing is written.
         owners: divides the tiles among the ranks; all of them call this.
-        pictures: evenly spaced views of which to write photograph | render | error side by side.
+        pictures: evenly spaced views of which to write render | photograph | error side by side.
         lpips: from `load_lpips`.
 
     Returns:
@@ -147,7 +147,7 @@ def evaluate(
             metrics["lpips"] = float(lpips(pair[0], pair[1]))
         per_view[cameras[index].name] = metrics
         if folder is not None and index in chosen:
-            write_comparison(folder / (cameras[index].name.replace("/", "_") + ".jpg"), render, target)
+            save_comparison(folder / (cameras[index].name.replace("/", "_") + ".jpg"), render, target, mask)
     found = {name: view for part in ranks.all_gather_object(per_view) for name, view in part.items()}
     per_view = {cameras[index].name: found[cameras[index].name] for index in indices}
     result: dict[str, Any] = {}
@@ -159,25 +159,3 @@ def evaluate(
     if folder is not None and ranks.rank == 0:
         (folder / "metrics.json").write_text(json.dumps(result, indent=1))
     return result
-
-
-def to_uint8(render: Tensor) -> Tensor:
-    """Quantise an image in [0, 1] to uint8 on the CPU."""
-    return (render.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu()
-
-
-def write_comparison(path: Path, render: Tensor, target: Tensor) -> None:
-    """Write photograph, render and their absolute difference (times 4) side by side."""
-    error = to_uint8((render.clamp(0, 1) - target.float() / 255.0).abs() * 4.0)
-    write_image(path, torch.cat((target.cpu(), to_uint8(render), error), dim=1))
-
-
-def write_image(path: Path, image: Tensor) -> None:
-    """Write an RGB image, uint8 [H, W, 3].
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), image.numpy()[..., ::-1]):
-        raise OSError(f"cannot write the picture {path}")
