@@ -8,7 +8,7 @@ import math
 from torch import Tensor
 
 from blitzgs.model import GaussianTable
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.training.config import OptimiserConfig
 from blitzgs.training.schedule import Schedule
 
@@ -21,6 +21,8 @@ class LazyAdam:
 
     Attributes:
         lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
+        pending_table: what bounds the drift of rows that are behind (`lazy_adam.schedule_table`); None in the
+            sparse variant, where nothing drifts.
     """
 
     def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:
@@ -30,6 +32,7 @@ class LazyAdam:
         self._betas = (config.beta1**batch, config.beta2**batch)
         self._eps = config.eps / math.sqrt(batch)
         self._sparse = config.sparse
+        self.pending_table = None if config.sparse else schedule_table(self.lr_table, *self._betas)
 
     def catch_up(self, table: GaussianTable, ids: Tensor | None, step: int) -> None:
         """Bring rows `ids` (int32 [A]; None: all) to the state after `step`."""

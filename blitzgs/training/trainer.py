@@ -17,7 +17,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.ops.density_stats import density_stats_
-from blitzgs.pipeline import Frame
+from blitzgs.pipeline import Active, Frame, RenderOptions, Views
 from blitzgs.population.density import DensityRules, densify
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.redistribution import redistribute
@@ -35,6 +35,7 @@ from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Event, Schedule
 from blitzgs.training.views import Space, ViewSet, camera_centres, render_options
+from blitzgs.view.blocks import BlockIndex, morton_order
 from blitzgs.view.levels import measure_levels
 
 
@@ -110,6 +111,7 @@ class Trainer:
             config.data.prefetch,
             self._owners if ranks.world_size > 1 else None,
         )
+        self._blocks = BlockIndex(self.table, self._optimiser.pending_table)
         self._guard = LossGuard()
         self._length_unit = self.space.extent * config.loss.scale_reference
 
@@ -131,6 +133,7 @@ class Trainer:
         count = len(table)
         table.keep(torch.arange(count) % self.ranks.world_size == self.ranks.rank)
         self.table = GaussianTable({name: table[name].to(self.ranks.device) for name in table})
+        self._sort()
         self.progress = Progress(
             step=0, sh_degree=0, level_count=levels.count, peak_gaussians=count, seconds=0.0
         )
@@ -181,11 +184,13 @@ class Trainer:
         batch = self._loader.get(step - 1, self.schedule.steps)
         views = self._views.pick(batch.indices)
         degree = self.schedule.sh_degree(begin, config.model.sh_degree)
-        self._optimiser.catch_up(self.table, None, step - 1)
+        options = render_options(config, self.space, degree)
+        active = self._active(views, options)
+        self._optimiser.catch_up(self.table, active.ids, step - 1)
         share = None
         if batch.ranges is not None:
             share = Share(self.ranks, batch.ranges, config.ranks.half_exchange)
-        frame = pipeline.forward(self.table, views, render_options(config, self.space, degree), share=share)
+        frame = pipeline.forward(self.table, views, options, active, share)
         self._owners.record(batch.indices, frame.tile_work)
         terms = loss_terms(frame, batch, config.loss, self._length_unit)
         names = [self.capture.cameras[i].name for i in batch.indices]
@@ -197,12 +202,26 @@ class Trainer:
         if begin < config.schedule.densify_until * config.schedule.scale:
             self._gather(frame, gradients.means2d)
         self._optimiser.step(self.table, gradients.parameters, frame.rows.visible_ids, step)
+        self._blocks.update(self.table, frame.rows.visible_ids)
         self.progress = dataclasses.replace(
             self.progress, step=step, sh_degree=degree, seconds=time.monotonic() - self._clock
         )
         if report is not None:
             check_table(self.table, step)
             self._log_step(report, step, log)
+
+    def _active(self, views: Views, options: RenderOptions) -> Active:
+        """Find the Gaussians that the views may see."""
+        near, far = options.near_plane, options.far_plane
+        return Active(
+            *self._blocks.active(
+                self.table, views.viewmats, views.Ks, views.width, views.height, near, far, options.eps2d
+            )
+        )
+
+    def _sort(self) -> None:
+        """Put neighbours in space next to each other, so that blocks of rows are small."""
+        self.table.permute(morton_order(self.table["means"]))
 
     def _crosses(self, begin: int, every: int) -> bool:
         """Whether the step at `begin` completes a multiple of `every` images."""
@@ -278,6 +297,8 @@ class Trainer:
         counts = dict(zip(dataclasses.asdict(report), self.ranks.all_reduce(values).tolist(), strict=True))
         if redistribute(self.table, self.ranks, self.config.ranks.max_imbalance):
             counts["redistributed"] = 1
+        self._sort()
+        self._blocks = BlockIndex(self.table, self._optimiser.pending_table)
         total = self._population()
         self.progress = dataclasses.replace(
             self.progress, peak_gaussians=max(self.progress.peak_gaussians, total)

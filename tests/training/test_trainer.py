@@ -140,7 +140,7 @@ def test_views_that_see_nothing(tmp_path):
 
 def test_non_finite_values_stop_the_run_by_name(tmp_path):
     trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
-    trainer.table["scales"][7, 1] = float("nan")
+    trainer.table["scales"][trainer.table["id"] == 7, 1] = float("nan")
     with pytest.raises(
         NonFiniteError, match=r"step 20: column 'scales' is not finite in 1 Gaussians \(ids 7\)"
     ):
