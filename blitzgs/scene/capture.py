@@ -23,7 +23,7 @@ from blitzgs.scene.image_files import ImageHeader, read_header
 from blitzgs.scene.lens import Lens
 from blitzgs.scene.ply import read_points
 from blitzgs.scene.splits import split_views
-from blitzgs.scene.undistort import Policy, Rectification, rectify
+from blitzgs.scene.undistort import Rectification, rectify
 
 _HEADER_THREADS = 16
 
@@ -49,8 +49,8 @@ class Capture:
     test: list[int]
     extent: float
     """INRIA's: 1.1 x the largest distance of a training camera from their mean centre, in world units."""
-    background: tuple[float, float, float] | None
-    """Colour that images with an alpha channel are composited over; None when no image has one."""
+    has_alpha: bool
+    """Whether some image has an alpha channel; `ImageStore` composites it over its background."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def load_capture(
     downscale: float = 1,
     split: int | str | Path = "auto",
     masks: str | bool | None = None,
-    undistort: Policy = "crop",
+    undistort: str = "crop",
     exif: str = "auto",
     allow_missing: bool = False,
 ) -> Capture:
@@ -108,9 +108,13 @@ def load_capture(
     root = Path(path)
     if downscale < 1:
         raise ValueError(f"downscale must be at least 1, got {downscale}")
-    if exif not in ("auto", "apply", "ignore"):
-        raise ValueError(f"exif must be auto, apply or ignore, got {exif!r}")
-    views, points, is_blender = _read_views(root, images, downscale)
+    for option, value, allowed in (
+        ("exif", exif, ("auto", "apply", "ignore")),
+        ("undistort", undistort, ("crop", "mask")),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
+    views, points = _read_views(root, images, downscale)
     views = _existing(_with_finite_poses(views), root, images, allow_missing)
     views.sort(key=lambda view: view.name)
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # headers may lie on a slow network disk
@@ -124,9 +128,10 @@ def load_capture(
     ]
     train, test = _split(views, root, split)
     centers = camera_centers(np.stack([c.world_to_camera for c in cameras]))
-    points = _finite_points(points) if points else _random_points(cameras, offset)
+    points = _finite_points(points)
+    if len(points.positions) == 0:
+        points = _random_points(cameras, offset)
     points.positions = points.positions - offset
-    has_alpha = any(header.has_alpha for header in headers)
     return Capture(
         root=root,
         cameras=cameras,
@@ -138,11 +143,11 @@ def load_capture(
         train=train,
         test=test,
         extent=_extent(centers[train], points.positions),
-        background=((1.0, 1.0, 1.0) if is_blender else (0.0, 0.0, 0.0)) if has_alpha else None,
+        has_alpha=any(header.has_alpha for header in headers),
     )
 
 
-def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View], _Points | None, bool]:
+def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View], _Points]:
     if not root.is_dir():
         raise FileNotFoundError(f"{root} is not a folder: --data needs a capture (images and a COLMAP model)")
     folder = colmap.find_model(root)
@@ -150,11 +155,10 @@ def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View],
     if transforms.find_transforms(root) and (folder is None or "colmap" in folder.relative_to(root).parts):
         return _read_transforms(root)
     if folder is not None:
-        views, points = _read_colmap(root, folder, images, downscale)
-        return views, points, False
+        return _read_colmap(root, folder, images, downscale)
     if "train" in parts:
         found = [_read_colmap(root / p, _model_in(root / p), images, downscale, part=p) for p in parts]
-        return [view for views, _ in found for view in views], found[0][1], False
+        return [view for views, _ in found for view in views], found[0][1]
     raise FileNotFoundError(
         f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
         ".bin or .txt), or transforms.json"
@@ -167,11 +171,12 @@ def _model_in(root: Path) -> Path:
     return folder
 
 
-def _read_transforms(root: Path) -> tuple[list[_View], _Points | None, bool]:
+def _read_transforms(root: Path) -> tuple[list[_View], _Points]:
     content = transforms.read_transforms(root)
     views = [_View(f.name, f.path, f.mask_path, f.lens, f.world_to_camera, f.is_test) for f in content.frames]
-    points = _Points(*read_points(content.points_path)) if content.points_path else None
-    return views, points, content.is_blender
+    if content.points_path is None:
+        return views, _Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+    return views, _Points(*read_points(content.points_path))
 
 
 def _read_colmap(
@@ -245,7 +250,7 @@ def _camera(
     header: ImageHeader,
     offset: Float64,
     downscale: float,
-    policy: Policy,
+    policy: str,
     exif: str,
     mask_folder: Path | None,
     plans: dict[Lens, Rectification],

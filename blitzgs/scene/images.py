@@ -85,6 +85,7 @@ class ImageStore:
         budget_bytes: int = DEFAULT_BUDGET,
         threads: int = 4,
         decoded_bytes: int | None = None,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         """Read nothing yet.
 
@@ -93,8 +94,10 @@ class ImageStore:
             budget_bytes: of compressed images kept in memory.
             threads: that decode ahead.
             decoded_bytes: of decoded images kept; a quarter of `budget_bytes` when left out.
+            background: RGB in [0, 1] that images with an alpha channel are composited over.
         """
         self.capture = capture
+        self._background = background if capture.has_alpha else None
         self._packed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
         self._decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(
             budget_bytes // 4 if decoded_bytes is None else decoded_bytes
@@ -228,7 +231,7 @@ class ImageStore:
 
     def _decode(self, camera: Camera, data: bytes) -> UInt8:
         lens, path = camera.rectification.lens, camera.image_path
-        pixels = apply_orientation(decode_rgb(data, str(path), self.capture.background), camera.orientation)
+        pixels = apply_orientation(decode_rgb(data, str(path), self._background), camera.orientation)
         if pixels.shape[:2] != (lens.height, lens.width):
             raise ValueError(
                 f"{path} is {pixels.shape[1]} x {pixels.shape[0]} now but was {lens.width} x {lens.height} "

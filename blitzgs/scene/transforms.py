@@ -47,7 +47,6 @@ class Transforms:
 
     frames: list[Frame]
     points_path: Path | None
-    is_blender: bool
 
 
 def find_transforms(root: Path) -> list[Path]:
@@ -66,8 +65,7 @@ def read_transforms(root: Path) -> Transforms:
     """
     frames: list[Frame] = []
     points_path = None
-    files = find_transforms(root)
-    for path in files:
+    for path in find_transforms(root):
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             entries = content["frames"]
@@ -83,7 +81,7 @@ def read_transforms(root: Path) -> Transforms:
             except (KeyError, TypeError, ValueError) as error:
                 reason = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
                 raise ValueError(f"{path}: frame {index}: {reason}") from error
-    return Transforms(frames, points_path, is_blender=files[0].name != "transforms.json")
+    return Transforms(frames, points_path)
 
 
 def _read_frame(root: Path, file: Path, content: Mapping[str, Any], entry: Mapping[str, Any]) -> Frame:

@@ -10,7 +10,6 @@ rest.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,7 +17,6 @@ import numpy.typing as npt
 
 from blitzgs.scene.lens import Array, Lens
 
-Policy = Literal["crop", "mask"]
 MAX_TANGENT = float(np.tan(np.radians(70.0)))
 _GRID = 384
 _MIN_SIDE = 16
@@ -69,8 +67,8 @@ class Rectification:
         return columns, rows, seen
 
 
-def rectify(lens: Lens, policy: Policy = "crop") -> Rectification:
-    """Choose the pinhole image for a lens.
+def rectify(lens: Lens, policy: str = "crop") -> Rectification:
+    """Choose the pinhole image for a lens; `policy` is "crop" or "mask".
 
     Raises:
         ValueError: hardly anything of the image can be kept (damaged distortion parameters).

@@ -18,9 +18,12 @@ class DataConfig:
         path: folder of the capture.
         images: image folder inside the capture.
         downscale: integer factor by which images are reduced (1: as they are).
-        masks: mask folder inside the capture, or null.
+        masks: mask folder inside the capture; null uses `masks/` where there is one.
         split: which views are held out: a number n (every n-th), "val" (Mega-NeRF's `val/` layout), a text
             file with one image name a line, or "auto": `val/` where there is one, else every 8th.
+        undistort: where a distorted image does not fill its pinhole image: "crop" or "mask".
+        exif: "auto" turns an image by its EXIF tag where only that fits its camera; or "apply", "ignore".
+        allow_missing: drop views whose image is missing instead of failing.
         cache_bytes: budget for the compressed images held in memory.
         threads: decoder threads.
         prefetch: batches decoded and uploaded ahead.
@@ -31,6 +34,9 @@ class DataConfig:
     downscale: int = 1
     masks: str | None = None
     split: str = "auto"
+    undistort: str = "crop"
+    exif: str = "auto"
+    allow_missing: bool = False
     cache_bytes: int = 8_000_000_000
     threads: int = 4
     prefetch: int = 3

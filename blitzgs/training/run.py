@@ -85,9 +85,17 @@ def open_capture(config: Config, ranks: Ranks) -> tuple[Capture, ImageStore]:
     if not data.path:
         raise ConfigError("data.path: no capture given; use --data DIR")
     capture = load_capture(
-        data.path, images=data.images, downscale=data.downscale, split=data.split, masks=data.masks
+        data.path,
+        images=data.images,
+        downscale=data.downscale,
+        split=data.split,
+        masks=data.masks,
+        undistort=data.undistort,
+        exif=data.exif,
+        allow_missing=data.allow_missing,
     )
-    return capture, ImageStore(capture, data.cache_bytes // ranks.local_world_size, data.threads)
+    budget = data.cache_bytes // ranks.local_world_size
+    return capture, ImageStore(capture, budget, data.threads, background=config.model.background)
 
 
 def check_alike(config: Config, capture: Capture, ranks: Ranks) -> None:

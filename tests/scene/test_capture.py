@@ -219,9 +219,23 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
     write_capture(tmp_path, NAMES[:2])
     with pytest.raises(ValueError, match="downscale must be at least 1, got 0.5"):
         load_capture(tmp_path, downscale=0.5)
+    with pytest.raises(ValueError, match="undistort must be one of crop, mask, got 'none'"):
+        load_capture(tmp_path, undistort="none")
     edit_model(tmp_path, lambda m: m.images.camera_ids.fill(7))
     with pytest.raises(ValueError, match=f"the cameras of 2 images .first: {NAMES[0]}. are not there"):
         load_capture(tmp_path)
+
+
+def test_a_model_without_points_starts_from_random_ones_where_the_cameras_look(tmp_path):
+    write_capture(tmp_path, NAMES)
+    folder = tmp_path / "sparse" / "0"
+    model = colmap.read_model(folder)
+    colmap.write_model(folder, colmap.ColmapModel(model.cameras, model.images))
+    with pytest.warns(UserWarning, match="no points: starting from 100000 random ones"):
+        capture = load_capture(tmp_path)
+    points = capture.points + capture.offset  # the cameras look at the origin from a distance of 4
+    assert np.abs(points.mean(axis=0)).max() < 0.05 and 1.2 < np.abs(points).max() < 1.6
+    np.testing.assert_array_equal(points[:9], (load_capture(tmp_path).points + capture.offset)[:9])
 
 
 def test_one_camera_gets_an_extent_from_the_points(tmp_path):
@@ -303,7 +317,7 @@ def test_blender_transforms(tmp_path):
     (tmp_path / "transforms_test.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames[2:]}))
     with pytest.warns(UserWarning, match="no points"):
         capture = load_capture(tmp_path)
-    assert (capture.train, capture.test, capture.background) == ([0, 1], [2], (1.0, 1.0, 1.0))
+    assert (capture.train, capture.test, capture.has_alpha) == ([0, 1], [2], True)
     camera = capture.cameras[0]
     assert camera.K[0, 0] == pytest.approx(15 / np.tan(0.4)) and camera.K[0, 2] == 15
     # The camera at z = 4 looks down its own -z, so the origin is 4 in front of it, and world up is image up.
@@ -311,8 +325,8 @@ def test_blender_transforms(tmp_path):
     np.testing.assert_allclose(origin[:3], [0, 0, 4], atol=1e-12)
     above = camera.world_to_camera @ np.append(np.array([0, 1, 0]) - capture.offset, 1)
     assert above[1] < 0
-    image = ImageStore(capture).get(0)
-    assert image[0, 0].tolist() == [255, 255, 255] and image[6, 6].tolist() == [30, 20, 10]
+    image = ImageStore(capture, background=(1.0, 0.5, 0.0)).get(0)
+    assert image[0, 0].tolist() == [255, 128, 0] and image[6, 6].tolist() == [30, 20, 10]
     assert len(capture.points) == 100_000
 
 
@@ -339,7 +353,7 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(content))
     capture = load_capture(tmp_path, masks=False)
-    assert capture.test == [2] and capture.background is None
+    assert capture.test == [2] and not capture.has_alpha
     np.testing.assert_allclose(capture.points + capture.offset, [[1, 2, 3], [4, 5, 6]])
     assert capture.colors.tolist() == [[9, 8, 7], [1, 2, 3]] and capture.track_lengths is None
     lens = capture.cameras[0].rectification.lens
