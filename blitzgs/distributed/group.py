@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from blitzgs.distributed.watchdog import Watchdog
+from blitzgs.distributed.watchdog import Watchdog, open_store
 
 T = TypeVar("T")
 ReduceOp = Literal["sum", "min", "max"]
@@ -89,6 +89,9 @@ class Ranks:
         on_gpu = self.device.type == "cuda"
         dist.init_process_group(
             backend="nccl" if on_gpu else "gloo",
+            store=open_store("group", self.rank == 0, STARTUP_TIMEOUT_SECONDS),
+            rank=self.rank,
+            world_size=self.world_size,
             timeout=timedelta(seconds=STARTUP_TIMEOUT_SECONDS),
             device_id=self.device if on_gpu else None,
         )

@@ -21,6 +21,29 @@ from torch._C._distributed_c10d import PrefixStore, TCPStore
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
 
 
+def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
+    """Connect to the job's key-value store, where MASTER_ADDR and MASTER_PORT say.
+
+    Keys carry `name` and the number of the restart: torchrun keeps the store over restarts, and a new rank
+    must not find the addresses of the one it replaces.
+
+    Args:
+        name: of this use of the store.
+        host: whether this process serves the store when torchrun's agent does not.
+        timeout_seconds: for connecting and waiting.
+    """
+    held_by_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    store = TCPStore(
+        os.environ["MASTER_ADDR"],
+        int(os.environ["MASTER_PORT"]),
+        is_master=host and not held_by_agent,
+        wait_for_workers=False,
+        multi_tenant=True,
+        timeout=timedelta(seconds=timeout_seconds),
+    )
+    return PrefixStore(f"blitzgs/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}/{name}", store)
+
+
 class Watchdog:
     """The progress of one rank, published every few seconds and checked against the other ranks'.
 
@@ -36,15 +59,7 @@ class Watchdog:
         self.timeout_seconds = timeout_seconds
         self.period = self.period_for(timeout_seconds)
         # A connection of its own: the process group's may block inside a collective.
-        client = TCPStore(
-            os.environ["MASTER_ADDR"],
-            int(os.environ["MASTER_PORT"]),
-            is_master=False,
-            wait_for_workers=False,
-            timeout=timedelta(seconds=30),
-        )
-        attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
-        self.store = PrefixStore(f"blitzgs/{attempt}", client)
+        self.store = open_store("watchdog", host=False, timeout_seconds=30)
         self.lock = threading.Lock()
         self.calls = 0
         self.name = "start"

@@ -13,10 +13,10 @@ from torch.distributed import TCPStore
 from blitzgs.distributed.group import Ranks
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.distributed.group"])
+CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli"])
 
 
-def _child(function, rank, world_size, port, timeout_seconds, arguments, pipe):
+def _child(function, rank, world_size, port, timeout_seconds, join, arguments, pipe):
     import torch
 
     torch.set_num_threads(1)
@@ -30,8 +30,11 @@ def _child(function, rank, world_size, port, timeout_seconds, arguments, pipe):
         TORCHELASTIC_USE_AGENT_STORE="True",
     )
     try:
-        with Ranks.from_environment("cpu", timeout_seconds) as ranks:
-            result = function(ranks, *pickle.loads(arguments))
+        if join:
+            with Ranks.from_environment("cpu", timeout_seconds) as ranks:
+                result = function(ranks, *pickle.loads(arguments))
+        else:
+            result = function(rank, *pickle.loads(arguments))
         pipe.send_bytes(pickle.dumps(("ok", result)))
     except BaseException:  # noqa: BLE001  (reported to the parent)
         pipe.send_bytes(pickle.dumps(("error", traceback.format_exc())))
@@ -50,8 +53,11 @@ class RankError(AssertionError):
         self.messages = messages
 
 
-def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.0):
-    """Return [function(ranks, *arguments) of each rank]; raise RankError if any rank fails."""
+def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.0, join=True):
+    """Return [function(ranks, *arguments) of each rank]; raise RankError if any rank fails.
+
+    With `join` false the function gets its rank's number and joins the job itself, as a command does.
+    """
     # Like torchrun's agent, the parent holds the store, so that it outlives any rank.
     store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
     # Plain pickles: multiprocessing's own would share the tensors' memory with the ranks.
@@ -60,7 +66,8 @@ def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.
     for rank in range(world_size):
         receiver, sender = CONTEXT.Pipe(duplex=False)
         process = CONTEXT.Process(
-            target=_child, args=(function, rank, world_size, store.port, timeout_seconds, payload, sender)
+            target=_child,
+            args=(function, rank, world_size, store.port, timeout_seconds, join, payload, sender),
         )
         process.start()
         sender.close()
@@ -91,6 +98,6 @@ def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.
     for process in processes:
         process.join(10)
     if failures:
-        key = "blitzgs/0/failure"
+        key = "blitzgs/0/watchdog/failure"
         raise RankError(failures, store.get(key).decode() if store.check([key]) else "")
     return results

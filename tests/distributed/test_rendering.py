@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The image does not depend on the number of ranks, bit for bit; losses and gradients only by rounding."""
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.pixels import collect_images
+from blitzgs.model import GaussianTable
+from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.training.batches import Batch
+from blitzgs.training.config import LossConfig
+from blitzgs.training.loss import batch_psnr, loss_terms, scale_term
+from tests.distributed.rank_harness import run_ranks
+from tests.training.tiny import look_at_origin, random_gaussians
+
+WIDTH, HEIGHT = 150, 90
+OPTIONS = RenderOptions(sh_degree=0, near_plane=0.05, far_plane=100.0, background=(0.1, 0.2, 0.3))
+# Owner of row i: shards of every shape, among them an empty one and 3 : 1.
+LAYOUTS = {1: [0], 2: [0, 0, 0, 1], 3: [0, 2, 2], 4: [0, 3, 1, 0, 0, 3]}
+
+
+def cameras(n_views, blind=False):
+    """Views around the scene; with `blind` the first looks away from it."""
+    poses = [
+        look_at_origin(np.array([3 * np.cos(a), 3 * np.sin(a), 1.5])) for a in np.linspace(0, 5, n_views)
+    ]
+    if blind:
+        poses[0] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ poses[0]
+    K = torch.tensor([[110.0, 0, 73.2], [0, 112.0, 46.1], [0, 0, 1]])
+    return Views(torch.from_numpy(np.stack(poses)).float(), K.repeat(n_views, 1, 1), WIDTH, HEIGHT)
+
+
+def shard(ranks):
+    """This rank's part of the scene, with equal depths and ids that are not in row order."""
+    table = random_gaussians(700)
+    table["means"][100:200] = table["means"][0:100]  # ties of depth
+    table["id"].copy_((table["id"] * 7919 + 5) % 100003)
+    layout = torch.tensor(LAYOUTS[ranks.world_size])
+    table.keep(layout[torch.arange(len(table)) % len(layout)] == ranks.rank)
+    return table
+
+
+def photographs(n_views):
+    g = torch.Generator().manual_seed(n_views)
+    targets = torch.randint(0, 256, (n_views, HEIGHT, WIDTH, 3), generator=g, dtype=torch.uint8)
+    masks = (torch.rand(n_views, HEIGHT, WIDTH, generator=g) > 0.2).byte()
+    return targets, masks, (3 * masks.sum((1, 2))).float()
+
+
+def _render(ranks):
+    """Images, losses and gradients of several batches, visited twice so that costs are measured."""
+    torch.set_num_threads(1)
+    table, owners, out = shard(ranks), TileOwners(ranks), []
+    for n_views, blind in [(1, False), (4, True), (1, True), (4, True), (1, False)]:
+        views = cameras(n_views, blind)
+        keys = [(n_views, blind, view) for view in range(n_views)]
+        share, ranges = None, None
+        if ranks.world_size > 1:
+            ranges = owners.divide(keys, WIDTH, HEIGHT)
+            share = Share(ranks, ranges)
+        frame = pipeline.forward(table, views, OPTIONS, share=share)
+        owners.record(keys, frame.tile_work)
+        image = frame.renders.clone()
+        if ranges is not None:
+            collect_images(image, ranges, ranks, 0)
+        targets, masks, samples = photographs(n_views)
+        if ranges is not None:
+            for view in range(n_views):  # pixels that this rank was never given
+                y0, y1 = ranges.pixel_rows(ranks.rank, view)
+                targets[view, :y0], targets[view, y1:] = 77, 77
+        batch = Batch(list(range(n_views)), targets, masks, samples, ranges)
+        terms = loss_terms(frame, batch, LossConfig(), 3.0)
+        gradients = pipeline.backward(table, frame, terms.v_renders, terms.scale_reg)
+        dense = [torch.zeros_like(column) for column in table.parameters]
+        for column, gradient in zip(dense, gradients.parameters, strict=True):
+            column[frame.rows.visible_ids.long()] = gradient
+        tiles = (0, image.numel()) if share is None else share.tiles
+        out.append(
+            {
+                "image": image,
+                "loss": terms.photometric,
+                "scale": scale_term(frame, table, 3.0),
+                "psnr": batch_psnr(frame, batch),
+                "gradients": dense,
+                "work": int(frame.tile_work.sum()),
+                "tiles": tiles,
+            }
+        )
+    return table["id"], out
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return _render(Ranks())
+
+
+def relative(a, b):
+    return ((a - b).norm() / b.norm().clamp(min=1e-30)).item()
+
+
+@pytest.mark.parametrize("world_size", [2, 3, 4])
+def test_images_are_the_same_bits_and_losses_agree(alone, world_size):
+    ids, expected = alone
+    assert expected[0]["image"].std() > 0.1  # there is something to see
+    assert torch.equal(expected[1]["image"][0], torch.tensor([0.1, 0.2, 0.3]).expand(HEIGHT, WIDTH, 3))
+    answers = run_ranks(_render, world_size)
+    rank_ids = torch.cat([a[0] for a in answers])
+    order, reference = rank_ids.argsort(), ids.argsort()
+    for step, want in enumerate(expected):
+        results = [a[1][step] for a in answers]
+        assert torch.equal(results[0]["image"], want["image"])
+        for result in results:
+            assert relative(result["loss"], want["loss"]) <= 1e-6
+            assert relative(result["scale"], want["scale"]) <= 1e-6
+            assert abs(result["psnr"] - want["psnr"]) <= 1e-5
+        for column, wanted in enumerate(want["gradients"]):
+            got = torch.cat([result["gradients"][column] for result in results])
+            assert relative(got[order], wanted[reference]) <= 2e-6
+        assert sum(result["work"] for result in results) == want["work"]
+    # The second visit is divided by what the first one measured; the scene has few, large tiles.
+    first, second = ([a[1][step]["tiles"] for a in answers] for step in (1, 3))
+    assert first != second
+    work = [a[1][3]["work"] for a in answers]
+    assert max(work) <= 1.15 * sum(work) / len(work)
+
+
+def _gather_all(ranks):
+    from blitzgs.population.redistribution import redistribute
+
+    table = shard(ranks)
+    table["extra"] = torch.stack((table["id"] % 251, table["id"] % 7), 1).to(torch.uint8)
+    table["flag"] = table["id"] % 2 == 0
+    before = {name: table[name].clone() for name in table}
+    moved = redistribute(table, ranks)
+    again = redistribute(table, ranks)
+    forced = redistribute(table, ranks, max_imbalance=0)
+    return before, dict(table.columns), (moved, again, forced)
+
+
+@pytest.mark.parametrize("world_size", [2, 4])
+def test_redistribution_conserves_every_row(world_size):
+    answers = run_ranks(_gather_all, world_size)
+    ids_before = torch.cat([before["id"] for before, _, _ in answers])
+    ids_after = torch.cat([after["id"] for _, after, _ in answers])
+    for name in answers[0][0]:
+        before = torch.cat([before[name] for before, _, _ in answers])[ids_before.argsort()]
+        after = torch.cat([after[name] for _, after, _ in answers])[ids_after.argsort()]
+        assert torch.equal(before, after), name
+    sizes = [len(after["id"]) for _, after, _ in answers]
+    assert max(sizes) - min(sizes) <= 1
+    assert all(flags == (True, False, True) for _, _, flags in answers)
+
+
+def test_one_rank_has_nothing_to_redistribute():
+    from blitzgs.population.redistribution import redistribute
+
+    table = random_gaussians(5)
+    assert not redistribute(table, Ranks(), 0)
+    assert isinstance(table, GaussianTable)

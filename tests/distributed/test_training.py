@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training on several ranks from one checkpoint: the same ids, and the same numbers up to rounding."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training import run
+from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import RankError, run_ranks
+from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+
+ROOT = Path(__file__).parents[2]
+# 10 + 20 steps of 2 images; density events (after 28, 36, 44 and 52 images) fall into the 20 steps.
+SETTINGS = (
+    "schedule.iterations=60",
+    "schedule.batch_size=2",
+    "schedule.densify_from=28",
+    "schedule.densify_until=60",
+    "schedule.densify_every=8",
+    "schedule.size_prune_after=0",
+    "population.grad_threshold=4e-3",
+    "population.clone_scale=0.02",
+    "population.max_gaussians=490",
+    "schedule.checkpoint_every=19",
+    "log.every=2",
+    "log.keep_checkpoints=9",
+    "ranks.max_imbalance=1.02",
+)
+
+
+def _train(ranks, folder, *overrides):
+    torch.set_num_threads(1)
+    capture, images = tiny_scene()
+    trainer = Trainer(tiny_config(*SETTINGS, *overrides), capture, images, folder, ranks, resume=True)
+    summary = trainer.train()
+    return summary, trainer.table["id"]
+
+
+def records(folder):
+    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    return [r for r in lines if "loss" in r], [r for r in lines if r.get("event") == "densify"]
+
+
+def sorted_table(folder):
+    table = run.restore(folder, Ranks())[0]
+    order = table["id"].argsort()
+    return {name: table[name][order] for name in table}
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory):
+    """A run of 10 steps on one rank: its first checkpoint is where all others begin."""
+    folder = tmp_path_factory.mktemp("start")
+    _train(Ranks(), folder)
+    base = tmp_path_factory.mktemp("base")
+    (base / "checkpoints").mkdir()
+    shutil.copytree(folder / "checkpoints" / "checkpoint_000000", base / "checkpoints" / "checkpoint_000000")
+    return folder, base
+
+
+@pytest.mark.parametrize("world_size", [2, 4])
+def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size):
+    whole, base = start
+    folder = tmp_path / "run"
+    shutil.copytree(base, folder)
+    answers = run_ranks(_train, world_size, folder)
+    losses, events = records(folder)
+    expected_losses, expected_events = records(whole)
+    expected_losses = [r for r in expected_losses if r["t"] > 20]
+    assert len(losses) == 20
+    for got, want in zip(losses, expected_losses, strict=True):
+        assert got["t"] == want["t"] and got["gaussians"] == want["gaussians"]
+        assert got["visible"] == want["visible"]
+        assert abs(got["loss"] - want["loss"]) <= 1e-5 * want["loss"]
+        assert abs(got["psnr"] - want["psnr"]) <= 1e-4
+    # The same Gaussians were cloned, split and pruned, at the same events.
+    assert len(events) == 4 and sum(e["cloned"] + e["split"] for e in events) > 50
+    for got, want in zip(events, expected_events, strict=True):
+        assert all(got[name] == want[name] for name in ("t", "cloned", "split", "pruned", "gaussians"))
+    assert events[-1]["held_back"] > 0  # the cap chose among all ranks' candidates
+    assert any(e.get("redistributed") for e in events)
+    got, want = sorted_table(folder), sorted_table(whole)
+    for name in ("id", "parent", "birth", "level", "last_step"):
+        assert torch.equal(got[name], want[name]), name
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert (got[name] - want[name]).norm() <= 1e-5 * want[name].norm(), name
+    for summary, _ in answers:
+        assert summary["gaussians"] == len(want["id"])
+    sizes = [len(ids) for _, ids in answers]
+    assert max(sizes) <= 1.02 * min(sizes) + 1
+    # The evaluation is that of one rank.
+    metrics = [
+        json.loads((f / "evaluation" / "000060" / "metrics.json").read_text()) for f in (folder, whole)
+    ]
+    assert abs(metrics[0]["psnr"] - metrics[1]["psnr"]) < 1e-3
+
+
+def _train_with_rank_config(ranks, folder):
+    _train(ranks, folder, f"loss.ssim=0.{ranks.rank + 1}")
+
+
+def test_a_mismatch_is_named(tmp_path):
+    with pytest.raises(RankError) as failure:
+        run_ranks(_train_with_rank_config, 2, tmp_path)
+    for message in failure.value.messages.values():
+        assert "the ranks disagree on configuration field loss.ssim: rank 0 (" in message
+        assert "): 0.1; rank 1 (" in message
+
+
+def _train_and_stop(rank, arguments, signalled_at):
+    """`blitzgs train`; rank 1 alone is asked to stop after a step."""
+    torch.set_num_threads(1)
+    from blitzgs.cli import main
+
+    step = Trainer._step
+
+    def stopping(self, number, log):
+        step(self, number, log)
+        if rank == 1 and number == signalled_at:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    Trainer._step = stopping
+    return main(arguments)
+
+
+def _command(rank, arguments):
+    torch.set_num_threads(1)
+    from blitzgs.cli import main
+
+    return main(arguments)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("capture")
+    write_tiny_capture(folder)
+    return folder
+
+
+def train_flags(capture, folder, command="train"):
+    settings = [*OVERRIDES, *SETTINGS, "log.pictures=0"]
+    return [command, "--data", str(capture), "--out", str(folder), "--resume"] + [f"--{s}" for s in settings]
+
+
+@pytest.fixture(scope="module")
+def trained(capture, tmp_path_factory):
+    """The same run uninterrupted, on two ranks, through the command line."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    assert run_ranks(_command, 2, train_flags(capture, folder), join=False) == [0, 0]
+    return folder
+
+
+def test_renders_are_the_same_bytes(trained, tmp_path):
+    for world_size in (1, 2, 3, 4):
+        out = tmp_path / str(world_size)
+        arguments = ["render", str(trained), "--split", "all", "--raw", "--out", str(out)]
+        assert run_ranks(_command, world_size, arguments, join=False) == [0] * world_size
+    names = sorted(path.name for path in (tmp_path / "1").iterdir())
+    assert len(names) == 8
+    for name in names:
+        expected = (tmp_path / "1" / name).read_bytes()
+        assert np.load(tmp_path / "1" / name).std() > 0.1
+        for world_size in (2, 3, 4):
+            assert (tmp_path / str(world_size) / name).read_bytes() == expected
+
+
+def assert_same_result(folder, expected):
+    got, want = sorted_table(folder), sorted_table(expected)
+    assert torch.equal(got["id"], want["id"])
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert (got[name] - want[name]).norm() <= 1e-5 * want[name].norm(), name
+
+
+def test_sigterm_on_one_rank_saves_and_a_resume_finishes(capture, trained, tmp_path):
+    flags = train_flags(capture, tmp_path)
+    assert run_ranks(_train_and_stop, 2, flags, 12, join=False) == [0, 0]
+    _, progress, _, _ = run.restore(tmp_path, Ranks())
+    assert progress.step == 16  # where the ranks next agree
+    assert not (tmp_path / "summary.json").exists()
+    # Another number of ranks may continue.
+    assert run_ranks(_command, 3, flags, join=False) == [0, 0, 0]
+    assert_same_result(tmp_path, trained)
+
+
+def test_torchrun_restarts_after_a_rank_is_killed(capture, trained, tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node=2",
+        "--max-restarts=1",
+    ]
+    command += [str(Path(__file__).with_name("killed_once.py"))]
+    done = subprocess.run(
+        command + train_flags(capture, tmp_path, "train"),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=150,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "rank 0: " in done.stderr and "rank 1 has not arrived" in done.stderr
+    assert (tmp_path / "killed").exists()
+    assert_same_result(tmp_path, trained)
