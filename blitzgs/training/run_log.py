@@ -5,19 +5,24 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-_FORMATS = {
-    "loss": "{:.4f}",
-    "psnr": "{:.2f} dB",
-    "gaussians": "{:,}",
-    "images_per_second": "{:.1f} images/s",
+_SHOWN: dict[str, Callable[[float], str]] = {
+    "loss": lambda value: f"loss {value:.4f}",
+    "psnr": lambda value: f"{value:.2f} dB",
+    "gaussians": lambda value: f"{_count(value)} Gaussians",
+    "images_per_second": lambda value: f"{value:.1f} images/s",
 }
+
+
+def _count(value: float) -> str:
+    return f"{value / 1e6:.2f}M" if value >= 1e6 else f"{value / 1e3:.1f}k"
 
 
 class RunLog:
@@ -46,12 +51,10 @@ class RunLog:
             self._board = _summary_writer(folder / "tensorboard")
         if self.console.is_terminal:
             self._progress = Progress(
-                TextColumn("{task.completed:,.0f}/{task.total:,.0f} images"),
-                BarColumn(),
-                TextColumn("{task.description}"),
-                TimeElapsedColumn(),
-                TextColumn("ETA"),
-                TimeRemainingColumn(),
+                TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
+                BarColumn(bar_width=8),
+                TextColumn("{task.description}  ETA"),
+                TimeRemainingColumn(compact=True),
                 console=self.console,
             )
             self._task = self._progress.add_task("", total=total, completed=done)
@@ -63,18 +66,13 @@ class RunLog:
         if self._board is not None:
             for name, value in values.items():
                 self._board.add_scalar(name, value, t)
-        text = "  ".join(
-            _FORMATS[name].format(value) + ("" if name in ("psnr", "images_per_second") else f" {name}")
-            for name, value in values.items()
-            if name in _FORMATS
-        )
+        text = "  ".join(_SHOWN[name](value) for name, value in values.items() if name in _SHOWN)
         if self._progress is not None:
             self._progress.update(self._task, completed=t, description=text)
         elif self._file is not None:
-            seconds = (time.monotonic() - self._started) * (self._total - t) / max(1, t - self._first)
-            self.console.print(
-                f"{t:>7,}/{self._total:,} images  {text}  ETA {int(seconds) // 60}:{int(seconds) % 60:02}"
-            )
+            rate = (time.monotonic() - self._started) / max(1, t - self._first)
+            left = timedelta(seconds=round(rate * (self._total - t)))
+            self.console.print(f"{t:>7,}/{self._total:,} images  {text}  ETA {left}", soft_wrap=True)
 
     def event(self, t: int, kind: str, values: Mapping[str, Any], text: str | None = None) -> None:
         """Record something that happened at time `t`; print `text` if given."""
