@@ -63,28 +63,25 @@ def test_every_mode_against_the_reference(dtype, rasterize_mode, render_mode):
 
 @pytest.mark.parametrize("channels, per_view", [(1, False), (2, True), (3, True), (5, False), (33, False)])
 def test_values_of_any_channel_count(channels, per_view):
-    scene = random_scene(n=60)
+    scene = random_scene(n=40, width=20, height=16)
     scene.sh_degree = None
-    generator = torch.Generator().manual_seed(9)
-    values = torch.rand(2, 60, channels, generator=generator)
+    values = torch.rand(2, 40, channels, generator=torch.Generator().manual_seed(9))
     scene.colors = values if per_view else values[0]
     renders, _, _ = rasterize_scene(scene)
     for view in range(2):
-        scene_of_view = random_scene(n=60)
-        scene_of_view.sh_degree = None
-        scene_of_view.colors = values[view] if per_view else values[0]
-        reference = reference_images(scene_of_view)[view]
+        scene.colors = values[view] if per_view else values[0]
+        reference = reference_images(scene)[view]
         assert image_error(renders[view], reference.image, reference.cut) <= 1e-5
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=10, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 10**6),
     n=st.integers(1, 120),
     scale=st.floats(0.01, 0.6),
     degree=st.integers(0, 3),
-    width=st.integers(1, 48),
-    height=st.integers(1, 40),
+    width=st.integers(1, 40),
+    height=st.integers(1, 32),
 )
 def test_random_scenes_against_the_reference(seed, n, scale, degree, width, height):
     scene = random_scene(n=n, seed=seed, cameras=1, scale=scale, width=width, height=height)

@@ -245,7 +245,9 @@ TEST_CASE("the cheap test never drops a row that exists") {
     const float opacity = 1 / (1 + std::exp(-3 * normal(engine)));
     Row<float> row{};
     const bool exists = project_row(camera, activate_gaussian(mean, quat, scale, opacity), options, &row);
-    const bool maybe = may_be_visible(camera, mean, scale, opacity, options);
+    const float sigmas = reach(opacity);
+    const bool maybe = sigmas >= 0 && in_depth_range(camera_depth(camera, mean), options) &&
+                       may_touch_image(camera, mean, widest_variance(scale), sigmas, options);
     REQUIRE((maybe || !exists));
     exist += exists;
     spared += !maybe;

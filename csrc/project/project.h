@@ -9,13 +9,14 @@
 //
 // Rows are ordered by (Gaussian, view). Every value of a row depends on its Gaussian and view alone, so rows
 // are bit-identical however Gaussians are divided among calls. Two passes with one host synchronisation
-// between them: project_count finds, in few bytes per candidate, which views see it; project_emit projects
-// those and evaluates SH for them alone. O(candidates * B + rows); no output of size N.
+// between them: project_count finds, in few bytes per candidate, which views see it; project_emit writes
+// those rows and evaluates SH for them alone. O(candidates * B + rows); no output of size N.
 //
 // project_bwd visits each visible Gaussian once, recomputes its rows and sums their gradients in row order:
 // no atomics, deterministic. The pose gradient is summed in double over fixed blocks of Gaussians.
 #pragma once
 #include <cstdint>
+#include <memory>
 
 #include "common/stream.h"
 #include "project/project_row.h"
@@ -34,11 +35,17 @@ struct ProjectInputs {
   ProjectOptions<T> options;
 };
 
+// Whatever else a backend keeps between the passes (the CPU: the rows; CUDA: nothing).
+struct ProjectCarry {
+  virtual ~ProjectCarry() = default;
+};
+
 // What project_count leaves for project_emit. view_masks [candidates]: bit v set iff view v sees it; and the
 // visible candidates and rows before each block of kProjectBlock candidates [blocks + 1].
 struct ProjectPlan {
   std::uint32_t* view_masks;
   std::int64_t *visible_before, *rows_before;
+  std::unique_ptr<ProjectCarry>* carry;
 };
 
 inline constexpr std::int64_t kProjectBlock = 1024;

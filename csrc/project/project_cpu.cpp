@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
+#include <memory>
+#include <utility>
 #include <vector>
 
 #include "common/parallel.h"
@@ -35,48 +37,68 @@ std::int32_t tiles_of(const Row<T>& row, const ProjectOptions<T>& o) {
   return count_tiles(row.mean2d, row.conic, row.opacity, o.width, o.height, o.tile_size);
 }
 
-// The views that see a candidate, and the tiles its rows touch.
+// The rows of each block of candidates, kept from the first pass for the second.
 template <class T>
-std::uint32_t visible_views(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras,
-                            std::int64_t candidate, std::int64_t* tiles) {
+struct KeptRow {
+  Row<T> row;
+  std::int32_t tiles;
+};
+template <class T>
+struct KeptRows final : ProjectCarry {
+  std::vector<std::vector<KeptRow<T>>> blocks;
+};
+
+// Projects a candidate into the views that may see it, adds its rows to `rows`, and returns their views.
+template <class T>
+std::uint32_t project_candidate(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras,
+                                std::int64_t candidate, std::vector<KeptRow<T>>* rows) {
   const std::int64_t id = candidate_id(in, candidate);
   const std::uint32_t allowed =
       in.active_views ? static_cast<std::uint32_t>(in.active_views[candidate]) : ~std::uint32_t{0};
   const Vec3<T> mean = load3(in.means + 3 * id);
-  const Vec3<T> scale = activate_scale(in.scales + 3 * id, in.options.raw);
-  const T opacity = activate_opacity(in.opacities[id], in.options.raw);
   std::uint32_t maybe = 0;
   for (int view = 0; view < in.n_views; ++view) {
-    const std::uint32_t bit = std::uint32_t{1} << view;
-    if ((allowed & bit) && may_be_visible(cameras[view], mean, scale, opacity, in.options)) maybe |= bit;
+    const bool ahead = in_depth_range(camera_depth(cameras[view], mean), in.options);
+    maybe |= static_cast<std::uint32_t>(ahead) << view;
   }
+  maybe &= allowed;
   if (maybe == 0) return 0;
-  if (in.sh && !finite_sh(in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree)) return 0;
-  const ActiveGaussian<T> gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity);
+  const Vec3<T> scale = activate_scale(in.scales + 3 * id, in.options.raw);
+  const T opacity = activate_opacity(in.opacities[id], in.options.raw);
+  const T sigmas = reach(opacity), widest = widest_variance(scale);
+  if (sigmas < T(0)) return 0;
+  ActiveGaussian<T> gaussian{};
   std::uint32_t seen = 0;
-  for (int view = 0; view < in.n_views; ++view) {
-    Row<T> row{};
-    if (!(maybe >> view & 1) || !project_row(cameras[view], gaussian, in.options, &row)) continue;
+  for (std::uint32_t rest = maybe, first = 1; rest != 0; rest &= rest - 1) {
+    const int view = __builtin_ctz(rest);
+    if (!may_touch_image(cameras[view], mean, widest, sigmas, in.options)) continue;
+    if (first) {
+      if (in.sh && !finite_sh(in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree)) return 0;
+      gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity);
+      first = 0;
+    }
+    KeptRow<T> kept{};
+    if (!project_row(cameras[view], gaussian, in.options, &kept.row)) continue;
+    kept.tiles = tiles_of(kept.row, in.options);
+    rows->push_back(kept);
     seen |= std::uint32_t{1} << view;
-    *tiles += tiles_of(row, in.options);
   }
   return seen;
 }
 
 template <class T>
-void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
-              std::int64_t id, std::int64_t index, const ProjectOutputs<T>& out) {
-  Row<T> row{};
-  project_row(camera, gaussian, in.options, &row);
+void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t id, std::int64_t index,
+              const KeptRow<T>& kept, const ProjectOutputs<T>& out) {
+  const Row<T>& row = kept.row;
   std::copy_n(row.mean2d, 2, out.means2d + 2 * index);
   std::copy_n(row.conic, 3, out.conics + 3 * index);
   out.depths[index] = row.depth;
   out.opacities[index] = row.opacity;
   out.radii[2 * index] = pixel_radius(row.extent[0]);
   out.radii[2 * index + 1] = pixel_radius(row.extent[1]);
-  out.tiles_touched[index] = tiles_of(row, in.options);
+  out.tiles_touched[index] = kept.tiles;
   if (in.sh) {
-    row_color(camera, gaussian.mean, in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree,
+    row_color(camera, load3(in.means + 3 * id), in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree,
               out.colors + 3 * index);
   }
 }
@@ -143,55 +165,55 @@ void project_count(const ProjectInputs<T>& in, const ProjectPlan& plan, ProjectC
                    CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const std::int64_t blocks = project_blocks(in.n_candidates);
-  std::vector<std::int64_t> tiles(blocks, 0);
+  auto kept = std::make_unique<KeptRows<T>>();
+  kept->blocks.resize(blocks);
   parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
-      std::int64_t visible = 0, rows = 0;
+      std::int64_t visible = 0;
       const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
       for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
-        const std::uint32_t seen = visible_views(in, cameras, c, &tiles[block]);
-        plan.view_masks[c] = seen;
-        visible += seen != 0;
-        rows += __builtin_popcount(seen);
+        plan.view_masks[c] = project_candidate(in, cameras, c, &kept->blocks[block]);
+        visible += plan.view_masks[c] != 0;
       }
       plan.visible_before[block] = visible;
-      plan.rows_before[block] = rows;
     }
   });
   *counts = {};
   for (std::int64_t block = 0; block < blocks; ++block) {
-    const std::int64_t visible = plan.visible_before[block], rows = plan.rows_before[block];
+    const std::int64_t visible = plan.visible_before[block];
     plan.visible_before[block] = counts->visible;
     plan.rows_before[block] = counts->rows;
     counts->visible += visible;
-    counts->rows += rows;
-    counts->tiles += tiles[block];
+    counts->rows += static_cast<std::int64_t>(kept->blocks[block].size());
+    for (const KeptRow<T>& row : kept->blocks[block]) counts->tiles += row.tiles;
   }
   plan.visible_before[blocks] = counts->visible;
   plan.rows_before[blocks] = counts->rows;
+  *plan.carry = std::move(kept);
 }
 
 template <class T>
-void project_emit(const ProjectInputs<T>& in, const ProjectPlan& plan, const ProjectCounts&,
+void project_emit(const ProjectInputs<T>& in, const ProjectPlan& plan, const ProjectCounts& counts,
                   const ProjectOutputs<T>& out, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
+  const auto& kept = static_cast<const KeptRows<T>&>(**plan.carry);
   const std::int64_t blocks = project_blocks(in.n_candidates);
-  out.row_offsets[plan.visible_before[blocks]] = static_cast<std::int32_t>(plan.rows_before[blocks]);
+  out.row_offsets[counts.visible] = static_cast<std::int32_t>(counts.rows);
   parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
-      std::int64_t u = plan.visible_before[block], row = plan.rows_before[block];
+      const KeptRow<T>* row = kept.blocks[block].data();
+      std::int64_t u = plan.visible_before[block], index = plan.rows_before[block];
       const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
       for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
         if (plan.view_masks[c] == 0) continue;
         const std::int64_t id = candidate_id(in, c);
-        const ActiveGaussian<T> gaussian = load_gaussian(in, id);
         out.visible_ids[u] = static_cast<std::int32_t>(id);
-        out.row_offsets[u++] = static_cast<std::int32_t>(row);
-        for (int view = 0; view < in.n_views; ++view) {
-          if (!(plan.view_masks[c] >> view & 1)) continue;
-          out.gaussian_ids[row] = static_cast<std::int32_t>(id);
-          out.camera_ids[row] = view;
-          emit_row(in, cameras[view], gaussian, id, row++, out);
+        out.row_offsets[u++] = static_cast<std::int32_t>(index);
+        for (std::uint32_t rest = plan.view_masks[c]; rest != 0; rest &= rest - 1) {
+          const int view = __builtin_ctz(rest);
+          out.gaussian_ids[index] = static_cast<std::int32_t>(id);
+          out.camera_ids[index] = view;
+          emit_row(in, cameras[view], id, index++, *row++, out);
         }
       }
     }

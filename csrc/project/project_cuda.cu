@@ -55,16 +55,16 @@ __device__ std::uint32_t visible_views(const Inputs& in, const Camera<float>* ca
   std::uint32_t maybe = in.active_views ? static_cast<std::uint32_t>(in.active_views[candidate]) : ~0u;
   const Vec3<float> mean = load3(in.means + 3 * id);
   for (int view = 0; view < in.n_views; ++view) {
-    const Camera<float>& camera = cameras[view];
-    const auto depth = static_cast<float>(row_times_point(camera.row_z, mean, camera.translation.z));
-    if (!in_depth_range(depth, in.options)) maybe &= ~(1u << view);
+    if (!in_depth_range(camera_depth(cameras[view], mean), in.options)) maybe &= ~(1u << view);
   }
   if (in.n_views < 32) maybe &= (1u << in.n_views) - 1u;
   if (maybe == 0) return 0;
   const Vec3<float> scale = activate_scale(in.scales + 3 * id, in.options.raw);
   const float opacity = activate_opacity(in.opacities[id], in.options.raw);
+  const float sigmas = reach(opacity), widest = widest_variance(scale);
+  if (sigmas < 0.0f) return 0;
   for (int view = 0; view < in.n_views; ++view) {
-    if ((maybe >> view & 1u) && !may_be_visible(cameras[view], mean, scale, opacity, in.options)) {
+    if ((maybe >> view & 1u) && !may_touch_image(cameras[view], mean, widest, sigmas, in.options)) {
       maybe &= ~(1u << view);
     }
   }

@@ -107,9 +107,10 @@ ForwardTensors project_fwd(const Tensor& means, const Tensor& quats, const Tenso
     check_dtype(kOp, "active_views", *views, ScalarType::Int);
   }
   DeviceScope scope(p.means);
+  std::unique_ptr<ProjectCarry> carry;
   const ProjectPlan plan{scope.workspace.allocate<std::uint32_t>(candidates),
                          scope.workspace.allocate<std::int64_t>(project_blocks(candidates) + 1),
-                         scope.workspace.allocate<std::int64_t>(project_blocks(candidates) + 1)};
+                         scope.workspace.allocate<std::int64_t>(project_blocks(candidates) + 1), &carry};
   ProjectCounts counts;
   std::vector<Tensor> out;
   dispatch_floating(p.means, [&](auto zero) {

@@ -63,22 +63,31 @@ BLITZGS_HD bool touches_image(const T* mean2d, T half_x, T half_y, const Project
 }
 
 template <class T>
+BLITZGS_HD T camera_depth(const Camera<T>& camera, const Vec3<T>& mean) {
+  return T(row_times_point(camera.row_z, mean, camera.translation.z));
+}
+
+template <class T>
 BLITZGS_HD bool in_depth_range(T depth, const ProjectOptions<T>& options) {
   return depth > options.near_plane && depth <= options.far_plane;
 }
 
-// Cheap test from 7 values a Gaussian: false only when project_row would be false. Sigma'_xx cannot exceed
-// |g_x|^2 max(s)^2 + eps, so the box around the splat cannot exceed this one (1.001: float rounding).
+// Largest variance along an axis: all the cheap test knows of a Gaussian's shape.
 template <class T>
-BLITZGS_HD bool may_be_visible(const Camera<T>& camera, const Vec3<T>& mean, const Vec3<T>& scale, T opacity,
-                               const ProjectOptions<T>& options) {
-  const T sigmas = reach(opacity);
+BLITZGS_HD T widest_variance(const Vec3<T>& scale) {
+  return larger(larger(scale.x * scale.x, scale.y * scale.y), scale.z * scale.z);
+}
+
+// Cheap test from 7 values a Gaussian, sigmas = reach(opacity) >= 0 and z inside (near, far]: false only when
+// project_row would be false. Sigma'_xx cannot exceed |g_x|^2 max(s)^2 + eps, so the box around the splat
+// cannot exceed this one (1.001: float rounding).
+template <class T>
+BLITZGS_HD bool may_touch_image(const Camera<T>& camera, const Vec3<T>& mean, T widest, T sigmas,
+                                const ProjectOptions<T>& options) {
   const ProjectedMean p = project_mean(camera, mean);
-  if (sigmas < T(0) || !in_depth_range(T(p.z), options)) return false;
   T mean2d[2];
   pixel_position(camera, p, mean2d);
   const PixelGradients<T> g = pixel_gradients(camera, p);
-  const T widest = larger(larger(scale.x * scale.x, scale.y * scale.y), scale.z * scale.z);
   const T half_x = T(1.001) * sigmas * std::sqrt(dot(g.gx, g.gx) * widest + options.eps2d);
   const T half_y = T(1.001) * sigmas * std::sqrt(dot(g.gy, g.gy) * widest + options.eps2d);
   return touches_image(mean2d, half_x, half_y, options);
@@ -138,9 +147,17 @@ BLITZGS_HD T view_direction(const Camera<T>& camera, const Vec3<T>& mean, Vec3<T
 // Whether the coefficients in use are finite; a Gaussian for which they are not has no rows.
 template <class T>
 BLITZGS_HD bool finite_sh(const T* sh, int degree) {
-  T zero = T(0);
-  for (int i = 0; i < 3 * sh_basis_count(degree); ++i) zero += T(0) * sh[i];
-  return zero == T(0);
+  int bad = 0;
+  for (int i = 0; i < 3 * sh_basis_count(degree); ++i) bad |= !is_finite(sh[i]);
+  return bad == 0;
+}
+
+// sum_k basis_k sh_k + 0.5; sh [K, 3].
+template <class T>
+BLITZGS_HD Vec3<T> unclipped_color(const T* basis, const T* sh, int degree) {
+  Vec3<T> sum{T(0.5), T(0.5), T(0.5)};
+  for (int k = 0; k < sh_basis_count(degree); ++k) sum = sum + basis[k] * load3(sh + 3 * k);
+  return sum;
 }
 
 // color = max(sum_k basis_k sh_k + 0.5, 0); sh [K, 3].
@@ -150,11 +167,8 @@ BLITZGS_HD void row_color(const Camera<T>& camera, const Vec3<T>& mean, const T*
   view_direction(camera, mean, &direction);
   T basis[kMaxShBasis];
   sh_basis(degree, direction, basis);
-  for (int channel = 0; channel < 3; ++channel) {
-    T sum = T(0.5);
-    for (int k = 0; k < sh_basis_count(degree); ++k) sum += basis[k] * sh[3 * k + channel];
-    color[channel] = larger(sum, T(0));
-  }
+  const Vec3<T> sum = unclipped_color(basis, sh, degree);
+  store3(Vec3<T>{larger(sum.x, T(0)), larger(sum.y, T(0)), larger(sum.z, T(0))}, color);
 }
 
 // v_sh [K, 3] += and v_mean +=; pose (null: not wanted) += . Zero where the colour is clipped at 0.
@@ -165,15 +179,12 @@ BLITZGS_HD void row_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, cons
   const T inverse_distance = view_direction(camera, mean, &direction);
   T basis[kMaxShBasis], v_basis[kMaxShBasis] = {};
   sh_basis(degree, direction, basis);
-  const int count = sh_basis_count(degree);
-  for (int channel = 0; channel < 3; ++channel) {
-    T sum = T(0.5);
-    for (int k = 0; k < count; ++k) sum += basis[k] * sh[3 * k + channel];
-    const T v = sum > T(0) ? v_color[channel] : T(0);
-    for (int k = 0; k < count; ++k) {
-      v_sh[3 * k + channel] += basis[k] * v;
-      v_basis[k] += sh[3 * k + channel] * v;
-    }
+  const Vec3<T> sum = unclipped_color(basis, sh, degree);
+  const Vec3<T> v{sum.x > T(0) ? v_color[0] : T(0), sum.y > T(0) ? v_color[1] : T(0),
+                  sum.z > T(0) ? v_color[2] : T(0)};
+  for (int k = 0; k < sh_basis_count(degree); ++k) {
+    store3(load3(v_sh + 3 * k) + basis[k] * v, v_sh + 3 * k);
+    v_basis[k] = dot(load3(sh + 3 * k), v);
   }
   const Vec3<T> v_direction = sh_basis_vjp(degree, direction, v_basis);
   const Vec3<T> v_offset = inverse_distance * (v_direction - dot(v_direction, direction) * direction);

@@ -154,7 +154,7 @@ SCENES = {
     "focal length 10": (lambda: focal_length(10.0), 2e-5),
     "focal length 1e5": (lambda: focal_length(1e5), 2e-5),
     "1e6 from the origin": (far_from_the_origin, 2e-5),
-    "20 000 on one tile": (lambda: one_tile(20_000), 5e-5),
+    "5 000 on one tile": (lambda: one_tile(5_000), 5e-5),
     "4 000 layers": (lambda: deep(4_000), 5e-5),
     "1 x 1 image": (lambda: image_of_size(1, 1), 2e-5),
     "2500 x 1 image": (lambda: image_of_size(2500, 1), 2e-5),
