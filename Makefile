@@ -42,7 +42,7 @@ demo: venv build
 	$(RUN) blitzgs train --config configs/smoke.yaml --data $(DEMO)/city --out $(DEMO)/run
 	$(RUN) blitzgs export $(DEMO)/run --ply $(DEMO)/city.ply
 	@echo
-	@echo "Pictures (render | photo | error): $(DEMO)/run/evaluation"
+	@echo "Pictures (photo | render | error): $(DEMO)/run/evaluation"
 	@echo "Figures:                           $(DEMO)/run/summary.json"
 	@echo "The model, for any 3DGS viewer:    $(DEMO)/city.ply"
 
