@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from blitzgs.scene.colmap import native_io
+
 UInt8 = npt.NDArray[np.uint8]
 
 _HEADER_BYTES = 1 << 16
@@ -105,17 +107,6 @@ def _exif_orientation(tiff: bytes) -> int:
     return 1
 
 
-def _jpeg_is_complete(data: bytes) -> bool:
-    """Whether the end marker follows the image data, where 0xFF is always escaped."""
-    start = 2
-    try:
-        for _, payload in _jpeg_segments(data):
-            start += 4 + len(payload)
-    except EOFError:
-        return False
-    return data.find(b"\xff\xd9", start) >= 0
-
-
 def _imdecode(data: bytes, flags: int, name: str) -> UInt8:
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
@@ -126,28 +117,32 @@ def _imdecode(data: bytes, flags: int, name: str) -> UInt8:
     return np.asarray(pixels)
 
 
-def check_complete(data: bytes, name: str) -> None:
-    """Refuse a JPEG that was cut off: decoders fill the missing part with grey.
+def read_whole(path: Path) -> bytes:
+    """The bytes of an image file; refused where a decoder would conceal what is missing or damaged.
+
+    Decoders show the part of a JPEG that is lost as grey, without an error, so its codes are walked here. What
+    leaves a valid sequence of codes (most changes of a single bit) cannot be told from a photograph.
 
     Raises:
-        ValueError: names the file.
+        ValueError: the file is truncated or damaged; names it, the byte offset and the reason.
     """
-    if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
-        raise ValueError(f"{name}: truncated JPEG: its end marker is missing after {len(data)} bytes")
+    data = path.read_bytes()
+    if data[:2] == b"\xff\xd8":
+        native_io().check_jpeg(data, str(path))
+    return data
 
 
 def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | None = None) -> UInt8:
     """Decode to RGB uint8 [H, W, 3] as stored (EXIF orientation not applied).
 
     Args:
-        data: the file.
+        data: the file, from `read_whole`.
         name: names the file in errors.
         background: composite an alpha channel over this colour (0 to 1); None drops it.
 
     Raises:
-        ValueError: the file is damaged, truncated or not an image.
+        ValueError: the file cannot be decoded.
     """
-    check_complete(data, name)
     if background is not None:
         pixels = _imdecode(data, cv2.IMREAD_UNCHANGED, name)
         if pixels.ndim == 3 and pixels.shape[2] == 4:
@@ -168,9 +163,8 @@ def decode_mask(data: bytes, name: str) -> UInt8:
     """Decode a mask to uint8 [H, W]: 0 where the file is black (excluded), 1 elsewhere.
 
     Raises:
-        ValueError: the file is damaged, truncated or not an image.
+        ValueError: the file cannot be decoded.
     """
-    check_complete(data, name)
     pixels = _imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, name)
     return np.asarray((pixels > 0).astype(np.uint8))
 

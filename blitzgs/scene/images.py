@@ -29,7 +29,7 @@ from torch import Tensor
 from blitzgs.scene.cameras import Camera
 from blitzgs.scene.capture import Capture
 from blitzgs.scene.colmap import native_io
-from blitzgs.scene.image_files import UInt8, apply_orientation, decode_mask, decode_rgb
+from blitzgs.scene.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
 from blitzgs.scene.undistort import Rectification
 
 K = TypeVar("K")
@@ -183,7 +183,7 @@ class ImageStore:
     def _read(self, path: Path) -> bytes:
         data = self._packed.get(path)
         if data is None:
-            data = path.read_bytes()
+            data = read_whole(path)
             self._packed.put(path, data, len(data))
         return data
 
@@ -195,7 +195,7 @@ class ImageStore:
         packed = self._packed.get(index)
         if packed is not None:
             return _uint8(native_io().decode_qoi(packed))
-        pixels = self._prepare(camera, self._decode(camera, camera.image_path.read_bytes()))
+        pixels = self._prepare(camera, self._decode(camera, read_whole(camera.image_path)))
         packed = native_io().encode_qoi(pixels)
         self._packed.put(index, packed, len(packed))
         return pixels

@@ -12,6 +12,7 @@
 #include <string_view>
 
 #include "io/colmap.h"
+#include "io/jpeg.h"
 #include "io/ply.h"
 #include "io/qoi.h"
 
@@ -198,6 +199,12 @@ void write_ply(const std::string& path, const py::list& comments,
   to_file(path, [&](std::ostream& out) { io::write_ply(out, table); });
 }
 
+void check_jpeg(const py::bytes& data, const std::string& name) {
+  const std::string_view view = data;
+  py::gil_scoped_release release;
+  io::check_jpeg({reinterpret_cast<const std::uint8_t*>(view.data()), view.size()}, name);
+}
+
 py::bytes encode_qoi(const Column<std::uint8_t>& rgb) {
   if (rgb.ndim() != 3 || rgb.shape(2) != 3) throw std::invalid_argument("qoi: the image must be [H, W, 3]");
   const io::QoiSize size{static_cast<std::uint32_t>(rgb.shape(1)), static_cast<std::uint32_t>(rgb.shape(0))};
@@ -233,6 +240,7 @@ PYBIND11_MODULE(_io, m) {
   m.def("write_cameras", &write_cameras, "path"_a, "cameras"_a);
   m.def("write_images", &write_images, "path"_a, "columns"_a);
   m.def("write_points", &write_points, "path"_a, "columns"_a);
+  m.def("check_jpeg", &check_jpeg, "data"_a, "name"_a);
   m.def("encode_qoi", &encode_qoi, "rgb"_a);
   m.def("decode_qoi", &decode_qoi, "data"_a);
   m.def("read_ply", &read_ply, "path"_a);

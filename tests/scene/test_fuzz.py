@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from blitzgs.scene import colmap
-from blitzgs.scene.image_files import decode_rgb, read_header
+from blitzgs.scene.image_files import decode_rgb, read_header, read_whole
 from blitzgs.scene.ply import read_ply
 from tests.scene.helpers import reconstruction, smooth_image, write_image
 from tests.scene.test_ply import gaussians, inria_file
@@ -45,7 +45,7 @@ READERS = {
     "images.txt": lambda path: colmap.native_io().read_images(path, True),
     "points3D.txt": lambda path: colmap.native_io().read_points(path, True),
     "model.ply": read_ply,
-    "photo.jpg": lambda path: (read_header(Path(path)), decode_rgb(Path(path).read_bytes(), path)),
+    "photo.jpg": lambda path: (read_header(Path(path)), decode_rgb(read_whole(Path(path)), path)),
 }
 FRACTION = st.floats(0, 1, exclude_max=True)
 

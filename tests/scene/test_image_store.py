@@ -2,14 +2,17 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from blitzgs.scene.capture import load_capture
+from blitzgs.scene.image_files import decode_rgb, read_whole
 from blitzgs.scene.images import BoundedCache, ImageStore
 from tests.scene.helpers import smooth_image, write_capture, write_image
 
+pytestmark = pytest.mark.filterwarnings("ignore:all training cameras are in one place")
 NAMES = [f"v{i:02d}.jpg" for i in range(12)]
 IMAGE_BYTES = 3 * 64 * 48
 
@@ -115,19 +118,54 @@ def test_truncated_jpegs_are_named_and_never_shown_in_part(capture, kept):
     path.write_bytes(data[: int(kept * len(data)) if isinstance(kept, float) else kept])
     store = ImageStore(capture)
     store.prefetch(range(4))
-    with pytest.raises(ValueError, match=f"{NAMES[2]}: (truncated|cannot be decoded)"):
+    with pytest.raises(ValueError, match=rf"{NAMES[2]}: (at byte \d+: truncated|cannot be decoded)"):
         store.get(2)
     with pytest.raises(ValueError, match=NAMES[2]):
         store.get(2)
     assert store.get(3).shape == (48, 64, 3)
 
 
-def test_a_jpeg_whose_end_was_zeroed_is_refused(capture):
+def lose(data, begin, end):
+    return data[:begin] + data[end:]
+
+
+def zero(data, begin, end):
+    return data[:begin] + bytes(end - begin) + data[end:]
+
+
+def scramble(data, begin, end):
+    return data[:begin] + np.random.default_rng(0).bytes(end - begin) + data[end:]
+
+
+@pytest.mark.parametrize("harm", [lose, zero, scramble])
+@pytest.mark.parametrize(("begin", "end"), [(0.4, 0.6), (0.8, 0.9), (0.5, 1.0)])
+def test_jpegs_with_lost_or_overwritten_blocks_are_refused(tmp_path, harm, begin, end):
+    write_capture(tmp_path, NAMES[:1], width=320, height=240)
+    capture = load_capture(tmp_path)
     path = capture.cameras[0].image_path
     data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
-    with pytest.raises(ValueError, match=f"{NAMES[0]}: truncated JPEG"):
+    path.write_bytes(harm(data, int(begin * len(data)), int(end * len(data))))
+    with pytest.raises(ValueError, match=rf"{NAMES[0]}: at byte \d+: .*(truncated|damaged)"):
         ImageStore(capture).get(0)
+
+
+@pytest.mark.parametrize("option", [None, "PROGRESSIVE", "OPTIMIZE", "RST_INTERVAL", "444", "411", "440"])
+@pytest.mark.parametrize("size", [(1, 1), (37, 53), (64, 96)])
+def test_every_kind_of_whole_jpeg_passes(tmp_path, option, size):
+    options = [cv2.IMWRITE_JPEG_QUALITY, 90]
+    if option in ("444", "411", "440"):
+        sampling = getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{option}")
+        options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+    elif option:
+        options += [getattr(cv2, f"IMWRITE_JPEG_{option}"), 1]
+    for pixels in (smooth_image(*size), smooth_image(*size)[..., 0]):
+        ok, data = cv2.imencode(".jpg", pixels, options)
+        path = tmp_path / "a.jpg"
+        path.write_bytes(data.tobytes() + b"trailing bytes")
+        assert decode_rgb(read_whole(path), "a.jpg").shape == (*size, 3)
+        path.write_bytes(data.tobytes()[:-2])
+        with pytest.raises(ValueError, match="end marker is missing"):
+            read_whole(path)
 
 
 def test_damaged_headers_are_named_at_load(tmp_path):

@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "io/jpeg.h"
+
+#include <vector>
+
+#include "common/catch.h"
+
+using namespace blitzgs::io;
+
+namespace {
+
+using Bytes = std::vector<std::uint8_t>;
+
+void append(Bytes& out, const Bytes& more) { out.insert(out.end(), more.begin(), more.end()); }
+
+Bytes segment(std::uint8_t marker, const Bytes& payload) {
+  const std::size_t length = payload.size() + 2;
+  Bytes out = {0xff, marker, static_cast<std::uint8_t>(length >> 8), static_cast<std::uint8_t>(length)};
+  append(out, payload);
+  return out;
+}
+
+// Codes by length: symbols[k] are those of k + 1 bits.
+Bytes table(std::uint8_t number, const std::vector<Bytes>& symbols) {
+  Bytes payload = {number};
+  for (std::size_t k = 0; k < 16; ++k) {
+    payload.push_back(static_cast<std::uint8_t>(k < symbols.size() ? symbols[k].size() : 0));
+  }
+  for (const Bytes& some : symbols) append(payload, some);
+  return segment(0xc4, payload);
+}
+
+// Grey. DC codes: 0 (no bits), 10 (one bit). AC codes: 0 (end of block), 10 (one bit), 110 (sixteen zeros).
+// The flattest block is the bits 00.
+Bytes jpeg(std::uint8_t width, std::uint8_t height, const Bytes& data, std::uint8_t frame = 0xc0,
+           std::uint8_t restart = 0) {
+  Bytes out = {0xff, 0xd8};
+  append(out, segment(0xe0, {'a', 'n', 'y', 0xff, 0xd9}));
+  append(out, table(0x00, {{0x00}, {0x01}}));
+  append(out, table(0x10, {{0x00}, {0x01}, {0xf0}}));
+  if (restart) append(out, segment(0xdd, {0, restart}));
+  append(out, segment(frame, {8, 0, height, 0, width, 1, 1, 0x11, 0}));
+  append(out, segment(0xda, {1, 1, 0x00, 0, 63, 0}));
+  append(out, data);
+  append(out, {0xff, 0xd9});
+  return out;
+}
+
+// The reason a file is refused, or an empty string.
+std::string problem(const Bytes& file) {
+  try {
+    check_jpeg(file, "f");
+    return "";
+  } catch (const FormatError& error) {
+    return error.what();
+  }
+}
+
+bool mentions(const Bytes& file, const char* reason) {
+  return problem(file).find(reason) != std::string::npos;
+}
+
+}  // namespace
+
+TEST_CASE("whole JPEGs pass") {
+  REQUIRE(problem(jpeg(16, 16, {0x00})).empty());              // four blocks
+  REQUIRE(problem(jpeg(17, 8, {0x03})).empty());               // three blocks and padding
+  REQUIRE(problem(jpeg(16, 16, {0x00, 0x00, 0x00})).empty());  // zeros that a camera appended
+  REQUIRE(problem(jpeg(8, 8, {0xb1})).empty());                // a DC and an AC code with a bit each
+  REQUIRE(problem(jpeg(24, 8, {0x3f, 0xff, 0xd0, 0x3f, 0xff, 0xd1, 0x3f}, 0xc0, 1)).empty());
+  REQUIRE(problem(jpeg(8, 8, {0x12, 0xff, 0x00, 0x34}, 0xc2)).empty());  // progressive: markers alone
+  Bytes followed = jpeg(16, 16, {0x00});
+  append(followed, {0xff, 0xd8, 1, 2, 3});  // another picture after the end
+  REQUIRE(problem(followed).empty());
+}
+
+TEST_CASE("cut JPEGs are refused wherever they end") {
+  for (const std::uint8_t frame : {0xc0, 0xc2}) {
+    const Bytes file = jpeg(16, 16, {0x00, 0x00, 0x00, 0x00}, frame);
+    for (std::size_t n = 0; n < file.size(); ++n)
+      REQUIRE_FALSE(problem(Bytes(file.begin(), file.begin() + n)).empty());
+  }
+}
+
+TEST_CASE("damaged image data are refused with the reason") {
+  REQUIRE(mentions(jpeg(32, 16, {0x00}), "image data end before the last block"));
+  REQUIRE(mentions(jpeg(16, 16, {0x00, 0x01}), "image data go on after the last block"));
+  REQUIRE(mentions(jpeg(8, 8, {0x3f, 0x12, 0x34}), "image data go on after the last block"));
+  REQUIRE(mentions(jpeg(8, 8, {0x7e, 0x00}), "no such Huffman code"));         // 0 then 111
+  REQUIRE(mentions(jpeg(8, 8, {0x6d, 0xb0, 0x00}), "too many coefficients"));  // 0 then 110 four times
+  REQUIRE(mentions(jpeg(24, 8, {0x3f, 0xff, 0xd0, 0x3f, 0xff, 0xd2, 0x3f}, 0xc0, 1), "out of order"));
+  REQUIRE(mentions({1, 2, 3}, "f: at byte 0: not a JPEG"));
+  REQUIRE(mentions({0xff, 0xd8, 0xff, 0xd9}, "it has no image data"));
+}
+
+TEST_CASE("JPEGs with wrong bytes pass or are refused, never worse") {
+  const Bytes file = jpeg(40, 40, {0x3f, 0xff, 0xd0, 0x00, 0x55, 0xff, 0x00, 0xd7}, 0xc0, 9);
+  int refusals = 0;
+  for (std::size_t at = 0; at < file.size(); ++at) {
+    for (int value = 0; value < 256; ++value) {
+      Bytes damaged = file;
+      damaged[at] = static_cast<std::uint8_t>(value);
+      refusals += !problem(damaged).empty();
+    }
+  }
+  REQUIRE(refusals > 0);
+}
