@@ -163,8 +163,8 @@ def forward(
     if share is None:
         visible = count_by_view(rows.camera_ids, count)
     else:
-        route, tiles = plan_route(splats, share.ranges, share.ranks), share.tiles
-        splats = send(splats, route, share.ranks, share.half)
+        route, tiles = plan_route(splats, share.ranges, share.ranks, share.half), share.tiles
+        splats = send(splats, route, share.ranks)
         n_isects, visible = route.n_isects, route.visible
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids, count,
@@ -212,7 +212,7 @@ def backward(
         len(views), views.width, views.height, options.tile_size, *tiles, False, options.deterministic,
     )  # fmt: skip
     if share is not None and frame.route is not None:
-        row_gradients = send_back(row_gradients, frame.route, share.ranks, share.half)
+        row_gradients = send_back(row_gradients, frame.route, share.ranks)
     v_means2d, v_conics, v_opacities, v_colors = row_gradients
     *parameters, _ = torch.ops.blitzgs.project_bwd(
         *table.parameters, views.viewmats, views.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,

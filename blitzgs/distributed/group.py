@@ -159,6 +159,10 @@ class Ranks:
         self._collective("exchange_counts", lambda: dist.all_to_all_single(received, counts.contiguous()))
         return received
 
+    def read(self, tensor: Tensor) -> Any:
+        """Return a small tensor as nested lists; waits for the device, and so for the ranks it waits for."""
+        return self._collective("read", tensor.tolist)
+
     def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
         """Send consecutive groups of rows, one to each rank, and return those received, by source rank.
 

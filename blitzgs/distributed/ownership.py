@@ -99,7 +99,7 @@ class Share:
     Attributes:
         ranks: the job; all its ranks render together.
         ranges: the tiles of each.
-        half: exchange splats in half precision (see `blitzgs.distributed.exchange.send`).
+        half: exchange splats in half precision (see `blitzgs.distributed.exchange.plan_route`).
     """
 
     ranks: Ranks
@@ -120,7 +120,7 @@ class TileOwners:
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks = ranks
-        self._costs: dict[Hashable, Tensor] = {}
+        self._costs: dict[Hashable, tuple[Tensor, torch.cuda.Event | None]] = {}
 
     def divide(self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16) -> TileRanges:
         """Divide the tiles of a batch.
@@ -148,21 +148,29 @@ class TileOwners:
         if self.ranks.world_size == 1:
             return
         work = self.ranks.all_reduce(tile_work.clone())
+        copied = None
         if work.is_cuda:
-            # Read at the next visit of these views, many steps from now.
             work = torch.empty(work.shape, dtype=work.dtype, pin_memory=True).copy_(work, non_blocking=True)
+            copied = torch.cuda.Event()
+            copied.record()
         for key, part in zip(keys, work.chunk(len(keys)), strict=True):
-            self._costs[key] = part
+            self._costs[key] = (part, copied)
 
     def _cost(self, key: Hashable, tiles: int) -> NDArray[np.float64]:
         """Cost of each tile of a view: measured at its last visit, else the mean of the views visited."""
-        known = self._costs.get(key)
-        if known is not None and len(known) == tiles:
-            return known.numpy().astype(np.float64) + TILE_COST
-        similar = [cost for cost in self._costs.values() if len(cost) == tiles]
+        if key in self._costs and len(self._costs[key][0]) == tiles:
+            return self._read(key) + TILE_COST
         # What views share: the far (upper) tiles of oblique ones cost more than the near ones.
-        recent = [cost.numpy().astype(np.float64) for cost in similar[-16:]]
-        return (np.mean(recent, axis=0) if recent else np.zeros(tiles)) + TILE_COST
+        similar = [other for other, (cost, _) in self._costs.items() if len(cost) == tiles][-16:]
+        return (
+            np.mean([self._read(other) for other in similar], 0) if similar else np.zeros(tiles)
+        ) + TILE_COST
+
+    def _read(self, key: Hashable) -> NDArray[np.float64]:
+        cost, copied = self._costs[key]
+        if copied is not None:
+            copied.synchronize()  # usually long since done: views come back after many steps
+        return cost.numpy().astype(np.float64)
 
 
 def divide(cost: NDArray[np.float64], parts: int) -> tuple[int, ...]:

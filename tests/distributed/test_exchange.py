@@ -63,7 +63,7 @@ def _round_trip(ranks, half):
     loss.backward()
     grads = [leaf.grad for leaf in leaves if leaf.is_floating_point()]
     # The explicit form gives the same.
-    plain = send(mine, plan_route(mine, ranges, ranks), ranks, half)
+    plain = send(mine, plan_route(mine, ranges, ranks, half), ranks)
     assert all(torch.equal(a, b) for a, b in zip(plain, got, strict=True))
     n_bytes = sum(route.sent)
     return mine.ids, [g.detach() for g in grads], {k: v.detach() for k, v in got._asdict().items()}, n_bytes

@@ -128,6 +128,25 @@ def test_images_are_the_same_bits_and_losses_agree(alone, world_size):
     assert max(work) <= 1.15 * sum(work) / len(work)
 
 
+def _render_half(ranks):
+    torch.set_num_threads(1)
+    table, views = shard(ranks), cameras(4)
+    ranges = TileOwners(ranks).divide(range(4), WIDTH, HEIGHT)
+    results = []
+    for half in (False, True):
+        frame = pipeline.forward(table, views, OPTIONS, share=Share(ranks, ranges, half))
+        gradients = pipeline.backward(table, frame, torch.ones_like(frame.renders))
+        results.append((frame.renders, gradients.parameters[4]))
+    return results
+
+
+def test_half_precision_exchange_is_close_but_not_the_same():
+    for (exact, exact_gradient), (half, half_gradient) in run_ranks(_render_half, 2):
+        error = (exact - half).abs()
+        assert 0 < error.max() < 0.02 and error.mean() < 1e-3
+        assert 0 < relative(half_gradient, exact_gradient) < 0.02
+
+
 def _gather_all(ranks):
     from blitzgs.population.redistribution import redistribute
 
