@@ -120,8 +120,8 @@ def _imdecode(data: bytes, flags: int, name: str) -> UInt8:
 def read_whole(path: Path) -> bytes:
     """The bytes of an image file; refused where a decoder would conceal what is missing or damaged.
 
-    Decoders show the part of a JPEG that is lost as grey, without an error, so its codes are walked here. What
-    leaves a valid sequence of codes (most changes of a single bit) cannot be told from a photograph.
+    Decoders show the part of a JPEG that is lost as grey, without an error, so its codes are walked here.
+    What leaves a valid sequence of codes (most changes of a single bit) cannot be told from a photograph.
 
     Raises:
         ValueError: the file is truncated or damaged; names it, the byte offset and the reason.

@@ -10,6 +10,7 @@ rest.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -53,18 +54,25 @@ class Rectification:
 
         cv2 puts the centre of pixel (i, j) at (i, j), hence the half pixel less.
         """
-        fx, fy, cx, cy = self.lens.intrinsics
-        u = (np.arange(self.width) + 0.5 + self.x0 - cx) / fx
         columns = np.empty((self.height, self.width), dtype=np.float32)
         rows = np.empty_like(columns)
+        every = np.arange(self.width)
         for begin in range(0, self.height, 256):  # float64 temporaries of a whole image would be gigabytes
             end = min(begin + 256, self.height)
-            v = (np.arange(begin, end) + 0.5 + self.y0 - cy) / fy
-            x, y = self.lens.project(*np.broadcast_arrays(u[None, :], v[:, None]))
+            x, y = self.source(every[None, :], np.arange(begin, end)[:, None])
             columns[begin:end], rows[begin:end] = x - 0.5, y - 0.5
-        seen = (columns >= -0.5) & (columns <= self.lens.width - 0.5)
-        seen &= (rows >= -0.5) & (rows <= self.lens.height - 0.5)
-        return columns, rows, seen
+        if not self.has_invalid:
+            return columns, rows, _inside(self.lens, columns + 0.5, rows + 0.5)
+        _, _, cx, cy = self.lens.intrinsics
+        axis = int(np.clip(cy - self.y0, 0, self.height - 1)), int(np.clip(cx - self.x0, 0, self.width - 1))
+        return columns, rows, _seen(self.lens, columns + 0.5, rows + 0.5, axis)
+
+    def source(self, columns: npt.ArrayLike, rows: npt.ArrayLike) -> tuple[Array, Array]:
+        """Where in the old image (x, y) the centres of pixels of the new one come from."""
+        fx, fy, cx, cy = self.lens.intrinsics
+        u = (np.asarray(columns) + 0.5 + self.x0 - cx) / fx
+        v = (np.asarray(rows) + 0.5 + self.y0 - cy) / fy
+        return self.lens.project(*np.broadcast_arrays(u, v))
 
 
 def rectify(lens: Lens, policy: str = "crop") -> Rectification:
@@ -95,7 +103,8 @@ def _seen_grid(lens: Lens) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
     while True:
         box = np.clip(box, -MAX_TANGENT, MAX_TANGENT)
         u, v = np.linspace(box[0], box[1], _GRID), np.linspace(box[2], box[3], _GRID)
-        seen = _seen(lens, u, v)
+        axis = int(np.abs(v).argmin()), int(np.abs(u).argmin())
+        seen = _seen(lens, *lens.project(*np.broadcast_arrays(u[None, :], v[:, None])), axis)
         open_sides = np.array([seen[:, 0].any(), seen[:, -1].any(), seen[0].any(), seen[-1].any()])
         open_sides &= np.abs(box) < MAX_TANGENT
         if not open_sides.any():
@@ -107,19 +116,28 @@ def _spans(box: Array) -> Array:
     return np.repeat([box[1] - box[0], box[3] - box[2]], 2)
 
 
-def _seen(lens: Lens, u: Array, v: Array) -> npt.NDArray[np.bool_]:
-    """Which directions land inside the image, without those that a polynomial folds back into it."""
-    x, y = lens.project(*np.broadcast_arrays(u[None, :], v[:, None]))
+def _inside(lens: Lens, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
-        seen = (x >= 0) & (x <= lens.width) & (y >= 0) & (y <= lens.height)
+        return np.asarray((x >= 0) & (x <= lens.width) & (y >= 0) & (y <= lens.height))
+
+
+def _seen(
+    lens: Lens, x: npt.NDArray[Any], y: npt.NDArray[Any], axis: tuple[int, int]
+) -> npt.NDArray[np.bool_]:
+    """Which directions of a grid land inside the image, without those that a polynomial folds back into it.
+
+    x, y are their pixels, [rows, columns] of the grid; `axis` is the row and column of the optical axis. Beyond
+    a fold the image is mirrored, and what is connected to the axis without crossing one was seen.
+    """
+    seen = _inside(lens, x, y)
+    with np.errstate(invalid="ignore"):
         dx_dv, dx_du = np.gradient(x)
         dy_dv, dy_du = np.gradient(y)
         seen &= dx_du * dy_dv > dx_dv * dy_du
-    _, labels = cv2.connectedComponents(seen.astype(np.uint8), connectivity=4)
-    row, column = int(np.abs(v).argmin()), int(np.abs(u).argmin())
-    if not seen[row, column]:
+    if not seen[axis]:
         raise ValueError(f"the lens does not see along its own axis; are the parameters right? {lens}")
-    return np.asarray(labels == labels[row, column])
+    _, labels = cv2.connectedComponents(seen.astype(np.uint8), connectivity=4)
+    return np.asarray(labels == labels[axis])
 
 
 def _bounds(seen: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
@@ -145,13 +163,15 @@ def _inner_rectangle(seen: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
 
 def _trim(plan: Rectification) -> Rectification:
     """Give up border pixels that the grid was too coarse to tell were not seen."""
-    seen = plan.maps()[2]
-    if seen.all():
-        return plan
-    top, bottom, left, right = _inner_rectangle(seen)
-    width, height = right - left + 1, bottom - top + 1
-    if min(width, height) < _MIN_SIDE:
-        raise ValueError(
-            f"undistorting leaves {width} x {height} pixels; are the parameters right? {plan.lens}"
-        )
-    return Rectification(plan.lens, width, height, plan.x0 + left, plan.y0 + top, has_invalid=False)
+    x0, y0, width, height = plan.x0, plan.y0, plan.width, plan.height
+    while min(width, height) >= _MIN_SIDE:
+        plan = Rectification(plan.lens, width, height, x0, y0, has_invalid=False)
+        every_row, every_column = np.arange(height), np.arange(width)
+        sides = ((every_column, 0), (every_column, height - 1), (0, every_row), (width - 1, every_row))
+        unseen = [1 - _inside(plan.lens, *plan.source(*side)).mean() for side in sides]
+        worst = int(np.argmax(unseen))
+        if unseen[worst] == 0:
+            return plan
+        x0, width = x0 + (worst == 2), width - (worst >= 2)
+        y0, height = y0 + (worst == 0), height - (worst < 2)
+    raise ValueError(f"undistorting leaves hardly a pixel; are the parameters right? {plan.lens}")

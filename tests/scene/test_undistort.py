@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+import time
+
 import cv2
 import numpy as np
 import pycolmap
@@ -122,6 +124,21 @@ def test_strong_distortion_that_folds_back_is_cut_off():
     plan = rectify(lens, "mask")
     limit = 1 / np.sqrt(3 * 0.35)  # where the derivative of u - 0.35 u^3 vanishes
     assert (plan.width - plan.K[0, 2]) / plan.K[0, 0] <= limit + 1e-2
+    columns, rows, seen = plan.maps()
+    v, u = np.mgrid[0 : plan.height, 0 : plan.width]
+    r = np.hypot((u + 0.5 - plan.K[0, 2]) / 500, (v + 0.5 - plan.K[1, 2]) / 500)
+    folded = (r > limit) & (np.abs(columns - 320) < 319) & (np.abs(rows - 240) < 239)
+    assert not seen[r > limit + 2e-3].any() and seen[r < 0.3].all()
+    assert folded.any(), "the test needs directions that are folded into the image"
+
+
+def test_planning_a_large_image_does_not_take_its_pixels():
+    begin = time.process_time()
+    plan = rectify(Lens("OPENCV", 9000, 6000, (8000.0, 8000.0, 4500.0, 3000.0, -0.1, 0.02, 1e-4, 1e-4)))
+    assert time.process_time() - begin < 3
+    ring = np.arange(plan.width), np.zeros(plan.width)
+    x, y = plan.source(*ring)
+    assert ((x >= 0) & (x <= 9000) & (y >= 0) & (y <= 6000)).all()
 
 
 def test_pinholes_and_zero_distortion_stay_as_they_are():
@@ -139,7 +156,7 @@ def test_impossible_lenses_are_refused():
         Lens("SIMPLE_PINHOLE", 640, 480, (float("nan"), 320.0, 240.0))
     with pytest.raises(ValueError, match="unknown camera model"):
         Lens("NOVEL", 640, 480, (1.0,))
-    with pytest.raises(ValueError, match="leaves .* pixels|along its own axis"):
+    with pytest.raises(ValueError, match="leaves .* pixel|along its own axis"):
         rectify(Lens("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -4e3)))
 
 
