@@ -65,7 +65,8 @@ class Ranks:
             The ranks; the trivial object when torchrun started a single process or none.
 
         Raises:
-            RuntimeError: a CUDA device was asked for that does not exist, or the other ranks did not appear.
+            ValueError: a CUDA device was asked for that does not exist.
+            RuntimeError: the other ranks did not appear.
         """
         world_size = int(os.environ.get("WORLD_SIZE", "1"))
         rank = int(os.environ.get("RANK", "0"))
@@ -272,7 +273,7 @@ def _resolve_device(device: str, local_rank: int) -> torch.device:
     if place.type == "cuda" and place.index is None:
         place = torch.device("cuda", local_rank)
     if place.type == "cuda" and place.index >= torch.cuda.device_count():
-        raise RuntimeError(
+        raise ValueError(
             f"local rank {local_rank} needs {place}, but this host has {torch.cuda.device_count()} "
             "CUDA devices; start fewer processes per node (torchrun --nproc-per-node) or use --device cpu"
         )

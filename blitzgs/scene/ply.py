@@ -120,6 +120,7 @@ def write_ply(
 
     Raises:
         ValueError: shapes disagree.
+        OSError: the file cannot be written; what was at `path` is still there.
     """
     n, k = len(means), sh.shape[1] if sh.ndim == 3 else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
@@ -143,10 +144,14 @@ def write_ply(
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    native_io().write_ply(
-        str(partial), comments or [], [(name, "f4") for name in names], n, rows.view(np.uint8)
-    )
-    os.replace(partial, path)
+    try:
+        native_io().write_ply(
+            str(partial), comments or [], [(name, "f4") for name in names], n, rows.view(np.uint8)
+        )
+        os.replace(partial, path)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def _array(tensor: Tensor) -> npt.NDArray[np.float32]:

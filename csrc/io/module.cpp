@@ -6,9 +6,12 @@
 #include <pybind11/stl.h>
 
 #include <algorithm>
+#include <cerrno>
+#include <cstring>
 #include <fstream>
 #include <memory>
 #include <span>
+#include <stdexcept>
 #include <string_view>
 
 #include "io/colmap.h"
@@ -63,6 +66,11 @@ std::vector<std::string> from_names(const py::handle& names) {
   return out;
 }
 
+// A file that cannot be written: OSError in Python.
+struct WriteError : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
 bool is_text(const std::string& path) { return path.ends_with(".txt"); }
 
 // Runs `read(stream)` on the file without the GIL.
@@ -78,10 +86,10 @@ template <class Write>
 void to_file(const std::string& path, Write write) {
   py::gil_scoped_release release;
   std::ofstream out(path, std::ios::binary | std::ios::trunc);
-  if (!out) throw std::runtime_error(path + ": cannot be opened for writing");
+  if (!out) throw WriteError(path + ": cannot be opened for writing: " + std::strerror(errno));
   write(out);
   out.close();
-  if (!out) throw std::runtime_error(path + ": writing failed (disk full?)");
+  if (!out) throw WriteError(path + ": writing failed: " + std::strerror(errno));
 }
 
 py::list camera_models() {
@@ -233,6 +241,7 @@ py::array_t<std::uint8_t> decode_qoi(const py::bytes& data) {
 PYBIND11_MODULE(_io, m) {
   m.doc() = "Host-side I/O of BlitzGS; blitzgs.scene.colmap and blitzgs.scene.ply are its public face.";
   py::register_exception<io::FormatError>(m, "FormatError", PyExc_ValueError);
+  py::register_exception<WriteError>(m, "WriteError", PyExc_OSError);
   m.def("camera_models", &camera_models);
   m.def("read_cameras", &read_cameras, "path"_a);
   m.def("read_images", &read_images, "path"_a, "with_points2d"_a);

@@ -55,7 +55,7 @@ def test_one_process_needs_no_group():
 
 
 def test_missing_gpu_is_named():
-    with pytest.raises(RuntimeError, match="local rank 0 needs cuda:99"):
+    with pytest.raises(ValueError, match="local rank 0 needs cuda:99"):
         Ranks.from_environment("cuda:99")
 
 

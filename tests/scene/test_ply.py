@@ -134,3 +134,15 @@ def test_point_clouds_with_faces_and_without_colours(tmp_path):
     bare = np.array([(1, 2, 3)], dtype=[(axis, "f8") for axis in "xyz"])
     plyfile.PlyData([plyfile.PlyElement.describe(bare, "vertex")]).write(tmp_path / "b.ply")
     assert read_points(tmp_path / "b.ply")[1].tolist() == [[128, 128, 128]]
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "model.ply"
+    write_ply(path, **gaussians(5, 1))
+    before = path.read_bytes()
+    (tmp_path / "model.ply.partial").symlink_to("/dev/full")  # opens, but has no room
+    with pytest.raises(OSError, match="model.ply.partial: writing failed: No space left on device"):
+        write_ply(path, **gaussians(5000, 3))
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["model.ply"]
+    with pytest.raises(OSError, match="cannot be opened for writing"):
+        write_ply("/proc/model.ply", **gaussians(1, 0))
