@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs a function on M Gloo ranks. A fork server imports torch once, so spawns are quick."""
+"""Runs a function on M ranks: Gloo on the CPU, NCCL on as many GPUs.
+
+A fork server imports torch once, so CPU ranks start quickly; a CUDA context does not survive a fork.
+"""
 
 import multiprocessing
 import multiprocessing.connection
@@ -8,6 +11,8 @@ import pickle
 import time
 import traceback
 
+import pytest
+import torch
 from torch.distributed import TCPStore
 
 from blitzgs.distributed.group import Ranks
@@ -16,9 +21,7 @@ CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli"])
 
 
-def _child(function, rank, world_size, port, timeout_seconds, join, arguments, pipe):
-    import torch
-
+def _child(function, rank, world_size, port, timeout_seconds, join, device, arguments, pipe):
     torch.set_num_threads(1)
     os.environ.update(
         RANK=str(rank),
@@ -31,7 +34,7 @@ def _child(function, rank, world_size, port, timeout_seconds, join, arguments, p
     )
     try:
         if join:
-            with Ranks.from_environment("cpu", timeout_seconds) as ranks:
+            with Ranks.from_environment(device, timeout_seconds) as ranks:
                 result = function(ranks, *pickle.loads(arguments))
         else:
             result = function(rank, *pickle.loads(arguments))
@@ -53,7 +56,22 @@ class RankError(AssertionError):
         self.messages = messages
 
 
-def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.0, join=True):
+def on_each_device(*world_sizes):
+    """Parameters (world_size, device) for a test: all on the CPU, and those there are GPUs for on CUDA."""
+    cpu = [pytest.param(size, "cpu", id=f"cpu-{size}") for size in world_sizes]
+    gpus = torch.cuda.device_count()
+    return cpu + [
+        pytest.param(
+            size,
+            "cuda",
+            id=f"cuda-{size}",
+            marks=[pytest.mark.cuda, pytest.mark.skipif(gpus < size, reason=f"needs {size} GPUs")],
+        )
+        for size in world_sizes
+    ]
+
+
+def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.0, join=True, device="cpu"):
     """Return [function(ranks, *arguments) of each rank]; raise RankError if any rank fails.
 
     With `join` false the function gets its rank's number and joins the job itself, as a command does.
@@ -62,12 +80,13 @@ def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.
     store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
     # Plain pickles: multiprocessing's own would share the tensors' memory with the ranks.
     payload = pickle.dumps(arguments)
+    context = CONTEXT if device == "cpu" else multiprocessing.get_context("spawn")
     processes, pipes = [], []
     for rank in range(world_size):
-        receiver, sender = CONTEXT.Pipe(duplex=False)
-        process = CONTEXT.Process(
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(
             target=_child,
-            args=(function, rank, world_size, store.port, timeout_seconds, join, payload, sender),
+            args=(function, rank, world_size, store.port, timeout_seconds, join, device, payload, sender),
         )
         process.start()
         sender.close()

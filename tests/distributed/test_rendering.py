@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The image does not depend on the number of ranks, bit for bit; losses and gradients only by rounding."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -14,7 +16,7 @@ from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import batch_psnr, loss_terms, scale_term
-from tests.distributed.rank_harness import run_ranks
+from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training.tiny import look_at_origin, random_gaussians
 
 WIDTH, HEIGHT = 150, 90
@@ -23,7 +25,7 @@ OPTIONS = RenderOptions(sh_degree=0, near_plane=0.05, far_plane=100.0, backgroun
 LAYOUTS = {1: [0], 2: [0, 0, 0, 1], 3: [0, 2, 2], 4: [0, 3, 1, 0, 0, 3]}
 
 
-def cameras(n_views, blind=False):
+def cameras(n_views, blind=False, device="cpu"):
     """Views around the scene; with `blind` the first looks away from it."""
     poses = [
         look_at_origin(np.array([3 * np.cos(a), 3 * np.sin(a), 1.5])) for a in np.linspace(0, 5, n_views)
@@ -31,7 +33,8 @@ def cameras(n_views, blind=False):
     if blind:
         poses[0] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ poses[0]
     K = torch.tensor([[110.0, 0, 73.2], [0, 112.0, 46.1], [0, 0, 1]])
-    return Views(torch.from_numpy(np.stack(poses)).float(), K.repeat(n_views, 1, 1), WIDTH, HEIGHT)
+    viewmats = torch.from_numpy(np.stack(poses)).float()
+    return Views(viewmats.to(device), K.repeat(n_views, 1, 1).to(device), WIDTH, HEIGHT)
 
 
 def shard(ranks):
@@ -41,7 +44,7 @@ def shard(ranks):
     table["id"].copy_((table["id"] * 7919 + 5) % 100003)
     layout = torch.tensor(LAYOUTS[ranks.world_size])
     table.keep(layout[torch.arange(len(table)) % len(layout)] == ranks.rank)
-    return table
+    return GaussianTable({name: table[name].to(ranks.device) for name in table})
 
 
 def photographs(n_views):
@@ -56,7 +59,7 @@ def _render(ranks):
     torch.set_num_threads(1)
     table, owners, out = shard(ranks), TileOwners(ranks), []
     for n_views, blind in [(1, False), (4, True), (1, True), (4, True), (1, False)]:
-        views = cameras(n_views, blind)
+        views = cameras(n_views, blind, ranks.device)
         keys = [(n_views, blind, view) for view in range(n_views)]
         share, ranges = None, None
         if ranks.world_size > 1:
@@ -72,7 +75,8 @@ def _render(ranks):
             for view in range(n_views):  # pixels that this rank was never given
                 y0, y1 = ranges.pixel_rows(ranks.rank, view)
                 targets[view, :y0], targets[view, y1:] = 77, 77
-        batch = Batch(list(range(n_views)), targets, masks, samples, ranges)
+        on_device = [tensor.to(ranks.device) for tensor in (targets, masks, samples)]
+        batch = Batch(list(range(n_views)), *on_device, ranges)
         terms = loss_terms(frame, batch, LossConfig(), 3.0)
         gradients = pipeline.backward(table, frame, terms.v_renders, terms.scale_reg)
         dense = [torch.zeros_like(column) for column in table.parameters]
@@ -81,33 +85,33 @@ def _render(ranks):
         tiles = (0, image.numel()) if share is None else share.tiles
         out.append(
             {
-                "image": image,
-                "loss": terms.photometric,
-                "scale": scale_term(frame, table, 3.0),
-                "psnr": batch_psnr(frame, batch),
-                "gradients": dense,
+                "image": image.cpu(),
+                "loss": terms.photometric.cpu(),
+                "scale": scale_term(frame, table, 3.0).cpu(),
+                "psnr": batch_psnr(frame, batch).cpu(),
+                "gradients": [gradient.cpu() for gradient in dense],
                 "work": int(frame.tile_work.sum()),
                 "tiles": tiles,
             }
         )
-    return table["id"], out
+    return table["id"].cpu(), out
 
 
 @pytest.fixture(scope="module")
 def alone():
-    return _render(Ranks())
+    return functools.cache(lambda device: _render(Ranks(device=torch.device(device))))
 
 
 def relative(a, b):
     return ((a - b).norm() / b.norm().clamp(min=1e-30)).item()
 
 
-@pytest.mark.parametrize("world_size", [2, 3, 4])
-def test_images_are_the_same_bits_and_losses_agree(alone, world_size):
-    ids, expected = alone
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 3, 4))
+def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device):
+    ids, expected = alone(device)
     assert expected[0]["image"].std() > 0.1  # there is something to see
     assert torch.equal(expected[1]["image"][0], torch.tensor([0.1, 0.2, 0.3]).expand(HEIGHT, WIDTH, 3))
-    answers = run_ranks(_render, world_size)
+    answers = run_ranks(_render, world_size, device=device)
     rank_ids = torch.cat([a[0] for a in answers])
     order, reference = rank_ids.argsort(), ids.argsort()
     for step, want in enumerate(expected):

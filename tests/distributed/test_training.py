@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training on several ranks from one checkpoint: the same ids, and the same numbers up to rounding."""
 
+import functools
 import json
 import os
 import shutil
@@ -16,7 +17,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import run
 from blitzgs.training.trainer import Trainer
-from tests.distributed.rank_harness import RankError, run_ranks
+from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
 
 ROOT = Path(__file__).parents[2]
@@ -43,7 +44,7 @@ def _train(ranks, folder, *overrides):
     capture, images = tiny_scene()
     trainer = Trainer(tiny_config(*SETTINGS, *overrides), capture, images, folder, ranks, resume=True)
     summary = trainer.train()
-    return summary, trainer.table["id"]
+    return summary, trainer.table["id"].cpu()
 
 
 def records(folder):
@@ -59,21 +60,26 @@ def sorted_table(folder):
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory):
-    """A run of 10 steps on one rank: its first checkpoint is where all others begin."""
-    folder = tmp_path_factory.mktemp("start")
-    _train(Ranks(), folder)
-    base = tmp_path_factory.mktemp("base")
-    (base / "checkpoints").mkdir()
-    shutil.copytree(folder / "checkpoints" / "checkpoint_000000", base / "checkpoints" / "checkpoint_000000")
-    return folder, base
+    """A run on one rank, and a folder with its checkpoint after 10 steps, where all others begin."""
+
+    @functools.cache
+    def make(device):
+        folder = tmp_path_factory.mktemp("start")
+        _train(Ranks(device=torch.device(device)), folder)
+        base = tmp_path_factory.mktemp("base")
+        checkpoint = Path("checkpoints") / "checkpoint_000000"
+        shutil.copytree(folder / checkpoint, base / checkpoint)
+        return folder, base
+
+    return make
 
 
-@pytest.mark.parametrize("world_size", [2, 4])
-def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size):
-    whole, base = start
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 4))
+def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
+    whole, base = start(device)
     folder = tmp_path / "run"
     shutil.copytree(base, folder)
-    answers = run_ranks(_train, world_size, folder)
+    answers = run_ranks(_train, world_size, folder, device=device)
     losses, events = records(folder)
     expected_losses, expected_events = records(whole)
     expected_losses = [r for r in expected_losses if r["t"] > 20]
