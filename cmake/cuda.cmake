@@ -23,8 +23,10 @@ target_compile_options(
 # Counting and emitting compute the same rows and tiles in different kernels: no contraction, so that they
 # get the same bits. These kernels wait for memory, not for arithmetic.
 set_source_files_properties(
-  ${CMAKE_SOURCE_DIR}/csrc/project/project_cuda.cu ${CMAKE_SOURCE_DIR}/csrc/intersect/intersect_cuda.cu
-  PROPERTIES COMPILE_OPTIONS "-fmad=false")
+  ${CMAKE_SOURCE_DIR}/csrc/project/project_cuda.cu
+  ${CMAKE_SOURCE_DIR}/csrc/intersect/intersect_cuda.cu
+  PROPERTIES COMPILE_OPTIONS "-fmad=false"
+)
 
 # The library needs libtorch_cuda.so when it is loaded. A CPU-only torch has none to link against, so
 # a stub of the same soname stands in; the real one is found when the library is loaded.
