@@ -119,6 +119,8 @@ class OptimiserConfig:
         position, position_final: learning rates of the means, relative to extent, at the start and after
             `schedule.position_decay`.
         sh_dc, sh_rest, opacity, scale, rotation: learning rates.
+        final_share: the share of these five rates that is left at the end of the run, reached exponentially;
+            1 keeps them constant.
         beta1, beta2, eps: Adam's constants for B = 1.
         sparse: leave the rows outside a step's active set alone (no decay, no drift) instead of repaying the
             steps they missed.
@@ -131,6 +133,7 @@ class OptimiserConfig:
     opacity: float = 2.5e-2
     scale: float = 5e-3
     rotation: float = 1e-3
+    final_share: float = 1.0
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15

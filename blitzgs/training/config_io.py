@@ -181,6 +181,12 @@ def _check(config: Config) -> None:
         (schedule.densify_every >= 1, "schedule.densify_every", schedule.densify_every, "1 or more"),
         (schedule.sh_every >= 1, "schedule.sh_every", schedule.sh_every, "1 or more"),
         (schedule.position_decay >= 1, "schedule.position_decay", schedule.position_decay, "1 or more"),
+        (
+            0 < config.optimiser.final_share <= 1,
+            "optimiser.final_share",
+            config.optimiser.final_share,
+            "in (0, 1]",
+        ),
         (0 <= config.loss.ssim <= 1, "loss.ssim", config.loss.ssim, "between 0 and 1"),
         (config.loss.scale_reference > 0, "loss.scale_reference", config.loss.scale_reference, "positive"),
         (

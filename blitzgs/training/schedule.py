@@ -104,5 +104,6 @@ class Schedule:
         constants = (config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest)
         table = torch.zeros(self.steps + 1, len(RATES), dtype=torch.float64)
         table[1:, 0] = position
-        table[1:, 1:] = torch.tensor(constants, dtype=torch.float64)
+        share = config.final_share ** (begin / self.iterations)
+        table[1:, 1:] = torch.tensor(constants, dtype=torch.float64) * share[:, None]
         return (table * math.sqrt(self.batch_size)).float()
