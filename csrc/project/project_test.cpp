@@ -1,0 +1,233 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "project/project.h"
+
+#include <algorithm>
+#include <limits>
+#include <random>
+#include <vector>
+
+#include "common/catch.h"
+
+using namespace blitzgs;
+
+namespace {
+
+struct NoWorkspace final : Workspace {
+  void* allocate_bytes(std::size_t) override { return nullptr; }
+};
+
+// 2500 Gaussians (three blocks of candidates) around the origin, seen by three cameras on the z axis.
+struct World {
+  static constexpr int kCount = 2500, kViews = 3, kBasis = 4;
+  std::vector<double> means, quats, scales, opacities, sh, viewmats, Ks;
+
+  World() {
+    std::mt19937 engine(5);
+    std::normal_distribution<double> normal;
+    const auto fill = [&](std::vector<double>* values, int size, double spread, double middle) {
+      for (int i = 0; i < size; ++i) values->push_back(middle + spread * normal(engine));
+    };
+    fill(&means, 3 * kCount, 1.5, 0.0);
+    fill(&quats, 4 * kCount, 1.0, 0.0);
+    fill(&scales, 3 * kCount, 0.5, -2.0);
+    fill(&opacities, kCount, 2.0, 0.0);
+    fill(&sh, 3 * kBasis * kCount, 0.5, 0.0);
+    for (int view = 0; view < kViews; ++view) {
+      const double z = 2.0 + view;
+      for (const double x :
+           {1.0, 0.0, 0.0, 0.1 * view, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, z, 0.0, 0.0, 0.0, 1.0}) {
+        viewmats.push_back(x);
+      }
+      for (const double x : {40.0, 0.0, 20.0, 0.0, 42.0, 15.0, 0.0, 0.0, 1.0}) Ks.push_back(x);
+    }
+  }
+
+  ProjectInputs<double> inputs() const {
+    const ProjectOptions<double> options{40, 30, 16, 1, kBasis, 0.05, 1e10, 0.3, 0.0, true, true};
+    return {means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), viewmats.data(),
+            Ks.data(),    nullptr,      nullptr,       kCount,           kViews,    options};
+  }
+};
+
+struct Projected {
+  ProjectCounts counts;
+  std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, row_offsets, radii, tiles;
+  std::vector<double> means2d, conics, depths, opacities, colors;
+};
+
+Projected project(const ProjectInputs<double>& in) {
+  Projected p;
+  NoWorkspace workspace;
+  std::vector<std::uint32_t> masks(in.n_candidates);
+  std::vector<std::int64_t> visible(project_blocks(in.n_candidates) + 1), rows(visible.size());
+  std::unique_ptr<ProjectCarry> carry;
+  const ProjectPlan plan{masks.data(), visible.data(), rows.data(), &carry};
+  cpu::project_count(in, plan, &p.counts, workspace, nullptr);
+  const std::size_t U = p.counts.visible, P = p.counts.rows;
+  for (auto* ints : {&p.gaussian_ids, &p.camera_ids, &p.tiles}) ints->resize(P);
+  p.radii.resize(2 * P);
+  p.visible_ids.resize(U);
+  p.row_offsets.resize(U + 1);
+  p.means2d.resize(2 * P);
+  p.conics.resize(3 * P);
+  p.depths.resize(P);
+  p.opacities.resize(P);
+  p.colors.resize(3 * P);
+  const ProjectOutputs<double> out{p.gaussian_ids.data(), p.camera_ids.data(), p.visible_ids.data(),
+                                   p.row_offsets.data(),  p.means2d.data(),    p.conics.data(),
+                                   p.depths.data(),       p.opacities.data(),  p.colors.data(),
+                                   p.radii.data(),        p.tiles.data()};
+  cpu::project_emit(in, plan, p.counts, out, workspace, nullptr);
+  return p;
+}
+
+// A scalar of the rows: the weighted sum of everything differentiable.
+struct Weights {
+  std::vector<double> means2d, conics, depths, opacities, colors;
+  std::vector<double> scale_reg{0.3, 0.0, -0.2};
+
+  explicit Weights(std::int64_t rows) {
+    std::mt19937 engine(6);
+    std::normal_distribution<double> normal;
+    for (auto* values : {&means2d, &conics, &depths, &opacities, &colors}) {
+      const std::int64_t width = values == &means2d ? 2 : (values == &conics || values == &colors ? 3 : 1);
+      for (std::int64_t i = 0; i < width * rows; ++i) values->push_back(normal(engine));
+    }
+  }
+
+  double of(const Projected& p, const World& world) const {
+    double sum = 0;
+    const auto add = [&](const std::vector<double>& w, const std::vector<double>& values) {
+      REQUIRE(w.size() == values.size());
+      for (std::size_t i = 0; i < w.size(); ++i) sum += w[i] * values[i];
+    };
+    add(means2d, p.means2d);
+    add(conics, p.conics);
+    add(depths, p.depths);
+    add(opacities, p.opacities);
+    add(colors, p.colors);
+    for (std::size_t row = 0; row < p.camera_ids.size(); ++row) {
+      const double* s = &world.scales[3 * p.gaussian_ids[row]];
+      sum += scale_reg[p.camera_ids[row]] * std::exp(std::min({s[0], s[1], s[2]}));
+    }
+    return sum;
+  }
+};
+
+}  // namespace
+
+TEST_CASE("rows are ordered by Gaussian and view, and the plan's counts are theirs") {
+  const World world;
+  const Projected p = project(world.inputs());
+  REQUIRE(p.counts.rows > 2000);
+  REQUIRE(p.counts.visible > 1000);
+  REQUIRE(p.row_offsets.front() == 0);
+  REQUIRE(p.row_offsets.back() == p.counts.rows);
+  std::int64_t tiles = 0;
+  for (std::int64_t row = 0; row < p.counts.rows; ++row) {
+    tiles += p.tiles[row];
+    if (row == 0) continue;
+    const std::int64_t before = p.gaussian_ids[row - 1] * World::kViews + p.camera_ids[row - 1];
+    REQUIRE(before < p.gaussian_ids[row] * World::kViews + p.camera_ids[row]);
+  }
+  REQUIRE(tiles == p.counts.tiles);
+  for (std::int64_t u = 0; u < p.counts.visible; ++u) {
+    for (int row = p.row_offsets[u]; row < p.row_offsets[u + 1]; ++row) {
+      REQUIRE(p.gaussian_ids[row] == p.visible_ids[u]);
+    }
+  }
+}
+
+TEST_CASE("candidates and their views select rows and change no bit of them") {
+  const World world;
+  const Projected all = project(world.inputs());
+  std::vector<std::int32_t> ids, views;
+  for (int id = 0; id < World::kCount; id += 3) {
+    ids.push_back(id);
+    views.push_back(id % 8);
+  }
+  ProjectInputs<double> in = world.inputs();
+  in.active_ids = ids.data();
+  in.active_views = views.data();
+  in.n_candidates = static_cast<std::int64_t>(ids.size());
+  const Projected some = project(in);
+  std::size_t next = 0;
+  for (std::int64_t row = 0; row < all.counts.rows; ++row) {
+    const int id = all.gaussian_ids[row];
+    if (id % 3 != 0 || !(id % 8 >> all.camera_ids[row] & 1)) continue;
+    REQUIRE(next < some.gaussian_ids.size());
+    REQUIRE(some.gaussian_ids[next] == id);
+    REQUIRE(some.camera_ids[next] == all.camera_ids[row]);
+    REQUIRE(some.conics[3 * next] == all.conics[3 * row]);
+    REQUIRE(some.colors[3 * next + 2] == all.colors[3 * row + 2]);
+    ++next;
+  }
+  REQUIRE(next == some.gaussian_ids.size());
+  REQUIRE(next > 100);
+}
+
+TEST_CASE("the backward pass is the derivative of the rows") {
+  World world;
+  const Projected p = project(world.inputs());
+  const Weights weights(p.counts.rows);
+  const std::int64_t U = p.counts.visible;
+  std::vector<double> v_means(3 * U), v_quats(4 * U), v_scales(3 * U), v_opacities(U),
+      v_sh(3 * World::kBasis * U), v_viewmats(16 * World::kViews);
+  NoWorkspace workspace;
+  cpu::project_bwd(
+      world.inputs(), ProjectRows{p.camera_ids.data(), p.visible_ids.data(), p.row_offsets.data(), U},
+      ProjectRowGradients<double>{weights.means2d.data(), weights.conics.data(), weights.depths.data(),
+                                  weights.opacities.data(), weights.colors.data()},
+      weights.scale_reg.data(),
+      ProjectGradients<double>{v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(),
+                               v_sh.data(), v_viewmats.data()},
+      workspace, nullptr);
+  // Steps of 1e-6 may move a row across the edge of the image; the sums are then of different rows.
+  const auto slope = [&](double* value) {
+    const double middle = *value, h = 1e-6;
+    *value = middle + h;
+    const Projected above = project(world.inputs());
+    const double up = above.counts.rows == p.counts.rows ? weights.of(above, world) : 0;
+    *value = middle - h;
+    const Projected below = project(world.inputs());
+    const double down = below.counts.rows == p.counts.rows ? weights.of(below, world) : 0;
+    *value = middle;
+    REQUIRE((above.counts.rows == p.counts.rows && below.counts.rows == p.counts.rows));
+    return (up - down) / (2 * h);
+  };
+  for (const std::int64_t u : {std::int64_t{0}, U / 3, U - 1}) {
+    const std::int64_t id = p.visible_ids[u];
+    for (int i = 0; i < 3; ++i) {
+      REQUIRE(slope(&world.means[3 * id + i]) == Approx(v_means[3 * u + i]).epsilon(1e-5).margin(1e-3));
+      REQUIRE(slope(&world.scales[3 * id + i]) == Approx(v_scales[3 * u + i]).epsilon(1e-5).margin(1e-3));
+      REQUIRE(slope(&world.quats[4 * id + i]) == Approx(v_quats[4 * u + i]).epsilon(1e-5).margin(1e-3));
+    }
+    REQUIRE(slope(&world.opacities[id]) == Approx(v_opacities[u]).epsilon(1e-5).margin(1e-3));
+    for (int k = 0; k < 3 * World::kBasis; k += 5) {
+      const std::int64_t stride = 3 * World::kBasis;
+      REQUIRE(slope(&world.sh[stride * id + k]) == Approx(v_sh[stride * u + k]).epsilon(1e-5).margin(1e-3));
+    }
+  }
+  for (const int i : {3, 5, 16 + 2, 32 + 8, 32 + 11}) {
+    INFO("viewmats entry " << i);
+    REQUIRE(slope(&world.viewmats[i]) == Approx(v_viewmats[i]).epsilon(1e-4));
+  }
+  REQUIRE(v_viewmats[15] == 0.0);
+}
+
+TEST_CASE("no Gaussians, no views, and Gaussians of NaN give no rows") {
+  World world;
+  ProjectInputs<double> in = world.inputs();
+  in.n_candidates = 0;
+  REQUIRE(project(in).row_offsets == std::vector<std::int32_t>{0});
+  in = world.inputs();
+  in.n_views = 0;
+  REQUIRE(project(in).counts.rows == 0);
+  const double nan = std::numeric_limits<double>::quiet_NaN();
+  for (auto* values : {&world.means, &world.quats, &world.scales, &world.opacities, &world.sh}) {
+    const std::vector<double> before = *values;
+    std::fill(values->begin(), values->end(), nan);
+    REQUIRE(project(world.inputs()).counts.rows == 0);
+    *values = before;
+  }
+}
