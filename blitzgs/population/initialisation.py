@@ -35,9 +35,9 @@ def octree_gaussians(
     the mean distance of its 3 nearest neighbours as its size on all axes. Ids count from 0.
 
     Args:
-        points: SfM points, float64 [M, 3].
+        points: SfM points, float64 [M, 3], on the CPU.
         colors: their colours, uint8 [M, 3].
-        centres: camera centres, float64 [V, 3].
+        centres: camera centres, float64 [V, 3]; their device measures the distances.
         levels: from `measure_levels` on the same points and cameras.
         visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
             cameras.
@@ -50,7 +50,6 @@ def octree_gaussians(
     Raises:
         ValueError: no voxel is left.
     """
-    points, colors = points.cpu(), colors.cpu()
     origin = _grid_origin(points, levels)
     parts = []
     for level in range(levels.count):
@@ -106,10 +105,13 @@ def _voxels(points: Tensor, colors: Tensor, origin: Tensor, size: float) -> tupl
 
 def _share_of_cameras(means: Tensor, centres: Tensor, farthest: float) -> Tensor:
     """Share of the cameras within `farthest` of each mean, float64 [C]."""
-    near = torch.zeros(len(means), dtype=torch.int64)
+    if math.isinf(farthest):
+        return torch.ones(len(means), dtype=torch.float64)
+    places = means.to(centres.device)
+    near = torch.zeros(len(places), dtype=torch.int64, device=places.device)
     for centre in centres:
-        near += (means - centre).norm(dim=1) <= farthest
-    return near.double() / len(centres)
+        near += (places - centre).norm(dim=1) <= farthest
+    return near.cpu().double() / len(centres)
 
 
 def _spacing(means: Tensor) -> Tensor:

@@ -120,7 +120,8 @@ class Trainer:
         config, lod = self.config, self.config.lod
         points = torch.from_numpy(self.capture.points) / self.space.unit
         centres = camera_centres([self.capture.cameras[i] for i in self.capture.train], self.space)
-        levels = measure_levels(points, centres, lod.fork, lod.base_resolution)
+        centres = centres.to(self.ranks.device)
+        levels = measure_levels(points.to(self.ranks.device), centres, lod.fork, lod.base_resolution)
         table = octree_gaussians(
             points,
             torch.from_numpy(self.capture.colors),

@@ -56,8 +56,8 @@ def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution
     b = round(log_2(1 / base_resolution)) - floor(K / 2) + 1.
 
     Args:
-        points: float64 [M, 3], M >= 1.
-        centres: camera centres, float64 [V, 3], V >= 1.
+        points: float64 [M, 3], M >= 1, on any device.
+        centres: camera centres, float64 [V, 3], V >= 1, on the same device.
         fork: f > 1.
         base_resolution: finest sensible voxel relative to the box.
 
@@ -70,13 +70,12 @@ def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution
         )
     far, near = [], []
     for centre in centres:
-        distances = (points - centre).norm(dim=1).sort().values
+        distances = (points - centre).norm(dim=1)
         far.append(_quantile(distances, 0.999))
         near.append(_quantile(distances, 0.001))
-    d_max = _quantile(torch.stack(far).sort().values, 0.999).item()
-    d_min = _quantile(torch.stack(near).sort().values, 0.001).item()
-    ordered = points.sort(dim=0).values
-    box = 1.1 * (_quantile(ordered, 0.99) - _quantile(ordered, 0.01)).max().item()
+    d_max = _quantile(torch.stack(far), 0.999).item()
+    d_min = _quantile(torch.stack(near), 0.001).item()
+    box = 1.1 * max((_quantile(axis, 0.99) - _quantile(axis, 0.01)).item() for axis in points.unbind(1))
     if not (box > 0 and d_min > 0):
         raise ValueError(
             f"octree levels need a spread-out cloud seen from outside its points: the box is {box:g} and the "
@@ -87,9 +86,11 @@ def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution
     return Levels(count=count, fork=fork, reference_distance=d_max, voxel_size=box / fork**base)
 
 
-def _quantile(ordered: Tensor, q: float) -> Tensor:
-    """Linearly interpolated quantile along the first axis of sorted values."""
-    position = q * (len(ordered) - 1)
+def _quantile(values: Tensor, q: float) -> Tensor:
+    """Linearly interpolated quantile of values [M] near one of their ends, without sorting them all."""
+    largest = q > 0.5
+    position = (1.0 - q if largest else q) * (len(values) - 1)
     below = math.floor(position)
-    above = min(below + 1, len(ordered) - 1)
-    return ordered[below] + (ordered[above] - ordered[below]) * (position - below)
+    count = min(below + 2, len(values))
+    ends = values.topk(count, largest=largest).values
+    return ends[below] + (ends[count - 1] - ends[below]) * (position - below)
