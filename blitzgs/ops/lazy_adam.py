@@ -57,7 +57,7 @@ def lazy_adam_step_(
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    table = _schedule_table(lr_table, beta1, beta2)
+    table = schedule_table(lr_table, beta1, beta2)
     torch.ops.blitzgs.lazy_adam_step_(
         list(params),
         list(exp_avgs),
@@ -98,7 +98,7 @@ def lazy_adam_catch_up_(
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    table = _schedule_table(lr_table, beta1, beta2)
+    table = schedule_table(lr_table, beta1, beta2)
     torch.ops.blitzgs.lazy_adam_catch_up_(
         list(params),
         list(exp_avgs),
@@ -126,19 +126,8 @@ def _explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
 _tables: Any = WeakTensorKeyDictionary()
 
 
-def _schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
-    """Return the table of csrc/lazy_adam/lazy_adam.h for this schedule, made on first use."""
-    key = (beta1, beta2, lr_table._version)
-    cached = _tables.get(lr_table)
-    if cached is None or cached[0] != key:
-        cached = (key, schedule_table(lr_table, beta1, beta2))
-        _tables[lr_table] = cached
-    table: Tensor = cached[1]
-    return table
-
-
 def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
-    """Sum the drift of zero-gradient steps from every step to the end of the schedule.
+    """Return the drift of zero-gradient steps from every step to the end of the schedule, made on first use.
 
     Args:
         lr_table: float32 [S + 1, 6], learning rates per step (row 0 unused).
@@ -151,6 +140,16 @@ def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     Raises:
         ValueError: decay rates outside their range.
     """
+    key = (beta1, beta2, lr_table._version)
+    cached = _tables.get(lr_table)
+    if cached is None or cached[0] != key:
+        cached = (key, _make_table(lr_table, beta1, beta2))
+        _tables[lr_table] = cached
+    table: Tensor = cached[1]
+    return table
+
+
+def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 < math.sqrt(beta2)):
         raise ValueError(
             f"Adam's decay rates must satisfy 0 <= beta1 < sqrt(beta2) < 1, got beta1={beta1}, beta2={beta2}"

@@ -1,0 +1,24 @@
+// SPDX-License-Identifier: Apache-2.0
+// Scratch memory for the tests that run without torch.
+#pragma once
+#include <cstddef>
+#include <memory>
+#include <vector>
+
+#include "common/stream.h"
+
+namespace blitzgs {
+
+class TestWorkspace final : public Workspace {
+ public:
+  void* allocate_bytes(std::size_t bytes) override {
+    // Exactly as long as asked, so that AddressSanitizer sees the first byte beyond.
+    held_.push_back(std::make_unique<std::byte[]>(bytes));
+    return held_.back().get();
+  }
+
+ private:
+  std::vector<std::unique_ptr<std::byte[]>> held_;
+};
+
+}  // namespace blitzgs
