@@ -7,6 +7,7 @@ import argparse
 import json
 import math
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -55,6 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = " (configuration fields are written --section.field=value)" if args.command == "train" else ""
         args.parser.error(f"unrecognized arguments: {' '.join(rest)}{hint}")
     args.overrides = rest
+    # A warning of ours is about the user's data, not about the line of code that noticed.
+    warnings.formatwarning = lambda message, *_, **__: f"blitzgs {args.command}: warning: {message}\n"
     try:
         status: int = args.run(args)
     except USER_ERRORS as error:

@@ -54,3 +54,12 @@ def scaled_matrix(K: Float64, old: tuple[int, int], new: tuple[int, int]) -> Flo
 def downscaled_size(width: int, height: int, factor: float) -> tuple[int, int]:
     """Size of an image downscaled by `factor`, each side rounded to the nearest pixel, at least 1."""
     return max(1, int(width / factor + 0.5)), max(1, int(height / factor + 0.5))
+
+
+def sees_any(camera: Camera, points: Float64) -> bool:
+    """Whether any of the re-centred points [M, 3] lies in front of a camera and within its image."""
+    x, y, depth = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
+    front = depth > 0
+    u = camera.K[0, 0] * x[front] / depth[front] + camera.K[0, 2]
+    v = camera.K[1, 1] * y[front] / depth[front] + camera.K[1, 2]
+    return bool(((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).any())

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.scene import colmap, transforms
-from blitzgs.scene.cameras import Camera, Float64, camera_centers, downscaled_size, scaled_matrix
+from blitzgs.scene.cameras import Camera, Float64, camera_centers, downscaled_size, scaled_matrix, sees_any
 from blitzgs.scene.files import ImageFinder, find_mask
 from blitzgs.scene.image_files import ImageHeader, read_header
 from blitzgs.scene.lens import Lens
@@ -26,6 +26,7 @@ from blitzgs.scene.splits import split_views
 from blitzgs.scene.undistort import Rectification, rectify
 
 _HEADER_THREADS = 16
+_SAMPLED_POINTS = 2000
 
 
 @dataclass(eq=False)
@@ -132,6 +133,7 @@ def load_capture(
     if len(points.positions) == 0:
         points = _random_points(cameras, offset)
     points.positions = points.positions - offset
+    _warn_of_blind_views(cameras, points.positions)
     return Capture(
         root=root,
         cameras=cameras,
@@ -145,6 +147,18 @@ def load_capture(
         extent=_extent(centers[train], points.positions),
         has_alpha=any(header.has_alpha for header in headers),
     )
+
+
+def _warn_of_blind_views(cameras: list[Camera], points: Float64) -> None:
+    """Say so when most views see no point: a model of another world, or axes of another convention."""
+    sample = points[:: max(1, len(points) // _SAMPLED_POINTS)]
+    blind = [camera.name for camera in cameras if not sees_any(camera, sample)]
+    if 2 * len(blind) > len(cameras):
+        warnings.warn(
+            f"{len(blind)} of {len(cameras)} views (first: {blind[0]}) see none of the points: do the poses "
+            "and the points belong together, and do the cameras look along +z?",
+            stacklevel=3,
+        )
 
 
 def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View], _Points]:
@@ -214,7 +228,9 @@ def _with_finite_poses(views: list[_View]) -> list[_View]:
     if len(finite) < len(views):
         first = next(v.name for v in views if not np.isfinite(v.world_to_camera).all())
         warnings.warn(
-            f"{len(views) - len(finite)} views without a finite pose dropped (first: {first})", stacklevel=3
+            f"{len(views) - len(finite)} of {len(views)} views have no finite pose and were dropped "
+            f"(first: {first})",
+            stacklevel=3,
         )
     return finite
 

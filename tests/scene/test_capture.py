@@ -204,11 +204,24 @@ def test_views_and_points_that_are_not_finite_are_dropped_with_a_warning(tmp_pat
     with pytest.warns(UserWarning) as caught:
         capture = load_capture(tmp_path)
     messages = " ".join(str(w.message) for w in caught)
-    assert "2 views without a finite pose" in messages and "1 of 20 points are not finite" in messages
+    assert "2 of 9 views have no finite pose" in messages and "1 of 20 points are not finite" in messages
     assert len(capture.cameras) == 7 and len(capture.points) == 19 and len(capture.track_lengths) == 19
 
     edit_model(tmp_path, lambda m: m.images.quats.fill(np.nan))
     with pytest.raises(ValueError, match="none of the 9 views has a pose"):
+        load_capture(tmp_path)
+
+
+def test_points_that_no_view_sees_are_a_warning(tmp_path, recwarn):
+    write_capture(tmp_path, [f"{i}.png" for i in range(4)])
+    load_capture(tmp_path)
+    assert not recwarn.list
+
+    def move_away(model):
+        model.points.positions += np.array([1e4, -1e4, 1e4])
+
+    edit_model(tmp_path, move_away)
+    with pytest.warns(UserWarning, match=r"4 of 4 views \(first: 0.png\) see none of the points"):
         load_capture(tmp_path)
 
 
