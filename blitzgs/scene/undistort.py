@@ -126,8 +126,8 @@ def _seen(
 ) -> npt.NDArray[np.bool_]:
     """Which directions of a grid land inside the image, without those that a polynomial folds back into it.
 
-    x, y are their pixels, [rows, columns] of the grid; `axis` is the row and column of the optical axis. Beyond
-    a fold the image is mirrored, and what is connected to the axis without crossing one was seen.
+    x, y are their pixels, [rows, columns] of the grid; `axis` is the row and column of the optical axis.
+    Beyond a fold the image is mirrored, and what is connected to the axis without crossing one was seen.
     """
     seen = _inside(lens, x, y)
     with np.errstate(invalid="ignore"):
