@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build demo test test-python test-cxx test-slow lint format clean
+.PHONY: venv venv-test build io demo test test-python test-cxx test-slow lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -37,12 +37,18 @@ $(VENV)/.installed-test: $(VENV)/.installed
 build:
 	$(RUN) $(PYTHON) setup.py --quiet build_ext --inplace
 
+# The one module that depends on Python's version, where the kernels are already built: without CMake and torch.
+io:
+	$(CXX) -O3 -std=c++20 -shared -fPIC -fvisibility=hidden -Icsrc $$($(PYTHON) -m pybind11 --includes) \
+	  $(filter-out %_test.cpp,$(wildcard csrc/io/*.cpp)) \
+	  -o blitzgs/_lib/_io$$($(PYTHON) -c "import sysconfig; print(sysconfig.get_config_var('EXT_SUFFIX'))")
+
 demo: venv build
 	$(RUN) blitzgs synth $(DEMO)/city --preset demo
 	$(RUN) blitzgs train --config configs/smoke.yaml --data $(DEMO)/city --out $(DEMO)/run
 	$(RUN) blitzgs export $(DEMO)/run --ply $(DEMO)/city.ply
 	@echo
-	@echo "Pictures (photo | render | error): $(DEMO)/run/evaluation"
+	@echo "Pictures (render | photograph | error): $(DEMO)/run/evaluation"
 	@echo "Figures:                           $(DEMO)/run/summary.json"
 	@echo "The model, for any 3DGS viewer:    $(DEMO)/city.ply"
 

@@ -35,7 +35,7 @@ def native_io() -> ModuleType:
     except ImportError as error:
         raise ImportError(
             f"the host I/O module of blitzgs is missing for this Python ({error}); run `pip install .`, or "
-            "`make build` in a checkout"
+            "`make build` in a checkout (`make io` where the kernels are built already)"
         ) from error
     return module
 

@@ -55,7 +55,7 @@ void put_pixel(std::vector<std::uint8_t>& out, Pixel pixel, Pixel before, Recent
     out.push_back(static_cast<std::uint8_t>(kLuma | (dg + 32)));
     out.push_back(static_cast<std::uint8_t>((dr_dg + 8) << 4 | (db_dg + 8)));
   } else {
-    out.insert(out.end(), {kRgb, pixel.r, pixel.g, pixel.b});
+    for (const std::uint8_t byte : {kRgb, pixel.r, pixel.g, pixel.b}) out.push_back(byte);
   }
 }
 
@@ -65,11 +65,12 @@ std::vector<std::uint8_t> encode_qoi(const std::uint8_t* rgb, QoiSize size) {
   const std::size_t pixels = std::size_t{size.width} * size.height;
   std::vector<std::uint8_t> out;
   out.reserve(kHeader + 2 * pixels + kEnd.size());
-  out.insert(out.end(), {'q', 'o', 'i', 'f'});
+  for (const char c : {'q', 'o', 'i', 'f'}) out.push_back(static_cast<std::uint8_t>(c));
   for (const std::uint32_t side : {size.width, size.height}) {
     for (int shift = 24; shift >= 0; shift -= 8) out.push_back(static_cast<std::uint8_t>(side >> shift));
   }
-  out.insert(out.end(), {3, 0});
+  out.push_back(3);  // channels
+  out.push_back(0);  // sRGB
   Recent recent;
   Pixel before;
   unsigned run = 0;
