@@ -135,11 +135,6 @@ class GaussianTable:
         return self.columns["means"].device
 
     @property
-    def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree the table can hold."""
-        return round(self.columns["sh"].shape[1] ** 0.5) - 1
-
-    @property
     def parameters(self) -> tuple[Tensor, ...]:
         """The five learned columns in the order of `PARAMETERS`."""
         return tuple(self.columns[name] for name in PARAMETERS)
@@ -153,11 +148,6 @@ class GaussianTable:
     def exp_avg_sqs(self) -> tuple[Tensor, ...]:
         """Adam's second moments in the order of `PARAMETERS`."""
         return tuple(self.columns[name] for name in EXP_AVG_SQS)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes held by all columns."""
-        return sum(column.nbytes for column in self.columns.values())
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add rows at the end.

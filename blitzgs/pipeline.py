@@ -20,8 +20,6 @@ from blitzgs.distributed.ownership import Share
 from blitzgs.model import GaussianTable
 from blitzgs.ops.project import Rows
 
-MAX_VIEWS = 32
-
 
 @dataclass(frozen=True)
 class Views:
@@ -136,7 +134,7 @@ def forward(
 
     Args:
         table: the Gaussians.
-        views: at most `MAX_VIEWS` views.
+        views: at most 32 views.
         options: how to render.
         active: rows and views to consider; None: all.
         share: who composites which tiles; every rank of the job calls this with its table. None: render all

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -41,10 +41,6 @@ class Levels:
         is resolvable from everywhere.
         """
         return math.inf if level == 0 else self.reference_distance * self.fork ** (0.5 - level)
-
-    def to_dict(self) -> dict[str, float]:
-        """Return the fields as JSON-able values."""
-        return asdict(self)
 
 
 def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution: float) -> Levels:
