@@ -54,6 +54,7 @@ class ModelConfig:
         near: near plane, relative to extent.
         far: far plane, relative to extent.
         eps2d: screen-space blur added to the projected covariance, pixels squared.
+        deterministic: repeat a run bit for bit on CUDA too (the CPU always does), at some cost.
         initial_opacity: opacity of the initial Gaussians.
     """
 
@@ -63,6 +64,7 @@ class ModelConfig:
     near: float = 0.01
     far: float = 1e6
     eps2d: float = 0.3
+    deterministic: bool = False
     initial_opacity: float = 0.1
 
 

@@ -115,6 +115,7 @@ def render_options(config: Config, space: Space, sh_degree: int) -> RenderOption
         eps2d=model.eps2d,
         antialiased=model.antialiased,
         background=model.background,
+        deterministic=model.deterministic,
     )
 
 

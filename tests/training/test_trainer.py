@@ -34,6 +34,17 @@ def assert_same_table(a, b):
         assert torch.equal(a[name], b[name]), name
 
 
+def stop_at_step_50(monkeypatch):
+    step = Trainer._step
+
+    def interrupted(self, number, log):
+        step(self, number, log)
+        if number == 50:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Trainer, "_step", interrupted)
+
+
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
@@ -78,14 +89,7 @@ def test_what_a_run_leaves_behind(whole_run):
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     """50 steps, SIGTERM, resume, 50 more: bit for bit the run that was never stopped."""
     _, whole, _ = whole_run
-    step = Trainer._step
-
-    def interrupted(self, number, log):
-        step(self, number, log)
-        if number == 50:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(Trainer, "_step", interrupted)
+    stop_at_step_50(monkeypatch)
     first, summary = train(tmp_path)
     assert summary is None and first.progress.step == 50
     monkeypatch.undo()
@@ -171,3 +175,19 @@ def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_r
     with pytest.raises(ConfigError, match=r"loss.ssim: the checkpoint was trained with 0.2, now 0.3"):
         train(folder, "loss.ssim=0.3", resume=True)
     train(folder, "log.every=50", resume=True)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path, monkeypatch):
+    ranks = Ranks(device=torch.device("cuda"))
+    config = tiny_config("model.deterministic=true")
+    whole = Trainer(config, *tiny_scene(), tmp_path / "whole", ranks)
+    summary = whole.train()
+    assert summary["psnr"] == pytest.approx(whole_run[2]["psnr"], abs=1.0)
+    stop_at_step_50(monkeypatch)
+    assert Trainer(config, *tiny_scene(), tmp_path / "cut", ranks).train() is None
+    monkeypatch.undo()
+    resumed = Trainer(config, *tiny_scene(), tmp_path / "cut", ranks, resume=True)
+    resumed.train()
+    assert_same_table(resumed.table, whole.table)
