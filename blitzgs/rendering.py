@@ -100,7 +100,7 @@ def rasterization(
             **unsupported,
         }
     )
-    _check(means, colors, viewmats, sh_degree, render_mode, rasterize_mode, backgrounds)
+    _check(means, opacities, colors, viewmats, sh_degree, render_mode, rasterize_mode, backgrounds)
     shaded = "RGB" in render_mode
     sh = colors if sh_degree is not None and shaded else None
     if sh_degree is None and shaded:
@@ -171,6 +171,7 @@ def _reject_unsupported(arguments: dict[str, Any]) -> None:
 
 def _check(
     means: Tensor,
+    opacities: Tensor,
     colors: Tensor,
     viewmats: Tensor,
     sh_degree: int | None,
@@ -188,6 +189,8 @@ def _check(
             f"{list(means.shape)} and {list(viewmats.shape)}"
         )
     N, C = means.shape[0], viewmats.shape[0]
+    if opacities.shape != (N,):  # any other might broadcast
+        raise ValueError(f"opacities must be [N] = {[N]}, got {list(opacities.shape)}")
     if sh_degree is not None:
         if colors.dim() != 3 or colors.shape[0] != N or colors.shape[2] != 3:
             raise ValueError(

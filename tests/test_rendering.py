@@ -189,6 +189,8 @@ def test_a_value_that_is_not_finite_spreads_to_no_pixel():
         ),
         ({"colors": torch.zeros(2, 4, 16, 3)}, "per-view coefficients are not supported"),
         ({"means": torch.zeros(1, 4, 3)}, "leading batch dimensions are not supported"),
+        ({"opacities": torch.zeros(1)}, r"opacities must be \[N\] = \[4\], got \[1\]"),
+        ({"opacities": torch.zeros(4, 1)}, r"opacities must be \[N\]"),
         ({"backgrounds": torch.zeros(2, 3)}, r"backgrounds must be \[C, D\]"),
     ],
 )
