@@ -34,8 +34,8 @@ def backward(
 ):
     renders, transmittances, last_ids, _, aux = outputs
     return torch.ops.blitzgs.rasterize_bwd(
-        *splats.values(), backgrounds, *lists(splats, n_cameras), renders, transmittances, last_ids, aux, v_renders,
-        v_alphas, n_cameras, WIDTH, HEIGHT, 16, *tiles, absgrad, True,
+        *splats.values(), backgrounds, *lists(splats, n_cameras), renders, transmittances, last_ids, aux,
+        v_renders, v_alphas, n_cameras, WIDTH, HEIGHT, 16, *tiles, absgrad, True,
     )  # fmt: skip
 
 
@@ -178,7 +178,7 @@ def test_last_ids_and_tile_work():
         assert torch.equal(again[2][0, y : y + 16, x : x + 16], last)
         assert again[3][tile] == work
         # The last composited entry is needed: without it the pixel's transmittance is another.
-        if 0 < work:
+        if work > 0:
             pixel = (last == last.max()).nonzero()[0]
             cut = alone.clamp(max=int(last.max()) - 1)
             less = torch.ops.blitzgs.rasterize_fwd(
@@ -352,6 +352,6 @@ def test_opcheck(absgrad):
         renders, transmittances, last_ids, _, aux = outputs
         torch.library.opcheck(
             torch.ops.blitzgs.rasterize_bwd,
-            (*(t.detach() for t in values), None, *tile_lists, renders, transmittances, last_ids, aux, renders, None,
-             1, WIDTH, HEIGHT, 16, 0, -1, absgrad, False),
+            (*(t.detach() for t in values), None, *tile_lists, renders, transmittances, last_ids, aux,
+             renders, None, 1, WIDTH, HEIGHT, 16, 0, -1, absgrad, False),
         )  # fmt: skip

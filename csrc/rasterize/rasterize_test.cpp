@@ -1,0 +1,117 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "rasterize/rasterize.h"
+
+#include <memory>
+#include <vector>
+
+#include "common/catch.h"
+#include "intersect/intersect.h"
+
+namespace {
+
+using namespace blitzgs;
+
+class HeapWorkspace final : public Workspace {
+ public:
+  void* allocate_bytes(std::size_t bytes) override {
+    held_.push_back(std::make_unique<char[]>(bytes));
+    return held_.back().get();
+  }
+
+ private:
+  std::vector<std::unique_ptr<char[]>> held_;
+};
+
+// Two splats on a 40 x 20 image: one round and near, one wide and far, listed in the wrong order.
+template <class T>
+struct Scene {
+  TileGrid grid = make_tile_grid(1, 40, 20, 16, 0, -1);
+  std::vector<T> means2d{T(20.5), T(10.5), T(12), T(8)};
+  std::vector<T> conics{T(0.02), T(0.005), T(0.03), T(0.25), T(0), T(0.25)};
+  std::vector<T> opacities{T(0.8), T(0.5)}, depths{T(2), T(1)}, colors{T(1), T(0.5), T(0), T(0), T(0), T(1)};
+  std::vector<std::int32_t> cameras{0, 0}, rows;
+  std::vector<std::int64_t> offsets = std::vector<std::int64_t>(7);
+  std::vector<T> renders = std::vector<T>(2400), rest = std::vector<T>(800);
+  std::vector<std::int32_t> last = std::vector<std::int32_t>(800), work = std::vector<std::int32_t>(6);
+  HeapWorkspace workspace;
+
+  void intersect_rows() {
+    const IntersectInput<T> in{
+        means2d.data(), conics.data(), opacities.data(), depths.data(), cameras.data(), nullptr, 2, grid};
+    rows.resize(cpu::count_intersections(in, workspace, nullptr));
+    REQUIRE(cpu::intersect(in, rows.size(), rows.data(), offsets.data(), workspace, nullptr) ==
+            static_cast<std::int64_t>(rows.size()));
+  }
+
+  RasterizeInput<T> input() const {
+    return {means2d.data(),
+            conics.data(),
+            opacities.data(),
+            colors.data(),
+            nullptr,
+            rows.data(),
+            offsets.data(),
+            2,
+            3,
+            grid};
+  }
+
+  // The sum of all colours of the image.
+  double render() {
+    cpu::rasterize_fwd(input(), {renders.data(), rest.data(), last.data(), work.data()},
+                       static_cast<std::int64_t>(rows.size()), nullptr, workspace, nullptr);
+    double sum = 0;
+    for (const T value : renders) sum += value;
+    return sum;
+  }
+};
+
+}  // namespace
+
+TEST_CASE("intersection lists rows front to back") {
+  Scene<float> scene;
+  scene.intersect_rows();
+  REQUIRE(scene.offsets == std::vector<std::int64_t>{0, 2, 3, 4, 6, 7, 8});
+  REQUIRE(scene.rows == std::vector<std::int32_t>{1, 0, 0, 0, 1, 0, 0, 0});
+}
+
+TEST_CASE("a pixel composites front to back") {
+  Scene<double> scene;
+  scene.intersect_rows();
+  scene.render();
+  const int pixel = 8 * 40 + 13;  // centre (13.5, 8.5)
+  const double front = 0.5 * std::exp(-0.5 * 0.25 * (1.5 * 1.5 + 0.5 * 0.5));
+  const double back = 0.8 * std::exp(-0.5 * (0.02 * 49 + 2 * 0.005 * 7 * 2 + 0.03 * 4));
+  REQUIRE(scene.renders[3 * pixel] == Approx(back * (1 - front)).epsilon(1e-12));
+  REQUIRE(scene.renders[3 * pixel + 2] == Approx(front).epsilon(1e-12));
+  REQUIRE(scene.rest[pixel] == Approx((1 - front) * (1 - back)).epsilon(1e-12));
+  REQUIRE(scene.last[pixel] == 2);
+}
+
+TEST_CASE("the gradient predicts a small step") {
+  Scene<double> scene;
+  scene.intersect_rows();
+  scene.render();
+  const std::vector<double> ones(2400, 1.0);
+  std::vector<double> v_means(4), v_conics(6), v_opacities(2), v_colors(6), v_abs(4);
+  cpu::rasterize_bwd<double>(
+      scene.input(), {scene.renders.data(), scene.rest.data(), scene.last.data(), ones.data(), nullptr},
+      static_cast<std::int64_t>(scene.rows.size()), nullptr, true,
+      {v_means.data(), v_conics.data(), v_opacities.data(), v_colors.data(), v_abs.data()}, scene.workspace,
+      nullptr);
+  const auto slope = [&scene](double& value) {
+    const double kept = value, step = 1e-7;
+    value = kept + step;
+    const double above = scene.render();
+    value = kept - step;
+    const double below = scene.render();
+    value = kept;
+    return (above - below) / (2 * step);
+  };
+  for (int i = 0; i < 2; ++i) REQUIRE(v_opacities[i] == Approx(slope(scene.opacities[i])).epsilon(1e-5));
+  for (int i = 0; i < 6; ++i) REQUIRE(v_colors[i] == Approx(slope(scene.colors[i])).epsilon(1e-5));
+  for (int i = 0; i < 4; ++i) {
+    REQUIRE(v_means[i] == Approx(slope(scene.means2d[i])).epsilon(1e-4).margin(1e-4));
+    REQUIRE(v_abs[i] >= std::fabs(v_means[i]));
+  }
+}
