@@ -1,29 +1,35 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <type_traits>
+
+#include "common/cpu_features.h"
 #include "common/parallel.h"
 #include "lazy_adam/lazy_adam.h"
+#include "lazy_adam/lazy_adam_lanes.h"
 
 namespace blitzgs::cpu {
 
 namespace {
 
 template <class T>
-void update_row(const AdamArgs<T>& args, const AdamStep<T>& step, const AdamDebt<T>& debt, std::int64_t row,
-                std::int64_t list_row) {
-  const bool owing = debt.from < debt.to;
-  for (int c = 0; c < kAdamColumns; ++c) {
-    const AdamColumn<T>& column = args.columns[c];
-    T* p = column.param + row * column.width;
-    T* m = column.exp_avg + row * column.width;
-    T* v = column.exp_avg_sq + row * column.width;
-    if (owing) {
-      for (std::int64_t j = 0; j < column.width; ++j) {
-        adam_catch_up(args, debt, adam_group(c, j), p[j], m[j], v[j]);
-      }
+AdamRowUpdate<T> row_update() {
+  if constexpr (std::is_same_v<T, float>) {
+    if (use_avx2()) return avx2_adam_row_update();
+  }
+  return update_row<PlainLanes<T>, T>;
+}
+
+// Rows of a list lie scattered, so a row's state is fetched while the rows before it are updated.
+constexpr std::int64_t kPrefetchDistance = 3;
+
+template <class T>
+void prefetch_row(const AdamArgs<T>& args, std::int64_t row) {
+  constexpr std::int64_t kLine = 64 / sizeof(T);
+  asm volatile("");  // gcc drops calls of functions that do nothing but prefetch
+  for (const AdamColumn<T>& column : args.columns) {
+    for (T* start : {column.param, column.exp_avg, column.exp_avg_sq}) {
+      for (std::int64_t j = 0; j < column.width; j += kLine) __builtin_prefetch(start + row * column.width + j, 1);
     }
-    if (!column.grad) continue;
-    const T* g = column.grad + list_row * column.width;
-    for (std::int64_t j = 0; j < column.width; ++j)
-      adam_update(step, adam_group(c, j), g[j], p[j], m[j], v[j]);
   }
 }
 
@@ -33,13 +39,16 @@ template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
   const bool with_gradient = args.columns[0].grad != nullptr;
   const AdamStep<T> step = adam_step_scalars(args);
+  const AdamRowUpdate<T> update = row_update<T>();
   const std::int32_t target = with_gradient ? args.step - 1 : args.step;
   parallel_for(0, args.n, 512, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       const std::int64_t row = args.ids ? args.ids[i] : i;
+      if (args.ids) prefetch_row(args, args.ids[std::min(i + kPrefetchDistance, end - 1)]);
       const std::int32_t from = args.sparse ? target : args.last_step[row];
       if (!with_gradient && from >= target) continue;
-      update_row(args, step, adam_debt(args, from, target), row, i);
+      const AdamDebt<T> debt = adam_debt(args, from, target);
+      update({args, step, debt, adam_explicit_drift<T>, row, i});
       args.last_step[row] = args.step;
     }
   });

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <cstdlib>
 #include <cstring>
 #include <type_traits>
 #include <vector>
 
+#include "common/cpu_features.h"
 #include "common/parallel.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_kernels.h"
@@ -14,12 +14,6 @@ namespace {
 
 // Partial gradients held at once: a few megabytes, so that they are summed out of the cache.
 constexpr std::int64_t kPartialsPerChunk = 1 << 17;
-
-bool use_avx2() {
-  static const bool use = std::getenv("BLITZGS_NO_AVX2") == nullptr && __builtin_cpu_supports("avx2") &&
-                          __builtin_cpu_supports("fma");
-  return use;
-}
 
 template <class T>
 TileKernels<T> tile_kernels(int n_channels, bool absgrad) {
