@@ -28,7 +28,8 @@ void prefetch_row(const AdamArgs<T>& args, std::int64_t row) {
   asm volatile("");  // gcc drops calls of functions that do nothing but prefetch
   for (const AdamColumn<T>& column : args.columns) {
     for (T* start : {column.param, column.exp_avg, column.exp_avg_sq}) {
-      for (std::int64_t j = 0; j < column.width; j += kLine) __builtin_prefetch(start + row * column.width + j, 1);
+      for (std::int64_t j = 0; j < column.width; j += kLine)
+        __builtin_prefetch(start + row * column.width + j, 1);
     }
   }
 }

@@ -172,8 +172,8 @@ void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
   }
 }
 
-// Lists name rows in no order that the hardware could foresee, so they are fetched some entries ahead. (Written
-// out in both loops: gcc drops calls of a function that only prefetches.)
+// Lists name rows in no order that the hardware could foresee, so they are fetched some entries ahead. Both
+// loops write it out, because gcc drops calls of a function that does nothing but prefetch.
 constexpr std::int32_t kPrefetchDistance = 6;
 
 // Returns the number of entries processed.
