@@ -44,6 +44,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "tile_bounds, "
       "int width, int height, int tile_size) -> (Tensor masks, Tensor counts)");
   m.def("route_rows(Tensor masks, int[] rows_per_rank) -> Tensor rows");
+  m.def("pack_rows(Tensor[] columns, Tensor rows) -> Tensor packed");
+  m.def("unpack_rows(Tensor packed, int[] widths) -> Tensor[] columns");
+  m.def("add_rows(Tensor values, Tensor rows, int[] rows_per_rank, int n_rows) -> Tensor total");
 
   // Alpha compositing.
   m.def(

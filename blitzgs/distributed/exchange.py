@@ -10,6 +10,7 @@ autograd.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileRanges
+from blitzgs.ops.pack import add_rows, pack_rows, unpack_rows
 from blitzgs.ops.route import route_count, route_rows
 
 
@@ -129,8 +131,8 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
         columns += [splats.conics, splats.opacities, splats.colors]
     else:
         columns += [route.halves]
-    arrived = ranks.all_to_all(_pack(columns, route.rows), route.sent, route.received)
-    means2d, depths, camera_ids, ids, *rest = _unpack(arrived, columns)
+    arrived = ranks.all_to_all(pack_rows(columns, route.rows), route.sent, route.received)
+    means2d, depths, camera_ids, ids, *rest = unpack_rows(arrived, columns)
     conics, opacities, colors = rest if route.halves is None else _from_halves(rest[0], means2d.dtype)
     return Splats(means2d, conics, opacities, colors, depths, camera_ids, ids)
 
@@ -146,18 +148,16 @@ def send_back(gradients: Sequence[Tensor], route: Route, ranks: Ranks) -> list[T
     Returns:
         Gradients [P, ...] of this rank's own rows; zero for rows that touch no tile.
     """
-    widths = [_row_size(gradient) for gradient in gradients]
-    flat = torch.cat([g.reshape(len(g), width) for g, width in zip(gradients, widths, strict=True)], 1)
-    # Gradients span too many magnitudes for float16.
-    wire = flat if route.halves is None else flat.bfloat16()
-    words = ranks.all_to_all(_words(wire), route.received, route.sent)
-    arrived = _unpack(words, [wire])[0].to(flat.dtype)
-    total = arrived.new_zeros((route.n_rows, arrived.shape[1]))
-    begin = 0
-    for count in route.sent:
-        # A row occurs once per destination, so no two additions of one call meet.
-        total.index_add_(0, route.rows[begin : begin + count], arrived[begin : begin + count])
-        begin += count
+    widths = [math.prod(gradient.shape[1:]) for gradient in gradients]
+    sent, dtype = list(gradients), gradients[0].dtype
+    if route.halves is not None:
+        # Gradients span too many magnitudes for float16.
+        flat = [g.reshape(len(g), width) for g, width in zip(gradients, widths, strict=True)]
+        sent = [torch.cat(flat, 1).bfloat16()]
+    every = torch.arange(len(sent[0]), dtype=torch.int32, device=sent[0].device)
+    words = ranks.all_to_all(pack_rows(sent, every), route.received, route.sent)
+    arrived = words.view(dtype) if route.halves is None else unpack_rows(words, sent)[0].to(dtype)
+    total = add_rows(arrived, route.rows, route.sent, route.n_rows)
     parts = total.split(widths, 1)
     return [part.reshape(-1, *g.shape[1:]) for part, g in zip(parts, gradients, strict=True)]
 
@@ -192,51 +192,6 @@ class _Exchange(torch.autograd.Function):
         *own, _, _ = gradients
         returned = send_back(own, ctx.route, ctx.ranks)
         return (*returned, None, None, None, None)
-
-
-def _words(column: Tensor) -> Tensor:
-    """View a column [n, ...] of any dtype as int32 [n, words], padding rows of odd half words."""
-    flat = column.reshape(len(column), _row_size(column))
-    if flat.element_size() == 2 and flat.shape[1] % 2:
-        flat = torch.nn.functional.pad(flat, (0, 1))
-    return _dense(flat).view(torch.int32)
-
-
-def _dense(tensor: Tensor) -> Tensor:
-    """Copy unless the strides are those of the shape: stricter than `contiguous`, as viewing dtypes is."""
-    return (
-        tensor if tensor.stride(0) == tensor.shape[1] else tensor.clone(memory_format=torch.contiguous_format)
-    )
-
-
-def _row_size(column: Tensor) -> int:
-    size = 1
-    for extent in column.shape[1:]:
-        size *= extent
-    return size
-
-
-def _pack(columns: Sequence[Tensor], rows: Tensor) -> Tensor:
-    """Gather rows of several columns into one int32 buffer [S, words]."""
-    words = [_words(column) for column in columns]
-    packed = words[0].new_empty((len(rows), sum(part.shape[1] for part in words)))
-    begin = 0
-    for part in words:
-        packed[:, begin : begin + part.shape[1]] = part[rows]
-        begin += part.shape[1]
-    return packed
-
-
-def _unpack(packed: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
-    """Undo `_pack`: columns of the dtypes and row shapes of `like`."""
-    columns, begin = [], 0
-    for column in like:
-        size = _row_size(column)
-        words = -(-size * column.element_size() // 4)
-        values = _dense(packed[:, begin : begin + words]).view(column.dtype)[:, :size]
-        columns.append(values.reshape(-1, *column.shape[1:]))
-        begin += words
-    return columns
 
 
 def _factor(conics: Tensor) -> Tensor:
