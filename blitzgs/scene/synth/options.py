@@ -54,8 +54,8 @@ class CityOptions:
 PRESETS = {
     # Made in well under a minute on two cores: the default scene of `make demo`.
     "demo": CityOptions(),
-    # A district, minutes to make.
+    # A district: minutes.
     "town": CityOptions(extent=420.0, views=240, width=960, height=640, points_per_view=800),
-    # A square kilometre and more than any single image sees.
+    # More than two square kilometres: hours on two cores, well under one on a server.
     "city": CityOptions(extent=1600.0, views=2400, width=1600, height=1064, points_per_view=1200),
 }

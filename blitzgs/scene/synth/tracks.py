@@ -94,10 +94,17 @@ def track(city: City, views: list[View], corners: list[Corners], seed: int, run:
     positions = np.concatenate([c.positions for c in corners])
     directions = np.concatenate([c.directions for c in corners])
     colors = np.concatenate([c.colors for c in corners])
-    source = np.repeat(np.arange(len(views)), [len(c.pixels) for c in corners])
+    starts = np.cumsum([0] + [len(c.pixels) for c in corners])
+    source = np.repeat(np.arange(len(views)), np.diff(starts))
+    balls = np.stack([_ball(c.positions) for c in corners])
 
     def seen(index: int) -> Ints:
-        return _observed(city, views[index], positions, directions, source == index, [seed, 7, index])
+        near = np.flatnonzero(_may_see(views[index], balls))
+        groups = [np.arange(starts[k], starts[k + 1]) for k in near]
+        rows = np.concatenate([np.zeros(0, np.int64), *groups])
+        own = source[rows] == index
+        found = _observed(city, views[index], positions[rows], directions[rows], own, [seed, 7, index])
+        return rows[found]
 
     lists = list(run(seen, range(len(views))))
     view_ids = np.repeat(np.arange(len(views)), [len(x) for x in lists])
@@ -107,19 +114,35 @@ def track(city: City, views: list[View], corners: list[Corners], seed: int, run:
     view_ids, point_ids = view_ids[kept], (np.cumsum(long_enough) - 1)[point_ids[kept]]
 
     rng = np.random.default_rng([seed, 8])
-    pixels = np.concatenate(
-        [v.project(positions[long_enough][point_ids[view_ids == i]])[0] for i, v in enumerate(views)]
-    )
-    starts = np.cumsum([0] + [len(c.pixels) for c in corners])
+    positions = positions[long_enough]
+    in_view = np.split(point_ids, np.cumsum(np.bincount(view_ids, minlength=len(views)))[:-1])
+    pixels = np.concatenate([v.project(positions[ids])[0] for v, ids in zip(views, in_view, strict=True)])
     loose = [c.pixels[~long_enough[a:b]] for c, a, b in zip(corners, starts[:-1], starts[1:], strict=True)]
     return Cloud(
-        positions=_triangulated(positions[long_enough], views, view_ids, point_ids, rng),
+        positions=_triangulated(positions, views, view_ids, point_ids, rng),
         colors=colors[long_enough],
         views=view_ids,
         points=point_ids,
         pixels=pixels + rng.normal(0, PIXEL_NOISE, pixels.shape),
         loose=loose,
     )
+
+
+def _ball(points: Doubles) -> Doubles:
+    """Return centre and radius [4] of a ball around points [N, 3]; the radius of none is -inf."""
+    if len(points) == 0:
+        return np.array([0, 0, 0, -np.inf])
+    centre = (points.min(0) + points.max(0)) / 2
+    return np.append(centre, np.linalg.norm(points - centre, axis=1).max())
+
+
+def _may_see(view: View, balls: Doubles) -> Bools:
+    """Return which balls [B, 4] reach into the pyramid of a view; conservative near its corners."""
+    x, y, z = ((balls[:, :3] - view.centre) @ view.rotation.T).T
+    half = np.array([view.width, view.height]) / (2 * view.focal)
+    outside = np.stack([np.abs(x) - half[0] * z, np.abs(y) - half[1] * z]) / np.hypot(half, 1)[:, None]
+    reached: Bools = np.maximum(outside.max(0), -z) < balls[:, 3]
+    return reached
 
 
 def _observed(
