@@ -133,12 +133,16 @@ def _write(folder: Path, options: CityOptions, threads: int, progress: Progress 
     cv2.setNumThreads(1)  # every core has a view of its own
     try:
         with ThreadPoolExecutor(threads) as pool:
-            corners = []
-            for found in pool.map(photograph, range(len(views))):
-                corners.append(found)
-                if progress:
-                    progress(len(corners), len(views))
-            cloud = track(city, views, corners, options.seed, pool.map)
+            try:
+                corners = []
+                for found in pool.map(photograph, range(len(views))):
+                    corners.append(found)
+                    if progress:
+                        progress(len(corners), len(views))
+                cloud = track(city, views, corners, options.seed, pool.map)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # or leaving the pool would first take every photograph
+                raise
     finally:
         cv2.setNumThreads(cv_threads)
     write_model(folder / "sparse" / "0", colmap_model(views, cloud))
