@@ -49,7 +49,7 @@ Several processes share the work with torchrun --nproc-per-node=M train.py (the 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status (1: failed with a message, 2: wrong usage, 130: Ctrl-C)."""
+    """Run the command line; returns the exit status (1: failed, 2: wrong usage, 130: Ctrl-C)."""
     parser = _parser()
     args, rest = parser.parse_known_args(arguments)
     if rest and not (args.command == "train" and all(text.startswith("--") and "=" in text for text in rest)):
