@@ -103,7 +103,7 @@ def _(
     means2d_abs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     pixels = (n_cameras, height, width)
-    aux_size = 0 if means2d.device.type == "cpu" else torch.library.get_ctx().new_dynamic_size()
+    aux_size = torch.library.get_ctx().new_dynamic_size()  # each backend's own business
     return (
         means2d.new_empty(*pixels, colors.shape[1]),
         means2d.new_empty(pixels),

@@ -76,7 +76,7 @@ struct RasterizeGradients {
   T* v_means2d_abs;  // null: not wanted
 };
 
-// aux is the backend's own memory between forward and backward, 16-byte aligned and of
+// aux is the backend's own memory between forward and backward, 64-byte aligned and of
 // rasterize_aux_bytes(), which may depend on the shapes and the number of entries, not on values on the
 // device. All outputs are written in full.
 namespace cpu {

@@ -56,14 +56,23 @@ SplatRow<T> pack_row(const RasterizeInput<T>& in, std::int64_t row) {
 }
 
 template <class T>
-const SplatRow<T>* pack_rows(const RasterizeInput<T>& in, Workspace& workspace) {
-  const std::size_t bytes = static_cast<std::size_t>(in.n_rows + 1) * sizeof(SplatRow<T>);
-  auto address = reinterpret_cast<std::uintptr_t>(workspace.allocate_bytes(bytes));
-  auto* splats = reinterpret_cast<SplatRow<T>*>((address + 63) / 64 * 64);
+SplatRow<T>* align_rows(void* memory) {
+  return reinterpret_cast<SplatRow<T>*>((reinterpret_cast<std::uintptr_t>(memory) + 63) / 64 * 64);
+}
+
+// Prepares the rows in memory of row_bytes().
+template <class T>
+const SplatRow<T>* pack_rows(const RasterizeInput<T>& in, void* memory) {
+  SplatRow<T>* splats = align_rows<T>(memory);
   parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t row = begin; row < end; ++row) splats[row] = pack_row(in, row);
   });
   return splats;
+}
+
+template <class T>
+std::int64_t row_bytes(std::int64_t n_rows) {
+  return (n_rows + 1) * static_cast<std::int64_t>(sizeof(SplatRow<T>));
 }
 
 // The part of a job that is the tile's place in the images and its list.
@@ -196,14 +205,17 @@ void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
 
 }  // namespace
 
-// The kernels prepare the rows anew in the backward pass: cheaper than the memory.
-std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t, std::int64_t, int) { return 0; }
+// The prepared rows of float32; float64, which is for checking, prepares them again in the backward pass.
+std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, std::int64_t, int) {
+  return row_bytes<float>(n_rows);
+}
 
 template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t, void*,
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t, void* aux,
                    Workspace& workspace, CudaStream) {
   clear_unowned(in, out);
-  const SplatRow<T>* splats = pack_rows(in, workspace);
+  const SplatRow<T>* splats =
+      pack_rows(in, sizeof(T) == 4 ? aux : workspace.allocate_bytes(row_bytes<T>(in.n_rows)));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, false);
   const TileMemory<T> memory(in, workspace);
   parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](std::int64_t task, int worker) {
@@ -216,7 +228,7 @@ void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, s
 }
 
 template <class T>
-void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t, const void*,
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t, const void* aux,
                    bool, const RasterizeGradients<T>& gradients, Workspace& workspace, CudaStream) {
   const bool absgrad = gradients.v_means2d_abs != nullptr;
   const int width = partial_width(in.n_channels, absgrad);
@@ -232,7 +244,9 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   parallel_for(0, in.n_rows * width, 1 << 16,
                [&](std::int64_t begin, std::int64_t end) { std::fill(sums + begin, sums + end, T(0)); });
 
-  const SplatRow<T>* splats = pack_rows(in, workspace);
+  const SplatRow<T>* splats = sizeof(T) == 4
+                                  ? align_rows<T>(const_cast<void*>(aux))
+                                  : pack_rows(in, workspace.allocate_bytes(row_bytes<T>(in.n_rows)));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, absgrad);
   const TileMemory<T> memory(in, workspace);
   for (const Chunk& chunk : chunks) {

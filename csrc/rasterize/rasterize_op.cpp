@@ -125,6 +125,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
   const Tensor colors_out = as_contiguous(renders), rest = as_contiguous(transmittances),
                last = as_contiguous(last_ids), v_pixels = as_contiguous(v_renders);
   const std::int64_t n_rows = splats.n_rows;
+  check_shape(kOp, "aux", aux,
+              {backend::rasterize_aux_bytes(grid, n_rows, splats.isect_rows.size(0),
+                                            static_cast<int>(splats.n_channels))});
+  STD_TORCH_CHECK(reinterpret_cast<std::uintptr_t>(aux.const_data_ptr()) % 64 == 0,
+                  "blitzgs::rasterize_bwd: aux must be 64-byte aligned, as rasterize_fwd returned it");
   Tensor v_means2d = make_empty(splats.means2d, {n_rows, 2});
   Tensor v_conics = make_empty(splats.means2d, {n_rows, 3});
   Tensor v_opacities = make_empty(splats.means2d, {n_rows});

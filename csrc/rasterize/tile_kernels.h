@@ -341,9 +341,6 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
 template <class Lanes>
 TileKernels<typename Lanes::Scalar> select_kernels(int n_channels, bool absgrad) {
   switch (n_channels) {
-    case 1:
-      return {forward_tile<Lanes, 1>,
-              absgrad ? backward_tile<Lanes, 1, true> : backward_tile<Lanes, 1, false>};
     case 3:
       return {forward_tile<Lanes, 3>,
               absgrad ? backward_tile<Lanes, 3, true> : backward_tile<Lanes, 3, false>};
