@@ -56,23 +56,19 @@ SplatRow<T> pack_row(const RasterizeInput<T>& in, std::int64_t row) {
 }
 
 template <class T>
-SplatRow<T>* align_rows(void* memory) {
-  return reinterpret_cast<SplatRow<T>*>((reinterpret_cast<std::uintptr_t>(memory) + 63) / 64 * 64);
-}
-
-// Prepares the rows in memory of row_bytes().
-template <class T>
-const SplatRow<T>* pack_rows(const RasterizeInput<T>& in, void* memory) {
-  SplatRow<T>* splats = align_rows<T>(memory);
+const SplatRow<T>* pack_rows(const RasterizeInput<T>& in, SplatRow<T>* splats) {
   parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t row = begin; row < end; ++row) splats[row] = pack_row(in, row);
   });
   return splats;
 }
 
+// Memory for the rows that lasts as long as the workspace.
 template <class T>
-std::int64_t row_bytes(std::int64_t n_rows) {
-  return (n_rows + 1) * static_cast<std::int64_t>(sizeof(SplatRow<T>));
+SplatRow<T>* allocate_rows(std::int64_t n_rows, Workspace& workspace) {
+  const std::size_t bytes = static_cast<std::size_t>(n_rows + 1) * sizeof(SplatRow<T>);
+  const auto address = reinterpret_cast<std::uintptr_t>(workspace.allocate_bytes(bytes));
+  return reinterpret_cast<SplatRow<T>*>((address + 63) / 64 * 64);
 }
 
 // The part of a job that is the tile's place in the images and its list.
@@ -207,7 +203,7 @@ void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
 
 // The prepared rows of float32; float64, which is for checking, prepares them again in the backward pass.
 std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, std::int64_t, int) {
-  return row_bytes<float>(n_rows);
+  return n_rows * static_cast<std::int64_t>(sizeof(SplatRow<float>));
 }
 
 template <class T>
@@ -215,7 +211,7 @@ void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, s
                    Workspace& workspace, CudaStream) {
   clear_unowned(in, out);
   const SplatRow<T>* splats =
-      pack_rows(in, sizeof(T) == 4 ? aux : workspace.allocate_bytes(row_bytes<T>(in.n_rows)));
+      pack_rows(in, sizeof(T) == 4 ? static_cast<SplatRow<T>*>(aux) : allocate_rows<T>(in.n_rows, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, false);
   const TileMemory<T> memory(in, workspace);
   parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](std::int64_t task, int worker) {
@@ -244,9 +240,8 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   parallel_for(0, in.n_rows * width, 1 << 16,
                [&](std::int64_t begin, std::int64_t end) { std::fill(sums + begin, sums + end, T(0)); });
 
-  const SplatRow<T>* splats = sizeof(T) == 4
-                                  ? align_rows<T>(const_cast<void*>(aux))
-                                  : pack_rows(in, workspace.allocate_bytes(row_bytes<T>(in.n_rows)));
+  const SplatRow<T>* splats = sizeof(T) == 4 ? static_cast<const SplatRow<T>*>(aux)
+                                             : pack_rows(in, allocate_rows<T>(in.n_rows, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, absgrad);
   const TileMemory<T> memory(in, workspace);
   for (const Chunk& chunk : chunks) {

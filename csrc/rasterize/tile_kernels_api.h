@@ -8,8 +8,8 @@
 
 namespace blitzgs::cpu {
 
-constexpr int kMaxTileSize = 64;  // rows of a tile are the bits of a word
-constexpr int kPackedChannels = 4;
+constexpr int kMaxTileSize = 64;    // rows of a tile are the bits of a word
+constexpr int kPackedChannels = 5;  // what a cache line has room for
 
 // The exponent of a splat is -(u^2 + w^2) with u = l11 dx + l21 dy, w = l22 dy; its factors carry the root of
 // this scale. float32 works in powers of two.
