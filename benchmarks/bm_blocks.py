@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time to find the active set of an aerial view, and how much larger than the visible set it is.
+
+python benchmarks/bm_blocks.py [--device cuda] [--rows 16000000] [--views 1]
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+from scenes import aerial
+from timing import median_ms
+from torch import Tensor
+
+from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.ops.lazy_adam import schedule_table
+from blitzgs.ops.project import project
+from blitzgs.view.blocks import BlockIndex, morton_order
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--rows", type=int, default=16_000_000)
+    parser.add_argument("--views", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=20)
+    args = parser.parse_args()
+    device, n = args.device, args.rows
+    scene = aerial(n, device)
+    raw = scene.raw()
+    zeros = torch.zeros(n, dtype=torch.int32, device=device)
+    table = GaussianTable.create(
+        {name: raw[name] for name in PARAMETERS if name != "sh"}
+        | {"sh": raw["sh"][:, :1].contiguous(), "last_step": zeros, "id": torch.arange(n, device=device)}
+        | {"parent": torch.full((n,), -1, device=device), "birth": zeros, "level": zeros.to(torch.uint8)}
+    )
+    views = scene.viewmats[:1].repeat(args.views, 1, 1), scene.Ks[:1].repeat(args.views, 1, 1)
+    schedule = schedule_table(torch.full((100, 6), 1e-3, device=device), 0.9, 0.999)
+    sort = median_ms(lambda means: morton_order(means), [(table["means"],)], 3, 1)
+    table.permute(morton_order(table["means"]))
+    index = BlockIndex(table, schedule)
+
+    def cull(*cameras: Tensor) -> tuple[Tensor, Tensor]:
+        return index.active(table, *cameras, scene.width, scene.height, 0.1, 1e6)
+
+    active, active_views = cull(*views)
+
+    def rows_of(**options: Tensor) -> int:
+        columns = (table[name] for name in PARAMETERS)
+        return len(
+            project(*columns, *views, scene.width, scene.height, near_plane=0.1, **options).visible_ids
+        )
+
+    visible = rows_of(active_ids=active, active_views=active_views)
+    print(f"{n} rows, {args.views} view(s), {device}: {len(active)} active, {visible} visible")
+    if visible != rows_of():
+        raise SystemExit("the active set misses visible rows")
+    timings = {
+        "Morton order of all rows": sort,
+        "bounds of all blocks": median_ms(lambda _: index.update(table, None), [views[:1]], 5),
+        "active set": median_ms(cull, [views], args.repeats),
+        "bounds after a step": median_ms(lambda ids: index.update(table, ids), [(active,)], args.repeats),
+        "projection of the active set": median_ms(
+            lambda ids, bits: rows_of(active_ids=ids, active_views=bits),
+            [(active, active_views)],
+            args.repeats,
+        ),
+        "projection of all rows": median_ms(lambda _: rows_of(), [views[:1]], args.repeats),
+    }
+    for name, milliseconds in timings.items():
+        print(f"{name:32s} {milliseconds:8.3f} ms")
+
+
+if __name__ == "__main__":
+    main()
