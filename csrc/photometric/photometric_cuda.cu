@@ -11,112 +11,11 @@
 
 #include "common/cuda_check.h"
 #include "photometric/photometric.h"
+#include "photometric/photometric_device.cuh"
 
 namespace blitzgs::cuda {
 
 namespace {
-
-constexpr int kThreads = 256;
-constexpr int kOut = 72;                     // pixels of a block's row
-constexpr int kIn = kOut + 2 * kSsimRadius;  // with the windows' margin
-constexpr int kRows = 4;                     // rows per round
-constexpr int kGroups = kOut / 4;            // horizontal items of a row and channel
-constexpr int kItems = kRows * 3 * kGroups;  // horizontal items of a round
-constexpr int kPitch = 84;                   // shared row: the last item reads 16 values from pixel 68
-constexpr int kOutPitch = 76;
-constexpr int kLead = 2 * kSsimRadius + 2;  // rows read before the first output, a multiple of kRows
-constexpr int kLeadRounds = kLead / kRows;
-constexpr int kPending = kSsimTaps - 1;
-static_assert(3 * kIn <= kThreads && kItems <= kThreads && kOut % 4 == 0 && kLead % kRows == 0);
-
-struct Launch {
-  int view, rows_per_strip;
-  std::int64_t map_pitch, map_size;  // floats per map row; floats per map (three channels of a view)
-  float* maps;                       // [3 maps][3 channels][height][map_pitch]
-  double* partials;                  // [blocks, 2] of this view
-};
-
-struct OwnedRows {
-  int begin, end;
-};
-
-// Rows of the view that hold an owned pixel.
-__device__ OwnedRows owned_rows(const PhotometricArgs<float>& args, std::int64_t view) {
-  const std::int64_t tiles = std::int64_t{args.tiles_x} * args.tiles_y;
-  const std::int64_t begin = max(args.tile_begin - view * tiles, std::int64_t{0});
-  const std::int64_t end = min(args.tile_end - view * tiles, tiles);
-  if (begin >= end) return {0, 0};
-  const std::int64_t last = (end + args.tiles_x - 1) / args.tiles_x * args.tile_size;
-  return {static_cast<int>(begin / args.tiles_x * args.tile_size),
-          static_cast<int>(min(last, static_cast<std::int64_t>(args.height)))};
-}
-
-__device__ bool owns_whole_view(const PhotometricArgs<float>& args, std::int64_t view) {
-  const std::int64_t tiles = std::int64_t{args.tiles_x} * args.tiles_y;
-  return args.tile_begin <= view * tiles && args.tile_end >= (view + 1) * tiles;
-}
-
-__device__ bool owns_pixel(const PhotometricArgs<float>& args, bool whole, int view, int row, int column) {
-  if (whole) return true;
-  const OwnedColumns owned = owned_columns(args, view, row);
-  return column >= owned.begin && column < owned.end;
-}
-
-template <bool kBytes>
-__device__ __forceinline__ float target_at(const PhotometricArgs<float>& args, std::int64_t at) {
-  // Rounded before it is subtracted: contracted into the difference, equal pixels would not cancel.
-  return kBytes ? __fmul_rn(static_cast<float>(args.targets_u8[at]), 1.0f / 255.0f) : args.targets[at];
-}
-
-// Adds one input to the open windows of a column; returns the window that it completes.
-__device__ __forceinline__ float advance(const float (&window)[kSsimTaps], float (&pending)[kPending],
-                                         float value) {
-  const float complete = fmaf(window[kSsimTaps - 1], value, pending[0]);
-#pragma unroll
-  for (int k = 0; k + 1 < kPending; ++k) pending[k] = fmaf(window[kPending - 1 - k], value, pending[k + 1]);
-  pending[kPending - 1] = window[0] * value;
-  return complete;
-}
-
-// Four neighbouring horizontal windows from a shared row; `row` points at the first pixel of the first.
-__device__ __forceinline__ void convolve4(const float (&window)[kSsimTaps], const float* row,
-                                          float (&out)[4]) {
-  float in[16];
-#pragma unroll
-  for (int i = 0; i < 4; ++i) {
-    const float4 pack = *reinterpret_cast<const float4*>(row + 4 * i);
-    in[4 * i] = pack.x, in[4 * i + 1] = pack.y, in[4 * i + 2] = pack.z, in[4 * i + 3] = pack.w;
-  }
-#pragma unroll
-  for (int j = 0; j < 4; ++j) {
-    out[j] = window[0] * in[j];
-#pragma unroll
-    for (int k = 1; k < kSsimTaps; ++k) out[j] = fmaf(window[k], in[j + k], out[j]);
-  }
-}
-
-// Sum over the block, on thread 0.
-__device__ double block_sum(double value) {
-  __shared__ double warps[kThreads / 32];
-  for (int offset = 16; offset > 0; offset /= 2) value += __shfl_down_sync(~0u, value, offset);
-  __syncthreads();
-  if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = value;
-  __syncthreads();
-  double total = 0;
-  if (threadIdx.x == 0) {
-    for (const double part : warps) total += part;
-  }
-  return total;
-}
-
-// Where a horizontal item of a round lies.
-struct Item {
-  int row, channel, pixel;
-};
-__device__ __forceinline__ Item item_of(int thread) {
-  const int row = thread / (3 * kGroups), rest = thread - row * 3 * kGroups;
-  return {row, rest / kGroups, 4 * (rest % kGroups)};
-}
 
 template <bool kBytes, bool kGradient, bool kSums>
 __global__ void __launch_bounds__(kThreads, 2)
@@ -140,14 +39,17 @@ __global__ void __launch_bounds__(kThreads, 2)
     const bool in_core = has_column && local >= kSsimRadius && local < kSsimRadius + kOut;
     const Item item = item_of(threadIdx.x);
     float pending[4][kPending] = {};
-    float x[kRows], y[kRows];
+    float x[kRows];
+    Target<kBytes> y[kRows];
+    const int stride = 3 * args.width;
+    const std::int64_t top_of_column = 3 * (image + pixel) + channel;
     const auto load = [&](int row) {
+      const std::int64_t at = top_of_column + std::int64_t{row} * stride;
 #pragma unroll
-      for (int i = 0; i < kRows; ++i, ++row) {
-        const bool inside = has_column && row >= 0 && row < args.height;
-        const std::int64_t at = 3 * (image + std::int64_t{row} * args.width + pixel) + channel;
-        x[i] = inside ? args.renders[at] : 0.0f;
-        y[i] = inside ? target_at<kBytes>(args, at) : 0.0f;
+      for (int i = 0; i < kRows; ++i) {
+        const bool inside = has_column && static_cast<unsigned>(row + i) < static_cast<unsigned>(args.height);
+        x[i] = inside ? args.renders[at + i * stride] : 0.0f;
+        y[i] = inside ? targets_of<kBytes>(args)[at + i * stride] : Target<kBytes>(0);
       }
     };
     const int first_row = begin - kSsimRadius - 2;
@@ -157,8 +59,9 @@ __global__ void __launch_bounds__(kThreads, 2)
       float (&buffer)[4][kRows][3][kPitch] = shared[round % 2];
 #pragma unroll
       for (int i = 0; i < kRows; ++i) {
-        const float difference = x[i] - y[i];
-        const float values[4] = {x[i], difference, fmaf(x[i], x[i], y[i] * y[i]), difference * difference};
+        const float target = target_value(y[i]), difference = x[i] - target;
+        const float values[4] = {x[i], difference, fmaf(x[i], x[i], target * target),
+                                 difference * difference};
 #pragma unroll
         for (int q = 0; q < 4; ++q) {
           const float complete = advance(args.window, pending[q], values[q]);
@@ -260,14 +163,6 @@ __global__ void __launch_bounds__(kThreads, 3)
   load(first_row);
   for (int round = 0; round < rounds; ++round) {
     const int top = begin + (round - kLeadRounds) * kRows;
-    float x[kRows], difference[kRows];
-#pragma unroll
-    for (int i = 0; i < kRows; ++i) {
-      if (!writes || top + i < begin || top + i >= end) continue;
-      const std::int64_t at = 3 * (out_column + std::int64_t{top + i} * args.width) + out_channel;
-      x[i] = args.renders[at];
-      difference[i] = x[i] - target_at<kBytes>(args, at);
-    }
 #pragma unroll
     for (int i = 0; i < kRows; ++i) {
 #pragma unroll
@@ -278,6 +173,15 @@ __global__ void __launch_bounds__(kThreads, 3)
     }
     if (round + 1 < rounds) load(first_row + (round + 1) * kRows);
     if (round < kLeadRounds) continue;
+    float x[kRows];
+    Target<kBytes> y[kRows];
+#pragma unroll
+    for (int i = 0; i < kRows; ++i) {
+      const bool used = writes && top + i < end;
+      const std::int64_t at = 3 * (out_column + std::int64_t{top + i} * args.width) + out_channel;
+      x[i] = used ? args.renders[at] : 0.0f;
+      y[i] = used ? targets_of<kBytes>(args)[at] : Target<kBytes>(0);
+    }
     __syncthreads();
     if (threadIdx.x < kItems) {
 #pragma unroll
@@ -295,11 +199,12 @@ __global__ void __launch_bounds__(kThreads, 3)
       if (!writes || row >= end) continue;
       const std::int64_t at = out_column + std::int64_t{row} * args.width;
       const bool counts = !args.masks || args.masks[at];
-      const float sign = difference[i] > 0 ? 1.0f : (difference[i] < 0 ? -1.0f : 0.0f);
+      const float difference = x[i] - target_value(y[i]);
+      const float sign = difference > 0 ? 1.0f : (difference < 0 ? -1.0f : 0.0f);
       const float* result = &results[0][i][out_channel][out_local];
       constexpr int kMap = kRows * 3 * kOutPitch;
       const float value = (counts ? weight * sign : 0.0f) + result[0] +
-                          2.0f * fmaf(x[i], result[kMap], difference[i] * result[2 * kMap]);
+                          2.0f * fmaf(x[i], result[kMap], difference * result[2 * kMap]);
       args.v_renders[3 * at + out_channel] =
           owns_pixel(args, whole, view, row, first_pixel + out_local) ? value : 0.0f;
     }
