@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <type_traits>
 
+#include "common/cpu_features.h"
 #include "common/parallel.h"
 #include "photometric/photometric_strip.h"
 
@@ -16,11 +17,9 @@ namespace {
 template <class T>
 void run_strips(const PhotometricArgs<T>& args, const std::int64_t* strips, std::int64_t begin,
                 std::int64_t end, double* sums) {
-#ifdef __x86_64__
   if constexpr (std::is_same_v<T, float>) {
-    if (__builtin_cpu_supports("avx2")) return photometric_strips_avx2(args, strips, begin, end, sums);
+    if (use_avx2()) return photometric_strips_avx2(args, strips, begin, end, sums);
   }
-#endif
   run_photometric_strips(args, strips, begin, end, sums);
 }
 

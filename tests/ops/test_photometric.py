@@ -1,4 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -11,6 +16,7 @@ from blitzgs.ops.photometric import (
     ssim,
 )
 
+ROOT = Path(__file__).parents[2]
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
 
@@ -163,6 +169,25 @@ def test_threads_do_not_change_the_result():
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
+
+
+WITHOUT_AVX2 = """
+import sys, torch
+from tests.ops.test_photometric import images
+from blitzgs.ops.photometric import photometric_fwd_bwd
+x, targets, masks = images((1, 60, 50))
+torch.save(photometric_fwd_bwd(x, targets, masks, torch.ones(1), torch.ones(1)), sys.argv[1])
+"""
+
+
+def test_vector_width_does_not_change_the_result(tmp_path):
+    environment = {**os.environ, "BLITZGS_NO_AVX2": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", WITHOUT_AVX2, str(tmp_path / "plain.pt")]
+    subprocess.run(command, env=environment, check=True, timeout=120)
+    x, targets, masks = images((1, 60, 50))
+    here = photometric_fwd_bwd(x, targets, masks, torch.ones(1), torch.ones(1))
+    plain = torch.load(tmp_path / "plain.pt")
+    assert all(torch.equal(a, b) for a, b in zip(here, plain, strict=True))
 
 
 @pytest.mark.parametrize("device", DEVICES)
