@@ -79,7 +79,8 @@ def main() -> None:
     some = torch.randint(0, 40, (n,), device=device)
     everyone = torch.arange(n, dtype=torch.int32, device=device)
     scattered = torch.nonzero(torch.rand(n, device=device) < args.fraction).flatten().int()
-    runs = everyone[: n // 256 * 256].reshape(-1, 256)[torch.rand(n // 256, device=device) < args.fraction].flatten()
+    chosen = torch.rand(n // 256, device=device) < args.fraction
+    runs = everyone[: n // 256 * 256].reshape(-1, 256)[chosen].flatten()
     for name, ids in (
         ("every row", everyone),
         (f"{args.fraction:.0%} of the rows, runs of 256", runs),
