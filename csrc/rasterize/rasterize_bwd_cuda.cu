@@ -71,14 +71,10 @@ struct EntrySums {
   float abs_x = 0.f, abs_y = 0.f;
 };
 
-struct EntryShape {
-  float x, y, l11, l21, l22, log2_opacity;
-};
-
 // The two pixel rows of this half of the subtile.
 template <int CHANNELS, bool ABSOLUTE>
 __device__ __forceinline__ EntrySums<CHANNELS> sum_half(const float2* group, const float4* v_render,
-                                                        const EntryShape& shape, float centre_x,
+                                                        const Entry& shape, float centre_x,
                                                         float centre_y, int half) {
   EntrySums<CHANNELS> sums;
 #pragma unroll
@@ -115,7 +111,7 @@ __device__ __forceinline__ EntrySums<CHANNELS> sum_half(const float2* group, con
 
 // Moments about the subtile's centre to gradients of the row.
 template <int CHANNELS, bool ABSOLUTE>
-__device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, const EntryShape& shape,
+__device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, const Entry& shape,
                                                  float centre_x, float centre_y) {
   const float x = centre_x - shape.x, y = centre_y - shape.y;
   const float mx = s.gx + x * s.g, my = s.gy + y * s.g;
@@ -132,20 +128,21 @@ __device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, c
   return gradient;
 }
 
-// Sums the group's entries and hands the results on. my_entry: the batch entry of group slot lane % 16.
+// Sums the group's entries, list[0 .. filled) of the warp's list, and hands the results on.
 template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
 __device__ __forceinline__ void flush_group(BackwardShared<TILE, DETERMINISTIC>& shared,
                                             const BackwardArguments& args, const Pixel& pixel, int warp,
-                                            int lane, int filled, int my_entry) {
+                                            int lane, int filled, const std::uint16_t* list) {
   __syncwarp();
   const int slot = lane % kGroup, half = lane / kGroup;
-  const float4 place = shared.batch.place[my_entry];
-  const float2 rest = shared.batch.rest[my_entry];
-  const EntryShape shape{place.x, place.y, place.z, place.w, rest.x, rest.y};
+  const std::uint32_t offset = slot < filled ? list[slot] : 0;
+  const Entry& shape = shared.batch.at(offset);
+  const int my_entry = static_cast<int>(offset / sizeof(Entry));
   const float centre_x = static_cast<float>(pixel.left + kSubtileWidth / 2);
   const float centre_y = static_cast<float>(pixel.top + kSubtileHeight / 2);
-  EntrySums<CHANNELS> sums = sum_half<CHANNELS, ABSOLUTE>(
-      shared.group[warp] + slot * kGroupStride, shared.v_render[warp], shape, centre_x, centre_y, half);
+  EntrySums<CHANNELS> sums =
+      sum_half<CHANNELS, ABSOLUTE>(shared.group[warp] + slot * kGroupStride, shared.v_render[warp], shape,
+                                   centre_x, centre_y, half);
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) sums.color[k] = add_halves(sums.color[k]);
   sums.g = add_halves(sums.g);
@@ -159,7 +156,10 @@ __device__ __forceinline__ void flush_group(BackwardShared<TILE, DETERMINISTIC>&
     sums.abs_y = add_halves(sums.abs_y);
   }
   const PackedGradient gradient = finish<CHANNELS, ABSOLUTE>(sums, shape, centre_x, centre_y);
-  if (slot < filled) {
+  bool touched = sums.g != 0.f;
+#pragma unroll
+  for (int k = 0; k < CHANNELS; ++k) touched |= sums.color[k] != 0.f;
+  if (slot < filled && (touched || DETERMINISTIC || ABSOLUTE)) {
     if constexpr (DETERMINISTIC) {
       float4* target = shared.partial[warp][my_entry].quads;
       target[half] = half ? gradient.quads[1] : gradient.quads[0];
@@ -187,19 +187,23 @@ struct BackwardPixel {
   float v[CHANNELS];
   int last;
 
-  __device__ __forceinline__ float2 add(float log2_a, bool touched, const float4& row_color) {
+  // last: offset in the batch from which on the pixel has composited nothing.
+  __device__ __forceinline__ float2 add(const Entry& entry, std::uint32_t offset, std::uint32_t last,
+                                        const Pixel& pixel) {
+    const float log2_a = log2_alpha(entry, pixel);
     const float raw = exp2_approx(log2_a);
+    const bool touched = log2_a >= kLog2Cut && offset < last;
     const float alpha = touched ? fminf(raw, static_cast<float>(kAlphaMax)) : 0.f;
     const float inverse = reciprocal_approx(1.f - alpha);
     transmittance *= inverse;
     const float weight = alpha * transmittance;
-    float dot = 0.f;
+    const float4 row_color = entry.color;
+    float dot = v[0] * row_color.x;
 #pragma unroll
-    for (int k = 0; k < CHANNELS; ++k) dot = __fmaf_rn(v[k], channel(row_color, k), dot);
+    for (int k = 1; k < CHANNELS; ++k) dot = __fmaf_rn(v[k], channel(row_color, k), dot);
     const float v_alpha = __fmaf_rn(transmittance, dot, -behind * inverse);
-    if (touched) behind = __fmaf_rn(weight, dot, behind);
-    const bool clipped = raw > static_cast<float>(kAlphaMax);
-    return {weight, touched && !clipped ? v_alpha * alpha : 0.f};
+    behind = __fmaf_rn(weight, dot, behind);
+    return {weight, raw > static_cast<float>(kAlphaMax) ? 0.f : v_alpha * alpha};
   }
 };
 
@@ -242,6 +246,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 1024 / (TILE * TILE) 
   const Pixel pixel = locate_pixel<TILE>(args.grid, tile, warp, lane);
 
   if (thread == 0) shared.last = 0;
+  shared.batch.init(thread);
   BackwardPixel<CHANNELS> state =
       start_pixel<TILE, CHANNELS, DETERMINISTIC>(shared, args, pixel, tile.camera, warp, lane);
   const int warp_last = __reduce_max_sync(kFullWarp, state.last);
@@ -262,34 +267,22 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 1024 / (TILE * TILE) 
     }
     __syncthreads();
 
-    int filled = 0, my_entry = 0;
-    for (int word = shared.batch.kWords - 1; word >= 0; --word) {
-      const int first = base + word * 32;
-      if (first >= warp_last) continue;
-      std::uint32_t bits = shared.batch.hits[warp][word];
-      if (warp_last - first < 32) bits &= (1u << (warp_last - first)) - 1u;
-      while (bits) {
-        const int bit = 31 - __clz(bits);
-        bits ^= 1u << bit;
-        const int entry = word * 32 + bit;
-        const float4 place = shared.batch.place[entry];
-        const float2 rest = shared.batch.rest[entry];
-        const float power =
-            log2_alpha(place.z, place.w, rest.x, rest.y, pixel.centre_x - place.x, pixel.centre_y - place.y);
-        const bool touched = power >= kLog2Cut && base + entry < state.last;
-        if (!__any_sync(kFullWarp, touched)) continue;
-        shared.group[warp][filled * kGroupStride + lane] =
-            state.add(power, touched, shared.batch.color[entry]);
-        if (lane % kGroup == filled) my_entry = entry;
-        if (++filled == kGroup) {
-          flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, pixel, warp, lane, filled,
-                                                               my_entry);
-          filled = 0;
+    const int warp_limit = warp_last - base, pixel_limit = min(max(state.last - base, 0), kBatch);
+    const std::uint32_t last = static_cast<std::uint32_t>(pixel_limit * sizeof(Entry));
+    const int n = shared.batch.template list<true>(warp, lane, warp_limit);
+    for (int first = 0; first < n; first += kGroup) {
+      const int filled = min(kGroup, n - first);
+      float2* slot = shared.group[warp] + lane;
+      for (int i = 0; i < filled; i += 4, slot += 4 * kGroupStride) {
+        std::uint32_t offsets[4];
+        shared.batch.quad(warp, first + i, offsets);
+#pragma unroll
+        for (int k = 0; k < 4; ++k) {
+          slot[k * kGroupStride] = state.add(shared.batch.at(offsets[k]), offsets[k], last, pixel);
         }
       }
-    }
-    if (filled > 0) {
-      flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, pixel, warp, lane, filled, my_entry);
+      flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, pixel, warp, lane, filled,
+                                                           &shared.batch.lists[warp][first]);
     }
     if constexpr (DETERMINISTIC) {
       __syncthreads();

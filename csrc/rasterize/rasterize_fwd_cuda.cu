@@ -42,32 +42,42 @@ __global__ void pack_rows_kernel(RasterizeInput<float> in, PackedRow* rows, floa
   colors[i] = c;
 }
 
-// One pixel's state while its list is composited.
+// One pixel's state while its list is composited. Entries are named by their offset in the batch.
 template <int CHANNELS>
 struct Compositor {
+  static constexpr std::uint32_t kNone = ~0u;
   float transmittance = 1.f;
   float color[CHANNELS] = {};
-  int last = 0;  // 1 + index of the last composited entry
-  int work = 0;  // entries looked at when the pixel ended
-  bool done;
+  float limit;                  // least log2(alpha) that still counts: infinite once the pixel has ended
+  std::uint32_t last = kNone;   // composited last
+  std::uint32_t ended = kNone;  // at which the pixel ended
 
-  __device__ __forceinline__ void add(float log2_a, const float4& row_color, int index) {
+  __device__ __forceinline__ void add(const Entry& entry, std::uint32_t offset, const Pixel& pixel) {
+    const float log2_a = log2_alpha(entry, pixel);
     const float alpha = fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax));
     const float next = __fmaf_rn(-alpha, transmittance, transmittance);
-    const bool touched = log2_a >= kLog2Cut && !done;
+    const bool touched = log2_a >= limit;
     const bool ends = touched && next < static_cast<float>(kMinTransmittance);
     if (ends) {
-      done = true;
-      work = index + 1;
+      limit = INFINITY;
+      ended = offset;
     }
-    if (!touched || ends) return;
-    const float weight = alpha * transmittance;
-    transmittance = next;
-    last = index + 1;
+    if (touched && !ends) {
+      const float weight = alpha * transmittance;
+      const float4 row_color = entry.color;
+      transmittance = next;
+      last = offset;
 #pragma unroll
-    for (int k = 0; k < CHANNELS; ++k) color[k] = __fmaf_rn(weight, channel(row_color, k), color[k]);
+      for (int k = 0; k < CHANNELS; ++k) color[k] = __fmaf_rn(weight, channel(row_color, k), color[k]);
+    }
   }
+
+  __device__ __forceinline__ bool done() const { return limit == INFINITY; }
 };
+
+__device__ __forceinline__ int entry_number(std::uint32_t offset) {
+  return static_cast<int>(offset / sizeof(Entry));
+}
 
 template <int TILE, int CHANNELS>
 __global__ void __launch_bounds__(TILE* TILE) forward_kernel(const ForwardArguments args) {
@@ -80,24 +90,27 @@ __global__ void __launch_bounds__(TILE* TILE) forward_kernel(const ForwardArgume
   const std::int64_t start = args.tile_offsets[tile.tile];
   const int count = static_cast<int>(args.tile_offsets[tile.tile + 1] - start);
   if (thread == 0) tile_work = 0;
+  batch.init(thread);
 
   Compositor<CHANNELS> state;
-  state.done = !pixel.inside;
+  state.limit = pixel.inside ? kLog2Cut : INFINITY;
+  int last = 0, work = pixel.inside ? count : 0;
   for (int base = 0; base < count; base += kBatch) {
-    if (__syncthreads_and(state.done)) break;
+    if (__syncthreads_and(state.done())) break;
     const bool present = thread < kBatch && base + thread < count;
     batch.load(args.rows, args.chunk, present ? args.isect_rows[start + base + thread] : -1, tile, thread);
     __syncthreads();
-    for (int word = 0; word < batch.kWords && !__all_sync(kFullWarp, state.done); ++word) {
-      for (std::uint32_t bits = batch.hits[warp][word]; bits; bits &= bits - 1) {
-        const int entry = word * 32 + __ffs(bits) - 1;
-        const float4 place = batch.place[entry];
-        const float2 rest = batch.rest[entry];
-        const float power =
-            log2_alpha(place.z, place.w, rest.x, rest.y, pixel.centre_x - place.x, pixel.centre_y - place.y);
-        state.add(power, batch.color[entry], base + entry);
-      }
+    const int n = batch.template list<false>(warp, lane, kBatch);
+    for (int i = 0; i < n; i += 4) {
+      if (i % 32 == 0 && __all_sync(kFullWarp, state.done())) break;
+      std::uint32_t offsets[4];
+      batch.quad(warp, i, offsets);
+#pragma unroll
+      for (int k = 0; k < 4; ++k) state.add(batch.at(offsets[k]), offsets[k], pixel);
     }
+    if (state.last != state.kNone) last = base + entry_number(state.last) + 1;
+    if (state.ended != state.kNone) work = base + entry_number(state.ended) + 1;
+    state.last = state.ended = state.kNone;
   }
 
   if (pixel.inside) {
@@ -115,9 +128,9 @@ __global__ void __launch_bounds__(TILE* TILE) forward_kernel(const ForwardArgume
   if (args.chunk.first > 0) return;
   if (pixel.inside) {
     args.out.transmittances[pixel.index] = state.transmittance;
-    args.out.last_ids[pixel.index] = state.last;
+    args.out.last_ids[pixel.index] = last;
   }
-  const int work = __reduce_max_sync(kFullWarp, !pixel.inside ? 0 : state.done ? state.work : count);
+  work = __reduce_max_sync(kFullWarp, work);
   __syncthreads();
   if (lane == 0) atomicMax(&tile_work, work);
   __syncthreads();

@@ -75,15 +75,6 @@ __device__ __forceinline__ float reciprocal_approx(float x) {
   return y;
 }
 
-// log2 of the unclipped alpha at offset (dx, dy) = pixel - mean. Written out with the fused operations,
-// because forward and backward must agree bit by bit on which pixels a row touches.
-__device__ __forceinline__ float log2_alpha(float l11, float l21, float l22, float log2_opacity, float dx,
-                                            float dy) {
-  const float u = __fmaf_rn(l11, dx, __fmul_rn(l21, dy));
-  const float v = __fmul_rn(l22, dy);
-  return __fmaf_rn(-u, u, __fmaf_rn(-v, v, log2_opacity));
-}
-
 template <int TILE>
 struct Tile {
   static constexpr int kThreads = TILE * TILE;
@@ -160,14 +151,38 @@ __device__ __forceinline__ std::uint32_t subtile_mask(const PackedRow& row, cons
   return mask;
 }
 
-// A batch of list entries in shared memory.
+// A list entry in shared memory.
+struct __align__(16) Entry {
+  float x, y, l11, l21;
+  float l22, log2_opacity, unused[2];
+  float4 color;
+};
+
+// log2 of the unclipped alpha at a pixel. Written out with the fused operations, because forward and backward
+// must agree bit by bit on which pixels a row touches.
+__device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pixel) {
+  const float4 a = reinterpret_cast<const float4*>(&entry)[0];
+  const float2 b = reinterpret_cast<const float2*>(&entry)[2];
+  const float dx = pixel.centre_x - a.x, dy = pixel.centre_y - a.y;
+  const float u = __fmaf_rn(a.z, dx, __fmul_rn(a.w, dy));
+  const float v = __fmul_rn(b.x, dy);
+  return __fmaf_rn(-u, u, __fmaf_rn(-v, v, b.y));
+}
+
+// A batch of list entries in shared memory, and for each subtile the list of those it has to look at, as byte
+// offsets so that the loops over them spend nothing on addresses. The lists are filled up to whole quads with an
+// entry that touches nothing.
 template <int TILE, int BATCH>
 struct EntryBatch {
   static constexpr int kWords = BATCH / 32;
-  float4 place[BATCH];  // x, y, l11, l21
-  float2 rest[BATCH];   // l22, log2_opacity
-  float4 color[BATCH];
-  std::uint32_t hits[Tile<TILE>::kWarps][kWords];  // entries each subtile has to look at
+  Entry entries[BATCH + 1];
+  std::uint32_t hits[Tile<TILE>::kWarps][kWords];
+  std::uint16_t lists[Tile<TILE>::kWarps][BATCH + 4];
+
+  // Once per block, before the first load.
+  __device__ __forceinline__ void init(int thread) {
+    if (thread == 0) entries[BATCH] = {0.f, 0.f, 0.f, 0.f, 0.f, -INFINITY, {0.f, 0.f}, {0.f, 0.f, 0.f, 0.f}};
+  }
 
   // Called by the whole block, threads >= BATCH included; row < 0 where there is no entry.
   __device__ __forceinline__ void load(const PackedRow* rows, const ChannelChunk& chunk, std::int32_t row,
@@ -178,9 +193,10 @@ struct EntryBatch {
     if (row >= 0) {
       const float4* source = reinterpret_cast<const float4*>(rows + row);
       const float4 a = __ldg(source), b = __ldg(source + 1);
-      color[thread] = load_color(chunk, row);
-      place[thread] = a;
-      rest[thread] = make_float2(b.x, b.y);
+      float4* target = reinterpret_cast<float4*>(entries + thread);
+      target[2] = load_color(chunk, row);
+      target[0] = a;
+      target[1] = b;
       mask = subtile_mask<TILE>({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile);
     }
     std::uint32_t mine = 0;
@@ -190,6 +206,40 @@ struct EntryBatch {
       if (lane == i) mine = word;
     }
     if (lane < Tile<TILE>::kWarps) hits[lane][thread >> 5] = mine;
+  }
+
+  // Writes the warp's list, of the batch's first `limit` entries, and returns its length.
+  template <bool BACKWARDS>
+  __device__ __forceinline__ int list(int warp, int lane, int limit) {
+    int n = 0;
+#pragma unroll
+    for (int i = 0; i < kWords; ++i) {
+      const int word = BACKWARDS ? kWords - 1 - i : i;
+      if (word * 32 >= limit) continue;
+      std::uint32_t bits = hits[warp][word];
+      if (limit - word * 32 < 32) bits &= (1u << (limit - word * 32)) - 1u;
+      const std::uint32_t before = BACKWARDS ? bits & (0xfffffffeu << lane) : bits & ((1u << lane) - 1u);
+      if (bits >> lane & 1u) {
+        lists[warp][n + __popc(before)] = static_cast<std::uint16_t>((word * 32 + lane) * sizeof(Entry));
+      }
+      n += __popc(bits);
+    }
+    if (lane < 4) lists[warp][n + lane] = static_cast<std::uint16_t>(BATCH * sizeof(Entry));
+    __syncwarp();
+    return n;
+  }
+
+  // Four offsets of a list.
+  __device__ __forceinline__ void quad(int warp, int at, std::uint32_t* offsets) const {
+    const uint2 packed = *reinterpret_cast<const uint2*>(&lists[warp][at]);
+    offsets[0] = packed.x & 0xffffu;
+    offsets[1] = packed.x >> 16;
+    offsets[2] = packed.y & 0xffffu;
+    offsets[3] = packed.y >> 16;
+  }
+
+  __device__ __forceinline__ const Entry& at(std::uint32_t offset) const {
+    return *reinterpret_cast<const Entry*>(reinterpret_cast<const char*>(entries) + offset);
   }
 };
 

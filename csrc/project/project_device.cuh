@@ -1,0 +1,141 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the CUDA projection's forward and backward share: cameras in shared memory, loads, and SH rows that a warp
+// moves between global and shared memory together.
+#pragma once
+#include <cstdint>
+#include <type_traits>
+
+#include "common/cuda_check.h"
+#include "project/project.h"
+
+namespace blitzgs::cuda {
+
+using Inputs = ProjectInputs<float>;
+
+// The cameras of a launch in shared memory; the caller synchronises.
+__device__ inline void load_cameras(const Inputs& in, Camera<float>* cameras) {
+  for (int view = threadIdx.x; view < in.n_views; view += blockDim.x) {
+    cameras[view] =
+        make_camera(in.viewmats + 16 * view, in.Ks + 9 * view, in.options.width, in.options.height);
+  }
+}
+
+__host__ __device__ inline bool aligned16(const void* pointer) {
+  return reinterpret_cast<std::uintptr_t>(pointer) % 16 == 0;
+}
+
+__device__ inline void load_quat(const Inputs& in, std::int64_t id, float* quat) {
+  float4 q;
+  if (aligned16(in.quats)) {
+    q = reinterpret_cast<const float4*>(in.quats)[id];
+  } else {
+    q = {in.quats[4 * id], in.quats[4 * id + 1], in.quats[4 * id + 2], in.quats[4 * id + 3]};
+  }
+  quat[0] = q.x;
+  quat[1] = q.y;
+  quat[2] = q.z;
+  quat[3] = q.w;
+}
+
+__device__ inline ActiveGaussian<float> load_gaussian(const Inputs& in, std::int64_t id) {
+  float quat[4];
+  load_quat(in, id, quat);
+  return activate_gaussian(load3(in.means + 3 * id), quat, activate_scale(in.scales + 3 * id, in.options.raw),
+                           activate_opacity(in.opacities[id], in.options.raw));
+}
+
+// The SH coefficients of one Gaussian in use at a degree, in registers.
+template <int DEGREE>
+struct ShRow {
+  static constexpr int kCount = 3 * (DEGREE + 1) * (DEGREE + 1);
+  static constexpr bool kWhole = kCount % 4 == 0;  // in 16-byte quads
+  static constexpr int kQuads = kWhole ? kCount / 4 : 1;
+  float values[kCount];
+
+  __device__ __forceinline__ void set_quad(int i, const float4& quad) {
+    values[4 * i] = quad.x;
+    values[4 * i + 1] = quad.y;
+    values[4 * i + 2] = quad.z;
+    values[4 * i + 3] = quad.w;
+  }
+  __device__ __forceinline__ float4 quad(int i) const {
+    return {values[4 * i], values[4 * i + 1], values[4 * i + 2], values[4 * i + 3]};
+  }
+};
+
+// Whether rows of `stride` floats at `sh` can be moved by 16 bytes.
+template <int DEGREE>
+bool quads_fit(const float* sh, int stride) {
+  return ShRow<DEGREE>::kWhole && sh && stride % 4 == 0 && aligned16(sh);
+}
+
+// A warp's 32 SH rows in shared memory. Lanes of one instruction move consecutive 16-byte pieces, of two or three
+// rows, where a lane for each row would touch 32 cache lines.
+template <int DEGREE>
+struct ShStage {
+  using Row = ShRow<DEGREE>;
+  static constexpr int kPitch = Row::kQuads | 1;  // odd, so that a column of rows spreads over the banks
+  float4 quads[32 * kPitch];
+
+  // Gathers row `id` of each lane; id < 0: none. Asynchronous until wait().
+  __device__ __forceinline__ void gather(const float* sh, std::int64_t stride, std::int32_t id, int lane) {
+#pragma unroll
+    for (int i = 0; i < Row::kQuads; ++i) {
+      const int at = i * 32 + lane, row = at / Row::kQuads, quad = at % Row::kQuads;
+      const std::int32_t row_id = __shfl_sync(0xffffffffu, id, row);
+      if (row_id < 0) continue;
+      const auto target = static_cast<unsigned>(__cvta_generic_to_shared(quads + row * kPitch + quad));
+      asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(target), "l"(sh + stride * row_id + 4 * quad));
+    }
+  }
+  __device__ __forceinline__ void wait() {
+    asm volatile("cp.async.wait_all;" ::: "memory");
+    __syncwarp();
+  }
+  __device__ __forceinline__ void read(int lane, Row* row) const {
+#pragma unroll
+    for (int i = 0; i < Row::kQuads; ++i) row->set_quad(i, quads[lane * kPitch + i]);
+  }
+  __device__ __forceinline__ void write(int lane, const Row& row) {
+#pragma unroll
+    for (int i = 0; i < Row::kQuads; ++i) quads[lane * kPitch + i] = row.quad(i);
+  }
+  // Stores the first `rows` rows at out, `stride` floats apart, and zeros where a row has more coefficients.
+  __device__ __forceinline__ void store(float* out, std::int64_t stride, std::int64_t rows, int lane) {
+    __syncwarp();
+#pragma unroll
+    for (int i = 0; i < Row::kQuads; ++i) {
+      const int at = i * 32 + lane, row = at / Row::kQuads, quad = at % Row::kQuads;
+      if (row < rows) reinterpret_cast<float4*>(out + stride * row)[quad] = quads[row * kPitch + quad];
+    }
+    const int rest = static_cast<int>(stride / 4) - Row::kQuads;
+    for (int at = lane; at < 32 * rest; at += 32) {
+      const int row = at / rest, quad = Row::kQuads + at % rest;
+      if (row < rows) reinterpret_cast<float4*>(out + stride * row)[quad] = {0.f, 0.f, 0.f, 0.f};
+    }
+  }
+};
+
+// Calls f(degree, quads) with both as types: the SH degree (0 without SH), and whether rows move by 16 bytes.
+template <class F>
+void dispatch_sh(const Inputs& in, const F& f) {
+  const auto with_degree = [&](auto degree) {
+    if (quads_fit<degree.value>(in.sh, 3 * in.options.sh_stride)) {
+      f(degree, std::bool_constant<ShRow<degree.value>::kWhole>{});
+    } else {
+      f(degree, std::false_type{});
+    }
+  };
+  switch (in.sh ? in.options.sh_degree : 0) {
+    case 0:
+      return with_degree(std::integral_constant<int, 0>{});
+    case 1:
+      return with_degree(std::integral_constant<int, 1>{});
+    case 2:
+      return with_degree(std::integral_constant<int, 2>{});
+    default:
+      return with_degree(std::integral_constant<int, 3>{});
+  }
+}
+
+}  // namespace blitzgs::cuda
