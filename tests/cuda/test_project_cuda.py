@@ -5,7 +5,8 @@ import pytest
 import torch
 from cuda_scenes import Scene, ops, relative_error
 
-NAMES = "gaussian_ids camera_ids visible_ids row_offsets means2d conics depths opacities colors".split()
+NAMES = ("gaussian_ids", "camera_ids", "visible_ids", "row_offsets")
+NAMES += ("means2d", "conics", "depths", "opacities", "colors")
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -62,8 +63,8 @@ def test_gradients_match_float64(scene, degree, antialiased):
         )
 
     expected, gradients = backward("cpu", torch.float64), backward("cuda", torch.float32)
-    for name, value, target in zip("means quats scales opacities sh viewmats".split(), gradients, expected,
-                                   strict=True):  # fmt: skip
+    names = ("means", "quats", "scales", "opacities", "sh", "viewmats")
+    for name, value, target in zip(names, gradients, expected, strict=True):
         assert value.shape == target.shape
         assert relative_error(value, target) < 1e-5, name
 

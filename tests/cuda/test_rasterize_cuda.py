@@ -71,8 +71,8 @@ def test_gradients_match_float64(scene, channels, tile_size, deterministic, absg
     v_alphas = torch.randn(decided.shape, generator=g) * decided
     expected = job.backward("cpu", torch.float64, exact, v_renders, v_alphas, absgrad, True)
     gradients = job.backward("cuda", torch.float32, ours, v_renders, v_alphas, absgrad, deterministic)
-    for name, value, target in zip("means2d conics opacities colors abs".split(), gradients, expected,
-                                   strict=True):  # fmt: skip
+    names = ("means2d", "conics", "opacities", "colors", "abs")
+    for name, value, target in zip(names, gradients, expected, strict=True):
         assert value.shape == target.shape
         assert relative_error(value, target) < 1e-4, name
 
