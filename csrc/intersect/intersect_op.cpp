@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "intersect/intersect.h"
 
+#include <exception>
 #include <limits>
 #include <tuple>
 
@@ -57,10 +58,17 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
                                grid};
     const std::int64_t capacity =
         n_isects >= 0 ? n_isects : backend::count_intersections(in, scope.workspace, scope.stream);
-    rows = make_empty(means, {capacity}, ScalarType::Int);
-    const std::int64_t count =
-        backend::intersect(in, capacity, mutable_data<std::int32_t>(rows),
-                           mutable_data<std::int64_t>(offsets), scope.workspace, scope.stream);
+    std::int64_t count = 0;
+    try {
+      rows = make_empty(means, {capacity}, ScalarType::Int);
+      count = backend::intersect(in, capacity, mutable_data<std::int32_t>(rows),
+                                 mutable_data<std::int64_t>(offsets), scope.workspace, scope.stream);
+    } catch (const std::exception& error) {
+      // What fails here is memory: the lists are the one thing whose size nobody asked for.
+      STD_TORCH_CHECK(false, "blitzgs::intersect: listing ", capacity, " intersections of ", n_rows,
+                      " rows failed; it takes about ", capacity * 20 / 1000000, " MB. Render fewer views at ",
+                      "once, in smaller images, or with a larger radius_clip. Cause: ", error.what());
+    }
     STD_TORCH_CHECK(count <= capacity, "blitzgs::intersect: n_isects is ", capacity, " but there are ", count,
                     " intersections; pass the sum of tiles_touched, or -1 to have them counted");
   });
