@@ -46,7 +46,7 @@ class OurStep:
         n = len(render.parameters[0])
         self.loss = Loss((render.grid[0], render.scene.height, render.scene.width, 3))
         first = [1e-6 * torch.randn_like(p) for p in render.parameters]
-        self.moments = [first, [m * m for m in first]]
+        self.moments = [first, [torch.full_like(m, 1e-12) for m in first]]
         self.rates = torch.full((STEP + 1000, 6), RATE, device="cuda")
         self.behind = (STEP - 40 + torch.arange(n, device="cuda") % 40).int()
         self.last_step = self.behind.clone()

@@ -26,14 +26,16 @@ __device__ RowGradient<float> load_row_gradient(const ProjectRowGradients<float>
 
 // A thread is a visible Gaussian.
 template <int DEGREE, bool QUADS>
-__global__ void __launch_bounds__(kThreads, 4)
+__global__ void __launch_bounds__(kThreads, 3)
     backward_kernel(const BackwardInputs args, const ProjectGradients<float> out) {
   using Coefficients = ShRow<DEGREE>;
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ ShStage<DEGREE> stages[QUADS ? kThreads / 32 : 1];
+  __shared__ TripleStage triples[kThreads / 32];
   const Inputs& in = args.in;
   const int lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? threadIdx.x / 32 : 0];
+  TripleStage& triple = triples[threadIdx.x / 32];
   const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x / 32 * 32;
   const std::int64_t u = first + lane;
   const std::int32_t id = u < args.rows.n_visible ? args.rows.visible_ids[u] : -1;
@@ -44,46 +46,54 @@ __global__ void __launch_bounds__(kThreads, 4)
   }
   load_cameras(in, cameras);
   __syncthreads();
+  const Vec3<float> mean = triple.gather(in.means, id, lane), scale = triple.gather(in.scales, id, lane);
 
-  Coefficients sh, v_sh;
+  Vec3<float> v_mean{}, v_scale{};
+  const ActiveGaussian<float> gaussian = make_gaussian(in, id < 0 ? 0 : id, mean, scale);
+  GaussianGradient<float> gradient{};
+  float axis_weight = 0.f;
+  const std::int32_t begin = id < 0 ? 0 : args.rows.row_offsets[u],
+                     end = id < 0 ? 0 : args.rows.row_offsets[u + 1];
+  PoseGradient<float>* no_pose = nullptr;
+  for (std::int64_t r = begin; r < end; ++r) {
+    const int view = args.rows.camera_ids[r];
+    project_row_vjp(cameras[view], gaussian, in.options, load_row_gradient(args.v, r), &gradient, no_pose);
+    if (args.scale_reg) axis_weight += args.scale_reg[view];
+  }
+
+  // The colours after the geometry, so that their coefficients are in registers for no longer than needed.
+  Coefficients v_sh;
 #pragma unroll
   for (float& value : v_sh.values) value = 0.f;
-  if constexpr (QUADS) {
-    if (has_colors) {
+  if (has_colors) {
+    Coefficients sh;
+    if constexpr (QUADS) {
       stage.wait();
       stage.read(lane, &sh);
       __syncwarp();
-    }
-  } else if (has_colors && id >= 0) {
+    } else if (id >= 0) {
 #pragma unroll
-    for (int i = 0; i < Coefficients::kCount; ++i) sh.values[i] = in.sh[stride * id + i];
+      for (int i = 0; i < Coefficients::kCount; ++i) sh.values[i] = in.sh[stride * id + i];
+    }
+    for (std::int64_t r = begin; r < end; ++r) {
+      const float v_color[3] = {args.v.colors[3 * r], args.v.colors[3 * r + 1], args.v.colors[3 * r + 2]};
+      row_color_vjp(cameras[args.rows.camera_ids[r]], mean, sh.values, DEGREE, v_color, v_sh.values,
+                    &gradient.mean, no_pose);
+    }
   }
   if (id >= 0) {
-    const ActiveGaussian<float> gaussian = load_gaussian(in, id);
-    GaussianGradient<float> gradient{};
-    float axis_weight = 0.f;
-    const std::int32_t last = args.rows.row_offsets[u + 1];
-    for (std::int64_t r = args.rows.row_offsets[u]; r < last; ++r) {
-      const int view = args.rows.camera_ids[r];
-      PoseGradient<float>* no_pose = nullptr;
-      project_row_vjp(cameras[view], gaussian, in.options, load_row_gradient(args.v, r), &gradient, no_pose);
-      if (has_colors) {
-        const float v_color[3] = {args.v.colors[3 * r], args.v.colors[3 * r + 1], args.v.colors[3 * r + 2]};
-        row_color_vjp(cameras[view], gaussian.mean, sh.values, DEGREE, v_color, v_sh.values, &gradient.mean,
-                      no_pose);
-      }
-      if (args.scale_reg) axis_weight += args.scale_reg[view];
-    }
     float v_quat[4];
-    activate_gaussian_vjp(
-        gaussian, in.options.raw, gradient, axis_weight,
-        ParameterGradients<float>{out.means + 3 * u, v_quat, out.scales + 3 * u, out.opacities + u});
+    activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
+                          ParameterGradients<float>{&v_mean.x, v_quat, &v_scale.x, out.opacities + u});
     reinterpret_cast<float4*>(out.quats)[u] = {v_quat[0], v_quat[1], v_quat[2], v_quat[3]};
   }
+  const std::int64_t rows = args.rows.n_visible - first;
+  triple.store(v_mean, out.means + 3 * first, rows, lane);
+  triple.store(v_scale, out.scales + 3 * first, rows, lane);
   if (!out.sh) return;
   if constexpr (QUADS) {
     stage.write(lane, v_sh);
-    stage.store(out.sh + stride * first, stride, args.rows.n_visible - first, lane);
+    stage.store(out.sh + stride * first, stride, rows, lane);
   } else if (id >= 0) {
     float* target = out.sh + stride * u;
 #pragma unroll

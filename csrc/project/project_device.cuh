@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the CUDA projection's forward and backward share: cameras in shared memory, loads, and SH rows that a warp
-// moves between global and shared memory together.
+// What the CUDA projection's forward and backward share: cameras in shared memory, loads, and SH rows that a
+// warp moves between global and shared memory together.
 #pragma once
 #include <cstdint>
 #include <type_traits>
@@ -37,12 +37,49 @@ __device__ inline void load_quat(const Inputs& in, std::int64_t id, float* quat)
   quat[3] = q.w;
 }
 
-__device__ inline ActiveGaussian<float> load_gaussian(const Inputs& in, std::int64_t id) {
+// From a mean and a stored scale that are loaded already.
+__device__ inline ActiveGaussian<float> make_gaussian(const Inputs& in, std::int64_t id,
+                                                      const Vec3<float>& mean, const Vec3<float>& scale) {
   float quat[4];
   load_quat(in, id, quat);
-  return activate_gaussian(load3(in.means + 3 * id), quat, activate_scale(in.scales + 3 * id, in.options.raw),
+  return activate_gaussian(mean, quat, activate_scale(&scale.x, in.options.raw),
                            activate_opacity(in.opacities[id], in.options.raw));
 }
+
+__device__ inline ActiveGaussian<float> load_gaussian(const Inputs& in, std::int64_t id) {
+  return make_gaussian(in, id, load3(in.means + 3 * id), load3(in.scales + 3 * id));
+}
+
+// A warp's 32 rows of three floats in shared memory, so that global memory is read and written in whole
+// sectors.
+struct TripleStage {
+  float values[96];
+
+  // Gathers row `id` of each lane (id < 0: none) and returns the lane's own.
+  __device__ __forceinline__ Vec3<float> gather(const float* source, std::int32_t id, int lane) {
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+      const int at = i * 32 + lane;
+      const std::int64_t row = __shfl_sync(0xffffffffu, id, at / 3);
+      if (row >= 0) values[at] = source[3 * row + at % 3];
+    }
+    __syncwarp();
+    const Vec3<float> mine = load3(values + 3 * lane);
+    __syncwarp();
+    return mine;
+  }
+  // Stores each lane's row, the first `rows` of them, one behind the other at `out`.
+  __device__ __forceinline__ void store(const Vec3<float>& mine, float* out, std::int64_t rows, int lane) {
+    store3(mine, values + 3 * lane);
+    __syncwarp();
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+      const int at = i * 32 + lane;
+      if (at < 3 * rows) out[at] = values[at];
+    }
+    __syncwarp();
+  }
+};
 
 // The SH coefficients of one Gaussian in use at a degree, in registers.
 template <int DEGREE>
@@ -69,8 +106,8 @@ bool quads_fit(const float* sh, int stride) {
   return ShRow<DEGREE>::kWhole && sh && stride % 4 == 0 && aligned16(sh);
 }
 
-// A warp's 32 SH rows in shared memory. Lanes of one instruction move consecutive 16-byte pieces, of two or three
-// rows, where a lane for each row would touch 32 cache lines.
+// A warp's 32 SH rows in shared memory. Lanes of one instruction move consecutive 16-byte pieces, of two or
+// three rows, where a lane for each row would touch 32 cache lines.
 template <int DEGREE>
 struct ShStage {
   using Row = ShRow<DEGREE>;
@@ -85,7 +122,8 @@ struct ShStage {
       const std::int32_t row_id = __shfl_sync(0xffffffffu, id, row);
       if (row_id < 0) continue;
       const auto target = static_cast<unsigned>(__cvta_generic_to_shared(quads + row * kPitch + quad));
-      asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(target), "l"(sh + stride * row_id + 4 * quad));
+      asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(target),
+                   "l"(sh + stride * row_id + 4 * quad));
     }
   }
   __device__ __forceinline__ void wait() {

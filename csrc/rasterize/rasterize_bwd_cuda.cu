@@ -74,8 +74,8 @@ struct EntrySums {
 // The two pixel rows of this half of the subtile.
 template <int CHANNELS, bool ABSOLUTE>
 __device__ __forceinline__ EntrySums<CHANNELS> sum_half(const float2* group, const float4* v_render,
-                                                        const Entry& shape, float centre_x,
-                                                        float centre_y, int half) {
+                                                        const Entry& shape, float centre_x, float centre_y,
+                                                        int half) {
   EntrySums<CHANNELS> sums;
 #pragma unroll
   for (int y = 0; y < 2; ++y) {
@@ -140,9 +140,8 @@ __device__ __forceinline__ void flush_group(BackwardShared<TILE, DETERMINISTIC>&
   const int my_entry = static_cast<int>(offset / sizeof(Entry));
   const float centre_x = static_cast<float>(pixel.left + kSubtileWidth / 2);
   const float centre_y = static_cast<float>(pixel.top + kSubtileHeight / 2);
-  EntrySums<CHANNELS> sums =
-      sum_half<CHANNELS, ABSOLUTE>(shared.group[warp] + slot * kGroupStride, shared.v_render[warp], shape,
-                                   centre_x, centre_y, half);
+  EntrySums<CHANNELS> sums = sum_half<CHANNELS, ABSOLUTE>(
+      shared.group[warp] + slot * kGroupStride, shared.v_render[warp], shape, centre_x, centre_y, half);
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) sums.color[k] = add_halves(sums.color[k]);
   sums.g = add_halves(sums.g);

@@ -170,8 +170,8 @@ __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pix
 }
 
 // A batch of list entries in shared memory, and for each subtile the list of those it has to look at, as byte
-// offsets so that the loops over them spend nothing on addresses. The lists are filled up to whole quads with an
-// entry that touches nothing.
+// offsets so that the loops over them spend nothing on addresses. The lists are filled up to whole quads with
+// an entry that touches nothing.
 template <int TILE, int BATCH>
 struct EntryBatch {
   static constexpr int kWords = BATCH / 32;
