@@ -210,23 +210,6 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// counts[block] += the candidate that `seen` views see, if any. Called by whole warps, whose lanes mostly
-// share a block: one atomic for each block of a warp.
-__device__ __forceinline__ void add_to_blocks(std::int64_t* counts, int block, std::uint32_t seen) {
-  const int lane = threadIdx.x % 32;
-  for (unsigned left = __ballot_sync(0xffffffffu, seen != 0); left;) {
-    const int leader = __ffs(left) - 1;
-    const bool shares = __shfl_sync(0xffffffffu, block, leader) == block && seen != 0;
-    const unsigned group = __ballot_sync(0xffffffffu, shares);
-    const auto rows = __reduce_add_sync(0xffffffffu, shares ? static_cast<unsigned>(__popc(seen)) : 0u);
-    if (lane == leader) {
-      atomicAdd(reinterpret_cast<unsigned long long*>(counts) + block,
-                static_cast<unsigned long long>(pack_counts(__popc(group), rows)));
-    }
-    left &= ~group;
-  }
-}
-
 // view_masks of what is left becomes exact, and visible_before the pack_counts() of each block.
 template <int DEGREE, bool QUADS>
 __global__ void __launch_bounds__(kThreads, 3)
@@ -238,18 +221,16 @@ __global__ void __launch_bounds__(kThreads, 3)
   __syncthreads();
   const auto n_left = static_cast<std::int64_t>(state.totals[3]);
   std::int64_t visible = 0, rows = 0, tiles = 0;
-  for (std::int64_t base = blockIdx.x * static_cast<std::int64_t>(kThreads); base < n_left;
-       base += static_cast<std::int64_t>(gridDim.x) * kThreads) {
-    const std::int64_t i = base + threadIdx.x;
-    const std::int32_t c = i < n_left ? state.left[i] : 0;
-    std::uint32_t seen = 0;
-    if (i < n_left) {
-      seen = exact_views<DEGREE, QUADS>(in, cameras, c, plan.view_masks[c], &tiles);
-      plan.view_masks[c] = seen;
-    }
-    visible += seen != 0;
+  for (std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x; i < n_left;
+       i += static_cast<std::int64_t>(gridDim.x) * kThreads) {
+    const std::int32_t c = state.left[i];
+    const std::uint32_t seen = exact_views<DEGREE, QUADS>(in, cameras, c, plan.view_masks[c], &tiles);
+    plan.view_masks[c] = seen;
+    if (seen == 0) continue;
+    visible += 1;
     rows += __popc(seen);
-    add_to_blocks(plan.visible_before, c / static_cast<int>(kProjectBlock), seen);
+    atomicAdd(reinterpret_cast<unsigned long long*>(plan.visible_before) + c / kProjectBlock,
+              static_cast<unsigned long long>(pack_counts(1, __popc(seen))));
   }
   visible = Reduce(storage[0]).Sum(visible);
   rows = Reduce(storage[1]).Sum(rows);
