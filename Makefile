@@ -64,7 +64,7 @@ test-cxx:
 	  || { apt-get update -qq && apt-get install -y -qq catch2; } >/dev/null 2>&1 \
 	  || { echo "Catch2 is missing: install it (Debian: apt-get install catch2)"; exit 1; }
 	$(RUN) cmake -S . -B build-tests -G Ninja -DBLITZGS_TESTS=ON -DBLITZGS_SANITIZE=ON -DBLITZGS_CUDA=OFF \
-	  -DBLITZGS_IO=OFF -DCMAKE_CXX_FLAGS_RELEASE=-O1 -DPython3_EXECUTABLE="$(abspath $(PYTHON))" >/dev/null
+	  -DBLITZGS_IO=OFF -DCMAKE_BUILD_TYPE=None -DCMAKE_CXX_FLAGS=-O1 -DPython3_EXECUTABLE="$(abspath $(PYTHON))" >/dev/null
 	$(RUN) cmake --build build-tests --target blitzgs_tests
 	./build-tests/blitzgs_tests
 
