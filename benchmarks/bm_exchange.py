@@ -28,7 +28,7 @@ from torch import Tensor
 
 from blitzgs.distributed.exchange import Splats, plan_route, send, send_back
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TILE_COST, Share, TileOwners, cost_balance
+from blitzgs.distributed.ownership import LOSS_REACH, TILE_COST, Share, TileOwners, cost_balance
 from blitzgs.distributed.pixels import collect_images
 from blitzgs.model import GaussianTable
 from blitzgs.ops.project import Rows
@@ -134,7 +134,7 @@ class Workload:
         table, options, ranks, clock = self.table, self.options, self.ranks, Clock(self.ranks.device)
         share, count, size = None, len(views), (views.width, views.height, options.tile_size)
         if ranks.world_size > 1:
-            share = Share(ranks, self.owners.divide(keys, *size), half)
+            share = Share(ranks, self.owners.divide(keys, *size, LOSS_REACH), half)
         targets = torch.full(
             (count, views.height, views.width, 3), 128, dtype=torch.uint8, device=ranks.device
         )
@@ -158,7 +158,7 @@ class Workload:
         if share is not None:
             route = plan_route(splats, share.ranges, ranks, half)
             splats = send(splats, route, ranks)
-            isects, tiles, visible = route.n_isects, share.tiles, route.visible
+            isects, tiles, visible = route.n_isects, share.composited, route.visible
         clock.mark()
         lists = ops.intersect(
             splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
@@ -172,12 +172,13 @@ class Workload:
         )  # fmt: skip
         clock.mark()
         work = frame.tile_work.clone()
-        self.owners.record(keys, frame.tile_work)
+        if share is not None:
+            self.owners.record(keys, frame.tile_work, share.ranges)
         terms = loss_terms(frame, batch, self.loss, 1.0)
         clock.mark()
         *gradients, _ = ops.rasterize_bwd(
             *values, frame.renders, frame.transmittances, frame.last_ids, frame.aux, terms.v_renders, None,
-            count, *size, *tiles, False, False,
+            count, *size, *(tiles if share is None else share.tiles), False, False,
         )  # fmt: skip
         clock.mark()
         if share is not None and route is not None:
@@ -199,7 +200,6 @@ class Workload:
             "rows": len(rows.gaussian_ids),
             "visible": len(rows.visible_ids),
             "sent": 0 if route is None else sum(route.sent) - route.sent[ranks.rank],
-            "halo": _halo_pixels(share),
             "balance": _balance(work, share, ranks),
             "frame": frame,
             "gradients": parameters,
@@ -216,16 +216,11 @@ def _bookkeeping(count: int) -> dict[str, Tensor]:
     }
 
 
-def _halo_pixels(share: Share | None) -> int:
-    if share is None:
-        return 0
-    tiles = sum(high - low for low, high in share.ranges.halo(share.ranks.rank))
-    return tiles * share.ranges.tile_size**2
-
-
 def _balance(work: Tensor, share: Share | None, ranks: Ranks) -> float:
     if share is None:
         return 1.0
+    begin, end = share.tiles
+    work[:begin], work[end:] = 0, 0
     cost = ranks.all_reduce(work).double().cpu().numpy() + TILE_COST
     return cost_balance(cost, share.ranges.bounds)
 
@@ -253,7 +248,7 @@ def measure(args: argparse.Namespace) -> None:
     """Run on this process's rank; rank 0 prints one JSON line."""
     with Ranks.from_environment(args.device) as ranks:
         load = Workload(args, ranks)
-        balances, times, totals = [[], []], [], torch.zeros(4, dtype=torch.int64, device=ranks.device)
+        balances, times, totals = [[], []], [], torch.zeros(3, dtype=torch.int64, device=ranks.device)
         for visit in range(2):
             for keys, views in load.batches:
                 result = load.step(keys, views, update=True)
@@ -261,9 +256,9 @@ def measure(args: argparse.Namespace) -> None:
                 if visit == 1:
                     slowest = torch.tensor(result["times"], device=ranks.device)
                     times.append(ranks.all_reduce(slowest, "max").tolist())
-                    counts = [result[name] for name in ("rows", "visible", "sent", "halo")]
+                    counts = [result[name] for name in ("rows", "visible", "sent")]
                     totals += torch.tensor(counts, device=ranks.device)
-        rows, visible, sent, halo = (x / len(load.batches) for x in ranks.all_reduce(totals).tolist())
+        rows, visible, sent = (x / len(load.batches) for x in ranks.all_reduce(totals).tolist())
         report = {
             "ranks": ranks.world_size,
             "device": torch.cuda.get_device_name() if ranks.device.type == "cuda" else "cpu",
@@ -271,7 +266,7 @@ def measure(args: argparse.Namespace) -> None:
             "visible per step": visible,
             "rows per step": rows,
             "rows sent to other ranks": sent,
-            "bytes per step": {"splats": 52 * sent, "gradients": 36 * sent, "pixels": 12 * halo},
+            "bytes per step": {"splats": 52 * sent, "gradients": 36 * sent},
             "balance": {
                 name: max(values) for name, values in zip(("estimated", "measured"), balances, strict=True)
             },

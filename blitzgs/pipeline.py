@@ -80,17 +80,17 @@ class Frame(NamedTuple):
         views: the views.
         options: the options.
         rows: this rank's projected Gaussians, P rows.
-        splats: what was composited: the rows, or those that reached this rank's tiles in the exchange.
+        splats: what was composited: the rows, or those that the exchange brought here.
         share: who composites which tiles; None: one rank does all.
         route: of the exchange.
         visible: int64 [B], Gaussians visible in each view, over all ranks.
         backgrounds: [B, 3]; None: black.
         isect_rows: int32 [I], splats by tile, front to back.
         tile_offsets: int64 [B * T + 1].
-        renders: [B, H, W, 3]; pixels of other ranks' tiles are zero.
+        renders: [B, H, W, 3]; pixels that this rank does not composite are zero.
         transmittances: [B, H, W], share of the background that shows.
         last_ids: int32 [B, H, W], for the backward pass.
-        tile_work: int32 [B * T], list entries each tile went through.
+        tile_work: int32 [B * T], list entries each composited tile went through.
         aux: the backend's own.
     """
 
@@ -161,7 +161,7 @@ def forward(
     if share is None:
         visible = count_by_view(rows.camera_ids, count)
     else:
-        route, tiles = plan_route(splats, share.ranges, share.ranks, share.half), share.tiles
+        route, tiles = plan_route(splats, share.ranges, share.ranks, share.half), share.composited
         splats = send(splats, route, share.ranks)
         n_isects, visible = route.n_isects, route.visible
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(

@@ -41,8 +41,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Which ranks a row has to be sent to.
   m.def(
       "route_count(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor camera_ids, int[] "
-      "tile_bounds, "
-      "int width, int height, int tile_size) -> (Tensor masks, Tensor counts)");
+      "tile_begins, int[] tile_ends, int width, int height, int tile_size) -> (Tensor masks, Tensor counts)");
   m.def("route_rows(Tensor masks, int[] rows_per_rank) -> Tensor rows");
   m.def("pack_rows(Tensor[] columns, Tensor rows) -> Tensor packed");
   m.def("unpack_rows(Tensor packed, int[] widths) -> Tensor[] columns");

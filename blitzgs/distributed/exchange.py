@@ -73,7 +73,7 @@ def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = Fa
 
     Args:
         splats: this rank's rows.
-        ranges: who owns which tiles.
+        ranges: who composites which tiles.
         ranks: the job.
         half: send conics (as Cholesky factors, which stay positive definite), opacities and colours in
             float16, and their gradients in bfloat16; positions and depths stay as they are. A row of three
@@ -89,7 +89,7 @@ def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = Fa
         conics,
         opacities,
         splats.camera_ids,
-        ranges.bounds,
+        [ranges.composited(rank) for rank in range(ranks.world_size)],
         ranges.width,
         ranges.height,
         ranges.tile_size,
@@ -124,7 +124,7 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
         ranks: the job.
 
     Returns:
-        The rows that touch this rank's tiles, grouped by source rank.
+        The rows that touch the tiles this rank composites, grouped by source rank.
     """
     columns = [splats.means2d, splats.depths, splats.camera_ids, splats.ids]
     if route.halves is None:

@@ -32,6 +32,9 @@ class TileRanges:
         width: image width in pixels.
         height: image height in pixels.
         tile_size: tile edge in pixels.
+        reach: a rank composites, besides its own tiles, those within this many pixels of them; what several
+            ranks composite has the same bits on each. `LOSS_REACH` where a loss is to be computed: no pixel
+            then has to be fetched. 0: its own alone.
     """
 
     bounds: tuple[int, ...]
@@ -39,6 +42,7 @@ class TileRanges:
     width: int
     height: int
     tile_size: int = 16
+    reach: int = 0
 
     @property
     def tiles_x(self) -> int:
@@ -54,20 +58,19 @@ class TileRanges:
         """Return a rank's [first, one past last) tile."""
         return self.bounds[rank], self.bounds[rank + 1]
 
-    def halo(self, rank: int) -> list[tuple[int, int]]:
-        """Return the ranges of other ranks' tiles within `LOSS_REACH` pixels of a rank's tiles.
+    def composited(self, rank: int) -> tuple[int, int]:
+        """Return the [first, one past last) tile that a rank composites: its own and those within `reach`.
 
         A little more than those: whole stretches of tiles in the flattened order, never beyond the view.
+        Empty for a rank without tiles. The firsts ascend with the ranks.
         """
         begin, end = self.of(rank)
+        ring = -(-self.reach // self.tile_size)
+        stretch = ring * (self.tiles_x + 1) if ring else 0
+        low = max(begin // self.tiles_per_view * self.tiles_per_view, begin - stretch)
         if begin == end:
-            return []
-        ring = -(-LOSS_REACH // self.tile_size)
-        reach = ring * (self.tiles_x + 1)
-        view_begin = begin // self.tiles_per_view * self.tiles_per_view
-        view_end = -(-end // self.tiles_per_view) * self.tiles_per_view
-        before, after = max(view_begin, begin - reach), min(view_end, end + reach)
-        return [(low, high) for low, high in ((before, begin), (end, after)) if low < high]
+            return low, low
+        return low, min(-(-end // self.tiles_per_view) * self.tiles_per_view, end + stretch)
 
     def pixel_mask(self, rank: int, device: torch.device) -> Tensor:
         """Mark the pixels of a rank's tiles, bool [B, H, W]."""
@@ -108,8 +111,13 @@ class Share:
 
     @property
     def tiles(self) -> tuple[int, int]:
-        """This rank's [first, one past last) tile."""
+        """This rank's own [first, one past last) tile."""
         return self.ranges.of(self.ranks.rank)
+
+    @property
+    def composited(self) -> tuple[int, int]:
+        """The [first, one past last) tile that this rank composites."""
+        return self.ranges.composited(self.ranks.rank)
 
 
 class TileOwners:
@@ -122,7 +130,9 @@ class TileOwners:
         self.ranks = ranks
         self._costs: dict[Hashable, tuple[Tensor, torch.cuda.Event | None]] = {}
 
-    def divide(self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16) -> TileRanges:
+    def divide(
+        self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, reach: int = 0
+    ) -> TileRanges:
         """Divide the tiles of a batch.
 
         Args:
@@ -130,24 +140,28 @@ class TileOwners:
             width: image width in pixels.
             height: image height in pixels.
             tile_size: tile edge in pixels.
+            reach: see `TileRanges`.
 
         Returns:
             Ranges whose costs differ by at most one tile from an equal share.
         """
         unit = TileRanges((0,), len(keys), width, height, tile_size)
         cost = np.concatenate([self._cost(key, unit.tiles_per_view) for key in keys])
-        return TileRanges(divide(cost, self.ranks.world_size), len(keys), width, height, tile_size)
+        bounds = divide(cost, self.ranks.world_size)
+        return TileRanges(bounds, len(keys), width, height, tile_size, reach)
 
-    def record(self, keys: Sequence[Hashable], tile_work: Tensor) -> None:
+    def record(self, keys: Sequence[Hashable], tile_work: Tensor, ranges: TileRanges) -> None:
         """Remember what the tiles of a batch cost. Collective; does not wait for the device.
 
         Args:
             keys: the B views.
-            tile_work: int32 [B * T], list entries each owned tile went through; 0 for the others' tiles.
+            tile_work: int32 [B * T], list entries each composited tile went through.
+            ranges: who owns which tiles; each tile counts at its owner.
         """
-        if self.ranks.world_size == 1:
-            return
-        work = self.ranks.all_reduce(tile_work.clone())
+        begin, end = ranges.of(self.ranks.rank)
+        work = torch.zeros_like(tile_work)
+        work[begin:end] = tile_work[begin:end]
+        work = self.ranks.all_reduce(work)
         copied = None
         if work.is_cuda:
             work = torch.empty(work.shape, dtype=work.dtype, pin_memory=True).copy_(work, non_blocking=True)

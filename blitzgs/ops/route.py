@@ -18,7 +18,7 @@ def route_count(
     conics: Tensor,
     row_opacities: Tensor,
     camera_ids: Tensor,
-    tile_bounds: Sequence[int],
+    tile_ranges: Sequence[tuple[int, int]],
     width: int,
     height: int,
     tile_size: int = 16,
@@ -30,8 +30,8 @@ def route_count(
         conics: [P, 3], inverse 2D covariance (a, b, c) in 1 / pixel^2.
         row_opacities: [P].
         camera_ids: int32 [P].
-        tile_bounds: M + 1 ascending flattened tile indices (camera * T + ty * tiles_x + tx); rank m owns
-            [tile_bounds[m], tile_bounds[m + 1]).
+        tile_ranges: [begin, end) of each of the M ranks, in flattened tile indices (camera * T + ty * tiles_x
+            + tx); they may overlap, and begin in ascending order.
         width: image width in pixels.
         height: image height in pixels.
         tile_size: tile edge in pixels.
@@ -41,10 +41,11 @@ def route_count(
         rank m and the row-tile intersections they make there.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, bounds that descend, or more than 63 ranks.
+        RuntimeError: wrong shapes or dtypes, ranges out of order, or more than 63 ranks.
     """
+    begins, ends = [begin for begin, _ in tile_ranges], [end for _, end in tile_ranges]
     masks, counts = torch.ops.blitzgs.route_count(
-        means2d, conics, row_opacities, camera_ids, list(tile_bounds), width, height, tile_size
+        means2d, conics, row_opacities, camera_ids, begins, ends, width, height, tile_size
     )
     return masks, counts
 
@@ -68,13 +69,14 @@ def _(
     conics: Tensor,
     row_opacities: Tensor,
     camera_ids: Tensor,
-    tile_bounds: Sequence[int],
+    tile_begins: Sequence[int],
+    tile_ends: Sequence[int],
     width: int,
     height: int,
     tile_size: int,
 ) -> tuple[Tensor, Tensor]:
     masks = means2d.new_empty(means2d.shape[0], dtype=torch.int64)
-    return masks, means2d.new_empty((len(tile_bounds) - 1, 2), dtype=torch.int64)
+    return masks, means2d.new_empty((len(tile_begins), 2), dtype=torch.int64)
 
 
 @torch.library.register_fake("blitzgs::route_rows")

@@ -10,7 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import TileOwners, TileRanges
+from blitzgs.distributed.ownership import LOSS_REACH, TileOwners, TileRanges
 from blitzgs.training.sampler import BatchSampler
 
 
@@ -112,7 +112,9 @@ class BatchLoader:
         self._worker.shutdown(wait=True, cancel_futures=True)
 
     def _divide(self, indices: list[int]) -> TileRanges | None:
-        return None if self._owners is None else self._owners.divide(indices, *self._sizes[indices[0]])
+        if self._owners is None:
+            return None
+        return self._owners.divide(indices, *self._sizes[indices[0]], reach=LOSS_REACH)
 
     def _rows(self, indices: list[int], ranges: TileRanges | None) -> list[tuple[int, int]]:
         """Pixel rows [y0, y1) of each view that this rank needs."""

@@ -85,7 +85,7 @@ def render_view(
         return pipeline.forward(table, picked, options).renders[0]
     ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
     frame = pipeline.forward(table, picked, options, share=Share(ranks, ranges))
-    owners.record([index], frame.tile_work)
+    owners.record([index], frame.tile_work, ranges)
     collect_images(frame.renders, ranges, ranks, destination)
     return frame.renders[0] if ranks.rank == destination else None
 

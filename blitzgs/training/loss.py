@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.pixels import exchange_halo
+from blitzgs.distributed.ownership import LOSS_REACH
 from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.pipeline import Frame
@@ -41,10 +41,13 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: floa
         batch: their photographs.
         config: weights.
         length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
+
+    Raises:
+        ValueError: the ranks composited less than their losses read.
     """
     count, share = len(frame.views), frame.share
-    if share is not None:
-        exchange_halo(frame.renders, share.ranges, share.ranks)
+    if share is not None and share.ranges.reach < LOSS_REACH:
+        raise ValueError(f"the loss reads {LOSS_REACH} px beyond a rank's tiles: divide them with that reach")
     samples = batch.samples
     l1_sums, ssim_sums, v_renders = photometric_fwd_bwd(
         frame.renders,

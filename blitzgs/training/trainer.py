@@ -192,7 +192,8 @@ class Trainer:
         if batch.ranges is not None:
             share = Share(self.ranks, batch.ranges, config.ranks.half_exchange)
         frame = pipeline.forward(self.table, views, options, active, share)
-        self._owners.record(batch.indices, frame.tile_work)
+        if batch.ranges is not None:
+            self._owners.record(batch.indices, frame.tile_work, batch.ranges)
         terms = loss_terms(frame, batch, config.loss, self._length_unit)
         names = [self.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, terms.photometric, self.table, frame)

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Routing: which ranks a projected row has to be sent to.
 //
-// The tiles of all cameras, flattened as in math/tiles.h, are cut at bounds[0] = 0 <= ... <= bounds[M] into
-// one contiguous range per rank. Row p goes to rank m iff for_each_tile_row() visits a tile in
-// [bounds[m], bounds[m + 1]): exactly the rows that intersect lists there.
+// Rank m composites the tiles [begin[m], end[m]) of all cameras, flattened as in math/tiles.h. The ranges may
+// overlap; their begins ascend. Row p goes to rank m iff for_each_tile_row() visits a tile of its range:
+// exactly the rows that intersect lists there.
 //
 //   means2d [P, 2] pixels, conics [P, 3], opacities [P], camera_ids int32 [P]
 //   -> masks int64 [P], bit m set for rank m; counts int64 [M, 2]: rows for rank m, and the row-tile
@@ -21,8 +21,8 @@ namespace blitzgs {
 
 constexpr int kMaxRanks = 63;
 
-struct RankBounds {
-  std::int64_t tile[kMaxRanks + 1];
+struct RankTiles {
+  std::int64_t begin[kMaxRanks], end[kMaxRanks];
   int n_ranks;
 };
 
@@ -34,7 +34,7 @@ struct RouteInput {
   const std::int32_t* camera_ids;
   std::int64_t n_rows;
   TileGrid grid;
-  RankBounds bounds;
+  RankTiles ranks;
 };
 
 // Calls f(rank, tiles) for each piece of a tile row inside a rank's range; returns the mask of the ranks.
@@ -48,9 +48,9 @@ BLITZGS_HD std::int64_t route_row(const RouteInput<T>& in, std::int64_t row, con
                     grid.tile_size, [&](int ty, int tx_begin, int tx_end) {
                       const std::int64_t start = first_tile + static_cast<std::int64_t>(ty) * grid.tiles_x;
                       const std::int64_t begin = start + tx_begin, end = start + tx_end;
-                      while (rank < in.bounds.n_ranks && in.bounds.tile[rank + 1] <= begin) ++rank;
-                      for (int m = rank; m < in.bounds.n_ranks && in.bounds.tile[m] < end; ++m) {
-                        const std::int64_t low = in.bounds.tile[m], high = in.bounds.tile[m + 1];
+                      while (rank < in.ranks.n_ranks && in.ranks.end[rank] <= begin) ++rank;
+                      for (int m = rank; m < in.ranks.n_ranks && in.ranks.begin[m] < end; ++m) {
+                        const std::int64_t low = in.ranks.begin[m], high = in.ranks.end[m];
                         const std::int64_t tiles = (high < end ? high : end) - (low > begin ? low : begin);
                         if (tiles <= 0) continue;
                         mask |= std::int64_t{1} << m;

@@ -9,7 +9,7 @@ namespace blitzgs::cpu {
 
 template <class T>
 void route_count(const RouteInput<T>& in, std::int64_t* masks, std::int64_t* counts, Workspace&, CudaStream) {
-  const int n_ranks = in.bounds.n_ranks;
+  const int n_ranks = in.ranks.n_ranks;
   std::fill(counts, counts + 2 * n_ranks, 0);
   std::mutex adding;
   parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {

@@ -29,10 +29,10 @@ TEST_CASE("route sends a row exactly to the ranks whose tiles it touches", "[rou
     camera_ids.push_back(i % cameras);
   }
   const std::int64_t n = static_cast<std::int64_t>(camera_ids.size());
-  // Rank 1 owns nothing, rank 2 a range that crosses from one image to the next.
-  const RankBounds bounds{{0, 13, 13, 100, n_tiles}, 4};
+  // Rank 1 has nothing; rank 2 crosses from one image to the next and overlaps both its neighbours.
+  const RankTiles ranks{{0, 2, 2, 89}, {24, 2, 100, n_tiles}, 4};
   const RouteInput<float> in{means.data(), conics.data(), opacities.data(), camera_ids.data(), n,
-                             grid,         bounds};
+                             grid,         ranks};
   std::vector<std::int64_t> masks(n), counts(8, -1);
   NoWorkspace workspace;
   cpu::route_count(in, masks.data(), counts.data(), workspace, nullptr);
@@ -43,10 +43,11 @@ TEST_CASE("route sends a row exactly to the ranks whose tiles it touches", "[rou
     for_each_tile(&means[2 * row], &conics[3 * row], opacities[row], width, height, tile_size,
                   [&](int tx, int ty) {
                     const std::int64_t tile = camera_ids[row] * grid.per_image() + ty * grid.tiles_x + tx;
-                    int rank = 0;
-                    while (tile >= bounds.tile[rank + 1]) ++rank;
-                    mask |= std::int64_t{1} << rank;
-                    ++expected[2 * rank + 1];
+                    for (int m = 0; m < 4; ++m) {
+                      if (tile < ranks.begin[m] || tile >= ranks.end[m]) continue;
+                      mask |= std::int64_t{1} << m;
+                      ++expected[2 * m + 1];
+                    }
                   });
     REQUIRE(masks[row] == mask);
     for (int m = 0; m < 4; ++m) expected[2 * m] += (mask >> m) & 1;
@@ -69,7 +70,7 @@ TEST_CASE("route sends a row exactly to the ranks whose tiles it touches", "[rou
 
 TEST_CASE("route of nothing is nothing", "[route]") {
   const TileGrid grid = make_tile_grid(1, 32, 32, 16, 0, -1);
-  const RouteInput<float> in{nullptr, nullptr, nullptr, nullptr, 0, grid, {{0, 2, 4}, 2}};
+  const RouteInput<float> in{nullptr, nullptr, nullptr, nullptr, 0, grid, {{0, 2}, {2, 4}, 2}};
   std::int64_t counts[4] = {7, 7, 7, 7};
   NoWorkspace workspace;
   cpu::route_count(in, nullptr, counts, workspace, nullptr);

@@ -3,8 +3,7 @@ import torch
 
 from blitzgs.distributed.exchange import Splats, exchange, plan_route, send, send_back
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileRanges
-from blitzgs.distributed.pixels import exchange_halo
+from blitzgs.distributed.ownership import LOSS_REACH, TileRanges
 from tests.distributed.rank_harness import run_ranks
 
 WIDTH, HEIGHT, CAMERAS = 100, 60, 2
@@ -29,7 +28,7 @@ def scene(n=240, dtype=torch.float32):
 
 def ranges_for(world_size):
     bounds = {1: (0, TILES), 2: (0, 17, TILES), 4: (0, 9, 9, 40, TILES)}[world_size]
-    return TileRanges(bounds, CAMERAS, WIDTH, HEIGHT)
+    return TileRanges(bounds, CAMERAS, WIDTH, HEIGHT, reach=LOSS_REACH)
 
 
 def owned_by(splats, rank, world_size):
@@ -74,7 +73,8 @@ def expected_gradients(whole, world_size):
     from blitzgs.ops.route import route_count
 
     ranges = ranges_for(world_size)
-    masks, _ = route_count(*whole[:3], whole.camera_ids, ranges.bounds, WIDTH, HEIGHT)
+    composited = [ranges.composited(rank) for rank in range(world_size)]
+    masks, _ = route_count(*whole[:3], whole.camera_ids, composited, WIDTH, HEIGHT)
     reach = sum(((masks >> m) & 1) * (1 + m) for m in range(world_size)).double() * weight_of(whole)
     r = reach[:, None]
     return masks, [
@@ -142,26 +142,3 @@ def test_one_rank_and_no_rows():
     got = send(none, route, alone)
     assert got.means2d.shape == (0, 2) and got.colors.shape == (0, 3)
     assert send_back([got.means2d], route, alone)[0].shape == (0, 2)
-
-
-def _halo(ranks):
-    g = torch.Generator().manual_seed(3)
-    whole = torch.rand(CAMERAS, HEIGHT, WIDTH, 3, generator=g)
-    ranges = ranges_for(ranks.world_size)
-    begin, end = ranges.of(ranks.rank)
-    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    tile = torch.stack([b * 28 + y // 16 * 7 + x // 16 for b in range(CAMERAS)])
-    owned = (tile >= begin) & (tile < end)
-    renders = torch.where(owned[..., None], whole, -1.0)
-    exchange_halo(renders, ranges, ranks)
-    # Everything within 10 pixels of an owned pixel of the same view is there now.
-    near = torch.nn.functional.max_pool2d(owned[:, None].float(), 21, 1, 10)[:, 0] > 0
-    assert torch.equal(renders[near], whole[near])
-    return int(near.sum() - owned.sum())
-
-
-def test_halo_brings_the_neighbours_pixels():
-    assert run_ranks(_halo, 2)[0] > 0
-    gained = run_ranks(_halo, 4)
-    assert gained[1] == 0  # owns nothing, needs nothing
-    assert min(gained[0], gained[2], gained[3]) > 0

@@ -4,7 +4,14 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TILE_COST, TileOwners, TileRanges, cost_balance, divide
+from blitzgs.distributed.ownership import (
+    LOSS_REACH,
+    TILE_COST,
+    TileOwners,
+    TileRanges,
+    cost_balance,
+    divide,
+)
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 4, 8])
@@ -28,12 +35,14 @@ def test_extreme_costs():
 
 def test_costs_are_those_of_the_last_visit():
     owners = TileOwners(Ranks(world_size=1))
-    owners.ranks = type("TwoRanks", (), {"world_size": 2, "all_reduce": staticmethod(lambda t: t)})()
+    owners.ranks = type(
+        "TwoRanks", (), {"world_size": 2, "rank": 0, "all_reduce": staticmethod(lambda t: t)}
+    )()
     # 64 x 48: 4 x 3 tiles a view.
     assert owners.divide(["a", "b"], 64, 48).bounds == (0, 12, 24)
     work = torch.zeros(24, dtype=torch.int32)
     work[:12] = 1000  # all in view a
-    owners.record(["a", "b"], work)
+    owners.record(["a", "b"], work, TileRanges((0, 24, 24), 2, 64, 48))
     assert owners.divide(["a", "b"], 64, 48).bounds == (0, 6, 24)
     assert owners.divide(["b", "a"], 64, 48).bounds == (0, 18, 24)
     # A view never seen is expected to cost what the others do on average.
@@ -42,15 +51,46 @@ def test_costs_are_those_of_the_last_visit():
     assert owners.divide(["a"], 32, 32).bounds == (0, 2, 4)
 
 
-def test_pixel_rows_and_halo():
-    ranges = TileRanges((0, 9, 9, 40, 56), 2, 100, 60)  # 7 x 4 tiles a view
+def test_pixel_rows_and_composited_tiles():
+    ranges = TileRanges((0, 9, 9, 40, 56), 2, 100, 60, reach=LOSS_REACH)  # 7 x 4 tiles a view
     assert ranges.of(2) == (9, 40)
-    assert ranges.halo(0) == [(9, 17)]
-    assert ranges.halo(1) == []
-    assert ranges.halo(2) == [(1, 9), (40, 48)]  # stops at no view's border it does not reach
-    assert ranges.halo(3) == [(32, 40)]
+    assert ranges.composited(0) == (0, 17)
+    assert ranges.composited(1) == (1, 1)  # owns nothing, needs nothing
+    assert ranges.composited(2) == (1, 48)
+    assert ranges.composited(3) == (32, 56)
+    plain = TileRanges(ranges.bounds, 2, 100, 60)
+    assert [plain.composited(rank) for rank in range(4)] == [plain.of(rank) for rank in range(4)]
     assert ranges.pixel_rows(0, 0) == (0, 42)
     assert ranges.pixel_rows(0, 1) == (0, 0)
     assert ranges.pixel_rows(2, 0) == (6, 60)
     assert ranges.pixel_rows(2, 1, margin=0) == (0, 32)
     assert ranges.pixel_rows(1, 0) == (0, 0)
+
+
+@pytest.mark.parametrize("tile_size", [4, 8, 16])
+@pytest.mark.parametrize("bounds", [(0, 0, 1), (0.1, 0.35, 0.35, 0.7), (0.24, 0.25, 0.26, 0.5, 0.98, 1)])
+def test_all_that_the_loss_reads_is_composited(tile_size, bounds):
+    """Every pixel within 10 of an owned one, of the same view; hardly more than that; none for no tiles."""
+    n_views, width, height = 3, 71, 50
+    per_view = -(-width // tile_size) * -(-height // tile_size)
+    cuts = (0, *(round(n_views * per_view * at) for at in bounds), n_views * per_view)
+    ranges = TileRanges(cuts, n_views, width, height, tile_size, LOSS_REACH)
+    firsts = [ranges.composited(rank)[0] for rank in range(len(cuts) - 1)]
+    assert firsts == sorted(firsts)
+    for rank in range(len(cuts) - 1):
+        begin, end = ranges.composited(rank)
+        owned = ranges.pixel_mask(rank, torch.device("cpu"))
+        there = TileRanges((0, begin, end), n_views, width, height, tile_size).pixel_mask(
+            1, torch.device("cpu")
+        )
+        near = torch.nn.functional.max_pool2d(owned[:, None].float(), 21, 1, 10)[:, 0] > 0
+        assert not (near & ~there).any()
+        low, high = ranges.of(rank)
+        if low == high:
+            assert begin == end
+            continue
+        ring = -(-LOSS_REACH // tile_size)
+        assert low - begin <= ring * (ranges.tiles_x + 1) and end - high <= ring * (ranges.tiles_x + 1)
+        # No view is entered in which nothing is owned.
+        views_owned = owned.flatten(1).any(1)
+        assert not there.flatten(1).any(1)[~views_owned].any()

@@ -9,7 +9,7 @@ import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.ownership import LOSS_REACH, Share, TileOwners, TileRanges
 from blitzgs.distributed.pixels import collect_images
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
@@ -54,22 +54,39 @@ def photographs(n_views):
     return targets, masks, (3 * masks.sum((1, 2))).float()
 
 
+def uneven(world_size, n_views):
+    """Borders in the middle of a tile row, ranks without tiles, a rank with more than a view."""
+    total = TileRanges((0,), n_views, WIDTH, HEIGHT).tiles_per_view * n_views
+    bounds = (0, *[0, 34, 34][: world_size - 1], total)
+    return TileRanges(bounds, n_views, WIDTH, HEIGHT, reach=LOSS_REACH)
+
+
 def _render(ranks):
     """Images, losses and gradients of several batches, visited twice so that costs are measured."""
     torch.set_num_threads(1)
     table, owners, out = shard(ranks), TileOwners(ranks), []
-    for n_views, blind in [(1, False), (4, True), (1, True), (4, True), (1, False)]:
+    for n_views, blind, even in [
+        (1, False, True),
+        (4, True, True),
+        (1, True, True),
+        (4, True, True),
+        (1, False, True),
+        (4, False, False),
+    ]:
         views = cameras(n_views, blind, ranks.device)
         keys = [(n_views, blind, view) for view in range(n_views)]
         share, ranges = None, None
         if ranks.world_size > 1:
-            ranges = owners.divide(keys, WIDTH, HEIGHT)
+            ranges = uneven(ranks.world_size, n_views)
+            if even:
+                ranges = owners.divide(keys, WIDTH, HEIGHT, reach=LOSS_REACH)
             share = Share(ranks, ranges)
         frame = pipeline.forward(table, views, OPTIONS, share=share)
-        owners.record(keys, frame.tile_work)
-        image = frame.renders.clone()
+        image, tile_work = frame.renders.clone(), frame.tile_work
         if ranges is not None:
+            owners.record(keys, frame.tile_work, ranges)
             collect_images(image, ranges, ranks, 0)
+            tile_work = tile_work[slice(*share.tiles)]
         targets, masks, samples = photographs(n_views)
         if ranges is not None:
             for view in range(n_views):  # pixels that this rank was never given
@@ -82,7 +99,8 @@ def _render(ranks):
         dense = [torch.zeros_like(column) for column in table.parameters]
         for column, gradient in zip(dense, gradients.parameters, strict=True):
             column[frame.rows.visible_ids.long()] = gradient
-        tiles = (0, image.numel()) if share is None else share.tiles
+        tiles = (0, len(frame.tile_work)) if share is None else share.tiles
+        composited = tiles if share is None else share.composited
         out.append(
             {
                 "image": image.cpu(),
@@ -90,8 +108,10 @@ def _render(ranks):
                 "scale": scale_term(frame, table, 3.0).cpu(),
                 "psnr": batch_psnr(frame, batch).cpu(),
                 "gradients": [gradient.cpu() for gradient in dense],
-                "work": int(frame.tile_work.sum()),
+                "work": int(tile_work.sum()),
                 "tiles": tiles,
+                "composited": composited,
+                "renders": frame.renders.cpu(),
             }
         )
     return table["id"].cpu(), out
@@ -118,6 +138,11 @@ def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device):
         results = [a[1][step] for a in answers]
         assert torch.equal(results[0]["image"], want["image"])
         for result in results:
+            n_views = len(result["renders"])
+            tiles = TileRanges((0, *result["composited"]), n_views, WIDTH, HEIGHT)
+            here = tiles.pixel_mask(1, torch.device("cpu"))[..., None]
+            # Own tiles and the ring around them, nothing else.
+            assert torch.equal(result["renders"], torch.where(here, want["image"], 0.0))
             assert relative(result["loss"], want["loss"]) <= 1e-6
             assert relative(result["scale"], want["scale"]) <= 1e-6
             assert abs(result["psnr"] - want["psnr"]) <= 1e-5
@@ -130,6 +155,24 @@ def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device):
     assert first != second
     work = [a[1][3]["work"] for a in answers]
     assert max(work) <= 1.15 * sum(work) / len(work)
+
+
+def _render_plain(ranks):
+    table, views = shard(ranks), cameras(3)
+    ranges = TileOwners(ranks).divide(range(3), WIDTH, HEIGHT)
+    frame = pipeline.forward(table, views, OPTIONS, share=Share(ranks, ranges))
+    mask = ranges.pixel_mask(ranks.rank, torch.device("cpu"))
+    outside = frame.renders[~mask].abs().sum().item()
+    with pytest.raises(ValueError, match="the loss reads 10 px beyond"):
+        loss_terms(frame, Batch([0, 1, 2], *photographs(3), ranges), LossConfig(), 3.0)
+    collect_images(frame.renders, ranges, ranks, 1)
+    return outside, frame.renders
+
+
+def test_rendering_alone_composites_no_ring():
+    answers = run_ranks(_render_plain, 3)
+    assert [outside for outside, _ in answers] == [0.0, 0.0, 0.0]
+    assert torch.equal(answers[1][1], pipeline.forward(shard(Ranks()), cameras(3), OPTIONS).renders)
 
 
 def _render_half(ranks):
