@@ -9,6 +9,7 @@ projected rows sits between projection and intersection, and its reverse between
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,6 +20,12 @@ from blitzgs.distributed.exchange import Route, Splats, count_by_view, plan_rout
 from blitzgs.distributed.ownership import Share
 from blitzgs.model import GaussianTable
 from blitzgs.ops.project import Rows
+
+Mark = Callable[[str], None]
+
+
+def unmarked(stage: str) -> None:
+    """Take no note of the end of a stage."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +136,7 @@ def forward(
     options: RenderOptions,
     active: Active | None = None,
     share: Share | None = None,
+    mark: Mark = unmarked,
 ) -> Frame:
     """Render views of a table whose active rows are up to date.
 
@@ -139,6 +147,7 @@ def forward(
         active: rows and views to consider; None: all.
         share: who composites which tiles; every rank of the job calls this with its table. None: render all
             of the views from this table alone.
+        mark: called at the end of each stage: "project", "exchange", "sort", "raster".
 
     Returns:
         The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
@@ -153,6 +162,7 @@ def forward(
             options.antialiased, True,
         )
     )  # fmt: skip
+    mark("project")
     splats = Splats(
         rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
         table["id"][rows.gaussian_ids],
@@ -164,10 +174,12 @@ def forward(
         route, tiles = plan_route(splats, share.ranges, share.ranks, share.half), share.composited
         splats = send(splats, route, share.ranks)
         n_isects, visible = route.n_isects, route.visible
+    mark("exchange")
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids, count,
         views.width, views.height, options.tile_size, *tiles, n_isects,
     )  # fmt: skip
+    mark("sort")
     backgrounds = None
     if any(options.background):
         backgrounds = torch.tensor(options.background, device=table.device).repeat(count, 1)
@@ -175,6 +187,7 @@ def forward(
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
         count, views.width, views.height, options.tile_size, *tiles,
     )  # fmt: skip
+    mark("raster")
     return Frame(
         views,
         options,
@@ -191,7 +204,11 @@ def forward(
 
 
 def backward(
-    table: GaussianTable, frame: Frame, v_renders: Tensor, scale_reg: Tensor | None = None
+    table: GaussianTable,
+    frame: Frame,
+    v_renders: Tensor,
+    scale_reg: Tensor | None = None,
+    mark: Mark = unmarked,
 ) -> Gradients:
     """Carry image gradients back to the parameters.
 
@@ -201,6 +218,7 @@ def backward(
         v_renders: gradient of the loss by the images, [B, H, W, 3]; this rank's tiles matter.
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
+        mark: called at the end of each stage: "raster back", "exchange back", "project back".
     """
     views, options, rows, splats, share = frame.views, frame.options, frame.rows, frame.splats, frame.share
     tiles = (0, -1) if share is None else share.tiles
@@ -209,12 +227,15 @@ def backward(
         frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders, None,
         len(views), views.width, views.height, options.tile_size, *tiles, False, options.deterministic,
     )  # fmt: skip
+    mark("raster back")
     if share is not None and frame.route is not None:
         row_gradients = send_back(row_gradients, frame.route, share.ranks)
+    mark("exchange back")
     v_means2d, v_conics, v_opacities, v_colors = row_gradients
     *parameters, _ = torch.ops.blitzgs.project_bwd(
         *table.parameters, views.viewmats, views.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
         views.width, views.height, options.sh_degree, options.eps2d, options.antialiased, True, v_means2d,
         v_conics, None, v_opacities, v_colors, scale_reg, False,
     )  # fmt: skip
+    mark("project back")
     return Gradients(tuple(parameters), v_means2d)

@@ -50,6 +50,7 @@ class Ranks:
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
     watchdog: Watchdog | None = None
+    _side: torch.cuda.Stream | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
     def from_environment(
@@ -159,6 +160,16 @@ class Ranks:
         received = torch.empty_like(counts)
         self._collective("exchange_counts", lambda: dist.all_to_all_single(received, counts.contiguous()))
         return received
+
+    def wait(self, event: torch.cuda.Event) -> None:
+        """Wait for work on the device, and so for the ranks that it waits for."""
+        self._collective("wait", event.synchronize)
+
+    def side_stream(self) -> torch.cuda.Stream | None:
+        """Return the stream for what the step need not wait for; None on the CPU."""
+        if self._side is None and self.device.type == "cuda":
+            self._side = torch.cuda.Stream(self.device)
+        return self._side
 
     def read(self, tensor: Tensor) -> Any:
         """Return a small tensor as nested lists; waits for the device, and so for the ranks it waits for."""

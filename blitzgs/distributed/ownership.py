@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.host_sum import HostSum
 
 # What a tile costs besides the list entries it goes through (its pixels are written and compared with the
 # image), in units of one entry.
@@ -128,7 +129,7 @@ class TileOwners:
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks = ranks
-        self._costs: dict[Hashable, tuple[Tensor, torch.cuda.Event | None]] = {}
+        self._costs: dict[Hashable, tuple[HostSum, int, int]] = {}  # where a view's tiles are in the sums
 
     def divide(
         self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, reach: int = 0
@@ -150,41 +151,57 @@ class TileOwners:
         bounds = divide(cost, self.ranks.world_size)
         return TileRanges(bounds, len(keys), width, height, tile_size, reach)
 
-    def record(self, keys: Sequence[Hashable], tile_work: Tensor, ranges: TileRanges) -> None:
-        """Remember what the tiles of a batch cost. Collective; does not wait for the device.
+    def record(
+        self,
+        keys: Sequence[Hashable],
+        tile_work: Tensor,
+        ranges: TileRanges,
+        values: Sequence[Tensor] = (),
+    ) -> HostSum:
+        """Remember what the tiles of a batch cost. Collective; waits for nothing.
 
         Args:
             keys: the B views.
             tile_work: int32 [B * T], list entries each composited tile went through.
             ranges: who owns which tiles; each tile counts at its owner.
+            values: float32 [n] each, more to add up over the ranks on this occasion.
+
+        Returns:
+            The sums, float32: those of all `values`, one after the other, then the tiles' work.
         """
         begin, end = ranges.of(self.ranks.rank)
-        work = torch.zeros_like(tile_work)
-        work[begin:end] = tile_work[begin:end]
-        work = self.ranks.all_reduce(work)
-        copied = None
-        if work.is_cuda:
-            work = torch.empty(work.shape, dtype=work.dtype, pin_memory=True).copy_(work, non_blocking=True)
-            copied = torch.cuda.Event()
-            copied.record()
-        for key, part in zip(keys, work.chunk(len(keys)), strict=True):
-            self._costs[key] = (part, copied)
+        first = sum(len(value) for value in values)
+
+        def summand() -> Tensor:
+            flat = torch.zeros(first + len(tile_work), device=tile_work.device)
+            if values:
+                torch.cat(tuple(values), out=flat[:first])
+            flat[first + begin : first + end] = tile_work[begin:end]
+            return flat
+
+        sums = HostSum(summand, (*values, tile_work), self.ranks)
+        tiles = ranges.tiles_per_view
+        for view, key in enumerate(keys):
+            self._costs[key] = (sums, first + view * tiles, first + (view + 1) * tiles)
+        return sums
 
     def _cost(self, key: Hashable, tiles: int) -> NDArray[np.float64]:
         """Cost of each tile of a view: measured at its last visit, else the mean of the views visited."""
-        if key in self._costs and len(self._costs[key][0]) == tiles:
+        if key in self._costs and self._tiles(key) == tiles:
             return self._read(key) + TILE_COST
         # What views share: the far (upper) tiles of oblique ones cost more than the near ones.
-        similar = [other for other, (cost, _) in self._costs.items() if len(cost) == tiles][-16:]
+        similar = [other for other in self._costs if self._tiles(other) == tiles][-16:]
         return (
             np.mean([self._read(other) for other in similar], 0) if similar else np.zeros(tiles)
         ) + TILE_COST
 
+    def _tiles(self, key: Hashable) -> int:
+        _, begin, end = self._costs[key]
+        return end - begin
+
     def _read(self, key: Hashable) -> NDArray[np.float64]:
-        cost, copied = self._costs[key]
-        if copied is not None:
-            copied.synchronize()  # usually long since done: views come back after many steps
-        return cost.numpy().astype(np.float64)
+        sums, begin, end = self._costs[key]
+        return sums.read()[begin:end].numpy().astype(np.float64)
 
 
 def divide(cost: NDArray[np.float64], parts: int) -> tuple[int, ...]:

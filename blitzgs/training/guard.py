@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from types import FrameType
 
 import torch
-from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.host_sum import HostSum
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.pipeline import Frame
 
@@ -27,34 +27,36 @@ class LossGuard:
     """Looks at every step's loss: at once on the CPU, one step late on CUDA, where looking means waiting."""
 
     def __init__(self) -> None:
-        self._pending: tuple[int, Sequence[str], Tensor, torch.cuda.Event] | None = None
+        self._pending: tuple[int, Sequence[str], HostSum] | None = None
 
     def check(
-        self, step: int, names: Sequence[str], loss: Tensor, table: GaussianTable, frame: Frame
+        self, step: int, names: Sequence[str], sums: HostSum, table: GaussianTable, frame: Frame
     ) -> None:
-        """Check the per-view losses, [B], of the views `names` in step `step` (from 1).
+        """Check the losses of the B views `names` in step `step` (from 1).
+
+        Args:
+            step: number of the step.
+            names: of its views.
+            sums: their `LossTerms.sums` over all ranks; [2 B], and more that is not looked at.
+            table: this rank's Gaussians.
+            frame: what was rendered.
 
         Raises:
             NonFiniteError: this loss (or, on CUDA, the previous step's) is not finite.
         """
-        if loss.device.type != "cuda":
-            _check_loss(step, names, loss, table, frame)
+        if frame.renders.device.type != "cuda":
+            _check_loss(step, names, sums, table, frame)
             return
-        previous = self._pending
-        held = torch.empty(loss.shape, dtype=loss.dtype, pin_memory=True)
-        held.copy_(loss, non_blocking=True)
-        copied = torch.cuda.Event()
-        copied.record()
-        self._pending = (step, names, held, copied)
+        previous, self._pending = self._pending, (step, names, sums)
         if previous is not None:
-            previous[3].synchronize()
-            _check_loss(*previous[:3], table, None)
+            _check_loss(*previous, table, None)
 
 
 def _check_loss(
-    step: int, names: Sequence[str], loss: Tensor, table: GaussianTable, frame: Frame | None
+    step: int, names: Sequence[str], sums: HostSum, table: GaussianTable, frame: Frame | None
 ) -> None:
-    bad = (~loss.isfinite()).nonzero().flatten().tolist()
+    finite = sums.read()[: 2 * len(names)].view(2, -1).isfinite().all(0)
+    bad = (~finite).nonzero().flatten().tolist()
     if bad:
         views = ", ".join(f"'{names[index]}'" for index in bad)
         raise NonFiniteError(f"step {step}: the loss of view {views} is not finite; {_origin(table, frame)}")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -20,13 +21,14 @@ class LossTerms(NamedTuple):
     """A batch's loss and where its gradients enter.
 
     Attributes:
-        photometric: per view, float32 [B].
+        sums: of |render - photograph| and of the SSIM map over this rank's pixels and the channels, float32
+            [B] each; see `photometric`.
         v_renders: gradient of the batch's mean loss by the images, [B, H, W, 3].
         scale_reg: weight of the smallest axis of each visible Gaussian, per view [B]; None when the term is
             off.
     """
 
-    photometric: Tensor
+    sums: tuple[Tensor, Tensor]
     v_renders: Tensor
     scale_reg: Tensor | None
 
@@ -34,7 +36,7 @@ class LossTerms(NamedTuple):
 def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: float) -> LossTerms:
     """Compare rendered views with their photographs.
 
-    On several ranks each compares its own tiles; the losses are those of all ranks together.
+    On several ranks each compares its own tiles.
 
     Args:
         frame: rendered batch of B views.
@@ -48,23 +50,40 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: floa
     count, share = len(frame.views), frame.share
     if share is not None and share.ranges.reach < LOSS_REACH:
         raise ValueError(f"the loss reads {LOSS_REACH} px beyond a rank's tiles: divide them with that reach")
-    samples = batch.samples
+    weights = _constant(((1.0 - config.ssim) / count,), (-config.ssim / count,), device=batch.samples.device)
+    l1_weights, ssim_weights = weights / batch.samples
     l1_sums, ssim_sums, v_renders = photometric_fwd_bwd(
         frame.renders,
         batch.targets,
         batch.masks,
-        (1.0 - config.ssim) / (samples * count),
-        -config.ssim / (samples * count),
+        l1_weights,
+        ssim_weights,
         frame.options.tile_size,
         *((0, -1) if share is None else share.tiles),
     )
-    if share is not None:
-        l1_sums, ssim_sums = share.ranks.all_reduce(torch.stack((l1_sums, ssim_sums)))
-    photometric = ((1.0 - config.ssim) * l1_sums - config.ssim * ssim_sums) / samples + config.ssim
     scale_reg = None
     if config.scale > 0:
-        scale_reg = config.scale / (length_unit * count * frame.visible.clamp(min=1).to(l1_sums.dtype))
-    return LossTerms(photometric, v_renders, scale_reg)
+        scale = _constant(config.scale / (length_unit * count), device=batch.samples.device)
+        scale_reg = scale / frame.visible.clamp(min=1)
+    return LossTerms((l1_sums, ssim_sums), v_renders, scale_reg)
+
+
+@lru_cache(maxsize=64)
+def _constant(*values: float | tuple[float, ...], device: torch.device) -> Tensor:
+    """Numbers of a run on the device, uploaded once, float32."""
+    return torch.tensor(values if len(values) > 1 else values[0], dtype=torch.float32, device=device)
+
+
+def photometric(sums: Tensor, samples: Tensor, config: LossConfig) -> Tensor:
+    """Return (1 - lambda) L1 + lambda (1 - SSIM) of each view, float32 [B].
+
+    Args:
+        sums: `LossTerms.sums` added up over all ranks, [2 B].
+        samples: `Batch.samples`, on the device of the sums.
+        config: weights.
+    """
+    l1, ssim = sums.view(2, -1)
+    return ((1.0 - config.ssim) * l1 - config.ssim * ssim) / samples + config.ssim
 
 
 def scale_term(frame: Frame, table: GaussianTable, length_unit: float) -> Tensor:

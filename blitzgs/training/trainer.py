@@ -12,12 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.host_sum import HostSum
+from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.ops.density_stats import density_stats_
-from blitzgs.pipeline import Active, Frame, RenderOptions, Views
+from blitzgs.pipeline import Frame
 from blitzgs.population.density import DensityRules, densify
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.redistribution import redistribute
@@ -28,14 +28,15 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
 from blitzgs.training.evaluation import evaluate, load_lpips
 from blitzgs.training.guard import LossGuard, StopRequest, check_table
-from blitzgs.training.loss import LossTerms, batch_psnr, loss_terms, scale_term
+from blitzgs.training.loss import batch_psnr, photometric, scale_term
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Event, Schedule
+from blitzgs.training.step import Stepper
 from blitzgs.training.views import Space, ViewSet, camera_centres, render_options
-from blitzgs.view.blocks import BlockIndex, morton_order
+from blitzgs.view.blocks import morton_order
 from blitzgs.view.levels import measure_levels
 
 
@@ -111,9 +112,16 @@ class Trainer:
             config.data.prefetch,
             self._owners if ranks.world_size > 1 else None,
         )
-        self._blocks = BlockIndex(self.table, self._optimiser.pending_table)
-        self._guard = LossGuard()
         self._length_unit = self.space.extent * config.loss.scale_reference
+        self._stepper = Stepper(
+            self.table,
+            self._optimiser,
+            self._owners,
+            config.loss,
+            self._length_unit,
+            config.ranks.half_exchange,
+        )
+        self._guard = LossGuard()
 
     def _initialise(self) -> None:
         """Make the first Gaussians from the capture's points; each rank keeps its share."""
@@ -186,40 +194,21 @@ class Trainer:
         views = self._views.pick(batch.indices)
         degree = self.schedule.sh_degree(begin, config.model.sh_degree)
         options = render_options(config, self.space, degree)
-        active = self._active(views, options)
-        self._optimiser.catch_up(self.table, active.ids, step - 1)
-        share = None
-        if batch.ranges is not None:
-            share = Share(self.ranks, batch.ranges, config.ranks.half_exchange)
-        frame = pipeline.forward(self.table, views, options, active, share)
-        if batch.ranges is not None:
-            self._owners.record(batch.indices, frame.tile_work, batch.ranges)
-        terms = loss_terms(frame, batch, config.loss, self._length_unit)
+        frame, terms, sums = self._stepper.forward(step, views, options, batch)
         names = [self.capture.cameras[i].name for i in batch.indices]
-        self._guard.check(step, names, terms.photometric, self.table, frame)
+        self._guard.check(step, names, sums, self.table, frame)
         report = None
         if self._crosses(begin, config.log.every):
-            report = self._measure(frame, batch, terms)
-        gradients = pipeline.backward(self.table, frame, terms.v_renders, terms.scale_reg)
+            report = self._measure(frame, batch, sums)
+        gradients = self._stepper.backward(step, frame, terms)
         if begin < config.schedule.densify_until * config.schedule.scale:
             self._gather(frame, gradients.means2d)
-        self._optimiser.step(self.table, gradients.parameters, frame.rows.visible_ids, step)
-        self._blocks.update(self.table, frame.rows.visible_ids)
         self.progress = dataclasses.replace(
             self.progress, step=step, sh_degree=degree, seconds=time.monotonic() - self._clock
         )
         if report is not None:
             check_table(self.table, step)
             self._log_step(report, step, log)
-
-    def _active(self, views: Views, options: RenderOptions) -> Active:
-        """Find the Gaussians that the views may see."""
-        near, far = options.near_plane, options.far_plane
-        return Active(
-            *self._blocks.active(
-                self.table, views.viewmats, views.Ks, views.width, views.height, near, far, options.eps2d
-            )
-        )
 
     def _sort(self) -> None:
         """Put neighbours in space next to each other, so that blocks of rows are small."""
@@ -244,10 +233,11 @@ class Trainer:
             float(len(views)),
         )
 
-    def _measure(self, frame: Frame, batch: Batch, terms: LossTerms) -> dict[str, float]:
+    def _measure(self, frame: Frame, batch: Batch, sums: HostSum) -> dict[str, float]:
         """Return the batch's total loss and PSNR."""
         scale = scale_term(frame, self.table, self._length_unit)
-        loss = (terms.photometric + self.config.loss.scale * scale).mean()
+        images = photometric(sums.read()[: 2 * len(frame.views)], batch.samples.cpu(), self.config.loss)
+        loss = images.mean() + self.config.loss.scale * scale.mean().cpu()
         visible = self.ranks.all_reduce(frame.rows.counts[:1].to(self.ranks.device))
         return {
             "loss": loss.item(),
@@ -300,7 +290,7 @@ class Trainer:
         if redistribute(self.table, self.ranks, self.config.ranks.max_imbalance):
             counts["redistributed"] = 1
         self._sort()
-        self._blocks = BlockIndex(self.table, self._optimiser.pending_table)
+        self._stepper.reindex()
         total = self._population()
         self.progress = dataclasses.replace(
             self.progress, peak_gaussians=max(self.progress.peak_gaussians, total)

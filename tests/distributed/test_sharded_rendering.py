@@ -15,7 +15,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
-from blitzgs.training.loss import batch_psnr, loss_terms, scale_term
+from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training.tiny import look_at_origin, random_gaussians
 
@@ -84,7 +84,6 @@ def _render(ranks):
         frame = pipeline.forward(table, views, OPTIONS, share=share)
         image, tile_work = frame.renders.clone(), frame.tile_work
         if ranges is not None:
-            owners.record(keys, frame.tile_work, ranges)
             collect_images(image, ranges, ranks, 0)
             tile_work = tile_work[slice(*share.tiles)]
         targets, masks, samples = photographs(n_views)
@@ -95,6 +94,9 @@ def _render(ranks):
         on_device = [tensor.to(ranks.device) for tensor in (targets, masks, samples)]
         batch = Batch(list(range(n_views)), *on_device, ranges)
         terms = loss_terms(frame, batch, LossConfig(), 3.0)
+        sums = torch.cat(terms.sums).cpu()
+        if ranges is not None:
+            sums = owners.record(keys, frame.tile_work, ranges, terms.sums).read()[: 2 * n_views]
         gradients = pipeline.backward(table, frame, terms.v_renders, terms.scale_reg)
         dense = [torch.zeros_like(column) for column in table.parameters]
         for column, gradient in zip(dense, gradients.parameters, strict=True):
@@ -104,7 +106,7 @@ def _render(ranks):
         out.append(
             {
                 "image": image.cpu(),
-                "loss": terms.photometric.cpu(),
+                "loss": photometric(sums, samples, LossConfig()),
                 "scale": scale_term(frame, table, 3.0).cpu(),
                 "psnr": batch_psnr(frame, batch).cpu(),
                 "gradients": [gradient.cpu() for gradient in dense],

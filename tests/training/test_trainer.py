@@ -152,14 +152,15 @@ def test_non_finite_values_stop_the_run_by_name(tmp_path):
 
 
 def test_a_non_finite_loss_names_step_and_view(tmp_path, monkeypatch):
-    from blitzgs.training import trainer as module
+    from blitzgs.training import step as module
 
     trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
     original = module.loss_terms
 
     def broken(*args):
         terms = original(*args)
-        return terms._replace(photometric=terms.photometric * float("inf"))
+        l1, ssim = terms.sums
+        return terms._replace(sums=(l1, ssim * float("inf")))
 
     monkeypatch.setattr(module, "loss_terms", broken)
     with pytest.raises(

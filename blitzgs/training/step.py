@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One training step, from a batch of views to moved Gaussians; what the trainer and its benchmark share."""
+
+from __future__ import annotations
+
+import torch
+
+from blitzgs import pipeline
+from blitzgs.distributed.host_sum import HostSum
+from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.model import GaussianTable
+from blitzgs.pipeline import Active, Frame, Gradients, Mark, RenderOptions, Views, unmarked
+from blitzgs.training.batches import Batch
+from blitzgs.training.config import LossConfig
+from blitzgs.training.loss import LossTerms, loss_terms
+from blitzgs.training.optimiser import LazyAdam
+from blitzgs.view.blocks import BlockIndex
+
+
+class Stepper:
+    """Takes training steps with one table: `forward`, then `backward`. Neither waits for a loss."""
+
+    def __init__(
+        self,
+        table: GaussianTable,
+        optimiser: LazyAdam,
+        owners: TileOwners,
+        loss: LossConfig,
+        length_unit: float,
+        half_exchange: bool = False,
+    ) -> None:
+        """Prepare to step.
+
+        Args:
+            table: this rank's Gaussians, in `morton_order`.
+            optimiser: of the table.
+            owners: learns what the tiles cost.
+            loss: weights of the loss.
+            length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
+            half_exchange: see `blitzgs.distributed.exchange.plan_route`.
+        """
+        self._table, self._optimiser, self._owners = table, optimiser, owners
+        self._loss, self._length_unit, self._half = loss, length_unit, half_exchange
+        self.reindex()
+
+    def reindex(self) -> None:
+        """Take note that rows of the table were added, removed or reordered."""
+        self._blocks = BlockIndex(self._table, self._optimiser.pending_table)
+
+    def forward(
+        self, step: int, views: Views, options: RenderOptions, batch: Batch, mark: Mark = unmarked
+    ) -> tuple[Frame, LossTerms, HostSum]:
+        """Catch up what the views may see, render them and compare them with their photographs.
+
+        Args:
+            step: number of the step, from 1.
+            views: B views of the batch.
+            options: how to render.
+            batch: the photographs, and who composites which tiles.
+            mark: called with its name at the end of each stage.
+
+        Returns:
+            The frame, the loss's terms, and the sums of its `LossTerms.sums` over all ranks, which
+            begin with [2 B].
+        """
+        table, ranks = self._table, self._owners.ranks
+        active = self._active(views, options)
+        mark("other")
+        self._optimiser.catch_up(table, active.ids, step - 1)
+        mark("optimiser")
+        share = None if batch.ranges is None else Share(ranks, batch.ranges, self._half)
+        frame = pipeline.forward(table, views, options, active, share, mark)
+        terms = loss_terms(frame, batch, self._loss, self._length_unit)
+        mark("loss")
+        if batch.ranges is None:
+            sums = HostSum(lambda: torch.cat(terms.sums), terms.sums, ranks)
+        else:
+            # Costs of tiles and losses travel together.
+            sums = self._owners.record(batch.indices, frame.tile_work, batch.ranges, terms.sums)
+        mark("other")
+        return frame, terms, sums
+
+    def backward(self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked) -> Gradients:
+        """Carry the gradients of `forward`'s loss back and move the Gaussians by them."""
+        table = self._table
+        gradients = pipeline.backward(table, frame, terms.v_renders, terms.scale_reg, mark)
+        self._optimiser.step(table, gradients.parameters, frame.rows.visible_ids, step)
+        mark("optimiser")
+        self._blocks.update(table, frame.rows.visible_ids)
+        mark("other")
+        return gradients
+
+    def _active(self, views: Views, options: RenderOptions) -> Active:
+        """Find the Gaussians that the views may see."""
+        near, far = options.near_plane, options.far_plane
+        return Active(
+            *self._blocks.active(
+                self._table, views.viewmats, views.Ks, views.width, views.height, near, far, options.eps2d
+            )
+        )
