@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of a lazy Adam step against its byte floor and against torch's fused dense Adam over every row.
+"""Time of lazy Adam's catch-up and step against byte floors and torch's fused dense Adam over every row.
 
 python benchmarks/bm_lazy_adam.py [--device cuda] [--rows 4000000] [--fraction 0.1]
 """
@@ -7,23 +7,60 @@ python benchmarks/bm_lazy_adam.py [--device cuda] [--rows 4000000] [--fraction 0
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
-from blitzgs.ops.lazy_adam import lazy_adam_step_
+from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_
 
 FLOATS = 59  # a row with SH of degree 3
 BETA1, BETA2, EPS = 0.9**4, 0.999**4, 1e-15 / 2
 STEP = 2000
 
 
-def make_state(n: int, device: str) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 16, 3)]
-    params = [torch.randn(s, device=device) for s in shapes]
-    exp_avgs = [1e-6 * torch.randn(s, device=device) for s in shapes]
-    return params, exp_avgs, [m * m for m in exp_avgs]
+class State:
+    """Parameters and moments whose sizes spread over some orders of magnitude around eps / rounding."""
+
+    def __init__(self, n: int, device: str) -> None:
+        shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 16, 3)]
+        self.params = [torch.randn(s, device=device) for s in shapes]
+        sizes = [1e-7 * torch.exp(2 * torch.randn(s, device=device)) for s in shapes]
+        self.exp_avgs = [torch.randn_like(size) * size for size in sizes]
+        self.exp_avg_sqs = [size**2 for size in sizes]
+        self.last_step = torch.empty(n, dtype=torch.int32, device=device)
+        self.moment_step = torch.empty_like(self.last_step)
+        self.lr_table = torch.full((30_001, 6), 1e-6, device=device)
+
+    def columns(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+        """Return parameters and moments."""
+        return self.params, self.exp_avgs, self.exp_avg_sqs
+
+    def catch_up(self, ids: Tensor) -> None:
+        """Bring rows to the step before `STEP`."""
+        lazy_adam_catch_up_(
+            *self.columns(), ids, self.last_step, self.moment_step, self.lr_table, STEP - 1, BETA1, BETA2, EPS
+        )
+
+    def step(self, ids: Tensor, grads: list[Tensor], sparse: bool) -> None:
+        """Take step `STEP`."""
+        lazy_adam_step_(
+            *self.columns(), grads, ids, self.last_step, self.moment_step, self.lr_table, STEP, BETA1, BETA2,
+            EPS, sparse,
+        )  # fmt: skip
+
+    def time(self, work: Callable[[], None], gaps: Tensor, repeats: int) -> float:
+        """Return the median ms of `work` on rows that stand `gaps` steps before `STEP` - 1."""
+
+        def once() -> float:
+            self.last_step.copy_(STEP - 1 - gaps)
+            self.moment_step.copy_(self.last_step)
+            return median_ms(lambda _: work(), [(gaps,)], repeats=1, warm_up=0)
+
+        once()
+        return sorted(once() for _ in range(repeats))[repeats // 2]
 
 
 def main() -> None:
@@ -36,47 +73,17 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=30)
     args = parser.parse_args()
     device, n = args.device, args.rows
-    params, exp_avgs, exp_avg_sqs = make_state(n, device)
-    lr_table = torch.full((30_001, 6), 1e-6, device=device)
-    last_step = torch.empty(n, dtype=torch.int32, device=device)
+    state = State(n, device)
     bandwidth = copy_bandwidth(device, 2048 if device == "cuda" else 256)
     print(f"{n} rows of {FLOATS} floats, {device}, copy {bandwidth:.0f} GB/s")
 
-    def report(name: str, milliseconds: float, rows: int) -> None:
-        gigabytes = rows * FLOATS * 4 * 7 / 1e9  # gradient read; parameter and moments read and written
-        floor = 1e3 * gigabytes / bandwidth
-        rate = 1e3 * gigabytes / milliseconds
-        print(f"{name:48s} {milliseconds:8.3f} ms  {rate:6.0f} GB/s  floor {floor:.3f} ms")
-
-    def step_time(ids: Tensor, gaps: Tensor, sparse: bool) -> float:
-        grads = [1e-6 * torch.randn((len(ids), *p.shape[1:]), device=device) for p in params]
-        behind = (STEP - 1 - gaps).int()
-
-        def once(rows: Tensor) -> None:
-            lazy_adam_step_(
-                params,
-                exp_avgs,
-                exp_avg_sqs,
-                grads,
-                rows,
-                last_step,
-                lr_table,
-                STEP,
-                BETA1,
-                BETA2,
-                EPS,
-                sparse,
-            )
-
-        def prepare_and_time() -> float:
-            last_step.copy_(behind)
-            return median_ms(once, [(ids,)], repeats=1, warm_up=0)
-
-        prepare_and_time()
-        return sorted(prepare_and_time() for _ in range(args.repeats))[args.repeats // 2]
+    def report(name: str, milliseconds: float, rows: int, touched: int) -> None:
+        gigabytes = rows * FLOATS * 4 * touched / 1e9
+        floor, rate = 1e3 * gigabytes / bandwidth, 1e3 * gigabytes / milliseconds
+        print(f"{name:58s} {milliseconds:8.3f} ms  {rate:6.0f} GB/s  floor {floor:.3f} ms", flush=True)
 
     none = torch.zeros(n, dtype=torch.int64, device=device)
-    some = torch.randint(0, 40, (n,), device=device)
+    some = torch.randint(1, 40, (n,), device=device)
     everyone = torch.arange(n, dtype=torch.int32, device=device)
     scattered = torch.nonzero(torch.rand(n, device=device) < args.fraction).flatten().int()
     chosen = torch.rand(n // 256, device=device) < args.fraction
@@ -86,14 +93,22 @@ def main() -> None:
         (f"{args.fraction:.0%} of the rows, runs of 256", runs),
         (f"{args.fraction:.0%} of the rows, scattered", scattered),
     ):
-        report(f"{name}, up to date", step_time(ids, none, False), len(ids))
-        report(f"{name}, 0..39 steps behind", step_time(ids, some, False), len(ids))
-        report(f"{name}, sparse variant", step_time(ids, none, True), len(ids))
+        grads = [1e-6 * torch.randn((len(ids), *p.shape[1:]), device=device) for p in state.params]
+        for label, work, gaps, touched in (
+            # Gradients read; parameters and moments read and written.
+            ("step, up to date", partial(state.step, ids, grads, False), none, 7),
+            ("step, 1..39 steps behind", partial(state.step, ids, grads, False), some, 7),
+            ("step, sparse variant", partial(state.step, ids, grads, True), none, 7),
+            # Parameters and moments read, parameters written.
+            ("catch-up, 1..39 steps behind", partial(state.catch_up, ids), some, 4),
+        ):
+            report(f"{name}: {label}", state.time(work, gaps, args.repeats), len(ids), touched)
 
-    for p in params:
+    for p in state.params:
         p.grad = 1e-6 * torch.randn_like(p)
-    dense = torch.optim.Adam(params, lr=1e-6, betas=(BETA1, BETA2), eps=EPS, fused=True)
-    report("torch fused dense Adam", median_ms(lambda _: dense.step(), [(params[0],)], args.repeats), n)
+    dense = torch.optim.Adam(state.params, lr=1e-6, betas=(BETA1, BETA2), eps=EPS, fused=True)
+    milliseconds = median_ms(lambda _: dense.step(), [(state.params[0],)], args.repeats)
+    report("torch fused dense Adam", milliseconds, n, 7)
 
 
 if __name__ == "__main__":

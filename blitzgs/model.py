@@ -47,7 +47,8 @@ def schema(sh_degree: int) -> dict[str, Column]:
 
     Returns:
         means [3], quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam
-        moments `exp_avg.*` and `exp_avg_sq.*`; last_step int32 (optimiser steps already applied to the row);
+        moments `exp_avg.*` and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step that the
+        row's parameters and moments stand at);
         id int64 (persistent, unique over ranks), parent int64 (-1: none), birth int32 (images seen when it
         was born), level uint8 (octree level); grad_sum float32, grad_count int32, max_radii float32 (pixels):
         density statistics since the last density event.
@@ -59,6 +60,7 @@ def schema(sh_degree: int) -> dict[str, Column]:
         columns |= {f"{prefix}.{name}": Column(f, shape) for name, shape in rows.items()}
     columns |= {
         "last_step": Column(torch.int32, ()),
+        "moment_step": Column(torch.int32, ()),
         "id": Column(torch.int64, ()),
         "parent": Column(torch.int64, ()),
         "birth": Column(torch.int32, ()),

@@ -10,11 +10,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("morton_keys(Tensor points) -> Tensor");
   m.def(
       "update_block_bounds_(Tensor(a!) bounds, Tensor? ids, Tensor means, Tensor scales, Tensor[] moments, "
-      "Tensor? last_step, Tensor? table) -> ()");
+      "Tensor? last_step, Tensor? moment_step, Tensor? table) -> ()");
   m.def(
       "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
-      "Tensor? table, Tensor viewmats, Tensor Ks, int width, int height, float near_plane, float far_plane, "
-      "float eps2d) -> (Tensor active_ids, Tensor active_views)");
+      "Tensor? moment_step, Tensor? table, Tensor viewmats, Tensor Ks, int width, int height, "
+      "float near_plane, float far_plane, float eps2d) -> (Tensor active_ids, Tensor active_views)");
 
   // Projection: parameters to screen-space rows, ordered by (Gaussian, view).
   m.def(
@@ -81,12 +81,13 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The optimiser: dense Adam over an index list, and its statistics for density control.
   m.def(
       "lazy_adam_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, Tensor[] grads, "
-      "Tensor ids, Tensor(d!) last_step, Tensor table, Tensor lr_table, int step, int explicit_steps, "
-      "float beta1, float beta2, float eps, bool sparse) -> ()");
+      "Tensor ids, Tensor(d!) last_step, Tensor(e!) moment_step, Tensor table, Tensor lr_table, int step, "
+      "int explicit_steps, float beta1, float beta2, float eps, bool sparse) -> ()");
   m.def(
       "lazy_adam_catch_up_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, Tensor? "
       "ids, "
-      "Tensor(d!) last_step, Tensor table, Tensor lr_table, int step, int explicit_steps, float beta1, "
+      "Tensor(d!) last_step, Tensor(e!) moment_step, Tensor table, Tensor lr_table, int step, "
+      "int explicit_steps, float beta1, "
       "float beta2, float eps) -> ()");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "

@@ -21,8 +21,9 @@ class PendingSteps(NamedTuple):
         exp_avg_sq_means: second moment of the means, float32 [N, 3].
         exp_avg_scales: first moment of the log scales, float32 [N, 3].
         exp_avg_sq_scales: second moment of the log scales, float32 [N, 3].
-        last_step: int32 [N], step each row's state stands at.
-        table: float64 [S + 1, 11], from `blitzgs.ops.lazy_adam.schedule_table`.
+        last_step: int32 [N], step each row's parameters stand at.
+        moment_step: int32 [N], step each row's moments stand at.
+        table: float64 [S + 1, 30], from `blitzgs.ops.lazy_adam.schedule_table`.
     """
 
     exp_avg_means: Tensor
@@ -30,6 +31,7 @@ class PendingSteps(NamedTuple):
     exp_avg_scales: Tensor
     exp_avg_sq_scales: Tensor
     last_step: Tensor
+    moment_step: Tensor
     table: Tensor
 
 
@@ -120,8 +122,10 @@ def cull_blocks(
     )
 
 
-def _pending_arguments(pending: PendingSteps | None) -> tuple[list[Tensor], Tensor | None, Tensor | None]:
-    return ([], None, None) if pending is None else (list(pending[:4]), pending.last_step, pending.table)
+def _pending_arguments(
+    pending: PendingSteps | None,
+) -> tuple[list[Tensor], Tensor | None, Tensor | None, Tensor | None]:
+    return ([], None, None, None) if pending is None else (list(pending[:4]), *pending[4:])
 
 
 @torch.library.register_fake("blitzgs::morton_keys")

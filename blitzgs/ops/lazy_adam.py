@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
@@ -25,6 +26,7 @@ def lazy_adam_step_(
     grads: Sequence[Tensor],
     ids: Tensor,
     last_step: Tensor,
+    moment_step: Tensor,
     lr_table: Tensor,
     step: int,
     beta1: float,
@@ -44,7 +46,8 @@ def lazy_adam_step_(
         exp_avg_sqs: second moments, shaped like `params`.
         grads: gradients of the listed rows, shaped like `params` with U rows.
         ids: int32 [U], the rows, each once.
-        last_step: int32 [N], the step that each row's state stands at; becomes `step` for `ids`.
+        last_step: int32 [N], the step that each row's parameters stand at; becomes `step` for `ids`.
+        moment_step: int32 [N], <= `last_step`, the step that its moments stand at; becomes `step` for `ids`.
         lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
             for every step of the schedule (row 0 unused). Must not change between calls.
         step: 1 <= step <= S.
@@ -65,6 +68,7 @@ def lazy_adam_step_(
         list(grads),
         ids,
         last_step,
+        moment_step,
         table,
         lr_table,
         step,
@@ -83,16 +87,18 @@ def lazy_adam_catch_up_(
     exp_avg_sqs: Sequence[Tensor],
     ids: Tensor | None,
     last_step: Tensor,
+    moment_step: Tensor,
     lr_table: Tensor,
     step: int,
     beta1: float,
     beta2: float,
     eps: float,
 ) -> None:
-    """Bring the rows `ids` (None: all rows) to the state dense Adam has after ``step``, in place.
+    """Bring the parameters of the rows `ids` (None: all rows) to where dense Adam has them after ``step``.
 
-    Rows that stand at `step` already are left untouched. Arguments as in `lazy_adam_step_`; ``step`` may be
-    0 (nothing to do).
+    In place. Rows that stand at `step` already are left untouched. Moments and `moment_step` stay: the next
+    step with a gradient applies the decay they still owe, beta^(step - moment_step). Arguments as in
+    `lazy_adam_step_`; ``step`` may be 0 (nothing to do).
 
     Raises:
         ValueError: decay rates outside their range.
@@ -105,6 +111,7 @@ def lazy_adam_catch_up_(
         list(exp_avg_sqs),
         ids,
         last_step,
+        moment_step,
         table,
         lr_table,
         step,
@@ -135,7 +142,7 @@ def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
         beta2: decay of the second moment, in (0, 1).
 
     Returns:
-        float64 [S + 1, 11], the table described in csrc/lazy_adam/lazy_adam.h, on the device of `lr_table`.
+        float64 [S + 1, 30], the table described in csrc/lazy_adam/adam_table.h, on the device of `lr_table`.
 
     Raises:
         ValueError: decay rates outside their range.
@@ -154,19 +161,24 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
         raise ValueError(
             f"Adam's decay rates must satisfy 0 <= beta1 < sqrt(beta2) < 1, got beta1={beta1}, beta2={beta2}"
         )
-    rates = lr_table.double().cpu().numpy()
+    rates = lr_table.double().cpu()
     steps = rates.shape[0]
-    ratio = beta1 / math.sqrt(beta2)
+    ratio, root = beta1 / math.sqrt(beta2), math.sqrt(beta2)
     t = torch.arange(steps, dtype=torch.float64)
-    table = torch.zeros(steps, 11, dtype=torch.float64)
-    table[:, 6], table[:, 7], table[:, 8] = beta1**t, beta2**t, ratio**t
+    table = torch.zeros(steps, 30, dtype=torch.float64)
+    powers = (beta1**t, beta2**t, ratio**t, root**t)
+    for column, power in enumerate(powers, start=24):
+        table[:, column] = power
     # -expm1(t log beta) keeps the digits that 1 - beta^t loses while t is small.
-    table[1:, 9] = 1 / (-torch.expm1(t[1:] * math.log(beta1)) if beta1 > 0 else torch.ones(steps - 1))
-    table[1:, 10] = (-torch.expm1(t[1:] * math.log(beta2))).rsqrt()
-    corrected = rates * (table[:, 9] / table[:, 10].clamp_min(1e-300)).numpy()[:, None]
-    tails = table[:, :6].numpy()
+    first = 1 / (-torch.expm1(t[1:] * math.log(beta1)) if beta1 > 0 else torch.ones(steps - 1))
+    second = (-torch.expm1(t[1:] * math.log(beta2))).rsqrt()
+    table[1:, 28], table[1:, 29] = first, second
+    orders = range(4)
+    terms = torch.stack([(first * second ** (k - 1))[:, None] * rates[1:] for k in orders], 1).numpy()
+    ratios = np.array([ratio * root**k for k in orders])[:, None]
+    tails = table.numpy()[:, :24].reshape(steps, 4, 6)
     for step in range(steps - 2, -1, -1):
-        tails[step] = ratio * (corrected[step + 1] + tails[step + 1])
+        tails[step] = ratios * (terms[step] + tails[step + 1])
     return table.to(lr_table.device)
 
 

@@ -16,8 +16,8 @@ from blitzgs.training.schedule import Schedule
 class LazyAdam:
     """Adam over the rows of a table, batch-scaled as Grendel does: lr sqrt(B), beta^B, eps / sqrt(B).
 
-    Rows that a step does not name fall behind (column `last_step`) and must be caught up before they are
-    read.
+    Rows that a step does not name fall behind (columns `last_step` and `moment_step`); their parameters must
+    be caught up before they are read.
 
     Attributes:
         lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
@@ -35,7 +35,7 @@ class LazyAdam:
         self.pending_table = None if config.sparse else schedule_table(self.lr_table, *self._betas)
 
     def catch_up(self, table: GaussianTable, ids: Tensor | None, step: int) -> None:
-        """Bring rows `ids` (int32 [A]; None: all) to the state after `step`."""
+        """Bring the parameters of rows `ids` (int32 [A]; None: all) to the state after `step`."""
         if self._sparse:
             return
         lazy_adam_catch_up_(
@@ -44,6 +44,7 @@ class LazyAdam:
             table.exp_avg_sqs,
             ids,
             table["last_step"],
+            table["moment_step"],
             self.lr_table,
             step,
             *self._betas,
@@ -59,6 +60,7 @@ class LazyAdam:
             gradients,
             ids,
             table["last_step"],
+            table["moment_step"],
             self.lr_table,
             step,
             *self._betas,

@@ -78,5 +78,6 @@ class BlockIndex:
             table["exp_avg.scales"],
             table["exp_avg_sq.scales"],
             table["last_step"],
+            table["moment_step"],
             self._schedule,
         )

@@ -23,6 +23,7 @@
 
 #include "common/host_device.h"
 #include "common/stream.h"
+#include "lazy_adam/adam_table.h"
 #include "math/morton.h"
 
 namespace blitzgs {
@@ -31,7 +32,6 @@ constexpr int kBlockRows = 256;
 constexpr int kBlockBounds = 7;  // lowest corner, highest corner, largest sigma
 constexpr int kMaxViews = 32;
 constexpr int kPlanes = 6;
-constexpr int kScheduleColumns = 11;  // of the table in lazy_adam.h: 0 = tail of the means, 2 = of the scales
 
 BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
 
@@ -39,8 +39,8 @@ BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows
 struct BlockRows {
   const float *means, *scales;  // [N, 3], scales logarithmic
   const float *exp_avg_means, *exp_avg_sq_means, *exp_avg_scales, *exp_avg_sq_scales;
-  const std::int32_t* last_step;  // [N]
-  const double* table;            // [S + 1, 11]
+  const std::int32_t *last_step, *moment_step;  // [N], where parameters and moments stand
+  const double* table;                          // [S + 1, kAdamTable]
   std::int64_t n;
 };
 
@@ -63,9 +63,11 @@ BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, std::int64_t row) {
   SweptBox box = empty_box();
   float mean_tail = 0.0f, scale_tail = 0.0f;
   if (rows.exp_avg_means) {
-    const double* entry = rows.table + static_cast<std::int64_t>(rows.last_step[row]) * kScheduleColumns;
-    mean_tail = static_cast<float>(entry[0]);
-    scale_tail = static_cast<float>(entry[2]);
+    const std::int32_t stand = rows.last_step[row], behind = stand - rows.moment_step[row];
+    const double* entry = rows.table + static_cast<std::int64_t>(stand) * kAdamTable;
+    const double decay = rows.table[static_cast<std::int64_t>(behind) * kAdamTable + kRatioPower];
+    mean_tail = static_cast<float>(decay * entry[kTails]);
+    scale_tail = static_cast<float>(decay * entry[kTails + 2]);
   }
   SweptBox swept;
   float largest = -FLT_MAX, check = 0.0f;

@@ -22,10 +22,18 @@ const float* hold_column(const char* op, const char* name, const Tensor& column,
   return data<float>(held.held.back());
 }
 
+const std::int32_t* hold_steps(const char* op, const char* name, const Tensor& column, std::int64_t n,
+                               HeldRows& held) {
+  check_dtype(op, name, column, ScalarType::Int);
+  check_shape(op, name, column, {n});
+  held.held.push_back(as_contiguous(column));
+  return data<std::int32_t>(held.held.back());
+}
+
 // moments: empty, or exp_avg and exp_avg_sq of the means, then of the scales.
 HeldRows hold_rows(const char* op, const Tensor& means, const Tensor& scales,
                    const std::vector<Tensor>& moments, const std::optional<Tensor>& last_step,
-                   const std::optional<Tensor>& table) {
+                   const std::optional<Tensor>& moment_step, const std::optional<Tensor>& table) {
   HeldRows held;
   const std::int64_t n = means.size(0);
   STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "blitzgs::", op, ": at most 2^31 rows, got ", n);
@@ -33,20 +41,19 @@ HeldRows hold_rows(const char* op, const Tensor& means, const Tensor& scales,
   held.rows.means = hold_column(op, "means", means, n, held);
   held.rows.scales = hold_column(op, "scales", scales, n, held);
   const bool pending = !moments.empty();
-  STD_TORCH_CHECK(pending ? moments.size() == 4 && last_step && table : !last_step && !table, "blitzgs::", op,
-                  ": pending steps need four moments, last_step and table together; got ", moments.size(),
-                  " moments");
+  const int given = last_step.has_value() + moment_step.has_value() + table.has_value();
+  STD_TORCH_CHECK(pending ? moments.size() == 4 && given == 3 : given == 0, "blitzgs::", op,
+                  ": pending steps need four moments, last_step, moment_step and table together; got ",
+                  moments.size(), " moments and ", given, " others");
   if (!pending) return held;
   held.rows.exp_avg_means = hold_column(op, "exp_avg of means", moments[0], n, held);
   held.rows.exp_avg_sq_means = hold_column(op, "exp_avg_sq of means", moments[1], n, held);
   held.rows.exp_avg_scales = hold_column(op, "exp_avg of scales", moments[2], n, held);
   held.rows.exp_avg_sq_scales = hold_column(op, "exp_avg_sq of scales", moments[3], n, held);
-  check_dtype(op, "last_step", *last_step, ScalarType::Int);
-  check_shape(op, "last_step", *last_step, {n});
   check_dtype(op, "table", *table, ScalarType::Double);
-  check_shape(op, "table", *table, {-1, kScheduleColumns});
-  held.held.push_back(as_contiguous(*last_step));
-  held.rows.last_step = data<std::int32_t>(held.held.back());
+  check_shape(op, "table", *table, {-1, kAdamTable});
+  held.rows.last_step = hold_steps(op, "last_step", *last_step, n, held);
+  held.rows.moment_step = hold_steps(op, "moment_step", *moment_step, n, held);
   held.held.push_back(as_contiguous(*table));
   held.rows.table = data<double>(held.held.back());
   return held;
@@ -71,9 +78,10 @@ Tensor morton_keys(const Tensor& points) {
 
 void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, const Tensor& means,
                           const Tensor& scales, const std::vector<Tensor>& moments,
-                          const std::optional<Tensor>& last_step, const std::optional<Tensor>& table) {
+                          const std::optional<Tensor>& last_step, const std::optional<Tensor>& moment_step,
+                          const std::optional<Tensor>& table) {
   const char* op = "update_block_bounds_";
-  const HeldRows held = hold_rows(op, means, scales, moments, last_step, table);
+  const HeldRows held = hold_rows(op, means, scales, moments, last_step, moment_step, table);
   check_bounds(op, bounds, held.rows.n);
   std::optional<Tensor> ids;
   if (ids_in) {
@@ -89,11 +97,12 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, co
 std::tuple<Tensor, Tensor> cull_blocks(const Tensor& bounds, const Tensor& means, const Tensor& scales,
                                        const std::vector<Tensor>& moments,
                                        const std::optional<Tensor>& last_step,
+                                       const std::optional<Tensor>& moment_step,
                                        const std::optional<Tensor>& table, const Tensor& viewmats_in,
                                        const Tensor& Ks_in, std::int64_t width, std::int64_t height,
                                        double near_plane, double far_plane, double eps2d) {
   const char* op = "cull_blocks";
-  const HeldRows held = hold_rows(op, means, scales, moments, last_step, table);
+  const HeldRows held = hold_rows(op, means, scales, moments, last_step, moment_step, table);
   check_bounds(op, bounds, held.rows.n);
   check_dtype(op, "viewmats", viewmats_in, ScalarType::Float);
   check_shape(op, "viewmats", viewmats_in, {-1, 4, 4});

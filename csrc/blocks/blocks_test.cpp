@@ -41,11 +41,13 @@ TEST_CASE("pending steps widen a row's box along its drift, and rows that are no
   std::vector<float> means = {1, 2, 3, 4, std::numeric_limits<float>::quiet_NaN(), 6};
   std::vector<float> scales(6, 0.0f), m(6, 0.0f), v(6, 1.0f), still(6, 0.0f);
   m[0] = 2;
-  std::vector<std::int32_t> last_step(2, 1);
-  std::vector<double> table(3 * blitzgs::kScheduleColumns, 0.0);
-  table[1 * blitzgs::kScheduleColumns] = 0.25;
-  const blitzgs::BlockRows rows{means.data(), scales.data(),    m.data(),     v.data(), still.data(),
-                                v.data(),     last_step.data(), table.data(), 2};
+  std::vector<std::int32_t> last_step(2, 1), moment_step(2, 0);
+  std::vector<double> table(3 * blitzgs::kAdamTable, 0.0);
+  table[1 * blitzgs::kAdamTable] = 0.5;  // of which half is past by step 1
+  table[1 * blitzgs::kAdamTable + blitzgs::kRatioPower] = 0.5;
+  const blitzgs::BlockRows rows{
+      means.data(), scales.data(),    m.data(),           v.data(),     still.data(),
+      v.data(),     last_step.data(), moment_step.data(), table.data(), 2};
   const blitzgs::SweptBox box = blitzgs::sweep_row(rows, 0);
   REQUIRE(box.low[0] == Approx(0.5).margin(1e-4));
   REQUIRE(box.high[0] == 1);

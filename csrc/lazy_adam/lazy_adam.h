@@ -4,35 +4,37 @@
 //
 // Dense Adam (Kingma & Ba 2015), step t, gradient g:
 //   m = beta1 m + (1 - beta1) g     v = beta2 v + (1 - beta2) g^2
-//   p -= lr_t (m / (1 - beta1^t)) / (sqrt(v) / sqrt(1 - beta2^t) + eps)
-// Without a gradient over the steps L+1 .. s the moments only decay, m beta1^k and v beta2^k with k = s - L,
-// and while eps is below the rounding of sqrt(v) the parameter drifts by m / sqrt(v) times
-//   sum over t = L+1 .. s of lr_t r^(t-L) c_t = tail[L] - r^(s-L) tail[s],
-//   r = beta1 / sqrt(beta2),  c_t = sqrt(1 - beta2^t) / (1 - beta1^t),  tail[L] = r (lr_{L+1} c_{L+1} +
-//   tail[L+1]),
-// one number per row and parameter group, read from a table made once per schedule. Elements for which eps
-// matters take the zero-gradient steps one by one, at most `explicit_steps` of them: after those, r^j is
-// below the rounding of the sum.
+//   p -= lr_t b_t m / (a_t sqrt(v) + eps)         b_t = 1 / (1 - beta1^t), a_t = 1 / sqrt(1 - beta2^t)
+// Without a gradient the moments only decay: j steps after a step P at which they are m and v, they are
+// m beta1^j and v beta2^j. Up to step s the parameter drifts by
+//   m sum over j = 1 .. s - P of mu_j rho_j / (rho_j sqrt(v) + eps),       t = P + j,
+//   rho_j = a_t beta2^(j/2),   mu_j = lr_t b_t / a_t q_0^j,   q_0 = beta1 / sqrt(beta2).
+// rho_j changes far more slowly than mu_j falls, so the sum is taken by the two-point Gauss rule of the
+// weights mu over rho: two places and weights with the weights' first four moments
+//   sum over j of mu_j rho_j^k = tail_k[P] - q_k^(s-P) tail_k[s],  k = 0 .. 3,
+// of tails that are tabulated once per schedule (adam_table.h). The rule is exact where eps is lost against
+// sqrt(v) (moment 0) and where it dominates (moment 1); in between, at its worst near eps = 3 sqrt(v), its
+// relative error is below half the square of rho's relative variance: 1e-9 of the drift in mid-schedule,
+// the rounding of float32 after some 200 single-view steps. Where that is not enough (earlier, and float64)
+// elements for which eps matters take the zero-gradient steps one by one, at most `explicit_steps` of them:
+// after those, q_0^j is below the rounding of the sum.
 //
-// Table [S+1, 11], double, row t (S is the last step of the schedule):
-//   0..5   tail[t] of means, quats, scales, opacities, SH DC, SH rest
-//   6..8   beta1^t, beta2^t, r^t
-//   9, 10  1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t)   (row 0: 0)
+// Two columns say where a row stands. `last_step`: its parameters. `moment_step` <= last_step: its moments,
+// which catching up reads and leaves alone (their decay is applied by the next step with a gradient).
 //
 // Rows are independent and each element is computed the same way wherever it lies, so results do not depend
-// on the order of the list or on sharding. O(1) per element.
+// on the order of the list or on sharding; CPU and CUDA give the same bits. O(1) per element.
 #pragma once
 #include <cmath>
 #include <cstdint>
 
 #include "common/host_device.h"
 #include "common/stream.h"
+#include "lazy_adam/adam_table.h"
 
 namespace blitzgs {
 
 constexpr int kAdamColumns = 5;  // means, quats, scales, opacities, sh
-constexpr int kAdamGroups = 6;   // learning rates: the SH column has two
-constexpr int kAdamTable = 11;
 
 template <class T>
 struct AdamColumn {
@@ -48,94 +50,151 @@ struct AdamArgs {
   AdamColumn<T> columns[kAdamColumns];
   const std::int32_t* ids;  // [n] rows, unique; null = row i is i
   std::int64_t n;
-  std::int32_t* last_step;  // [N]
-  const double* table;      // [S+1, 11]
-  const float* lr_table;    // [S+1, 6]
+  std::int32_t *last_step, *moment_step;  // [N]
+  const double* table;                    // [S+1, kAdamTable]
+  const float* lr_table;                  // [S+1, 6]
   std::int32_t step;
   std::int32_t explicit_steps;
   double beta1, beta2, eps;
   bool sparse;  // plain sparse Adam: no decay, no drift
+
+  BLITZGS_HD bool with_gradient() const { return columns[0].grad != nullptr; }
+  // Where parameters stand before the step with a gradient, if there is one.
+  BLITZGS_HD std::int32_t target() const { return with_gradient() ? step - 1 : step; }
+  BLITZGS_HD const double* table_row(std::int32_t t) const {
+    return table + static_cast<std::int64_t>(t) * kAdamTable;
+  }
 };
 
-// What is owed by one row whose state stands at step `from` and shall stand at step `to`.
+// The Gauss rule of one group: drift = sum of m / (place sqrt(v) + eps) * weight.
+template <class T>
+struct alignas(4 * sizeof(T)) AdamRule {
+  T place[2], weight[2];
+};
+
+// What parameters that stand at step `from` still owe at step `to`.
 template <class T>
 struct AdamDebt {
+  AdamRule<T> rules[kAdamGroups];
   std::int32_t from, to;
-  T decay1, decay2;  // beta1^k, beta2^k
-  T negligible;      // sqrt(v) above this: eps is lost in rounding over the whole gap
-  T drift[kAdamGroups];
+  T explicit_up_to;  // sqrt(v) up to this: step by step; negative: the rules do for all
 };
+
+// Returns the rule of a group; `error` becomes a bound of its relative error if that is larger.
+template <class T>
+BLITZGS_HD AdamRule<T> adam_rule(const AdamArgs<T>& args, std::int32_t from, std::int32_t to, int group,
+                                 double& error) {
+  const double *begin = args.table_row(from) + kTails + group, *end = args.table_row(to) + kTails + group;
+  const double* power = args.table_row(to - from);
+  double moments[kAdamOrders], q = power[kRatioPower];
+  for (int k = 0; k < kAdamOrders; ++k, q *= power[kRootPower]) {
+    moments[k] = begin[k * kAdamGroups] - q * end[k * kAdamGroups];
+  }
+  const double total = moments[0];
+  if (!(total > 0)) return {{T(1), T(1)}, {T(0), T(0)}};  // rates of zero
+  const double mean = moments[1] / total, square = moments[2] / total, cube = moments[3] / total;
+  const double variance = square - mean * mean, share = variance / (mean * mean);
+  // A single step, or steps too alike for double to tell apart.
+  if (!(share > 1e-10)) return {{static_cast<T>(mean), T(1)}, {static_cast<T>(total * mean), T(0)}};
+  const double skew = (cube - 3 * mean * square + 2 * mean * mean * mean) / (2 * variance);
+  const double spread = std::sqrt(skew * skew + variance), above = skew + spread, below = skew - spread;
+  const double places[2] = {mean + above, mean + below};
+  const double weights[2] = {total * (-below / (2 * spread)), total * (above / (2 * spread))};
+  error = error > 0.5 * share * share ? error : 0.5 * share * share;
+  return {{static_cast<T>(places[0]), static_cast<T>(places[1])},
+          {static_cast<T>(weights[0] * places[0]), static_cast<T>(weights[1] * places[1])}};
+}
 
 template <class T>
 BLITZGS_HD AdamDebt<T> adam_debt(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
-  AdamDebt<T> debt{};
+  AdamDebt<T> debt;
   debt.from = from;
   debt.to = to;
-  if (from >= to) return debt;
-  const std::int32_t k = to - from;
-  const double* begin = args.table + static_cast<std::int64_t>(from) * kAdamTable;
-  const double* end = args.table + static_cast<std::int64_t>(to) * kAdamTable;
-  const double* power = args.table + static_cast<std::int64_t>(k) * kAdamTable;
-  debt.decay1 = static_cast<T>(power[6]);
-  debt.decay2 = static_cast<T>(power[7]);
-  const std::int32_t reach = k < args.explicit_steps ? k : args.explicit_steps;
+  double error = 0;
+  for (int g = 0; g < kAdamGroups; ++g) debt.rules[g] = adam_rule(args, from, to, g, error);
   const double rounding = sizeof(T) == 4 ? 5.9e-8 : 1.1e-16;
-  // sqrt(v beta2^reach) / sqrt(1 - beta2^t) is smallest at the end of the gap or later, where 1 - beta2^t
-  // < 1.
-  debt.negligible =
-      static_cast<T>(args.eps / (rounding * std::sqrt(args.table[std::int64_t{reach} * kAdamTable + 7])));
-  for (int g = 0; g < kAdamGroups; ++g) debt.drift[g] = static_cast<T>(begin[g] - power[8] * end[g]);
+  debt.explicit_up_to = T(-1);
+  if (error > 2 * rounding) {
+    // eps is lost against the smallest place * sqrt(v); a_t >= 1, and after explicit_steps nothing counts.
+    const std::int32_t gap = to - from, reach = gap < args.explicit_steps ? gap : args.explicit_steps;
+    debt.explicit_up_to = static_cast<T>(args.eps / (rounding * args.table_row(reach)[kRootPower]));
+  }
   return debt;
 }
 
-// The zero-gradient steps of one element, one by one.
+// The zero-gradient steps of one element, one by one; m and root = sqrt(v) at step debt.from.
 template <class T>
-BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T v) {
+BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T root) {
   const T beta1 = static_cast<T>(args.beta1), root_beta2 = static_cast<T>(std::sqrt(args.beta2));
   const T eps = static_cast<T>(args.eps);
   const std::int32_t last =
       debt.to - debt.from < args.explicit_steps ? debt.to : debt.from + args.explicit_steps;
-  T root = std::sqrt(v), drift = 0;
+  T drift = 0;
   for (std::int32_t t = debt.from + 1; t <= last; ++t) {
-    const double* row = args.table + static_cast<std::int64_t>(t) * kAdamTable;
+    const double* row = args.table_row(t);
     m *= beta1;
     root *= root_beta2;
-    drift += args.lr_table[static_cast<std::int64_t>(t) * kAdamGroups + group] *
-             (m * static_cast<T>(row[9])) / (root * static_cast<T>(row[10]) + eps);
+    drift += static_cast<T>(args.lr_table[static_cast<std::int64_t>(t) * kAdamGroups + group]) *
+             (m * static_cast<T>(row[kCorrection1])) / (root * static_cast<T>(row[kCorrection2]) + eps);
   }
   return drift;
 }
 
+// What a parameter moves down by while its debt is paid; m and v at step debt.from.
 template <class T>
-BLITZGS_HD void adam_catch_up(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T& p, T& m, T& v) {
-  if (m != 0) {
-    const T root = std::sqrt(v);
-    p -= root > debt.negligible ? m / root * debt.drift[group] : adam_explicit_drift(args, debt, group, m, v);
-  }
-  m *= debt.decay1;
-  v *= debt.decay2;
+BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, const AdamRule<T>& rule, int group,
+                        T m, T v) {
+  if (m == 0) return 0;
+  const T root = std::sqrt(v), eps = static_cast<T>(args.eps);
+  if (!(root > debt.explicit_up_to)) return adam_explicit_drift(args, debt, group, m, root);
+  return m / (rule.place[0] * root + eps) * rule.weight[0] +
+         m / (rule.place[1] * root + eps) * rule.weight[1];
+}
+
+// How one row's moments decay: from where they stand to where its parameters stand, and to the target.
+template <class T>
+struct AdamRow {
+  std::int32_t from;  // where the parameters stand
+  T here1, here2;     // beta1^k, beta2^k to there
+  T then1, then2;     // to the target
+  bool moves;         // drifts noticeably on its way to the target
+};
+
+template <class T>
+BLITZGS_HD AdamRow<T> adam_row(const AdamArgs<T>& args, std::int64_t row) {
+  const std::int32_t target = args.target();
+  if (args.sparse) return {target, T(1), T(1), T(1), T(1), false};
+  const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
+  const double *here = args.table_row(from - stand), *then = args.table_row(target - stand);
+  // explicit_steps after the moments' step, what is left of the drift is below its rounding.
+  return {from,
+          static_cast<T>(here[kBeta1Power]),
+          static_cast<T>(here[kBeta2Power]),
+          static_cast<T>(then[kBeta1Power]),
+          static_cast<T>(then[kBeta2Power]),
+          from < target && from - stand < args.explicit_steps};
 }
 
 // The scalars of one step with a gradient.
 template <class T>
 struct AdamStep {
   T beta1, one_minus_beta1, beta2, one_minus_beta2, inverse_root2, eps;
-  T rate[kAdamGroups];  // lr_t / (1 - beta1^t)
+  T rate[kAdamGroups];  // lr_t b_t
 };
 
 template <class T>
 BLITZGS_HD AdamStep<T> adam_step_scalars(const AdamArgs<T>& args) {
-  const double* row = args.table + static_cast<std::int64_t>(args.step) * kAdamTable;
+  const double* row = args.table_row(args.step);
   AdamStep<T> s;
   s.beta1 = static_cast<T>(args.beta1);
   s.one_minus_beta1 = static_cast<T>(1.0 - args.beta1);
   s.beta2 = static_cast<T>(args.beta2);
   s.one_minus_beta2 = static_cast<T>(1.0 - args.beta2);
-  s.inverse_root2 = static_cast<T>(row[10]);
+  s.inverse_root2 = static_cast<T>(row[kCorrection2]);
   s.eps = static_cast<T>(args.eps);
   for (int g = 0; g < kAdamGroups; ++g) {
-    s.rate[g] =
-        static_cast<T>(args.lr_table[static_cast<std::int64_t>(args.step) * kAdamGroups + g] * row[9]);
+    s.rate[g] = static_cast<T>(args.lr_table[static_cast<std::int64_t>(args.step) * kAdamGroups + g] *
+                               row[kCorrection1]);
   }
   return s;
 }
@@ -147,14 +206,15 @@ BLITZGS_HD void adam_update(const AdamStep<T>& s, int group, T g, T& p, T& m, T&
   p -= s.rate[group] * m / (std::sqrt(v) * s.inverse_root2 + s.eps);
 }
 
-// The learning-rate group of element j of a column.
+// The learning-rate group of element j of a column; groups ascend within a column and over the columns.
 BLITZGS_HD int adam_group(int column, std::int64_t element) {
   return column == 4 && element >= 3 ? 5 : column;
 }
 
 namespace cpu {
-// With gradients: rows behind step - 1 are caught up, then step `step` is taken. Without (column.grad null):
-// rows behind `step` are caught up. last_step of the rows becomes `step`.
+// With gradients: the parameters of rows behind step - 1 are caught up, then step `step` is taken, after
+// which parameters and moments stand there. Without (column.grad null): the parameters of rows behind `step`
+// are caught up and stand at `step`.
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
 }  // namespace cpu

@@ -34,23 +34,44 @@ void prefetch_row(const AdamArgs<T>& args, std::int64_t row) {
   }
 }
 
+// Few different steps owe: each thread works a debt out once for many rows.
+template <class T>
+class DebtCache {
+ public:
+  const AdamDebt<T>& get(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
+    AdamDebt<T>& debt = debts_[from % kSlots];
+    if (!used_[from % kSlots] || debt.from != from) {
+      debt = adam_debt(args, from, to);
+      used_[from % kSlots] = true;
+    }
+    return debt;
+  }
+
+ private:
+  static constexpr int kSlots = 64;
+  AdamDebt<T> debts_[kSlots];
+  bool used_[kSlots] = {};
+};
+
 }  // namespace
 
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
-  const bool with_gradient = args.columns[0].grad != nullptr;
+  const bool with_gradient = args.with_gradient();
   const AdamStep<T> step = adam_step_scalars(args);
   const AdamRowUpdate<T> update = row_update<T>();
-  const std::int32_t target = with_gradient ? args.step - 1 : args.step;
+  const std::int32_t target = args.target();
   parallel_for(0, args.n, 512, [&](std::int64_t begin, std::int64_t end) {
+    DebtCache<T> debts;
     for (std::int64_t i = begin; i < end; ++i) {
       const std::int64_t row = args.ids ? args.ids[i] : i;
       if (args.ids) prefetch_row(args, args.ids[std::min(i + kPrefetchDistance, end - 1)]);
-      const std::int32_t from = args.sparse ? target : args.last_step[row];
-      if (!with_gradient && from >= target) continue;
-      const AdamDebt<T> debt = adam_debt(args, from, target);
-      update({args, step, debt, adam_explicit_drift<T>, row, i});
+      const AdamRow<T> state = adam_row(args, row);
+      if (!with_gradient && state.from >= target) continue;
+      const AdamDebt<T>* debt = state.moves ? &debts.get(args, state.from, target) : nullptr;
+      if (with_gradient || debt) update({args, step, state, debt, adam_explicit_drift<T>, row, i});
       args.last_step[row] = args.step;
+      if (with_gradient) args.moment_step[row] = args.step;
     }
   });
 }

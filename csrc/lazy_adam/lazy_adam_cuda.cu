@@ -8,108 +8,164 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kRows = 64;  // rows per block
-constexpr int kThreads = 256;
+constexpr int kRows = 32;  // rows per block
+constexpr int kThreads = 128;
+
+// What rows that stand at any step before the target owe: every row of a launch goes to the same step, so
+// the double arithmetic is done once a step, not once a row.
+__global__ void list_debts(const AdamArgs<float> args, AdamDebt<float>* debts) {
+  const std::int32_t from = blockIdx.x * blockDim.x + threadIdx.x;
+  if (from < args.target()) debts[from] = adam_debt(args, from, args.target());
+}
 
 template <int Width>
 struct alignas(4 * Width) Pack {
   float x[Width];
 };
 
-// One block's rows of one column. Items are packs of Width floats; all items of a thread are independent, and
-// the loads of kUnroll of them are in flight at once: a row without debt costs its bytes alone.
-template <int Column, int Width, int kUnroll, bool Gradient>
-__device__ __forceinline__ void update_column(const AdamArgs<float>& args, const AdamStep<float>& step,
-                                              const AdamDebt<float>* debts, const std::int32_t* rows,
-                                              std::int64_t first, int count) {
-  using P = Pack<Width>;
-  const AdamColumn<float>& column = args.columns[Column];
-  const int packs = static_cast<int>(column.width) / Width;
-  const int items = count * packs;
-  for (int base = threadIdx.x; base < items; base += kThreads * kUnroll) {
-    P p[kUnroll], m[kUnroll], v[kUnroll], g[kUnroll];
-#pragma unroll
-    for (int u = 0; u < kUnroll; ++u) {
-      const int item = base + u * kThreads;
-      if (item >= items) break;
-      const int local = item / packs, pack = item - local * packs;
-      const std::int64_t at = rows[local] * column.width + pack * Width;
-      p[u] = *reinterpret_cast<const P*>(column.param + at);
-      m[u] = *reinterpret_cast<const P*>(column.exp_avg + at);
-      v[u] = *reinterpret_cast<const P*>(column.exp_avg_sq + at);
-      if (Gradient)
-        g[u] = *reinterpret_cast<const P*>(column.grad + (first + local) * column.width + pack * Width);
-    }
-#pragma unroll
-    for (int u = 0; u < kUnroll; ++u) {
-      const int item = base + u * kThreads;
-      if (item >= items) break;
-      const int local = item / packs, pack = item - local * packs;
-      const AdamDebt<float>& debt = debts[local];
-      if (debt.from < debt.to) {
-#pragma unroll
-        for (int j = 0; j < Width; ++j) {
-          adam_catch_up(args, debt, adam_group(Column, pack * Width + j), p[u].x[j], m[u].x[j], v[u].x[j]);
-        }
-      }
-      if (Gradient) {
-#pragma unroll
-        for (int j = 0; j < Width; ++j) {
-          const int group = adam_group(Column, pack * Width + j);
-          adam_update(step, group, g[u].x[j], p[u].x[j], m[u].x[j], v[u].x[j]);
-        }
-      }
-      const std::int64_t at = rows[local] * column.width + pack * Width;
-      *reinterpret_cast<P*>(column.param + at) = p[u];
-      *reinterpret_cast<P*>(column.exp_avg + at) = m[u];
-      *reinterpret_cast<P*>(column.exp_avg_sq + at) = v[u];
+// A row as the threads of its block see it.
+struct BlockRow {
+  std::int32_t row, list_row;
+  AdamRow<float> state;
+};
+
+// One pack of Width elements of one row: loads first, so that many packs are in flight, then the arithmetic.
+template <int Column, int Width, bool Gradient>
+class Item {
+ public:
+  __device__ __forceinline__ void load(const AdamArgs<float>& args, const BlockRow* rows, int local,
+                                       int pack) {
+    const AdamColumn<float>& column = args.columns[Column];
+    local_ = local;
+    pack_ = pack;
+    at_ = rows[local].row * column.width + pack * Width;
+    p_ = *reinterpret_cast<const P*>(column.param + at_);
+    m_ = *reinterpret_cast<const P*>(column.exp_avg + at_);
+    v_ = *reinterpret_cast<const P*>(column.exp_avg_sq + at_);
+    if (Gradient) {
+      g_ = *reinterpret_cast<const P*>(column.grad + rows[local].list_row * column.width + pack * Width);
     }
   }
+
+  __device__ __forceinline__ void finish(const AdamArgs<float>& args, const AdamStep<float>& step,
+                                         const AdamDebt<float>* debts, const BlockRow* rows) {
+    const AdamColumn<float>& column = args.columns[Column];
+    const AdamRow<float>& state = rows[local_].state;
+    const int first = adam_group(Column, pack_ * Width), last = adam_group(Column, pack_ * Width + Width - 1);
+    if (state.moves) {
+      const AdamDebt<float>& debt = debts[state.from];
+      const AdamRule<float> rules[2] = {debt.rules[first], debt.rules[last]};
+#pragma unroll
+      for (int j = 0; j < Width; ++j) {
+        const bool low = j < Width - 1;  // of a pack over two groups, the last element alone has the second
+        p_.x[j] -= adam_drift(args, debt, rules[low ? 0 : 1], low ? first : last, m_.x[j] * state.here1,
+                              v_.x[j] * state.here2);
+      }
+    }
+    if (Gradient) {
+#pragma unroll
+      for (int j = 0; j < Width; ++j) {
+        m_.x[j] *= state.then1;
+        v_.x[j] *= state.then2;
+        adam_update(step, j < Width - 1 ? first : last, g_.x[j], p_.x[j], m_.x[j], v_.x[j]);
+      }
+      *reinterpret_cast<P*>(column.exp_avg + at_) = m_;
+      *reinterpret_cast<P*>(column.exp_avg_sq + at_) = v_;
+    }
+    *reinterpret_cast<P*>(column.param + at_) = p_;
+  }
+
+ private:
+  using P = Pack<Width>;
+  P p_, m_, v_, g_;
+  std::int64_t at_;
+  int local_, pack_;
+};
+
+// The rows of the block that there is something to do for, in `rows`; returns how many.
+template <bool Gradient>
+__device__ __forceinline__ int collect_rows(const AdamArgs<float>& args, BlockRow* rows) {
+  static_assert(kRows == 32, "the first warp has a row a lane");
+  bool work = false;
+  if (threadIdx.x < kRows) {
+    BlockRow mine;
+    const std::int64_t i = blockIdx.x * std::int64_t{kRows} + threadIdx.x;
+    if (i < args.n) {
+      mine.list_row = static_cast<std::int32_t>(i);
+      mine.row = args.ids ? args.ids[i] : mine.list_row;
+      mine.state = adam_row(args, mine.row);
+      work = Gradient || mine.state.moves;
+      if (Gradient || mine.state.from < args.step) args.last_step[mine.row] = args.step;
+      if (Gradient) args.moment_step[mine.row] = args.step;
+    }
+    const unsigned ballot = __ballot_sync(~0u, work);
+    if (work) rows[__popc(ballot & ((1u << threadIdx.x) - 1))] = mine;
+  }
+  return __syncthreads_count(work);
 }
 
-// A block owns kRows rows of the list in all five columns, so last_step is read and written by it alone.
+// A block owns kRows rows of the list in all five columns, so their steps are read and written by it alone.
+// The short columns' loads are in flight while the SH column is worked on.
 template <int ShWidth, bool Gradient>
-__global__ void __launch_bounds__(kThreads) lazy_adam_kernel(const AdamArgs<float> args) {
-  __shared__ AdamDebt<float> debts[kRows];
-  __shared__ std::int32_t rows[kRows];
+__global__ void __launch_bounds__(kThreads)
+    lazy_adam_kernel(const AdamArgs<float> args, const AdamDebt<float>* debts) {
+  __shared__ BlockRow rows[kRows];
   __shared__ AdamStep<float> step;
-  __shared__ int owing;
-  const std::int64_t first = static_cast<std::int64_t>(blockIdx.x) * kRows;
-  const int count = static_cast<int>(args.n - first < kRows ? args.n - first : kRows);
-  const std::int32_t target = Gradient ? args.step - 1 : args.step;
-  if (threadIdx.x == 0) owing = 0;
-  __syncthreads();
-  if (threadIdx.x < count) {
-    const std::int64_t i = first + threadIdx.x;
-    const std::int32_t row = args.ids ? args.ids[i] : static_cast<std::int32_t>(i);
-    const std::int32_t from = args.sparse ? target : args.last_step[row];
-    rows[threadIdx.x] = row;
-    debts[threadIdx.x] = adam_debt(args, from, target);
-    if (from < target) owing = 1;
-    if (Gradient || from < target) args.last_step[row] = args.step;
+  if (Gradient && threadIdx.x == kThreads - 1) step = adam_step_scalars(args);
+  const int count = collect_rows<Gradient>(args, rows);
+  const int thread = threadIdx.x;
+  Item<0, 1, Gradient> mean;
+  Item<1, 4, Gradient> quat;
+  Item<2, 1, Gradient> scale;
+  Item<3, 1, Gradient> opacity;
+  if (thread < 3 * count) {
+    mean.load(args, rows, thread / 3, thread % 3);
+    scale.load(args, rows, thread / 3, thread % 3);
   }
-  if (threadIdx.x == kThreads - 1) step = adam_step_scalars(args);
-  __syncthreads();
-  if (!Gradient && !owing) return;
-  update_column<4, ShWidth, 3, Gradient>(args, step, debts, rows, first, count);
-  update_column<0, 1, 1, Gradient>(args, step, debts, rows, first, count);
-  update_column<2, 1, 1, Gradient>(args, step, debts, rows, first, count);
-  update_column<1, 4, 1, Gradient>(args, step, debts, rows, first, count);
-  update_column<3, 1, 1, Gradient>(args, step, debts, rows, first, count);
+  if (thread < count) {
+    quat.load(args, rows, thread, 0);
+    opacity.load(args, rows, thread, 0);
+  }
+  constexpr int kUnroll = 3;
+  const int packs = static_cast<int>(args.columns[4].width) / ShWidth, items = count * packs;
+  for (int base = thread; base < items; base += kThreads * kUnroll) {
+    Item<4, ShWidth, Gradient> sh[kUnroll];
+#pragma unroll
+    for (int u = 0; u < kUnroll; ++u) {
+      const int item = base + u * kThreads;
+      if (item < items) sh[u].load(args, rows, item / packs, item % packs);
+    }
+#pragma unroll
+    for (int u = 0; u < kUnroll; ++u) {
+      if (base + u * kThreads < items) sh[u].finish(args, step, debts, rows);
+    }
+  }
+  if (thread < 3 * count) {
+    mean.finish(args, step, debts, rows);
+    scale.finish(args, step, debts, rows);
+  }
+  if (thread < count) {
+    quat.finish(args, step, debts, rows);
+    opacity.finish(args, step, debts, rows);
+  }
 }
 
 }  // namespace
 
 template <class T>
-void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream stream) {
+void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
   static_assert(std::is_same_v<T, float>);
   if (args.n == 0) return;
-  const bool with_gradient = args.columns[0].grad != nullptr;
+  AdamDebt<float>* debts = nullptr;
+  if (args.target() > 0 && !args.sparse) {
+    debts = workspace.allocate<AdamDebt<float>>(args.target());
+    list_debts<<<blocks_for(args.target(), 64), 64, 0, stream>>>(args, debts);
+    check_launch("list_debts");
+  }
   const bool wide = args.columns[4].width % 4 == 0;
-  const unsigned blocks = blocks_for(args.n, kRows);
-  auto kernel = with_gradient ? (wide ? lazy_adam_kernel<4, true> : lazy_adam_kernel<1, true>)
-                              : (wide ? lazy_adam_kernel<4, false> : lazy_adam_kernel<1, false>);
-  kernel<<<blocks, kThreads, 0, stream>>>(args);
+  auto kernel = args.with_gradient() ? (wide ? lazy_adam_kernel<4, true> : lazy_adam_kernel<1, true>)
+                                     : (wide ? lazy_adam_kernel<4, false> : lazy_adam_kernel<1, false>);
+  kernel<<<blocks_for(args.n, kRows), kThreads, 0, stream>>>(args, debts);
   check_launch("lazy_adam");
 }
 

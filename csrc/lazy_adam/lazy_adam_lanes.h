@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The update of one row, eight elements at a time, over the lane types of math/lanes.h: operation for
-// operation what adam_catch_up() and adam_update() do, hence the same bits. Compiled plain and with AVX2.
+// operation what adam_drift() and adam_update() do, hence the same bits. Compiled plain and with AVX2.
 #pragma once
 #include <cstdint>
 
@@ -9,15 +9,16 @@
 
 namespace blitzgs::cpu {
 
-// The elements for which eps matters while they catch up; rare, and left to plain code.
+// The elements that drift step by step; rare, and left to plain code.
 template <class T>
-using ExplicitDrift = T (*)(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T v);
+using ExplicitDrift = T (*)(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T root);
 
 template <class T>
 struct AdamRowJob {
   const AdamArgs<T>& args;
   const AdamStep<T>& step;
-  const AdamDebt<T>& debt;
+  const AdamRow<T>& state;
+  const AdamDebt<T>* debt;  // null unless the row moves
   ExplicitDrift<T> explicit_drift;
   std::int64_t row, list_row;
 };
@@ -30,56 +31,67 @@ AdamRowUpdate<float> avx2_adam_row_update();
 
 namespace {
 
-// Eight elements and what differs between their learning-rate groups.
-template <class Lanes>
-struct AdamElements {
-  Lanes p, m, v, drift, rate;
-};
+// One number per lane, which depends on its learning-rate group. Groups ascend.
+template <class Lanes, class F>
+Lanes by_group(const int* groups, const F& value) {
+  if (groups[0] == groups[kLanes - 1]) return Lanes::broadcast(value(groups[0]));
+  typename Lanes::Scalar values[kLanes];
+  for (int i = 0; i < kLanes; ++i) values[i] = value(groups[i]);
+  return Lanes::load(values);
+}
 
+// Returns the drift of eight elements; m and v where the parameters stand.
 template <class Lanes, class T>
-void catch_up(const AdamRowJob<T>& job, const int* groups, AdamElements<Lanes>& x) {
-  const Lanes zero = Lanes::zero(), root = Lanes::sqrt(x.v);
-  const auto moving = Lanes::greater(Lanes::abs(x.m), zero);
-  const auto simple = moving & Lanes::greater(root, Lanes::broadcast(job.debt.negligible));
-  Lanes drift = Lanes::keep(simple, x.m / root * x.drift);
-  if (unsigned bits = moving.and_not(simple).bits()) {
-    T m[kLanes], v[kLanes], each[kLanes];
-    x.m.store(m);
-    x.v.store(v);
+Lanes drift_of(const AdamRowJob<T>& job, const int* groups, Lanes m, Lanes v) {
+  const AdamDebt<T>& debt = *job.debt;
+  const Lanes root = Lanes::sqrt(v), eps = Lanes::broadcast(static_cast<T>(job.args.eps));
+  const auto moving = Lanes::greater(Lanes::abs(m), Lanes::zero());
+  const auto ruled = moving & Lanes::greater(root, Lanes::broadcast(debt.explicit_up_to));
+  Lanes parts[2];
+  for (int i = 0; i < 2; ++i) {
+    const Lanes place = by_group<Lanes>(groups, [&](int g) { return debt.rules[g].place[i]; });
+    const Lanes weight = by_group<Lanes>(groups, [&](int g) { return debt.rules[g].weight[i]; });
+    parts[i] = m / (place * root + eps) * weight;
+  }
+  Lanes drift = Lanes::keep(ruled, parts[0] + parts[1]);
+  if (unsigned bits = moving.and_not(ruled).bits()) {
+    T ms[kLanes], roots[kLanes], each[kLanes];
+    m.store(ms);
+    root.store(roots);
     drift.store(each);
     for (int i = 0; i < kLanes; ++i) {
-      if (bits >> i & 1) each[i] = job.explicit_drift(job.args, job.debt, groups[i], m[i], v[i]);
+      if (bits >> i & 1) each[i] = job.explicit_drift(job.args, debt, groups[i], ms[i], roots[i]);
     }
     drift = Lanes::load(each);
   }
-  x.p = x.p - drift;
-  x.m = x.m * Lanes::broadcast(job.debt.decay1);
-  x.v = x.v * Lanes::broadcast(job.debt.decay2);
+  return drift;
 }
 
 template <class Lanes, class T>
-void take_step(const AdamStep<T>& s, Lanes g, AdamElements<Lanes>& x) {
-  x.m = Lanes::broadcast(s.beta1) * x.m + Lanes::broadcast(s.one_minus_beta1) * g;
-  x.v = Lanes::broadcast(s.beta2) * x.v + Lanes::broadcast(s.one_minus_beta2) * (g * g);
-  const Lanes root = Lanes::sqrt(x.v) * Lanes::broadcast(s.inverse_root2) + Lanes::broadcast(s.eps);
-  x.p = x.p - x.rate * x.m / root;
+void take_step(const AdamStep<T>& s, const int* groups, Lanes g, Lanes& p, Lanes& m, Lanes& v) {
+  m = Lanes::broadcast(s.beta1) * m + Lanes::broadcast(s.one_minus_beta1) * g;
+  v = Lanes::broadcast(s.beta2) * v + Lanes::broadcast(s.one_minus_beta2) * (g * g);
+  const Lanes root = Lanes::sqrt(v) * Lanes::broadcast(s.inverse_root2) + Lanes::broadcast(s.eps);
+  p = p - by_group<Lanes>(groups, [&](int i) { return s.rate[i]; }) * m / root;
 }
 
-// Updates eight elements in place; g null: catch up only.
+// Updates eight elements in place; g null: the parameters catch up.
 template <class Lanes, class T>
 void update_elements(const AdamRowJob<T>& job, const int* groups, T* p, T* m, T* v, const T* g) {
-  T drift[kLanes], rate[kLanes];
-  for (int i = 0; i < kLanes; ++i) {
-    drift[i] = job.debt.drift[groups[i]];
-    rate[i] = job.step.rate[groups[i]];
+  Lanes param = Lanes::load(p), first = Lanes::load(m), second = Lanes::load(v);
+  const AdamRow<T>& state = job.state;
+  if (job.debt) {
+    param = param - drift_of<Lanes>(job, groups, first * Lanes::broadcast(state.here1),
+                                    second * Lanes::broadcast(state.here2));
   }
-  AdamElements<Lanes> x{Lanes::load(p), Lanes::load(m), Lanes::load(v), Lanes::load(drift),
-                        Lanes::load(rate)};
-  if (job.debt.from < job.debt.to) catch_up(job, groups, x);
-  if (g) take_step(job.step, Lanes::load(g), x);
-  x.p.store(p);
-  x.m.store(m);
-  x.v.store(v);
+  if (g) {
+    first = first * Lanes::broadcast(state.then1);
+    second = second * Lanes::broadcast(state.then2);
+    take_step(job.step, groups, Lanes::load(g), param, first, second);
+    first.store(m);
+    second.store(v);
+  }
+  param.store(p);
 }
 
 // Elements of several short columns, gathered to fill the lanes.
@@ -101,6 +113,7 @@ class AdamGather {
 
   void flush() {
     if (used_ == 0) return;
+    const bool step = job_.args.columns[0].grad != nullptr;
     T p[kLanes] = {}, m[kLanes] = {}, v[kLanes] = {};
     for (int i = 0; i < used_; ++i) {
       p[i] = *from_[i].p;
@@ -109,11 +122,12 @@ class AdamGather {
     }
     for (int i = used_; i < kLanes; ++i) {
       g_[i] = T(0);
-      groups_[i] = 0;
+      groups_[i] = groups_[used_ - 1];
     }
-    update_elements<Lanes>(job_, groups_, p, m, v, job_.args.columns[0].grad ? g_ : nullptr);
+    update_elements<Lanes>(job_, groups_, p, m, v, step ? g_ : nullptr);
     for (int i = 0; i < used_; ++i) {
       *from_[i].p = p[i];
+      if (!step) continue;
       *from_[i].m = m[i];
       *from_[i].v = v[i];
     }

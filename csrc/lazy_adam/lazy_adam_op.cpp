@@ -31,8 +31,8 @@ void check_lists(const char* op, const std::vector<Tensor>& tensors, const char*
 // grads empty = catch up only.
 void run_lazy_adam(const char* op, std::vector<Tensor>& params, std::vector<Tensor>& exp_avgs,
                    std::vector<Tensor>& exp_avg_sqs, const std::vector<Tensor>& grads,
-                   const std::optional<Tensor>& ids, Tensor& last_step, const Tensor& table,
-                   const Tensor& lr_table, const AdamOptions& options) {
+                   const std::optional<Tensor>& ids, Tensor& last_step, Tensor& moment_step,
+                   const Tensor& table, const Tensor& lr_table, const AdamOptions& options) {
   check_lists(op, params, "params");
   check_lists(op, exp_avgs, "exp_avgs");
   check_lists(op, exp_avg_sqs, "exp_avg_sqs");
@@ -41,12 +41,15 @@ void run_lazy_adam(const char* op, std::vector<Tensor>& params, std::vector<Tens
   check_floating(op, "means", like);
   check_dtype(op, "last_step", last_step, ScalarType::Int);
   check_shape(op, "last_step", last_step, {rows});
+  check_dtype(op, "moment_step", moment_step, ScalarType::Int);
+  check_shape(op, "moment_step", moment_step, {rows});
   check_dtype(op, "table", table, ScalarType::Double);
   check_shape(op, "table", table, {-1, kAdamTable});
   check_dtype(op, "lr_table", lr_table, ScalarType::Float);
   check_shape(op, "lr_table", lr_table, {table.size(0), kAdamGroups});
-  STD_TORCH_CHECK(table.is_contiguous() && lr_table.is_contiguous() && last_step.is_contiguous(),
-                  "blitzgs::", op, ": table, lr_table and last_step must be contiguous");
+  STD_TORCH_CHECK(table.is_contiguous() && lr_table.is_contiguous() && last_step.is_contiguous() &&
+                      moment_step.is_contiguous(),
+                  "blitzgs::", op, ": table, lr_table, last_step and moment_step must be contiguous");
   STD_TORCH_CHECK(options.step >= 0 && options.step < table.size(0), "blitzgs::", op, ": step ", options.step,
                   " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
   std::optional<Tensor> list;
@@ -85,6 +88,7 @@ void run_lazy_adam(const char* op, std::vector<Tensor>& params, std::vector<Tens
     args.ids = data_or_null<std::int32_t>(list);
     args.n = n;
     args.last_step = mutable_data<std::int32_t>(last_step);
+    args.moment_step = mutable_data<std::int32_t>(moment_step);
     args.table = data<double>(table);
     args.lr_table = data<float>(lr_table);
     args.step = static_cast<std::int32_t>(options.step);
@@ -99,20 +103,21 @@ void run_lazy_adam(const char* op, std::vector<Tensor>& params, std::vector<Tens
 
 void lazy_adam_step_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
                      std::vector<Tensor> exp_avg_sqs, std::vector<Tensor> grads, const Tensor& ids,
-                     Tensor last_step, const Tensor& table, const Tensor& lr_table, std::int64_t step,
-                     std::int64_t explicit_steps, double beta1, double beta2, double eps, bool sparse) {
+                     Tensor last_step, Tensor moment_step, const Tensor& table, const Tensor& lr_table,
+                     std::int64_t step, std::int64_t explicit_steps, double beta1, double beta2, double eps,
+                     bool sparse) {
   check_lists("lazy_adam_step_", grads, "grads");
   STD_TORCH_CHECK(step >= 1, "blitzgs::lazy_adam_step_: steps count from 1, got ", step);
-  run_lazy_adam("lazy_adam_step_", params, exp_avgs, exp_avg_sqs, grads, ids, last_step, table, lr_table,
-                {step, explicit_steps, beta1, beta2, eps, sparse});
+  run_lazy_adam("lazy_adam_step_", params, exp_avgs, exp_avg_sqs, grads, ids, last_step, moment_step, table,
+                lr_table, {step, explicit_steps, beta1, beta2, eps, sparse});
 }
 
 void lazy_adam_catch_up_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
                          std::vector<Tensor> exp_avg_sqs, const std::optional<Tensor>& ids, Tensor last_step,
-                         const Tensor& table, const Tensor& lr_table, std::int64_t step,
+                         Tensor moment_step, const Tensor& table, const Tensor& lr_table, std::int64_t step,
                          std::int64_t explicit_steps, double beta1, double beta2, double eps) {
-  run_lazy_adam("lazy_adam_catch_up_", params, exp_avgs, exp_avg_sqs, {}, ids, last_step, table, lr_table,
-                {step, explicit_steps, beta1, beta2, eps, false});
+  run_lazy_adam("lazy_adam_catch_up_", params, exp_avgs, exp_avg_sqs, {}, ids, last_step, moment_step, table,
+                lr_table, {step, explicit_steps, beta1, beta2, eps, false});
 }
 
 }  // namespace

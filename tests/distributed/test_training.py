@@ -96,7 +96,7 @@ def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
     assert events[-1]["held_back"] > 0  # the cap chose among all ranks' candidates
     assert any(e.get("redistributed") for e in events)
     got, want = sorted_table(folder), sorted_table(whole)
-    for name in ("id", "parent", "birth", "level", "last_step"):
+    for name in ("id", "parent", "birth", "level", "last_step", "moment_step"):
         assert torch.equal(got[name], want[name]), name
     for name in ("means", "quats", "scales", "opacities", "sh"):
         assert (got[name] - want[name]).norm() <= 1e-5 * want[name].norm(), name

@@ -22,6 +22,7 @@ class State:
         self.exp_avgs = [torch.zeros_like(p) for p in self.params]
         self.exp_avg_sqs = [torch.zeros_like(p) for p in self.params]
         self.last_step = torch.zeros(n, dtype=torch.int32, device=device)
+        self.moment_step = torch.zeros_like(self.last_step)
 
     def moments(self):
         return self.exp_avgs, self.exp_avg_sqs
@@ -33,6 +34,7 @@ class State:
             grads,
             ids,
             self.last_step,
+            self.moment_step,
             lr_table,
             step,
             BETA1,
@@ -43,8 +45,26 @@ class State:
 
     def catch_up(self, ids, lr_table, step):
         lazy_adam_catch_up_(
-            self.params, *self.moments(), ids, self.last_step, lr_table, step, BETA1, BETA2, EPS
+            self.params,
+            *self.moments(),
+            ids,
+            self.last_step,
+            self.moment_step,
+            lr_table,
+            step,
+            BETA1,
+            BETA2,
+            EPS,
         )
+
+    def moments_at(self, step):
+        """Both moments with the decay that they still owe at `step`, float64."""
+        gaps = (step - self.moment_step).double()
+        return [
+            [(m.double().flatten(1).T * beta**gaps).T.reshape(m.shape) if m.dim() > 1 else m * beta**gaps
+             for m in moments]
+            for beta, moments in ((BETA1, self.exp_avgs), (BETA2, self.exp_avg_sqs))
+        ]  # fmt: skip
 
 
 def learning_rates(steps):
@@ -124,7 +144,7 @@ def test_equals_dense_adam_over_thousands_of_steps(dtype):
             assert error <= 1.5 * (dense32.double() - dense).abs().max()
         else:
             assert error < 1e-11
-    for ours, name in ((state.exp_avgs, "exp_avg"), (state.exp_avg_sqs, "exp_avg_sq")):
+    for ours, name in zip(state.moments_at(steps), ("exp_avg", "exp_avg_sq"), strict=True):
         for mine, dense in zip(ours, exact.moment(name), strict=True):
             tolerance = 1e-4 if dtype == torch.float32 else 1e-11
             largest = float(dense.abs().max())
@@ -170,6 +190,90 @@ def test_eps_is_exact_where_it_matters():
     state.catch_up(None, lr_table, 400)
     for ours, exact in zip(state.params, dense.params(), strict=True):
         torch.testing.assert_close(ours, exact, rtol=0, atol=1e-9)
+
+
+def scattered_state(n, dtype, step):
+    """Rows that stand at `step` with second moments of 1e-40 to 1 and any first moment, some of it zero."""
+    state = State(n, dtype)
+    generator = torch.Generator().manual_seed(11)
+    for m, v in zip(*state.moments(), strict=True):
+        root = 10.0 ** (20 * torch.rand(v.shape, generator=generator, dtype=torch.float64) - 20)
+        share = torch.randn(v.shape, generator=generator, dtype=torch.float64)
+        share[torch.rand(v.shape, generator=generator) < 0.1] = 0
+        v.copy_(root**2)
+        m.copy_(v.double().sqrt() * share)
+    state.last_step.fill_(step)
+    state.moment_step.fill_(step)
+    return state
+
+
+def drift_one_by_one(state, lr_table, begin, end):
+    """What dense Adam subtracts from the parameters over zero gradients, float64."""
+    rates = lr_table.double()
+    drifts = []
+    for c, (m, v) in enumerate(zip(*(map(torch.Tensor.double, x) for x in state.moments()), strict=True)):
+        root, drift = v.sqrt(), torch.zeros_like(m)
+        for t in range(begin + 1, end + 1):
+            j = t - begin
+            rate = rates[t, c].expand(m.shape).clone()
+            if c == 4:
+                rate[:, 1:] = rates[t, 5]
+            first = m * BETA1**j / (1 - BETA1**t)
+            drift += rate * first / (root * BETA2 ** (j / 2) / math.sqrt(1 - BETA2**t) + EPS)
+        drifts.append(drift)
+    return drifts
+
+
+@pytest.mark.parametrize("begin", [1, 30, 150, 400, 2000])
+@pytest.mark.parametrize("gap", [1, 2, 40, 700])
+def test_float32_drift_of_any_second_moment(begin, gap):
+    """The rules (late) and the steps one by one (early) are exact to rounding wherever eps weighs."""
+    lr_table = learning_rates(4000)
+    state = scattered_state(200, torch.float32, begin)
+    for p in state.params:
+        p.zero_()  # so that the parameter is the drift, unrounded
+    state.catch_up(None, lr_table, begin + gap)
+    for ours, exact in zip(state.params, drift_one_by_one(state, lr_table, begin, begin + gap), strict=True):
+        normal = exact.abs() > 1e-30
+        assert normal.double().mean() > 0.8
+        torch.testing.assert_close(-ours.double()[normal], exact[normal], rtol=4e-6, atol=0)
+        assert (ours[~normal].abs() < 1e-29).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_catching_up_in_parts_is_catching_up_at_once(dtype):
+    """Moments stand still meanwhile; past the steps that matter nothing is left to do."""
+    lr_table = learning_rates(4000)
+    begin, tolerance = 900, 3e-6 if dtype == torch.float32 else 1e-12
+    once, parts = (scattered_state(50, dtype, begin) for _ in range(2))
+    moments = [m.clone() for m in (*once.exp_avgs, *once.exp_avg_sqs)]
+    for p in (*once.params, *parts.params):
+        p.zero_()
+    for step in (901, 902, 917, 940, 1300, 3000):
+        parts.catch_up(None, lr_table, step)
+    once.catch_up(None, lr_table, 3000)
+    for a, b in zip(once.params, parts.params, strict=True):
+        torch.testing.assert_close(a, b, rtol=tolerance, atol=1e-37)
+    for before, after in zip(moments, (*parts.exp_avgs, *parts.exp_avg_sqs), strict=True):
+        assert torch.equal(before, after)
+    assert bool((parts.moment_step == begin).all()) and bool((parts.last_step == 3000).all())
+
+
+def test_a_step_after_catching_up_equals_a_step_alone():
+    lr_table = learning_rates(1000)
+    a, b = (scattered_state(40, torch.float64, 500) for _ in range(2))
+    ids = torch.arange(40, dtype=torch.int32)
+    grads = [
+        torch.randn(s, generator=torch.Generator().manual_seed(2), dtype=torch.float64) for s in shapes(40)
+    ]
+    a.catch_up(ids, lr_table, 533)
+    for state in (a, b):
+        state.step(grads, ids, lr_table, 541)
+        assert bool((state.last_step == 541).all()) and bool((state.moment_step == 541).all())
+    for x, y in zip((*a.exp_avgs, *a.exp_avg_sqs), (*b.exp_avgs, *b.exp_avg_sqs), strict=True):
+        assert torch.equal(x, y)
+    for x, y in zip(a.params, b.params, strict=True):
+        torch.testing.assert_close(x, y, rtol=0, atol=1e-13)
 
 
 def test_order_of_the_list_does_not_matter():
@@ -221,7 +325,18 @@ def test_empty_list_and_zero_gradient():
 def test_errors_name_the_value():
     state, lr_table = one_update()
     with pytest.raises(ValueError, match=r"beta1=0.9, beta2=0.5"):
-        lazy_adam_catch_up_(state.params, *state.moments(), None, state.last_step, lr_table, 5, 0.9, 0.5, EPS)
+        lazy_adam_catch_up_(
+            state.params,
+            *state.moments(),
+            None,
+            state.last_step,
+            state.moment_step,
+            lr_table,
+            5,
+            0.9,
+            0.5,
+            EPS,
+        )
     with pytest.raises(
         RuntimeError, match="step 9999 is outside the learning-rate table, which ends at step 4000"
     ):
@@ -248,6 +363,7 @@ def test_opcheck():
             grads,
             ids,
             state.last_step,
+            state.moment_step,
             table,
             lr_table,
             2,
@@ -260,7 +376,20 @@ def test_opcheck():
     )
     torch.library.opcheck(
         torch.ops.blitzgs.lazy_adam_catch_up_,
-        (state.params, *state.moments(), ids, state.last_step, table, lr_table, 9, 100, BETA1, BETA2, EPS),
+        (
+            state.params,
+            *state.moments(),
+            ids,
+            state.last_step,
+            state.moment_step,
+            table,
+            lr_table,
+            9,
+            100,
+            BETA1,
+            BETA2,
+            EPS,
+        ),
     )
 
 
@@ -279,4 +408,5 @@ def test_cuda_equals_cpu(k):
         state.catch_up(None, rates[device], 300)
     for name in ("params", "exp_avgs", "exp_avg_sqs"):
         for a, b in zip(getattr(states["cpu"], name), getattr(states["cuda"], name), strict=True):
-            torch.testing.assert_close(a, b.cpu(), rtol=1e-4, atol=1e-5 * float(a.abs().max()))
+            assert torch.equal(a, b.cpu())  # bit for bit
+    assert torch.equal(states["cpu"].moment_step, states["cuda"].moment_step.cpu())

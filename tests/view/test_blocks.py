@@ -133,14 +133,16 @@ def test_nothing_is_missed_while_thousands_of_steps_are_pending(device):
             dense = {name: table[name].clone() for name in table}
             lazy_adam_catch_up_(
                 *([dense[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)), None,
-                dense["last_step"], rates, step - 1, beta1, beta2, eps,
+                dense["last_step"], dense["moment_step"], rates, step - 1, beta1, beta2, eps,
             )  # fmt: skip
             expected = {row for row, _ in seen(dense, viewmats, Ks)}
             assert expected <= set(ids.tolist())
             crossed += len({row for row, _ in seen(table, viewmats, Ks)} ^ expected)
         ids = ids[torch.rand(len(ids), generator=generator).to(device) < 0.5]  # the rest turns out invisible
         grads = [torch.randn((len(ids), *p.shape[1:]), generator=generator).to(device) for p in columns[0]]
-        lazy_adam_step_(*columns, grads, ids, table["last_step"], rates, step, beta1, beta2, eps)
+        lazy_adam_step_(
+            *columns, grads, ids, table["last_step"], table["moment_step"], rates, step, beta1, beta2, eps
+        )
         index.update(table, ids)
     assert crossed > 0  # pending drift really moved rows across the views' borders
     assert int(table["last_step"].min()) < steps - 20
@@ -205,7 +207,7 @@ def test_opcheck(device):
     moments = [
         table[name] for name in ("exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales")
     ]
-    columns = (table["means"], table["scales"], moments, table["last_step"], schedule)
+    columns = (table["means"], table["scales"], moments, table["last_step"], table["moment_step"], schedule)
     torch.library.opcheck(torch.ops.blitzgs.morton_keys, (table["means"],))
     torch.library.opcheck(torch.ops.blitzgs.update_block_bounds_, (bounds, None, *columns))
     torch.library.opcheck(
