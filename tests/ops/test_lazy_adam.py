@@ -29,33 +29,15 @@ class State:
 
     def step(self, grads, ids, lr_table, step, **kwargs):
         lazy_adam_step_(
-            self.params,
-            *self.moments(),
-            grads,
-            ids,
-            self.last_step,
-            self.moment_step,
-            lr_table,
-            step,
-            BETA1,
-            BETA2,
-            EPS,
-            **kwargs,
-        )
+            self.params, *self.moments(), grads, ids, self.last_step, self.moment_step, lr_table, step,
+            BETA1, BETA2, EPS, **kwargs,
+        )  # fmt: skip
 
     def catch_up(self, ids, lr_table, step):
         lazy_adam_catch_up_(
-            self.params,
-            *self.moments(),
-            ids,
-            self.last_step,
-            self.moment_step,
-            lr_table,
-            step,
-            BETA1,
-            BETA2,
-            EPS,
-        )
+            self.params, *self.moments(), ids, self.last_step, self.moment_step, lr_table, step,
+            BETA1, BETA2, EPS,
+        )  # fmt: skip
 
     def moments_at(self, step):
         """Both moments with the decay that they still owe at `step`, float64."""
@@ -326,17 +308,9 @@ def test_errors_name_the_value():
     state, lr_table = one_update()
     with pytest.raises(ValueError, match=r"beta1=0.9, beta2=0.5"):
         lazy_adam_catch_up_(
-            state.params,
-            *state.moments(),
-            None,
-            state.last_step,
-            state.moment_step,
-            lr_table,
-            5,
-            0.9,
-            0.5,
-            EPS,
-        )
+            state.params, *state.moments(), None, state.last_step, state.moment_step, lr_table, 5,
+            0.9, 0.5, EPS,
+        )  # fmt: skip
     with pytest.raises(
         RuntimeError, match="step 9999 is outside the learning-rate table, which ends at step 4000"
     ):
@@ -355,41 +329,14 @@ def test_opcheck():
     table = schedule_table(lr_table, BETA1, BETA2)
     grads = [torch.randn(s) for s in shapes(2)]
     ids = torch.tensor([1, 3], dtype=torch.int32)
+    columns = state.params, *state.moments()
+    steps = state.last_step, state.moment_step, table, lr_table
     torch.library.opcheck(
         torch.ops.blitzgs.lazy_adam_step_,
-        (
-            state.params,
-            *state.moments(),
-            grads,
-            ids,
-            state.last_step,
-            state.moment_step,
-            table,
-            lr_table,
-            2,
-            100,
-            BETA1,
-            BETA2,
-            EPS,
-            False,
-        ),
+        (*columns, grads, ids, *steps, 2, 100, BETA1, BETA2, EPS, False),
     )
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_catch_up_,
-        (
-            state.params,
-            *state.moments(),
-            ids,
-            state.last_step,
-            state.moment_step,
-            table,
-            lr_table,
-            9,
-            100,
-            BETA1,
-            BETA2,
-            EPS,
-        ),
+        torch.ops.blitzgs.lazy_adam_catch_up_, (*columns, ids, *steps, 9, 100, BETA1, BETA2, EPS)
     )
 
 
