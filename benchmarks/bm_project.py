@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of projection, forward and backward, against the bytes it has to move.
 
+The scene's Gaussians are in random order; the last lines are of a table in Morton order with the active rows
+given, as in training.
+
 python benchmarks/bm_project.py [--device cuda] [--gaussians 4000000] [--views 1 4]
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from typing import Any
 
 import torch
@@ -14,8 +18,11 @@ from scenes import BenchmarkScene, aerial
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
-from blitzgs.ops.project import Rows
+from blitzgs.ops.blocks import BLOCK_ROWS, cull_blocks, update_block_bounds_
+from blitzgs.ops.project import Rows, project_rows
+from blitzgs.view.blocks import morton_order
 
+COLUMNS = ("means", "quats", "scales", "opacities", "sh")
 CULL_BYTES = 4 * (3 + 3 + 1)  # mean, scales, opacity: read for every Gaussian
 VISIBLE_BYTES = 4 * (4 + 48)  # quaternion, SH: read for the visible ones
 ROW_BYTES = 4 * (1 + 1 + 2 + 3 + 1 + 1 + 3 + 2 + 1)  # written
@@ -23,12 +30,29 @@ ROW_GRADIENT_BYTES = 4 * (2 + 3 + 1 + 3)  # read backward
 GRADIENT_BYTES = 4 * 59  # parameters read and gradients written backward, each
 
 
-def arguments(scene: BenchmarkScene, active_ids: Tensor | None = None) -> tuple[Any, ...]:
+def arguments(
+    scene: BenchmarkScene, active_ids: Tensor | None = None, active_views: Tensor | None = None
+) -> tuple[Any, ...]:
     raw = scene.raw()
     return (
-        *raw.values(), scene.viewmats, scene.Ks, active_ids, None, scene.width, scene.height, 16, 3, 0.01,
+        *raw.values(), scene.viewmats, scene.Ks, active_ids, active_views, scene.width, scene.height, 16, 3, 0.01,
         1e10, 0.3, 0.0, False, True,
     )  # fmt: skip
+
+
+def in_morton_order(scene: BenchmarkScene) -> BenchmarkScene:
+    order = morton_order(scene.means)
+    sorted_columns = {name: getattr(scene, name)[order].contiguous() for name in COLUMNS}
+    return dataclasses.replace(scene, **sorted_columns)
+
+
+def active_rows(scene: BenchmarkScene) -> tuple[Tensor, Tensor]:
+    raw = scene.raw()
+    bounds = torch.empty(-(-len(scene.means) // BLOCK_ROWS), 7, device=scene.means.device)
+    update_block_bounds_(bounds, None, raw["means"], raw["scales"])
+    return cull_blocks(
+        bounds, raw["means"], raw["scales"], scene.viewmats, scene.Ks, scene.width, scene.height, 0.01, 1e10
+    )
 
 
 def backward_arguments(scene: BenchmarkScene, rows: Rows) -> tuple[Any, ...]:
@@ -53,7 +77,7 @@ def main() -> None:
     for views in args.views:
         scene = aerial(args.gaussians, args.device, views=views)
         forward = arguments(scene)
-        rows = Rows(*torch.ops.blitzgs.project_fwd(*forward))
+        rows = project_rows(*forward)
         visible, n_rows, _ = rows.counts.tolist()
 
         def report(name: str, milliseconds: float, megabytes: float, n_rows: int = n_rows) -> None:
@@ -63,12 +87,22 @@ def main() -> None:
 
         print(f"{views} view(s): {visible} visible, {n_rows} rows")
         moved = VISIBLE_BYTES * visible + ROW_BYTES * n_rows
-        time = median_ms(torch.ops.blitzgs.project_fwd, [forward], args.repeats)
+        time = median_ms(project_rows, [forward], args.repeats)
         report("forward, all candidates", time, (CULL_BYTES * args.gaussians + moved) / 1e6)
-        time = median_ms(torch.ops.blitzgs.project_fwd, [arguments(scene, rows.visible_ids)], args.repeats)
+        time = median_ms(project_rows, [arguments(scene, rows.visible_ids)], args.repeats)
         report("forward, the visible given", time, (CULL_BYTES * visible + moved) / 1e6)
+        back = (2 * GRADIENT_BYTES * visible + ROW_GRADIENT_BYTES * n_rows) / 1e6
         time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, rows)], args.repeats)
-        report("backward", time, (2 * GRADIENT_BYTES * visible + ROW_GRADIENT_BYTES * n_rows) / 1e6)
+        report("backward", time, back)
+        del rows, forward
+        scene = in_morton_order(scene)
+        active = active_rows(scene)
+        forward = arguments(scene, *active)
+        rows = project_rows(*forward)
+        time = median_ms(project_rows, [forward], args.repeats)
+        report(f"Morton order, {len(active[0])} active", time, (CULL_BYTES * len(active[0]) + moved) / 1e6)
+        time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, rows)], args.repeats)
+        report("Morton order, backward", time, back)
 
 
 if __name__ == "__main__":

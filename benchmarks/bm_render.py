@@ -21,7 +21,7 @@ import torch
 from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401
+from blitzgs.ops.project import project_rows
 
 ops = torch.ops.blitzgs
 TILE_SIZE = 16
@@ -46,7 +46,7 @@ class OurRender:
     def project(self) -> None:
         """Run the projection."""
         s = self.scene
-        self.rows = ops.project_fwd(
+        self.rows = project_rows(
             *self.parameters, *self.cameras, None, None, s.width, s.height, TILE_SIZE, 3, 0.01, 1e10, 0.3,
             0.0, False, True,
         )  # fmt: skip
@@ -54,7 +54,7 @@ class OurRender:
     def intersect(self) -> None:
         """List the rows of each tile."""
         r = self.rows
-        count = int(r[11][2])
+        count = int(r.counts[2])
         self.lists = ops.intersect(r[4], r[5], r[7], r[6], r[1], None, *self.grid, count)
 
     def rasterize(self) -> None:
@@ -163,7 +163,7 @@ def run(name: str, repeats: int) -> dict[str, Any]:
     ours = OurRender(scene)
     result: dict[str, Any] = {"scene": scene.name, "blitzgs": measure(ours, v, repeats)}
     image = ours.forward()
-    result["visible"], result["rows"], result["intersections"] = ours.rows[11].tolist()
+    result["visible"], result["rows"], result["intersections"] = ours.rows.counts.tolist()
     result["stages"] = stages(ours, v, repeats)
     del ours.saved, ours.splats, ours.lists, ours.rows, ours.v_rows, ours.gradients
     try:

@@ -16,10 +16,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.exchange import Route, Splats, count_by_view, plan_route, send, send_back
+from blitzgs.distributed.exchange import Route, Splats, plan_route, read_traffic, send, send_back
 from blitzgs.distributed.ownership import Share
 from blitzgs.model import GaussianTable
+from blitzgs.ops.host import to_host
 from blitzgs.ops.project import Rows
+from blitzgs.ops.route import route_rows
 
 Mark = Callable[[str], None]
 
@@ -153,27 +155,11 @@ def forward(
         The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
         ranks shared the work.
     """
-    active = active or Active()
-    count = len(views)
-    rows = Rows(
-        *torch.ops.blitzgs.project_fwd(
-            *table.parameters, views.viewmats, views.Ks, active.ids, active.views, views.width, views.height,
-            options.tile_size, options.sh_degree, options.near_plane, options.far_plane, options.eps2d, 0.0,
-            options.antialiased, True,
-        )
-    )  # fmt: skip
+    count, tiles = len(views), (0, -1)
+    rows, splats, route, n_isects, visible = _project(table, views, options, active, share)
     mark("project")
-    splats = Splats(
-        rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
-        table["id"][rows.gaussian_ids],
-    )  # fmt: skip
-    route, n_isects, tiles = None, int(rows.counts[2]), (0, -1)
-    if share is None:
-        visible = count_by_view(rows.camera_ids, count)
-    else:
-        route, tiles = plan_route(splats, share.ranges, share.ranks, share.half), share.composited
-        splats = send(splats, route, share.ranks)
-        n_isects, visible = route.n_isects, route.visible
+    if share is not None and route is not None:
+        splats, tiles = send(splats, route, share.ranks), share.composited
     mark("exchange")
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids, count,
@@ -239,3 +225,49 @@ def backward(
     )  # fmt: skip
     mark("project back")
     return Gradients(tuple(parameters), v_means2d)
+
+
+def _project(
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: Active | None,
+    share: Share | None,
+) -> tuple[Rows, Splats, Route | None, int, Tensor]:
+    """Project a table and, on several ranks, agree on which row goes where: the step's one wait.
+
+    Returns this rank's rows; the same as splats; where they go (None: they stay); at least the number of
+    intersections to composite here; rows of each view over all ranks, int64 [B].
+    """
+    active = active or Active()
+    # Halves are routed by what arrives: rounding may move a splat's border over that of a tile.
+    asking = share if share is not None and not share.half else None
+    wanted = [] if asking is None else [asking.ranges.composited(m) for m in range(asking.ranks.world_size)]
+    arguments = (
+        *table.parameters, views.viewmats, views.Ks, active.ids, active.views, views.width, views.height,
+        options.tile_size, options.sh_degree, options.near_plane, options.far_plane, options.eps2d, 0.0,
+        options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted],
+    )  # fmt: skip
+    plan, carry, totals = torch.ops.blitzgs.project_count(*arguments)
+    traffic = None if asking is None else read_traffic(totals, len(views), asking.ranks)
+    counts = to_host(totals)[:3] if traffic is None else traffic.counts
+    rows = Rows._make((*torch.ops.blitzgs.project_emit(*arguments, plan, carry, counts), counts))
+    splats = Splats(
+        rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
+        table["id"][rows.gaussian_ids],
+    )  # fmt: skip
+    if traffic is not None:
+        route = Route(
+            route_rows(rows.rank_masks, traffic.sent),
+            traffic.sent,
+            traffic.received,
+            int(counts[1]),
+            traffic.n_isects,
+            traffic.visible,
+            None,
+        )
+    elif share is not None:
+        route = plan_route(splats, share.ranges, share.ranks, share.half)
+    else:
+        return rows, splats, None, int(counts[2]), totals[3 : 3 + len(views)]
+    return rows, splats, route, route.n_isects, route.visible

@@ -18,12 +18,19 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
 
   // Projection: parameters to screen-space rows, ordered by (Gaussian, view).
   m.def(
-      "project_fwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
-      "Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, int tile_size, "
-      "int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, bool antialiased, "
-      "bool raw) -> (Tensor gaussian_ids, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, "
+      "project_count(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
+      "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
+      "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
+      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends) -> (Tensor plan, Tensor carry, "
+      "Tensor totals)");
+  m.def(
+      "project_emit(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
+      "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
+      "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
+      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor plan, Tensor carry, "
+      "Tensor counts) -> (Tensor gaussian_ids, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, "
       "Tensor means2d, Tensor conics, Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, "
-      "Tensor tiles_touched, Tensor counts)");
+      "Tensor tiles_touched, Tensor rank_masks)");
   m.def(
       "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
       "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exchange of a step: projected splats from their owners to the ranks whose tiles they touch, and back.
 
-Each rank projects its own Gaussians. `plan_route` finds where each row has to go (one small size exchange,
-which is all the host waits for); `send` carries the rows there in one all-to-all of packed buffers;
-`send_back` returns their gradients along the same routes and adds them up at the owner, by rank, so that the
-sum does not depend on who was faster (paper §3.1). `exchange` is the differentiable form for use with
-autograd.
+Each rank projects its own Gaussians. The counting pass of the projection finds where each row will have to
+go, and `read_traffic` tells everyone (one small collective, which is all the host waits for); `send` carries
+the rows there in one all-to-all of packed buffers; `send_back` returns their gradients along the same routes
+and adds them up at the owner, by rank, so that the sum does not depend on who was faster (paper §3.1).
+`exchange` is the differentiable form for use with autograd, `plan_route` for rows that are there already.
 """
 
 from __future__ import annotations
@@ -68,8 +68,47 @@ class Route(NamedTuple):
     halves: Tensor | None
 
 
+class Traffic(NamedTuple):
+    """What the host has to know before rows are written and exchanged.
+
+    Attributes:
+        counts: int64 [3] on the CPU: this rank's visible Gaussians, rows and tiles they touch.
+        sent: rows for each rank.
+        received: rows from each rank.
+        n_isects: row-tile intersections among the rows to receive.
+        visible: int64 [B], rows of each view over all ranks.
+    """
+
+    counts: Tensor
+    sent: list[int]
+    received: list[int]
+    n_isects: int
+    visible: Tensor
+
+
+def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
+    """Agree on how many rows go where; the step's only wait for the device.
+
+    Args:
+        totals: of `project_count`, with the tiles of each rank; int64 [3 + B + 2 M].
+        n_views: B.
+        ranks: the job.
+    """
+    everyone = ranks.gather_counts(totals)
+    by_rank = ranks.read(everyone)
+    first, mine = 3 + n_views, ranks.rank
+    to_me = first + 2 * mine
+    return Traffic(
+        counts=torch.tensor(by_rank[mine][:3]),
+        sent=by_rank[mine][first::2],
+        received=[counts[to_me] for counts in by_rank],
+        n_isects=sum(counts[to_me + 1] for counts in by_rank),
+        visible=everyone[:, 3:first].sum(0),
+    )
+
+
 def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> Route:
-    """Find the ranks that each row has to reach; the step's only wait for the device.
+    """Find the ranks that each row has to reach, from the rows alone; waits for the device.
 
     Args:
         splats: this rank's rows.

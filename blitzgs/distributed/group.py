@@ -16,6 +16,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.distributed.watchdog import Watchdog, open_store
+from blitzgs.ops.host import to_host
 
 T = TypeVar("T")
 ReduceOp = Literal["sum", "min", "max"]
@@ -173,7 +174,7 @@ class Ranks:
 
     def read(self, tensor: Tensor) -> Any:
         """Return a small tensor as nested lists; waits for the device, and so for the ranks it waits for."""
-        return self._collective("read", tensor.tolist)
+        return self._collective("read", lambda: to_host(tensor).tolist())
 
     def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
         """Send consecutive groups of rows, one to each rank, and return those received, by source rank.
@@ -194,6 +195,21 @@ class Ranks:
             lambda: dist.all_to_all_single(result, rows.contiguous(), list(received), list(sent)),
         )
         return result
+
+    def gather_counts(self, counts: Tensor) -> Tensor:
+        """Tell every rank every rank's numbers.
+
+        Args:
+            counts: int64 [C] on `device`, the same C everywhere.
+
+        Returns:
+            int64 [M, C] on `device`, by rank. Does not wait for the device.
+        """
+        if self.world_size == 1:
+            return counts[None].clone()
+        gathered = counts.new_empty(self.world_size * len(counts))
+        self._collective("gather_counts", lambda: dist.all_gather_into_tensor(gathered, counts))
+        return gathered.view(self.world_size, -1)
 
     def exchange_rows(self, rows: Tensor, sent: Sequence[int]) -> tuple[Tensor, list[int]]:
         """`all_to_all` with its own size exchange; returns the rows and how many came from each rank."""

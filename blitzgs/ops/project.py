@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.host import to_host
 
 
 class Rows(NamedTuple):
@@ -25,7 +26,8 @@ class Rows(NamedTuple):
     colors: Tensor  # [P, 3]; [0, 3] without SH
     radii: Tensor  # int32 [P, 2]: half width and height of the box around alpha >= 1/255, rounded up
     tiles_touched: Tensor  # int32 [P]
-    counts: Tensor  # int64 [3] on the CPU: U, P, sum of tiles_touched
+    rank_masks: Tensor  # int64 [P]: bit m set where rank m wants the row; [0] where no rank asked
+    counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
 
 
 def project(
@@ -53,7 +55,8 @@ def project(
     """Project Gaussians into B views (EWA splatting; the image's definition).
 
     A row exists where a Gaussian can reach alpha = 1/255 in the image at a depth in (near, far]. Anything
-    NaN or infinite hides its Gaussian. Differentiable in means, quats, scales, opacities, sh and viewmats
+    NaN or infinite hides its Gaussian: there is no row, or, where only the colour is not finite, one whose
+    opacity, colour, radii and tiles are 0. Differentiable in means, quats, scales, opacities, sh and viewmats
     (dense gradients; the pose's as 12 free entries); the culling itself has no gradient.
 
     Args:
@@ -83,35 +86,36 @@ def project(
     Raises:
         RuntimeError: a wrong shape, dtype or value, by name.
     """
-    return Rows(
-        *torch.ops.blitzgs.project_fwd(
-            means,
-            quats,
-            scales,
-            opacities,
-            sh,
-            viewmats,
-            Ks,
-            active_ids,
-            active_views,
-            width,
-            height,
-            tile_size,
-            sh_degree,
-            near_plane,
-            far_plane,
-            eps2d,
-            radius_clip,
-            antialiased,
-            raw,
-        )
+    return project_rows(
+        means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width, height, tile_size,
+        sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
+    )  # fmt: skip
+
+
+def project_rows(*arguments: Any) -> Rows:
+    """`project` with the positional arguments of its ops, from means to raw, and no ranks to ask."""
+    plan, carry, totals = torch.ops.blitzgs.project_count(*arguments, [], [])
+    counts = to_host(totals)[:3]
+    rows = torch.ops.blitzgs.project_emit(*arguments, [], [], plan, carry, counts)
+    return Rows._make((*rows, counts))
+
+
+@torch.library.register_fake("blitzgs::project_count")
+def _(means: Tensor, *rest: Any) -> Any:
+    context = torch.library.get_ctx()
+    viewmats, tile_begins = rest[4], rest[18]
+    return (
+        means.new_empty(context.new_dynamic_size(), dtype=torch.int64),
+        means.new_empty(context.new_dynamic_size(), dtype=torch.uint8),
+        means.new_empty(3 + viewmats.shape[0] + 2 * len(tile_begins), dtype=torch.int64),
     )
 
 
-@torch.library.register_fake("blitzgs::project_fwd")
+@torch.library.register_fake("blitzgs::project_emit")
 def _(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None, *rest: Any) -> Any:
     context = torch.library.get_ctx()
     U, P = context.new_dynamic_size(), context.new_dynamic_size()
+    tile_begins = rest[14]
 
     def ints(*shape: Any) -> Tensor:
         return means.new_empty(shape, dtype=torch.int32)
@@ -128,7 +132,7 @@ def _(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tenso
         means.new_empty(0 if sh is None else P, 3),
         ints(P, 2),
         ints(P),
-        torch.empty(3, dtype=torch.int64, device="cpu"),
+        means.new_empty(P if tile_begins else 0, dtype=torch.int64),
     )
 
 
@@ -160,7 +164,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
     means, quats, scales, opacities, sh, viewmats, Ks = inputs[:7]
     width, height, _, sh_degree = inputs[9:13]
     eps2d, _, antialiased, raw = inputs[15:19]
-    rows = Rows(*output)
+    rows = Rows._make((*output, inputs[-1]))
     ctx.save_for_backward(
         means, quats, scales, opacities, sh, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets
     )
@@ -171,7 +175,7 @@ def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
     means, quats, scales, opacities, sh, viewmats, Ks, camera_ids, visible_ids, row_offsets = (
         ctx.saved_tensors
     )
-    v = Rows(*v_output)  # type: ignore[arg-type]
+    v = Rows._make((*v_output, None))
     P = camera_ids.shape[0]
     zeros = means.new_zeros(P, 3)
     gradients = torch.ops.blitzgs.project_bwd(
@@ -202,7 +206,7 @@ def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
         )
     ]
     v_viewmats = gradients[5] if ctx.needs_input_grad[5] else None
-    return (*dense, v_viewmats, *(None,) * 13)
+    return (*dense, v_viewmats, *(None,) * 18)
 
 
-torch.library.register_autograd("blitzgs::project_fwd", _backward, setup_context=_setup_context)
+torch.library.register_autograd("blitzgs::project_emit", _backward, setup_context=_setup_context)

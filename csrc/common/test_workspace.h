@@ -16,6 +16,8 @@ class TestWorkspace final : public Workspace {
     held_.push_back(std::make_unique<std::byte[]>(bytes));
     return held_.back().get();
   }
+  // What was allocated last; null before that.
+  void* last() const { return held_.empty() ? nullptr : held_.back().get(); }
 
  private:
   std::vector<std::unique_ptr<std::byte[]>> held_;

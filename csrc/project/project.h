@@ -4,21 +4,28 @@
 //
 // A row exists iff near < z <= far, its opacity (compensated when antialiased) is >= 1/255, the box around
 // alpha >= 1/255 overlaps the image and reaches beyond radius_clip, its view is in the candidate's mask, and
-// everything it needs is finite: a NaN or infinite parameter hides its Gaussian and spreads nowhere. With
-// radius_clip = 0 no dropped row could have changed a pixel.
+// its geometry is finite: a NaN or infinite parameter hides its Gaussian and spreads nowhere. With
+// radius_clip = 0 no dropped row could have changed a pixel. A row whose colour is not finite is there but
+// hidden: opacity, colour, radii and tiles_touched are 0, so nothing composites it (SH rows are by far the
+// most bytes, and are read once: by project_emit).
 //
 // Rows are ordered by (Gaussian, view). Every value of a row depends on its Gaussian and view alone, so rows
-// are bit-identical however Gaussians are divided among calls. Two passes with one host synchronisation
-// between them: project_count finds, in few bytes per candidate, which views see it; project_emit writes
-// those rows and evaluates SH for them alone. O(candidates * B + rows); no output of size N.
+// are bit-identical however Gaussians are divided among calls. Two passes: project_count finds, in few bytes
+// per candidate, which views see it, and sums up what there will be; project_emit, told the sums, writes
+// those rows and evaluates SH for them alone. Neither waits for the device. O(candidates * B + rows); no
+// output of size N.
+//
+// On several ranks, `ranges` says which tiles each wants. The same walk over a row's tiles that counts them
+// then finds the ranks that the row has to reach.
 //
 // project_bwd visits each visible Gaussian once, recomputes its rows and sums their gradients in row order:
 // no atomics, deterministic. The pose gradient is summed in double over fixed blocks of Gaussians.
 #pragma once
+#include <cstddef>
 #include <cstdint>
-#include <memory>
 
 #include "common/stream.h"
+#include "math/rank_tiles.h"
 #include "project/project_row.h"
 
 namespace blitzgs {
@@ -35,34 +42,31 @@ struct ProjectInputs {
   ProjectOptions<T> options;
 };
 
-// Whatever else a backend keeps between the passes (the CPU: the rows; CUDA: nothing).
-struct ProjectCarry {
-  virtual ~ProjectCarry() = default;
-};
+// What project_count sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P rows,
+// the tiles they touch (an upper bound: hidden rows count), the rows of each view [B], and for each rank its
+// rows and the tiles they touch there [M, 2].
+inline constexpr int kTotalVisible = 0, kTotalRows = 1, kTotalTiles = 2, kTotalViews = 3;
 
-// What project_count leaves for project_emit. view_masks [candidates]: bit v set iff view v sees it; and the
-// visible candidates and rows before each block of kProjectBlock candidates [blocks + 1].
-struct ProjectPlan {
-  std::uint32_t* view_masks;
-  std::int64_t *visible_before, *rows_before;
-  std::unique_ptr<ProjectCarry>* carry;
-};
+inline std::int64_t project_totals(std::int64_t n_views, std::int64_t n_ranks) {
+  return kTotalViews + n_views + 2 * n_ranks;
+}
 
 inline constexpr std::int64_t kProjectBlock = 1024;
 
 inline std::int64_t project_blocks(std::int64_t items) { return (items + kProjectBlock - 1) / kProjectBlock; }
 
-// Sizes for allocation, on the host: U visible Gaussians, P rows, tiles they touch in all.
-struct ProjectCounts {
-  std::int64_t visible = 0, rows = 0, tiles = 0;
+// What project_emit has to be told: project_totals' first two.
+struct ProjectSizes {
+  std::int64_t visible, rows;
 };
 
-// colors is null without sh. row_offsets [U + 1].
+// colors is null without sh, rank_masks (bit m: rank m wants the row) without ranges. row_offsets [U + 1].
 template <class T>
 struct ProjectOutputs {
   std::int32_t *gaussian_ids, *camera_ids, *visible_ids, *row_offsets;
   T *means2d, *conics, *depths, *opacities, *colors;
   std::int32_t *radii, *tiles_touched;
+  std::int64_t* rank_masks;
 };
 
 // Gradients of the rows; v_depths and v_colors may be null (zero).
@@ -84,22 +88,29 @@ struct ProjectRows {
 };
 
 namespace cpu {
+// plan [project_plan_bytes] is the backend's own, from count to emit. So is what count puts into `carry` (the
+// CPU: its rows, which it need not compute twice; CUDA: nothing): one allocation at most, which emit gets
+// back.
+std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
-void project_count(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&, CudaStream);
+void project_count(const ProjectInputs<T>&, const RankTiles& ranges, void* plan, Workspace& carry,
+                   std::int64_t* totals, Workspace&, CudaStream);
 template <class T>
-void project_emit(const ProjectInputs<T>&, const ProjectPlan&, const ProjectCounts&, const ProjectOutputs<T>&,
-                  Workspace&, CudaStream);
+void project_emit(const ProjectInputs<T>&, const RankTiles& ranges, const void* plan, const void* carry,
+                  const ProjectSizes&, const ProjectOutputs<T>&, Workspace&, CudaStream);
 // scale_reg [B] or null: adds scale_reg[b] * d(min_j s_j) for each row in view b (the paper's L_scale).
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
                  const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
+std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
-void project_count(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&, CudaStream);
+void project_count(const ProjectInputs<T>&, const RankTiles& ranges, void* plan, Workspace& carry,
+                   std::int64_t* totals, Workspace&, CudaStream);
 template <class T>
-void project_emit(const ProjectInputs<T>&, const ProjectPlan&, const ProjectCounts&, const ProjectOutputs<T>&,
-                  Workspace&, CudaStream);
+void project_emit(const ProjectInputs<T>&, const RankTiles& ranges, const void* plan, const void* carry,
+                  const ProjectSizes&, const ProjectOutputs<T>&, Workspace&, CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
                  const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);

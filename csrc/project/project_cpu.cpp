@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <memory>
+#include <mutex>
+#include <stdexcept>
 #include <utility>
 #include <vector>
 
@@ -32,26 +33,36 @@ ActiveGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
                            activate_opacity(in.opacities[id], in.options.raw));
 }
 
-template <class T>
-std::int32_t tiles_of(const Row<T>& row, const ProjectOptions<T>& o) {
-  return count_tiles(row.mean2d, row.conic, row.opacity, o.width, o.height, o.tile_size);
-}
-
-// The rows of each block of candidates, kept from the first pass for the second.
+// A row as the first pass finds it and the second takes it back.
 template <class T>
 struct KeptRow {
   Row<T> row;
   std::int32_t tiles;
-};
-template <class T>
-struct KeptRows final : ProjectCarry {
-  std::vector<std::vector<KeptRow<T>>> blocks;
+  std::int64_t ranks;
 };
 
-// Projects a candidate into the views that may see it, adds its rows to `rows`, and returns their views.
+// plan: the visible candidates and the rows before each block of kProjectBlock candidates [blocks + 1], and
+// view_masks [candidates]: bit v set iff view v sees it.
+template <class Count, class Mask>
+struct Plan {
+  Count *visible_before, *rows_before;
+  Mask* view_masks;
+
+  template <class Memory>
+  Plan(Memory* memory, std::int64_t candidates)
+      : visible_before(static_cast<Count*>(memory)),
+        rows_before(visible_before + project_blocks(candidates) + 1),
+        view_masks(reinterpret_cast<Mask*>(rows_before + project_blocks(candidates) + 1)) {}
+};
+using NewPlan = Plan<std::int64_t, std::uint32_t>;
+using MadePlan = Plan<const std::int64_t, const std::uint32_t>;
+
+// Projects a candidate into the views that may see it, adds its rows to `rows` and what they are to `totals`,
+// and returns their views.
 template <class T>
-std::uint32_t project_candidate(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras,
-                                std::int64_t candidate, std::vector<KeptRow<T>>* rows) {
+std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ranges,
+                                const std::vector<Camera<T>>& cameras, std::int64_t candidate,
+                                std::vector<KeptRow<T>>* rows, std::int64_t* totals) {
   const std::int64_t id = candidate_id(in, candidate);
   const std::uint32_t allowed =
       in.active_views ? static_cast<std::uint32_t>(in.active_views[candidate]) : ~std::uint32_t{0};
@@ -69,20 +80,26 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const std::vector<Ca
   if (sigmas < T(0)) return 0;
   ActiveGaussian<T> gaussian{};
   std::uint32_t seen = 0;
+  std::int64_t* by_rank = totals + kTotalViews + in.n_views;
   for (std::uint32_t rest = maybe, first = 1; rest != 0; rest &= rest - 1) {
     const int view = __builtin_ctz(rest);
     if (!may_touch_image(cameras[view], mean, widest, sigmas, in.options)) continue;
     if (first) {
-      if (in.sh && !finite_sh(in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree)) return 0;
       gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity);
       first = 0;
     }
     KeptRow<T> kept{};
     if (!project_row(cameras[view], gaussian, in.options, &kept.row)) continue;
-    kept.tiles = tiles_of(kept.row, in.options);
+    kept.tiles = row_tiles(kept.row, view, in.options, ranges, &kept.ranks,
+                           [&](int rank, std::int64_t tiles) { by_rank[2 * rank + 1] += tiles; });
+    for (int rank = 0; rank < ranges.n_ranks; ++rank) by_rank[2 * rank] += kept.ranks >> rank & 1;
+    ++totals[kTotalRows];
+    ++totals[kTotalViews + view];
+    totals[kTotalTiles] += kept.tiles;
     rows->push_back(kept);
     seen |= std::uint32_t{1} << view;
   }
+  totals[kTotalVisible] += seen != 0;
   return seen;
 }
 
@@ -93,14 +110,14 @@ void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t 
   std::copy_n(row.mean2d, 2, out.means2d + 2 * index);
   std::copy_n(row.conic, 3, out.conics + 3 * index);
   out.depths[index] = row.depth;
-  out.opacities[index] = row.opacity;
-  out.radii[2 * index] = pixel_radius(row.extent[0]);
-  out.radii[2 * index + 1] = pixel_radius(row.extent[1]);
-  out.tiles_touched[index] = kept.tiles;
-  if (in.sh) {
-    row_color(camera, load3(in.means + 3 * id), in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree,
-              out.colors + 3 * index);
-  }
+  const bool shown =
+      !in.sh || row_color(camera, load3(in.means + 3 * id), in.sh + 3 * in.options.sh_stride * id,
+                          in.options.sh_degree, out.colors + 3 * index);
+  out.opacities[index] = shown ? row.opacity : T(0);
+  out.radii[2 * index] = shown ? pixel_radius(row.extent[0]) : 0;
+  out.radii[2 * index + 1] = shown ? pixel_radius(row.extent[1]) : 0;
+  out.tiles_touched[index] = shown ? kept.tiles : 0;
+  if (out.rank_masks) out.rank_masks[index] = kept.ranks;
 }
 
 // Gradients of visible Gaussian u; poses [B] or null.
@@ -160,56 +177,73 @@ void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_v
 
 }  // namespace
 
-template <class T>
-void project_count(const ProjectInputs<T>& in, const ProjectPlan& plan, ProjectCounts* counts, Workspace&,
-                   CudaStream) {
-  const std::vector<Camera<T>> cameras = make_cameras(in);
-  const std::int64_t blocks = project_blocks(in.n_candidates);
-  auto kept = std::make_unique<KeptRows<T>>();
-  kept->blocks.resize(blocks);
-  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      std::int64_t visible = 0;
-      const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
-      for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
-        plan.view_masks[c] = project_candidate(in, cameras, c, &kept->blocks[block]);
-        visible += plan.view_masks[c] != 0;
-      }
-      plan.visible_before[block] = visible;
-    }
-  });
-  *counts = {};
-  for (std::int64_t block = 0; block < blocks; ++block) {
-    const std::int64_t visible = plan.visible_before[block];
-    plan.visible_before[block] = counts->visible;
-    plan.rows_before[block] = counts->rows;
-    counts->visible += visible;
-    counts->rows += static_cast<std::int64_t>(kept->blocks[block].size());
-    for (const KeptRow<T>& row : kept->blocks[block]) counts->tiles += row.tiles;
-  }
-  plan.visible_before[blocks] = counts->visible;
-  plan.rows_before[blocks] = counts->rows;
-  *plan.carry = std::move(kept);
+std::size_t project_plan_bytes(std::int64_t candidates) {
+  return static_cast<std::size_t>(2 * (project_blocks(candidates) + 1)) * sizeof(std::int64_t) +
+         static_cast<std::size_t>(candidates) * sizeof(std::uint32_t);
 }
 
 template <class T>
-void project_emit(const ProjectInputs<T>& in, const ProjectPlan& plan, const ProjectCounts& counts,
-                  const ProjectOutputs<T>& out, Workspace&, CudaStream) {
+void project_count(const ProjectInputs<T>& in, const RankTiles& ranges, void* plan_memory, Workspace& carry,
+                   std::int64_t* totals, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
-  const auto& kept = static_cast<const KeptRows<T>&>(**plan.carry);
   const std::int64_t blocks = project_blocks(in.n_candidates);
-  out.row_offsets[counts.visible] = static_cast<std::int32_t>(counts.rows);
+  const std::int64_t n_totals = project_totals(in.n_views, ranges.n_ranks);
+  const NewPlan plan(plan_memory, in.n_candidates);
+  std::vector<std::vector<KeptRow<T>>> kept(blocks);
+  std::fill_n(totals, n_totals, 0);
+  std::mutex adding;
   parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
+    std::vector<std::int64_t> sums(n_totals, 0);
     for (std::int64_t block = begin; block < end; ++block) {
-      const KeptRow<T>* row = kept.blocks[block].data();
-      std::int64_t u = plan.visible_before[block], index = plan.rows_before[block];
+      const std::int64_t before = sums[kTotalVisible];
       const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
       for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
-        if (plan.view_masks[c] == 0) continue;
+        plan.view_masks[c] = project_candidate(in, ranges, cameras, c, &kept[block], sums.data());
+      }
+      plan.visible_before[block] = sums[kTotalVisible] - before;
+    }
+    const std::lock_guard<std::mutex> lock(adding);
+    for (std::int64_t i = 0; i < n_totals; ++i) totals[i] += sums[i];
+  });
+  std::int64_t visible = 0, rows = 0;
+  for (std::int64_t block = 0; block < blocks; ++block) {
+    visible += std::exchange(plan.visible_before[block], visible);
+    plan.rows_before[block] = rows;
+    rows += static_cast<std::int64_t>(kept[block].size());
+  }
+  plan.visible_before[blocks] = visible;
+  plan.rows_before[blocks] = rows;
+  auto* all = carry.allocate<KeptRow<T>>(rows);
+  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t block = begin; block < end; ++block) {
+      std::copy(kept[block].begin(), kept[block].end(), all + plan.rows_before[block]);
+      kept[block] = {};
+    }
+  });
+}
+
+template <class T>
+void project_emit(const ProjectInputs<T>& in, const RankTiles&, const void* plan_memory, const void* carry,
+                  const ProjectSizes& sizes, const ProjectOutputs<T>& out, Workspace&, CudaStream) {
+  const std::vector<Camera<T>> cameras = make_cameras(in);
+  const std::int64_t blocks = project_blocks(in.n_candidates);
+  const MadePlan plan(plan_memory, in.n_candidates);
+  if (plan.visible_before[blocks] != sizes.visible || plan.rows_before[blocks] != sizes.rows) {
+    throw std::invalid_argument("blitzgs::project_emit: counts must be the totals of project_count");
+  }
+  out.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
+  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t block = begin; block < end; ++block) {
+      std::int64_t u = plan.visible_before[block], index = plan.rows_before[block];
+      const auto* row = static_cast<const KeptRow<T>*>(carry) + index;
+      const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
+      for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
+        const std::uint32_t mask = plan.view_masks[c];
+        if (mask == 0) continue;
         const std::int64_t id = candidate_id(in, c);
         out.visible_ids[u] = static_cast<std::int32_t>(id);
         out.row_offsets[u++] = static_cast<std::int32_t>(index);
-        for (std::uint32_t rest = plan.view_masks[c]; rest != 0; rest &= rest - 1) {
+        for (std::uint32_t rest = mask; rest != 0; rest &= rest - 1) {
           const int view = __builtin_ctz(rest);
           out.gaussian_ids[index] = static_cast<std::int32_t>(id);
           out.camera_ids[index] = view;
@@ -240,10 +274,10 @@ void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const Proj
 }
 
 #define BLITZGS_INSTANTIATE(T)                                                                             \
-  template void project_count<T>(const ProjectInputs<T>&, const ProjectPlan&, ProjectCounts*, Workspace&,  \
-                                 CudaStream);                                                              \
-  template void project_emit<T>(const ProjectInputs<T>&, const ProjectPlan&, const ProjectCounts&,         \
-                                const ProjectOutputs<T>&, Workspace&, CudaStream);                         \
+  template void project_count<T>(const ProjectInputs<T>&, const RankTiles&, void*, Workspace&,             \
+                                 std::int64_t*, Workspace&, CudaStream);                                   \
+  template void project_emit<T>(const ProjectInputs<T>&, const RankTiles&, const void*, const void*,       \
+                                const ProjectSizes&, const ProjectOutputs<T>&, Workspace&, CudaStream);    \
   template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&, \
                                const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
 BLITZGS_INSTANTIATE(float)

@@ -113,26 +113,34 @@ struct ShStage {
   using Row = ShRow<DEGREE>;
   static constexpr int kPitch = Row::kQuads | 1;  // odd, so that a column of rows spreads over the banks
   float4 quads[32 * kPitch];
+  std::int32_t ids[32];
 
-  // Gathers row `id` of each lane; id < 0: none. Asynchronous until wait().
-  __device__ __forceinline__ void gather(const float* sh, std::int64_t stride, std::int32_t id, int lane) {
+  // Gathers row `id` of each lane (id < 0: none), once where consecutive lanes have the same; returns where a
+  // lane's row is. Asynchronous until wait().
+  __device__ __forceinline__ int gather(const float* sh, std::int64_t stride, std::int32_t id, int lane) {
+    const std::int32_t previous = __shfl_up_sync(0xffffffffu, id, 1);
+    const bool first = id >= 0 && (lane == 0 || id != previous);
+    const unsigned firsts = __ballot_sync(0xffffffffu, first);
+    const int slot = __popc(firsts & (0xffffffffu >> (31 - lane))) - 1, count = __popc(firsts);
+    if (first) ids[slot] = id;
+    __syncwarp();
 #pragma unroll
     for (int i = 0; i < Row::kQuads; ++i) {
       const int at = i * 32 + lane, row = at / Row::kQuads, quad = at % Row::kQuads;
-      const std::int32_t row_id = __shfl_sync(0xffffffffu, id, row);
-      if (row_id < 0) continue;
+      if (row >= count) break;
       const auto target = static_cast<unsigned>(__cvta_generic_to_shared(quads + row * kPitch + quad));
       asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(target),
-                   "l"(sh + stride * row_id + 4 * quad));
+                   "l"(sh + stride * ids[row] + 4 * quad));
     }
+    return slot;
   }
   __device__ __forceinline__ void wait() {
     asm volatile("cp.async.wait_all;" ::: "memory");
     __syncwarp();
   }
-  __device__ __forceinline__ void read(int lane, Row* row) const {
+  __device__ __forceinline__ void read(int slot, Row* row) const {
 #pragma unroll
-    for (int i = 0; i < Row::kQuads; ++i) row->set_quad(i, quads[lane * kPitch + i]);
+    for (int i = 0; i < Row::kQuads; ++i) row->set_quad(i, quads[slot * kPitch + i]);
   }
   __device__ __forceinline__ void write(int lane, const Row& row) {
 #pragma unroll

@@ -1,289 +1,253 @@
 // SPDX-License-Identifier: Apache-2.0
 // Compiled without FMA contraction (cmake/cuda.cmake): counting and emitting project the same row in two
 // kernels, and must get the same bits.
-#include <cub/block/block_reduce.cuh>
-#include <cub/block/block_scan.cuh>
 #include <cub/device/device_scan.cuh>
+#include <cub/warp/warp_reduce.cuh>
 
 #include <algorithm>
 
+#include "project/project_cull.cuh"
 #include "project/project_device.cuh"
 
 namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kThreads = 256;
-constexpr int kRounds = static_cast<int>(kProjectBlock) / kThreads;
+constexpr int kSegment = 256;  // candidates that a warp takes together
+constexpr int kBatch = 4;      // of them, those of a lane at a time
+constexpr int kCountThreads = 128, kCountBlocks = 4096;
+constexpr int kListThreads = 256;
 constexpr int kEmitThreads = 128;
-constexpr int kCountBlocks = 4096;  // of the exact test, whose work is only known on the device
 
-__device__ std::int64_t candidate_id(const Inputs& in, std::int64_t candidate) {
-  return in.active_ids ? in.active_ids[candidate] : candidate;
+__host__ __device__ std::int64_t segments_of(std::int64_t candidates) {
+  return (candidates + kSegment - 1) / kSegment;
 }
 
-__device__ std::int32_t tiles_of(const Row<float>& row, const ProjectOptions<float>& o) {
-  return count_tiles(row.mean2d, row.conic, row.opacity, o.width, o.height, o.tile_size);
-}
-
-// What the quick test needs of a camera: bounds in float, rounded up.
-struct Frustum {
-  Vec3<float> row_x, row_y, row_z, translation;
-  float fx, fy, cx, cy;
-  float largest, offset;   // of the rotation's entries and of the translation's: bounds the rounding of p
-  float reach_x, reach_y;  // |d pixel / d world| * z cannot exceed this
-};
-
-__device__ float norm1(const Vec3<float>& v) { return fabsf(v.x) + fabsf(v.y) + fabsf(v.z); }
-__device__ float top(const Vec3<float>& v) { return fmaxf(fabsf(v.x), fmaxf(fabsf(v.y), fabsf(v.z))); }
-
-__device__ Frustum make_frustum(const Camera<float>& c) {
-  Frustum f{c.row_x, c.row_y, c.row_z, c.translation, c.fx, c.fy, c.cx, c.cy, 0.f, 0.f, 0.f, 0.f};
-  f.largest = fmaxf(top(c.row_x), fmaxf(top(c.row_y), top(c.row_z)));
-  f.offset = top(c.translation);
-  const float along = sqrtf(dot(c.row_z, c.row_z));
-  const float u = fmaxf(fabsf(c.slope_min_x), fabsf(c.slope_max_x));
-  const float v = fmaxf(fabsf(c.slope_min_y), fabsf(c.slope_max_y));
-  f.reach_x = 1.01f * fabsf(c.fx) * (sqrtf(dot(c.row_x, c.row_x)) + u * along);
-  f.reach_y = 1.01f * fabsf(c.fy) * (sqrtf(dot(c.row_y, c.row_y)) + v * along);
-  return f;
-}
-
-// A bound on the rounding of any coordinate of p = W mean + t in float.
-__device__ float rounding(const Frustum& f, const Vec3<float>& mean) {
-  return 1e-6f * (f.largest * norm1(mean) + f.offset);
-}
-
-__device__ bool may_be_in_depth(const Frustum& f, const Vec3<float>& mean, const ProjectOptions<float>& o) {
-  const float z = dot(f.row_z, mean) + f.translation.z, error = rounding(f, mean);
-  return z + error > o.near_plane && z - error <= o.far_plane;
-}
-
-// Is the splat's box, no larger than `spread` standard deviations of its largest axis, within [0, size)? All
-// times z.
-__device__ bool may_overlap(float focal, float centre, float x, float z, float error, float reach,
-                            float spread, float sigmas, float root_eps, float size) {
-  const float position = focal * x + centre * z;
-  const float slack = error * (fabsf(focal) + fabsf(centre) + size) +
-                      1e-5f * (fabsf(focal * x) + (fabsf(centre) + size) * fabsf(z));
-  const float half = reach * spread + 1.01f * sigmas * root_eps * (z + error) + slack;
-  return position + half > 0.f && position - half < size * z;
-}
-
-// False only when project_row would be false: no division, no quaternion, floats alone.
-__device__ bool may_be_seen(const Frustum& f, const Vec3<float>& mean, float largest_scale, float sigmas,
-                            const ProjectOptions<float>& o) {
-  if (!may_be_in_depth(f, mean, o)) return false;
-  const float z = dot(f.row_z, mean) + f.translation.z, error = rounding(f, mean);
-  const float x = dot(f.row_x, mean) + f.translation.x, y = dot(f.row_y, mean) + f.translation.y;
-  const float spread = sigmas * largest_scale, root_eps = sqrtf(o.eps2d);
-  return may_overlap(f.fx, f.cx, x, z, error, f.reach_x, spread, sigmas, root_eps,
-                     static_cast<float>(o.width)) &&
-         may_overlap(f.fy, f.cy, y, z, error, f.reach_y, spread, sigmas, root_eps,
-                     static_cast<float>(o.height));
-}
-
-// How many standard deviations any splat of this candidate can reach; raw opacities never exceed 1.
-__device__ float most_sigmas(const Inputs& in, std::int64_t id) {
-  return in.options.raw ? 3.331f : 1.0001f * reach(in.opacities[id]);
-}
-
-__device__ float largest_scale(const Inputs& in, std::int64_t id) {
-  const float* s = in.scales + 3 * id;
-  const float widest = fmaxf(s[0], fmaxf(s[1], s[2]));
-  return in.options.raw ? 1.0001f * expf(widest) : widest;
-}
-
-// The views that may see each of a thread's candidates, from the mean, then the scale.
+// The views that may see each of kBatch candidates first, first + 32, ..., from the mean, then the scale.
 __device__ void quick_views(const Inputs& in, const Frustum* frusta, std::int64_t first,
                             std::uint32_t* maybe) {
-  std::int64_t ids[kRounds];
-  Vec3<float> means[kRounds];
+  std::int64_t ids[kBatch];
+  Vec3<float> means[kBatch];
 #pragma unroll
-  for (int round = 0; round < kRounds; ++round) {
-    const std::int64_t c = first + round * kThreads;
+  for (int k = 0; k < kBatch; ++k) {
+    const std::int64_t c = first + 32 * k;
     const bool present = c < in.n_candidates;
-    ids[round] = present ? candidate_id(in, c) : 0;
-    maybe[round] = !present ? 0u : in.active_views ? static_cast<std::uint32_t>(in.active_views[c]) : ~0u;
-    if (in.n_views < 32) maybe[round] &= (1u << in.n_views) - 1u;
-    means[round] = maybe[round] ? load3(in.means + 3 * ids[round]) : Vec3<float>{0.f, 0.f, 0.f};
+    ids[k] = present ? candidate_id(in, c) : 0;
+    maybe[k] = !present ? 0u : in.active_views ? static_cast<std::uint32_t>(in.active_views[c]) : ~0u;
+    if (in.n_views < 32) maybe[k] &= (1u << in.n_views) - 1u;
+    means[k] = maybe[k] ? load3(in.means + 3 * ids[k]) : Vec3<float>{0.f, 0.f, 0.f};
   }
 #pragma unroll
-  for (int round = 0; round < kRounds; ++round) {
+  for (int k = 0; k < kBatch; ++k) {
     for (int view = 0; view < in.n_views; ++view) {
-      if (!may_be_in_depth(frusta[view], means[round], in.options)) maybe[round] &= ~(1u << view);
+      if (!may_be_in_depth(frusta[view], means[k], in.options)) maybe[k] &= ~(1u << view);
     }
   }
-  float scales[kRounds], sigmas[kRounds];
+  float scales[kBatch], sigmas[kBatch];
 #pragma unroll
-  for (int round = 0; round < kRounds; ++round) {
-    scales[round] = maybe[round] ? largest_scale(in, ids[round]) : 0.f;
-    sigmas[round] = maybe[round] ? most_sigmas(in, ids[round]) : 0.f;
+  for (int k = 0; k < kBatch; ++k) {
+    scales[k] = maybe[k] ? largest_scale(in, ids[k]) : 0.f;
+    sigmas[k] = maybe[k] ? most_sigmas(in, ids[k]) : 0.f;
   }
 #pragma unroll
-  for (int round = 0; round < kRounds; ++round) {
-    for (int view = 0; view < in.n_views && maybe[round]; ++view) {
-      if (!may_be_seen(frusta[view], means[round], scales[round], sigmas[round], in.options)) {
-        maybe[round] &= ~(1u << view);
-      }
+  for (int k = 0; k < kBatch; ++k) {
+    for (int view = 0; view < in.n_views && maybe[k]; ++view) {
+      if (!may_be_seen(frusta[view], means[k], scales[k], sigmas[k], in.options)) maybe[k] &= ~(1u << view);
     }
   }
 }
 
-template <int DEGREE, bool QUADS>
-__device__ bool has_finite_sh(const Inputs& in, std::int64_t id) {
-  const float* sh = in.sh + 3 * in.options.sh_stride * id;
-  if constexpr (QUADS) {
-    float zero = 0.f;
-#pragma unroll
-    for (int i = 0; i < ShRow<DEGREE>::kQuads; ++i) {
-      const float4 v = reinterpret_cast<const float4*>(sh)[i];
-      zero += 0.f * v.x + 0.f * v.y + 0.f * v.z + 0.f * v.w;
-    }
-    return zero == 0.f;
-  } else {
-    return finite_sh(sh, DEGREE);
-  }
-}
+// Visible candidates and rows in one number, so that one scan serves both.
+__device__ std::int64_t pack_counts(std::int64_t visible, std::int64_t rows) { return visible << 32 | rows; }
 
-// The views that do see a candidate, of those that may, and the tiles its rows touch.
-template <int DEGREE, bool QUADS>
-__device__ std::uint32_t exact_views(const Inputs& in, const Camera<float>* cameras, std::int64_t candidate,
-                                     std::uint32_t maybe, std::int64_t* tiles) {
-  const std::int64_t id = candidate_id(in, candidate);
-  const ActiveGaussian<float> gaussian = load_gaussian(in, id);
+// before [segments + 1]: pack_counts() of the segments before each. The visible candidates of segment s are
+// the first entries from kSegment * s on, ascending: the views that see each, and where in the segment it is.
+template <class Count, class Views, class Slot>
+struct Plan {
+  Count* before;
+  Views* views;
+  Slot* slots;
+
+  template <class Memory>
+  Plan(Memory* memory, std::int64_t candidates)
+      : before(static_cast<Count*>(memory)),
+        views(reinterpret_cast<Views*>(before + segments_of(candidates) + 1)),
+        slots(reinterpret_cast<Slot*>(views + candidates)) {}
+};
+using NewPlan = Plan<std::int64_t, std::uint32_t, std::uint8_t>;
+using MadePlan = Plan<const std::int64_t, const std::uint32_t, const std::uint8_t>;
+
+// A block's sums for project_totals. Adding 64-bit numbers in shared memory is slow, so tiles carry by hand.
+struct Sums {
+  unsigned views[kMaxViews], rank_rows[kMaxRanks], tiles_low[kMaxRanks], tiles_high[kMaxRanks];
+  unsigned long long visible, rows, tiles;
+
+  __device__ void add_tiles(int rank, unsigned tiles) {
+    const unsigned before = atomicAdd(&tiles_low[rank], tiles);
+    if (before + tiles < before) atomicAdd(&tiles_high[rank], 1u);
+  }
+};
+
+// The views that do see a candidate, of those that may.
+__device__ std::uint32_t exact_views(const Inputs& in, const RankTiles& ranges, const Camera<float>* cameras,
+                                     std::int64_t candidate, std::uint32_t maybe, Sums* sums,
+                                     std::int64_t* tiles) {
+  const ActiveGaussian<float> gaussian = load_gaussian(in, candidate_id(in, candidate));
   std::uint32_t seen = 0;
-  std::int64_t touched = 0;
   for (; maybe; maybe &= maybe - 1) {
     const int view = __ffs(maybe) - 1;
     Row<float> row{};
     if (!project_row(cameras[view], gaussian, in.options, &row)) continue;
     seen |= 1u << view;
-    touched += tiles_of(row, in.options);
+    std::int64_t ranks;
+    *tiles += row_tiles(row, view, in.options, ranges, &ranks, [&](int rank, std::int64_t count) {
+      sums->add_tiles(rank, static_cast<unsigned>(count));
+    });
+    for (; ranks; ranks &= ranks - 1) atomicAdd(&sums->rank_rows[__ffsll(ranks) - 1], 1u);
   }
-  if (seen == 0 || (in.sh && !has_finite_sh<DEGREE, QUADS>(in, id))) return 0;
-  *tiles += touched;
   return seen;
 }
 
-// Visible candidates and rows in one number, so that one scan serves both: neither can exceed 2^31 - 1.
-__device__ std::int64_t pack_counts(std::int64_t visible, std::int64_t rows) { return visible << 32 | rows; }
-
-// What counting leaves on the device. left [candidates]: those the quick test leaves over, in any order.
-struct CountState {
-  std::int32_t* left;
-  unsigned long long* totals;  // visible, rows, tiles, length of left; zeroed
-};
-
-// view_masks: the views that may see each candidate.
-__global__ void __launch_bounds__(kThreads)
-    quick_kernel(const Inputs in, const ProjectPlan plan, const CountState state) {
-  __shared__ Frustum frusta[kMaxViews];
-  __shared__ int n_left;
-  __shared__ unsigned long long first_left;
-  if (threadIdx.x == 0) n_left = 0;
-  for (int view = threadIdx.x; view < in.n_views; view += kThreads) {
-    frusta[view] = make_frustum(
-        make_camera(in.viewmats + 16 * view, in.Ks + 9 * view, in.options.width, in.options.height));
+// Adds a block's sums to the totals of the launch.
+__device__ void store_sums(const Sums& sums, const Inputs& in, int n_ranks, unsigned long long* totals) {
+  const int thread = threadIdx.x;
+  if (thread == 0) {
+    atomicAdd(totals + kTotalVisible, sums.visible);
+    atomicAdd(totals + kTotalRows, sums.rows);
+    atomicAdd(totals + kTotalTiles, sums.tiles);
   }
-  __syncthreads();
-  const std::int64_t base = blockIdx.x * kProjectBlock + threadIdx.x;
-  std::uint32_t maybe[kRounds];
-  int slots[kRounds];
-  quick_views(in, frusta, base, maybe);
-#pragma unroll
-  for (int round = 0; round < kRounds; ++round) {
-    const std::int64_t c = base + round * kThreads;
-    if (c < in.n_candidates) plan.view_masks[c] = maybe[round];
-    if (maybe[round]) slots[round] = atomicAdd(&n_left, 1);
+  if (thread < in.n_views && sums.views[thread]) {
+    atomicAdd(totals + kTotalViews + thread, static_cast<unsigned long long>(sums.views[thread]));
   }
-  __syncthreads();
-  if (threadIdx.x == 0) {
-    plan.visible_before[blockIdx.x] = 0;
-    first_left = n_left ? atomicAdd(state.totals + 3, static_cast<unsigned long long>(n_left)) : 0;
-  }
-  __syncthreads();
-#pragma unroll
-  for (int round = 0; round < kRounds; ++round) {
-    if (maybe[round])
-      state.left[first_left + slots[round]] = static_cast<std::int32_t>(base + round * kThreads);
+  if (thread < n_ranks && sums.rank_rows[thread]) {
+    unsigned long long* target = totals + kTotalViews + in.n_views + 2 * thread;
+    atomicAdd(target, static_cast<unsigned long long>(sums.rank_rows[thread]));
+    atomicAdd(target + 1,
+              static_cast<unsigned long long>(sums.tiles_high[thread]) << 32 | sums.tiles_low[thread]);
   }
 }
 
-// view_masks of what is left becomes exact, and visible_before the pack_counts() of each block.
-template <int DEGREE, bool QUADS>
-__global__ void __launch_bounds__(kThreads, 3)
-    count_kernel(const Inputs in, const ProjectPlan plan, const CountState state) {
+// A warp takes a segment of candidates: the quick test of all, then the exact test of those it leaves. Warps
+// never wait for one another, so some stream means while others work.
+__global__ void __launch_bounds__(kCountThreads, 6)
+    count_kernel(const Inputs in, const RankTiles ranges, const NewPlan plan, unsigned long long* totals) {
   __shared__ Camera<float> cameras[kMaxViews];
-  using Reduce = cub::BlockReduce<std::int64_t, kThreads>;
-  __shared__ typename Reduce::TempStorage storage[3];
+  __shared__ Frustum frusta[kMaxViews];
+  __shared__ Sums sums;
+  __shared__ std::uint32_t left_views[kCountThreads / 32][kSegment];
+  __shared__ std::uint8_t left_slots[kCountThreads / 32][kSegment];
+  for (int i = threadIdx.x; i < static_cast<int>(sizeof(Sums) / 4); i += kCountThreads) {
+    reinterpret_cast<unsigned*>(&sums)[i] = 0;
+  }
   load_cameras(in, cameras);
   __syncthreads();
-  const auto n_left = static_cast<std::int64_t>(state.totals[3]);
-  std::int64_t visible = 0, rows = 0, tiles = 0;
-  for (std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x; i < n_left;
-       i += static_cast<std::int64_t>(gridDim.x) * kThreads) {
-    const std::int32_t c = state.left[i];
-    const std::uint32_t seen = exact_views<DEGREE, QUADS>(in, cameras, c, plan.view_masks[c], &tiles);
-    plan.view_masks[c] = seen;
-    if (seen == 0) continue;
-    visible += 1;
-    rows += __popc(seen);
-    atomicAdd(reinterpret_cast<unsigned long long*>(plan.visible_before) + c / kProjectBlock,
-              static_cast<unsigned long long>(pack_counts(1, __popc(seen))));
+  for (int view = threadIdx.x; view < in.n_views; view += kCountThreads)
+    frusta[view] = make_frustum(cameras[view]);
+  __syncthreads();
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const unsigned below = (1u << lane) - 1u;
+  std::uint32_t* const left = left_views[warp];
+  std::uint8_t* const slots = left_slots[warp];
+  const std::int64_t n_segments = segments_of(in.n_candidates);
+  std::int64_t tiles = 0, visible = 0, rows = 0;
+  unsigned of_view = 0;  // rows of view `lane`
+  for (std::int64_t s = blockIdx.x * (kCountThreads / 32) + warp; s < n_segments;
+       s += static_cast<std::int64_t>(gridDim.x) * (kCountThreads / 32)) {
+    int n_left = 0;
+    for (int batch = 0; batch < kSegment; batch += 32 * kBatch) {
+      std::uint32_t maybe[kBatch];
+      quick_views(in, frusta, s * kSegment + batch + lane, maybe);
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        const unsigned some = __ballot_sync(0xffffffffu, maybe[k] != 0);
+        if (maybe[k]) {
+          const int at = n_left + __popc(some & below);
+          left[at] = maybe[k];
+          slots[at] = static_cast<std::uint8_t>(batch + 32 * k + lane);
+        }
+        n_left += __popc(some);
+      }
+    }
+    __syncwarp();
+    int n_visible = 0;
+    unsigned n_rows = 0;
+    for (int first = 0; first < n_left; first += 32) {
+      const bool present = first + lane < n_left;
+      const std::uint8_t slot = present ? slots[first + lane] : 0;
+      const std::uint32_t seen =
+          present ? exact_views(in, ranges, cameras, s * kSegment + slot, left[first + lane], &sums, &tiles)
+                  : 0;
+      const unsigned some = __ballot_sync(0xffffffffu, seen != 0);
+      if (seen) {
+        const std::int64_t at = s * kSegment + n_visible + __popc(some & below);
+        plan.views[at] = seen;
+        plan.slots[at] = slot;
+      }
+      n_visible += __popc(some);
+      n_rows += __popc(seen);
+      for (int view = 0; view < in.n_views; ++view) {
+        const unsigned seeing = __ballot_sync(0xffffffffu, seen >> view & 1u);
+        if (lane == view) of_view += __popc(seeing);
+      }
+    }
+    __syncwarp();
+    n_rows = __reduce_add_sync(0xffffffffu, n_rows);
+    if (lane == 0) plan.before[s] = pack_counts(n_visible, n_rows);
+    visible += n_visible;
+    rows += n_rows;
   }
-  visible = Reduce(storage[0]).Sum(visible);
-  rows = Reduce(storage[1]).Sum(rows);
-  tiles = Reduce(storage[2]).Sum(tiles);
-  if (threadIdx.x > 0 || rows == 0) return;
-  atomicAdd(state.totals, static_cast<unsigned long long>(visible));
-  atomicAdd(state.totals + 1, static_cast<unsigned long long>(rows));
-  atomicAdd(state.totals + 2, static_cast<unsigned long long>(tiles));
+  if (of_view) atomicAdd(&sums.views[lane], of_view);
+  using Reduce = cub::WarpReduce<std::int64_t>;
+  __shared__ typename Reduce::TempStorage storage[kCountThreads / 32];
+  tiles = Reduce(storage[warp]).Sum(tiles);
+  if (lane == 0) {
+    atomicAdd(&sums.tiles, static_cast<unsigned long long>(tiles));
+    atomicAdd(&sums.visible, static_cast<unsigned long long>(visible));
+    atomicAdd(&sums.rows, static_cast<unsigned long long>(rows));
+  }
+  if (blockIdx.x == 0 && threadIdx.x == 0) plan.before[n_segments] = 0;
+  __syncthreads();
+  if (sums.rows > 0) store_sums(sums, in, ranges.n_ranks, totals);
 }
 
-// Which Gaussian and view each row is of. plan.visible_before: pack_counts() before each block.
-__global__ void __launch_bounds__(kThreads)
-    list_rows_kernel(const Inputs in, const ProjectPlan plan, const ProjectCounts counts,
+// Which Gaussian and view each row is of. A warp takes a segment.
+__global__ void __launch_bounds__(kListThreads)
+    list_rows_kernel(const Inputs in, const MadePlan plan, const ProjectSizes sizes,
                      const ProjectOutputs<float> out) {
-  using Scan = cub::BlockScan<std::int64_t, kThreads>;
-  __shared__ typename Scan::TempStorage storage;
-  if (blockIdx.x == 0 && threadIdx.x == 0) {
-    out.row_offsets[counts.visible] = static_cast<std::int32_t>(counts.rows);
-  }
-  const std::int64_t before = plan.visible_before[blockIdx.x];
-  const std::int64_t after =
-      blockIdx.x + 1 < gridDim.x ? plan.visible_before[blockIdx.x + 1] : counts.visible << 32 | counts.rows;
-  if (before == after) return;
-  const std::int64_t first = blockIdx.x * kProjectBlock + threadIdx.x * kRounds;
-  std::uint32_t masks[kRounds];
-  std::int64_t mine = 0;
-#pragma unroll
-  for (int k = 0; k < kRounds; ++k) {
-    masks[k] = first + k < in.n_candidates ? plan.view_masks[first + k] : 0;
-    mine += pack_counts(masks[k] != 0, __popc(masks[k]));
-  }
-  std::int64_t position;
-  Scan(storage).ExclusiveSum(mine, position);
-  position += before;
-#pragma unroll
-  for (int k = 0; k < kRounds; ++k) {
-    if (!masks[k]) continue;
-    const auto id = static_cast<std::int32_t>(candidate_id(in, first + k));
-    const std::int64_t u = position >> 32;
-    std::int64_t at = position & 0xffffffff;
-    out.visible_ids[u] = id;
-    out.row_offsets[u] = static_cast<std::int32_t>(at);
-    for (std::uint32_t mask = masks[k]; mask; mask &= mask - 1, ++at) {
-      out.gaussian_ids[at] = id;
-      out.camera_ids[at] = __ffs(mask) - 1;
+  const int lane = threadIdx.x % 32;
+  const std::int64_t s = (blockIdx.x * static_cast<std::int64_t>(kListThreads) + threadIdx.x) / 32;
+  if (s == 0 && lane == 0) out.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
+  if (s >= segments_of(in.n_candidates)) return;
+  const std::int64_t before = plan.before[s];
+  const auto count = static_cast<int>((plan.before[s + 1] >> 32) - (before >> 32));
+  std::int64_t at = before & 0xffffffff;
+  for (int first = 0; first < count; first += 32) {
+    const bool present = first + lane < count;
+    const std::uint32_t views = present ? plan.views[s * kSegment + first + lane] : 0;
+    int end = __popc(views);
+    for (int step = 1; step < 32; step *= 2) {
+      const int other = __shfl_up_sync(0xffffffffu, end, step);
+      if (lane >= step) end += other;
     }
-    position += pack_counts(1, __popc(masks[k]));
+    const std::int64_t u = (before >> 32) + first + lane;
+    std::int64_t row = at + end - __popc(views);
+    at += __shfl_sync(0xffffffffu, end, 31);
+    if (!present || u >= sizes.visible) continue;
+    const auto id =
+        static_cast<std::int32_t>(candidate_id(in, s * kSegment + plan.slots[s * kSegment + first + lane]));
+    out.visible_ids[u] = id;
+    out.row_offsets[u] = static_cast<std::int32_t>(row);
+    for (std::uint32_t rest = views; rest && row < sizes.rows; rest &= rest - 1, ++row) {
+      out.gaussian_ids[row] = id;
+      out.camera_ids[row] = __ffs(rest) - 1;
+    }
   }
 }
 
 template <int DEGREE, bool QUADS>
 __global__ void __launch_bounds__(kEmitThreads)
-    emit_kernel(const Inputs in, const ProjectOutputs<float> out, std::int64_t n_rows) {
+    emit_kernel(const Inputs in, const RankTiles ranges, const ProjectOutputs<float> out,
+                std::int64_t n_rows) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ ShStage<DEGREE> stages[QUADS ? kEmitThreads / 32 : 1];
   __shared__ TripleStage triples[kEmitThreads / 32];
@@ -292,10 +256,12 @@ __global__ void __launch_bounds__(kEmitThreads)
   ShStage<DEGREE>& stage = stages[QUADS ? threadIdx.x / 32 : 0];
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kEmitThreads) + threadIdx.x;
   const std::int32_t id = i < n_rows ? out.gaussian_ids[i] : -1;
-  if constexpr (QUADS) stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
+  int slot = 0;
+  if constexpr (QUADS) slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
   load_cameras(in, cameras);
   __syncthreads();
-  const Camera<float>& camera = cameras[id < 0 ? 0 : out.camera_ids[i]];
+  const int view = id < 0 ? 0 : out.camera_ids[i];
+  const Camera<float>& camera = cameras[view];
   const Vec3<float> mean = triple.gather(in.means, id, lane), scale = triple.gather(in.scales, id, lane);
   if (id >= 0) {
     const ActiveGaussian<float> gaussian = make_gaussian(in, id, mean, scale);
@@ -306,72 +272,74 @@ __global__ void __launch_bounds__(kEmitThreads)
     out.depths[i] = row.depth;
     out.opacities[i] = row.opacity;
     reinterpret_cast<int2*>(out.radii)[i] = {pixel_radius(row.extent[0]), pixel_radius(row.extent[1])};
-    out.tiles_touched[i] = tiles_of(row, in.options);
+    std::int64_t ranks;
+    out.tiles_touched[i] = row_tiles(row, view, in.options, ranges, &ranks, [](int, std::int64_t) {});
+    if (out.rank_masks) out.rank_masks[i] = ranks;
   }
   if (!in.sh) return;
+  bool shown = true;
   if constexpr (QUADS) {
     stage.wait();
     if (id < 0) return;
     ShRow<DEGREE> sh;
-    stage.read(lane, &sh);
-    row_color(camera, mean, sh.values, DEGREE, out.colors + 3 * i);
+    stage.read(slot, &sh);
+    shown = row_color(camera, mean, sh.values, DEGREE, out.colors + 3 * i);
   } else if (id >= 0) {
-    row_color(camera, mean, in.sh + 3 * in.options.sh_stride * std::int64_t{id}, DEGREE, out.colors + 3 * i);
+    shown = row_color(camera, mean, in.sh + 3 * in.options.sh_stride * std::int64_t{id}, DEGREE,
+                      out.colors + 3 * i);
   }
-}
-
-// Turns the counts of blocks into the counts before each.
-void scan_blocks(std::int64_t* counts, std::int64_t n, Workspace& workspace, CudaStream stream) {
-  std::size_t bytes = 0;
-  check(cub::DeviceScan::ExclusiveSum(nullptr, bytes, counts, counts, n, stream), "project_fwd");
-  void* scratch = workspace.allocate_bytes(bytes);
-  check(cub::DeviceScan::ExclusiveSum(scratch, bytes, counts, counts, n, stream), "project_fwd");
+  if (shown) return;
+  out.opacities[i] = 0.f;
+  reinterpret_cast<int2*>(out.radii)[i] = {0, 0};
+  out.tiles_touched[i] = 0;
 }
 
 }  // namespace
 
-template <>
-void project_count<float>(const Inputs& in, const ProjectPlan& plan, ProjectCounts* counts,
-                          Workspace& workspace, CudaStream stream) {
-  *counts = {};
-  const std::int64_t blocks = project_blocks(in.n_candidates);
-  if (blocks == 0 || in.n_views == 0) return;
-  constexpr int kTotals = 4;
-  const CountState state{workspace.allocate<std::int32_t>(in.n_candidates),
-                         workspace.allocate<unsigned long long>(kTotals)};
-  check(cudaMemsetAsync(state.totals, 0, kTotals * sizeof(*state.totals), stream), "project_fwd");
-  quick_kernel<<<static_cast<unsigned>(blocks), kThreads, 0, stream>>>(in, plan, state);
-  check_launch("project_fwd");
-  const auto grid =
-      static_cast<unsigned>(std::min<std::int64_t>(kCountBlocks, blocks_for(in.n_candidates, kThreads)));
-  dispatch_sh(in, [&](auto degree, auto quads) {
-    count_kernel<degree.value, quads.value><<<grid, kThreads, 0, stream>>>(in, plan, state);
-  });
-  check_launch("project_fwd");
-  scan_blocks(plan.visible_before, blocks, workspace, stream);
-  unsigned long long host[3];
-  check(cudaMemcpyAsync(host, state.totals, sizeof(host), cudaMemcpyDeviceToHost, stream), "project_fwd");
-  check(cudaStreamSynchronize(stream), "project_fwd");
-  counts->visible = static_cast<std::int64_t>(host[0]);
-  counts->rows = static_cast<std::int64_t>(host[1]);
-  counts->tiles = static_cast<std::int64_t>(host[2]);
+std::size_t project_plan_bytes(std::int64_t candidates) {
+  return static_cast<std::size_t>(segments_of(candidates) + 1) * sizeof(std::int64_t) +
+         static_cast<std::size_t>(candidates) * (sizeof(std::uint32_t) + sizeof(std::uint8_t));
 }
 
 template <>
-void project_emit<float>(const Inputs& in, const ProjectPlan& plan, const ProjectCounts& counts,
-                         const ProjectOutputs<float>& out, Workspace&, CudaStream stream) {
-  if (counts.rows == 0) {
-    check(cudaMemsetAsync(out.row_offsets, 0, sizeof(std::int32_t), stream), "project_fwd");
+void project_count<float>(const Inputs& in, const RankTiles& ranges, void* plan_memory, Workspace&,
+                          std::int64_t* totals, Workspace& workspace, CudaStream stream) {
+  const std::size_t bytes = project_totals(in.n_views, ranges.n_ranks) * sizeof(std::int64_t);
+  check(cudaMemsetAsync(totals, 0, bytes, stream), "project_count");
+  const std::int64_t segments = segments_of(in.n_candidates);
+  const NewPlan plan(plan_memory, in.n_candidates);
+  if (segments == 0 || in.n_views == 0) return;
+  const auto grid = std::min<std::int64_t>(kCountBlocks, blocks_for(segments, kCountThreads / 32));
+  count_kernel<<<static_cast<unsigned>(grid), kCountThreads, 0, stream>>>(
+      in, ranges, plan, reinterpret_cast<unsigned long long*>(totals));
+  check_launch("project_count");
+  std::size_t scratch_bytes = 0;
+  const auto scan = [&](void* scratch) {
+    check(
+        cub::DeviceScan::ExclusiveSum(scratch, scratch_bytes, plan.before, plan.before, segments + 1, stream),
+        "project_count");
+  };
+  scan(nullptr);
+  scan(workspace.allocate_bytes(scratch_bytes));
+}
+
+template <>
+void project_emit<float>(const Inputs& in, const RankTiles& ranges, const void* plan_memory, const void*,
+                         const ProjectSizes& sizes, const ProjectOutputs<float>& out, Workspace&,
+                         CudaStream stream) {
+  if (sizes.rows == 0) {
+    check(cudaMemsetAsync(out.row_offsets, 0, sizeof(std::int32_t), stream), "project_emit");
     return;
   }
-  const auto blocks = static_cast<unsigned>(project_blocks(in.n_candidates));
-  list_rows_kernel<<<blocks, kThreads, 0, stream>>>(in, plan, counts, out);
-  check_launch("project_fwd");
+  const MadePlan plan(plan_memory, in.n_candidates);
+  list_rows_kernel<<<blocks_for(segments_of(in.n_candidates), kListThreads / 32), kListThreads, 0, stream>>>(
+      in, plan, sizes, out);
+  check_launch("project_emit");
   dispatch_sh(in, [&](auto degree, auto quads) {
     emit_kernel<degree.value, quads.value>
-        <<<blocks_for(counts.rows, kEmitThreads), kEmitThreads, 0, stream>>>(in, out, counts.rows);
+        <<<blocks_for(sizes.rows, kEmitThreads), kEmitThreads, 0, stream>>>(in, ranges, out, sizes.rows);
   });
-  check_launch("project_fwd");
+  check_launch("project_emit");
 }
 
 }  // namespace blitzgs::cuda

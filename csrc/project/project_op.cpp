@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
 #include <limits>
 #include <tuple>
 
@@ -83,70 +84,148 @@ OptionalTensor contiguous_or_none(const OptionalTensor& tensor) {
   return tensor ? OptionalTensor(as_contiguous(*tensor)) : std::nullopt;
 }
 
-using ForwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                                  Tensor, Tensor, Tensor>;
+// The arguments that project_count and project_emit share.
+struct Forward {
+  Parameters p;
+  OptionalTensor ids, views;
+  std::int64_t candidates;
+  ProjectOptions<double> options;
+  RankTiles ranges;
 
-ForwardTensors project_fwd(const Tensor& means, const Tensor& quats, const Tensor& scales,
-                           const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
-                           const Tensor& Ks, const OptionalTensor& active_ids,
-                           const OptionalTensor& active_views, std::int64_t width, std::int64_t height,
-                           std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
-                           double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw) {
-  constexpr const char* kOp = "project_fwd";
-  const Parameters p(kOp, means, quats, scales, opacities, sh, viewmats, Ks, sh_degree);
-  check_image(kOp, width, height);
-  STD_TORCH_CHECK(tile_size > 0, "blitzgs::project_fwd: tile_size must be positive, got ", tile_size);
-  const OptionalTensor ids = contiguous_or_none(active_ids), views = contiguous_or_none(active_views);
-  const std::int64_t candidates = ids ? ids->numel() : p.count;
-  if (ids) {
-    check_shape(kOp, "active_ids", *ids, {-1});
-    check_dtype(kOp, "active_ids", *ids, ScalarType::Int);
+  Forward(const char* op, const Tensor& means, const Tensor& quats, const Tensor& scales,
+          const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats, const Tensor& Ks,
+          const OptionalTensor& active_ids, const OptionalTensor& active_views, std::int64_t width,
+          std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
+          double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
+          const std::vector<std::int64_t>& tile_begins, const std::vector<std::int64_t>& tile_ends)
+      : p(op, means, quats, scales, opacities, sh, viewmats, Ks, sh_degree),
+        ids(contiguous_or_none(active_ids)),
+        views(contiguous_or_none(active_views)),
+        candidates(ids ? ids->numel() : p.count),
+        options{static_cast<int>(width),
+                static_cast<int>(height),
+                static_cast<int>(tile_size),
+                static_cast<int>(sh_degree),
+                static_cast<int>(p.sh_stride),
+                near_plane,
+                far_plane,
+                eps2d,
+                radius_clip,
+                antialiased,
+                raw},
+        ranges{} {
+    check_image(op, width, height);
+    STD_TORCH_CHECK(tile_size > 0, "blitzgs::", op, ": tile_size must be positive, got ", tile_size);
+    if (ids) {
+      check_shape(op, "active_ids", *ids, {-1});
+      check_dtype(op, "active_ids", *ids, ScalarType::Int);
+    }
+    if (views) {
+      check_shape(op, "active_views", *views, {candidates});
+      check_dtype(op, "active_views", *views, ScalarType::Int);
+    }
+    STD_TORCH_CHECK(tile_begins.size() == tile_ends.size() && tile_begins.size() <= kMaxRanks,
+                    "blitzgs::", op, ": tile_begins and tile_ends must have one entry for each of at most ",
+                    kMaxRanks, " ranks, got ", tile_begins.size(), " and ", tile_ends.size());
+    ranges.n_ranks = static_cast<int>(tile_begins.size());
+    std::copy(tile_begins.begin(), tile_begins.end(), ranges.begin);
+    std::copy(tile_ends.begin(), tile_ends.end(), ranges.end);
   }
-  if (views) {
-    check_shape(kOp, "active_views", *views, {candidates});
-    check_dtype(kOp, "active_views", *views, ScalarType::Int);
-  }
-  DeviceScope scope(p.means);
-  std::unique_ptr<ProjectCarry> carry;
-  const ProjectPlan plan{scope.workspace.allocate<std::uint32_t>(candidates),
-                         scope.workspace.allocate<std::int64_t>(project_blocks(candidates) + 1),
-                         scope.workspace.allocate<std::int64_t>(project_blocks(candidates) + 1), &carry};
-  ProjectCounts counts;
-  std::vector<Tensor> out;
-  dispatch_floating(p.means, [&](auto zero) {
-    using T = decltype(zero);
-    const ProjectOptions<T> options{static_cast<int>(width),
-                                    static_cast<int>(height),
-                                    static_cast<int>(tile_size),
-                                    static_cast<int>(sh_degree),
-                                    static_cast<int>(p.sh_stride),
-                                    static_cast<T>(near_plane),
-                                    static_cast<T>(far_plane),
-                                    static_cast<T>(eps2d),
-                                    static_cast<T>(radius_clip),
-                                    antialiased,
-                                    raw};
-    ProjectInputs<T> in = p.inputs<T>(options);
+
+  template <class T>
+  ProjectInputs<T> inputs() const {
+    const auto& o = options;
+    ProjectInputs<T> in =
+        p.inputs<T>({o.width, o.height, o.tile_size, o.sh_degree, o.sh_stride, static_cast<T>(o.near_plane),
+                     static_cast<T>(o.far_plane), static_cast<T>(o.eps2d), static_cast<T>(o.radius_clip),
+                     o.antialiased, o.raw});
     in.active_ids = data_or_null<std::int32_t>(ids);
     in.active_views = data_or_null<std::int32_t>(views);
     in.n_candidates = candidates;
-    backend::project_count(in, plan, &counts, scope.workspace, scope.stream);
-    STD_TORCH_CHECK(
-        counts.rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::project_fwd: ", counts.rows,
-        " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
-    const std::int64_t U = counts.visible, P = counts.rows;
-    const auto ints = ScalarType::Int;
-    out = {make_empty(p.means, {P}, ints),
-           make_empty(p.means, {P}, ints),
-           make_empty(p.means, {U}, ints),
-           make_empty(p.means, {U + 1}, ints),
-           make_empty(p.means, {P, 2}),
-           make_empty(p.means, {P, 3}),
-           make_empty(p.means, {P}),
-           make_empty(p.means, {P}),
-           make_empty(p.means, {sh ? P : 0, 3}),
-           make_empty(p.means, {P, 2}, ints),
-           make_empty(p.means, {P}, ints)};
+    return in;
+  }
+};
+
+// The one allocation of project_count that outlives it.
+class Carry final : public Workspace {
+ public:
+  explicit Carry(const Tensor& like) : like_(like), tensor_(make_empty(like, {0}, ScalarType::Byte)) {}
+  void* allocate_bytes(std::size_t bytes) override {
+    tensor_ = make_empty(like_, {static_cast<std::int64_t>(bytes)}, ScalarType::Byte);
+    return tensor_.mutable_data_ptr();
+  }
+  const Tensor& tensor() const { return tensor_; }
+
+ private:
+  Tensor like_, tensor_;
+};
+
+std::tuple<Tensor, Tensor, Tensor> project_count(
+    const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
+    const OptionalTensor& sh, const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& active_ids,
+    const OptionalTensor& active_views, std::int64_t width, std::int64_t height, std::int64_t tile_size,
+    std::int64_t sh_degree, double near_plane, double far_plane, double eps2d, double radius_clip,
+    bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
+    const std::vector<std::int64_t>& tile_ends) {
+  const Forward f("project_count", means, quats, scales, opacities, sh, viewmats, Ks, active_ids,
+                  active_views, width, height, tile_size, sh_degree, near_plane, far_plane, eps2d,
+                  radius_clip, antialiased, raw, tile_begins, tile_ends);
+  const std::size_t bytes = backend::project_plan_bytes(f.candidates);
+  Tensor plan = make_empty(f.p.means, {static_cast<std::int64_t>((bytes + 7) / 8)}, ScalarType::Long);
+  Tensor totals = make_empty(f.p.means, {project_totals(f.p.n_views, f.ranges.n_ranks)}, ScalarType::Long);
+  Carry carry(f.p.means);
+  DeviceScope scope(f.p.means);
+  dispatch_floating(f.p.means, [&](auto zero) {
+    backend::project_count(f.inputs<decltype(zero)>(), f.ranges, plan.mutable_data_ptr(), carry,
+                           mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
+  });
+  return {plan, carry.tensor(), totals};
+}
+
+using RowTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
+                              Tensor, Tensor>;
+
+RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& scales,
+                        const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
+                        const Tensor& Ks, const OptionalTensor& active_ids,
+                        const OptionalTensor& active_views, std::int64_t width, std::int64_t height,
+                        std::int64_t tile_size, std::int64_t sh_degree, double near_plane, double far_plane,
+                        double eps2d, double radius_clip, bool antialiased, bool raw,
+                        const std::vector<std::int64_t>& tile_begins,
+                        const std::vector<std::int64_t>& tile_ends, const Tensor& plan, const Tensor& carry,
+                        const Tensor& counts) {
+  constexpr const char* kOp = "project_emit";
+  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
+                  height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
+                  tile_begins, tile_ends);
+  const auto bytes = static_cast<std::int64_t>(backend::project_plan_bytes(f.candidates));
+  check_dtype(kOp, "plan", plan, ScalarType::Long);
+  check_shape(kOp, "plan", plan, {(bytes + 7) / 8});
+  check_dtype(kOp, "counts", counts, ScalarType::Long);
+  STD_TORCH_CHECK(counts.is_cpu() && counts.numel() >= 2,
+                  "blitzgs::project_emit: counts must be the totals of project_count, on the CPU");
+  const auto* totals = data<std::int64_t>(counts);
+  const ProjectSizes sizes{totals[kTotalVisible], totals[kTotalRows]};
+  STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(),
+                  "blitzgs::project_emit: ", sizes.rows,
+                  " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
+  const std::int64_t U = sizes.visible, P = sizes.rows;
+  const auto ints = ScalarType::Int;
+  std::vector<Tensor> out{make_empty(f.p.means, {P}, ints),
+                          make_empty(f.p.means, {P}, ints),
+                          make_empty(f.p.means, {U}, ints),
+                          make_empty(f.p.means, {U + 1}, ints),
+                          make_empty(f.p.means, {P, 2}),
+                          make_empty(f.p.means, {P, 3}),
+                          make_empty(f.p.means, {P}),
+                          make_empty(f.p.means, {P}),
+                          make_empty(f.p.means, {sh ? P : 0, 3}),
+                          make_empty(f.p.means, {P, 2}, ints),
+                          make_empty(f.p.means, {P}, ints),
+                          make_empty(f.p.means, {f.ranges.n_ranks > 0 ? P : 0}, ScalarType::Long)};
+  DeviceScope scope(f.p.means);
+  dispatch_floating(f.p.means, [&](auto zero) {
+    using T = decltype(zero);
     const ProjectOutputs<T> rows{mutable_data<std::int32_t>(out[0]),
                                  mutable_data<std::int32_t>(out[1]),
                                  mutable_data<std::int32_t>(out[2]),
@@ -157,16 +236,12 @@ ForwardTensors project_fwd(const Tensor& means, const Tensor& quats, const Tenso
                                  mutable_data<T>(out[7]),
                                  mutable_data<T>(out[8]),
                                  mutable_data<std::int32_t>(out[9]),
-                                 mutable_data<std::int32_t>(out[10])};
-    backend::project_emit(in, plan, counts, rows, scope.workspace, scope.stream);
+                                 mutable_data<std::int32_t>(out[10]),
+                                 f.ranges.n_ranks > 0 ? mutable_data<std::int64_t>(out[11]) : nullptr};
+    backend::project_emit(f.inputs<T>(), f.ranges, plan.const_data_ptr(), carry.const_data_ptr(), sizes, rows,
+                          scope.workspace, scope.stream);
   });
-  Tensor sizes = torch::stable::new_empty(p.means, {3}, ScalarType::Long, std::nullopt,
-                                          torch::stable::Device(torch::headeronly::DeviceType::CPU));
-  std::int64_t* values = mutable_data<std::int64_t>(sizes);
-  values[0] = counts.visible;
-  values[1] = counts.rows;
-  values[2] = counts.tiles;
-  return {out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9], out[10], sizes};
+  return {out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9], out[10], out[11]};
 }
 
 using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
@@ -236,6 +311,7 @@ BackwardTensors project_bwd(const Tensor& means, const Tensor& quats, const Tens
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("project_fwd", TORCH_BOX(&blitzgs::project_fwd));
+  m.impl("project_count", TORCH_BOX(&blitzgs::project_count));
+  m.impl("project_emit", TORCH_BOX(&blitzgs::project_emit));
   m.impl("project_bwd", TORCH_BOX(&blitzgs::project_bwd));
 }

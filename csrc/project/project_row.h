@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "math/projection.h"
+#include "math/rank_tiles.h"
 #include "math/sh.h"
 #include "math/tiles.h"
 
@@ -129,6 +130,29 @@ BLITZGS_HD bool project_row(const Camera<T>& camera, const ActiveGaussian<T>& ga
   return touches_image(row->mean2d, T(1.0001) * row->extent[0], T(1.0001) * row->extent[1], options);
 }
 
+// How many tiles a row touches, and in *ranks which ranks want it: f(rank, tiles) for every piece of a tile
+// row that a rank wants.
+template <class T, class F>
+BLITZGS_HD std::int32_t row_tiles(const Row<T>& row, int view, const ProjectOptions<T>& options,
+                                  const RankTiles& ranges, std::int64_t* ranks, const F& f) {
+  const int tiles_x = (options.width + options.tile_size - 1) / options.tile_size;
+  const int tiles_y = (options.height + options.tile_size - 1) / options.tile_size;
+  const std::int64_t image = static_cast<std::int64_t>(view) * tiles_x * tiles_y;
+  std::int32_t count = 0;
+  std::int64_t wanted = 0;
+  for_each_tile_row(row.mean2d, row.conic, row.opacity, options.width, options.height, options.tile_size,
+                    [&](int ty, int begin, int end) {
+                      count += end - begin;
+                      const std::int64_t first = image + static_cast<std::int64_t>(ty) * tiles_x;
+                      for_each_rank(ranges, first + begin, first + end, [&](int rank, std::int64_t tiles) {
+                        wanted |= std::int64_t{1} << rank;
+                        f(rank, tiles);
+                      });
+                    });
+  *ranks = wanted;
+  return count;
+}
+
 template <class T>
 BLITZGS_HD std::int32_t pixel_radius(T extent) {
   return static_cast<std::int32_t>(std::ceil(smaller(extent, T(1 << 30))));
@@ -144,14 +168,6 @@ BLITZGS_HD T view_direction(const Camera<T>& camera, const Vec3<T>& mean, Vec3<T
   return inverse;
 }
 
-// Whether the coefficients in use are finite; a Gaussian for which they are not has no rows.
-template <class T>
-BLITZGS_HD bool finite_sh(const T* sh, int degree) {
-  int bad = 0;
-  for (int i = 0; i < 3 * sh_basis_count(degree); ++i) bad |= !is_finite(sh[i]);
-  return bad == 0;
-}
-
 // sum_k basis_k sh_k + 0.5; sh [K, 3].
 template <class T>
 BLITZGS_HD Vec3<T> unclipped_color(const T* basis, const T* sh, int degree) {
@@ -160,18 +176,26 @@ BLITZGS_HD Vec3<T> unclipped_color(const T* basis, const T* sh, int degree) {
   return sum;
 }
 
-// color = max(sum_k basis_k sh_k + 0.5, 0); sh [K, 3].
 template <class T>
-BLITZGS_HD void row_color(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree, T* color) {
+BLITZGS_HD bool finite_color(const Vec3<T>& color) {
+  return is_finite(color.x) && is_finite(color.y) && is_finite(color.z);
+}
+
+// color = max(sum_k basis_k sh_k + 0.5, 0); sh [K, 3]. False, and zeros, when the sum is not finite, as with
+// any coefficient in use that is not: the row is hidden.
+template <class T>
+BLITZGS_HD bool row_color(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree, T* color) {
   Vec3<T> direction;
   view_direction(camera, mean, &direction);
   T basis[kMaxShBasis];
   sh_basis(degree, direction, basis);
   const Vec3<T> sum = unclipped_color(basis, sh, degree);
-  store3(Vec3<T>{larger(sum.x, T(0)), larger(sum.y, T(0)), larger(sum.z, T(0))}, color);
+  const bool shown = finite_color(sum);
+  store3(shown ? Vec3<T>{larger(sum.x, T(0)), larger(sum.y, T(0)), larger(sum.z, T(0))} : Vec3<T>{}, color);
+  return shown;
 }
 
-// v_sh [K, 3] += and v_mean +=; pose (null: not wanted) += . Zero where the colour is clipped at 0.
+// v_sh [K, 3] += and v_mean +=; pose (null: not wanted) += . Zero where the colour is clipped at 0 or hidden.
 template <class T>
 BLITZGS_HD void row_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree,
                               const T* v_color, T* v_sh, Vec3<T>* v_mean, PoseGradient<T>* pose) {
@@ -180,6 +204,7 @@ BLITZGS_HD void row_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, cons
   T basis[kMaxShBasis], v_basis[kMaxShBasis] = {};
   sh_basis(degree, direction, basis);
   const Vec3<T> sum = unclipped_color(basis, sh, degree);
+  if (!finite_color(sum)) return;
   const Vec3<T> v{sum.x > T(0) ? v_color[0] : T(0), sum.y > T(0) ? v_color[1] : T(0),
                   sum.z > T(0) ? v_color[2] : T(0)};
   for (int k = 0; k < sh_basis_count(degree); ++k) {

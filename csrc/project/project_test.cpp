@@ -7,14 +7,11 @@
 #include <vector>
 
 #include "common/catch.h"
+#include "common/test_workspace.h"
 
 using namespace blitzgs;
 
 namespace {
-
-struct NoWorkspace final : Workspace {
-  void* allocate_bytes(std::size_t) override { return nullptr; }
-};
 
 // 2500 Gaussians (three blocks of candidates) around the origin, seen by three cameras on the z axis.
 struct World {
@@ -50,20 +47,20 @@ struct World {
 };
 
 struct Projected {
-  ProjectCounts counts;
+  ProjectSizes sizes;
+  std::vector<std::int64_t> totals, rank_masks;
   std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, row_offsets, radii, tiles;
   std::vector<double> means2d, conics, depths, opacities, colors;
 };
 
-Projected project(const ProjectInputs<double>& in) {
+Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) {
   Projected p;
-  NoWorkspace workspace;
-  std::vector<std::uint32_t> masks(in.n_candidates);
-  std::vector<std::int64_t> visible(project_blocks(in.n_candidates) + 1), rows(visible.size());
-  std::unique_ptr<ProjectCarry> carry;
-  const ProjectPlan plan{masks.data(), visible.data(), rows.data(), &carry};
-  cpu::project_count(in, plan, &p.counts, workspace, nullptr);
-  const std::size_t U = p.counts.visible, P = p.counts.rows;
+  TestWorkspace workspace, carry;
+  void* plan = workspace.allocate_bytes(cpu::project_plan_bytes(in.n_candidates));
+  p.totals.resize(project_totals(in.n_views, ranks.n_ranks));
+  cpu::project_count(in, ranks, plan, carry, p.totals.data(), workspace, nullptr);
+  p.sizes = {p.totals[kTotalVisible], p.totals[kTotalRows]};
+  const std::size_t U = p.sizes.visible, P = p.sizes.rows;
   for (auto* ints : {&p.gaussian_ids, &p.camera_ids, &p.tiles}) ints->resize(P);
   p.radii.resize(2 * P);
   p.visible_ids.resize(U);
@@ -73,11 +70,12 @@ Projected project(const ProjectInputs<double>& in) {
   p.depths.resize(P);
   p.opacities.resize(P);
   p.colors.resize(3 * P);
+  p.rank_masks.resize(P);
   const ProjectOutputs<double> out{p.gaussian_ids.data(), p.camera_ids.data(), p.visible_ids.data(),
                                    p.row_offsets.data(),  p.means2d.data(),    p.conics.data(),
                                    p.depths.data(),       p.opacities.data(),  p.colors.data(),
-                                   p.radii.data(),        p.tiles.data()};
-  cpu::project_emit(in, plan, p.counts, out, workspace, nullptr);
+                                   p.radii.data(),        p.tiles.data(),      p.rank_masks.data()};
+  cpu::project_emit(in, ranks, plan, carry.last(), p.sizes, out, workspace, nullptr);
   return p;
 }
 
@@ -119,19 +117,22 @@ struct Weights {
 TEST_CASE("rows are ordered by Gaussian and view, and the plan's counts are theirs") {
   const World world;
   const Projected p = project(world.inputs());
-  REQUIRE(p.counts.rows > 2000);
-  REQUIRE(p.counts.visible > 1000);
+  REQUIRE(p.sizes.rows > 2000);
+  REQUIRE(p.sizes.visible > 1000);
   REQUIRE(p.row_offsets.front() == 0);
-  REQUIRE(p.row_offsets.back() == p.counts.rows);
+  REQUIRE(p.row_offsets.back() == p.sizes.rows);
   std::int64_t tiles = 0;
-  for (std::int64_t row = 0; row < p.counts.rows; ++row) {
+  for (std::int64_t row = 0; row < p.sizes.rows; ++row) {
     tiles += p.tiles[row];
     if (row == 0) continue;
     const std::int64_t before = p.gaussian_ids[row - 1] * World::kViews + p.camera_ids[row - 1];
     REQUIRE(before < p.gaussian_ids[row] * World::kViews + p.camera_ids[row]);
   }
-  REQUIRE(tiles == p.counts.tiles);
-  for (std::int64_t u = 0; u < p.counts.visible; ++u) {
+  REQUIRE(tiles == p.totals[kTotalTiles]);
+  for (int view = 0; view < World::kViews; ++view) {
+    REQUIRE(p.totals[kTotalViews + view] == std::count(p.camera_ids.begin(), p.camera_ids.end(), view));
+  }
+  for (std::int64_t u = 0; u < p.sizes.visible; ++u) {
     for (int row = p.row_offsets[u]; row < p.row_offsets[u + 1]; ++row) {
       REQUIRE(p.gaussian_ids[row] == p.visible_ids[u]);
     }
@@ -152,7 +153,7 @@ TEST_CASE("candidates and their views select rows and change no bit of them") {
   in.n_candidates = static_cast<std::int64_t>(ids.size());
   const Projected some = project(in);
   std::size_t next = 0;
-  for (std::int64_t row = 0; row < all.counts.rows; ++row) {
+  for (std::int64_t row = 0; row < all.sizes.rows; ++row) {
     const int id = all.gaussian_ids[row];
     if (id % 3 != 0 || !(id % 8 >> all.camera_ids[row] & 1)) continue;
     REQUIRE(next < some.gaussian_ids.size());
@@ -166,14 +167,37 @@ TEST_CASE("candidates and their views select rows and change no bit of them") {
   REQUIRE(next > 100);
 }
 
+TEST_CASE("each row knows the ranks that composite its tiles, and the totals count them") {
+  const World world;
+  // Views of 3 x 2 tiles. Rank 1 has none; ranks 0 and 2 overlap.
+  const RankTiles ranks{{0, 4, 4, 10}, {7, 4, 12, 18}, 4};
+  const Projected p = project(world.inputs(), ranks), alone = project(world.inputs());
+  REQUIRE(p.conics == alone.conics);
+  std::vector<std::int64_t> expected(8, 0);
+  for (std::size_t row = 0; row < p.rank_masks.size(); ++row) {
+    std::int64_t mask = 0;
+    for_each_tile(&p.means2d[2 * row], &p.conics[3 * row], p.opacities[row], 40, 30, 16, [&](int tx, int ty) {
+      const int tile = 6 * p.camera_ids[row] + 3 * ty + tx;
+      for (int m = 0; m < 4; ++m) {
+        if (tile < ranks.begin[m] || tile >= ranks.end[m]) continue;
+        mask |= std::int64_t{1} << m;
+        ++expected[2 * m + 1];
+      }
+    });
+    REQUIRE(p.rank_masks[row] == mask);
+    for (int m = 0; m < 4; ++m) expected[2 * m] += mask >> m & 1;
+  }
+  REQUIRE(std::equal(expected.begin(), expected.end(), p.totals.begin() + kTotalViews + World::kViews));
+}
+
 TEST_CASE("the backward pass is the derivative of the rows") {
   World world;
   const Projected p = project(world.inputs());
-  const Weights weights(p.counts.rows);
-  const std::int64_t U = p.counts.visible;
+  const Weights weights(p.sizes.rows);
+  const std::int64_t U = p.sizes.visible;
   std::vector<double> v_means(3 * U), v_quats(4 * U), v_scales(3 * U), v_opacities(U),
       v_sh(3 * World::kBasis * U), v_viewmats(16 * World::kViews);
-  NoWorkspace workspace;
+  TestWorkspace workspace;
   cpu::project_bwd(
       world.inputs(), ProjectRows{p.camera_ids.data(), p.visible_ids.data(), p.row_offsets.data(), U},
       ProjectRowGradients<double>{weights.means2d.data(), weights.conics.data(), weights.depths.data(),
@@ -187,12 +211,12 @@ TEST_CASE("the backward pass is the derivative of the rows") {
     const double middle = *value, h = 1e-6;
     *value = middle + h;
     const Projected above = project(world.inputs());
-    const double up = above.counts.rows == p.counts.rows ? weights.of(above, world) : 0;
+    const double up = above.sizes.rows == p.sizes.rows ? weights.of(above, world) : 0;
     *value = middle - h;
     const Projected below = project(world.inputs());
-    const double down = below.counts.rows == p.counts.rows ? weights.of(below, world) : 0;
+    const double down = below.sizes.rows == p.sizes.rows ? weights.of(below, world) : 0;
     *value = middle;
-    REQUIRE((above.counts.rows == p.counts.rows && below.counts.rows == p.counts.rows));
+    REQUIRE((above.sizes.rows == p.sizes.rows && below.sizes.rows == p.sizes.rows));
     return (up - down) / (2 * h);
   };
   for (const std::int64_t u : {std::int64_t{0}, U / 3, U - 1}) {
@@ -222,12 +246,17 @@ TEST_CASE("no Gaussians, no views, and Gaussians of NaN give no rows") {
   REQUIRE(project(in).row_offsets == std::vector<std::int32_t>{0});
   in = world.inputs();
   in.n_views = 0;
-  REQUIRE(project(in).counts.rows == 0);
+  REQUIRE(project(in).sizes.rows == 0);
   const double nan = std::numeric_limits<double>::quiet_NaN();
-  for (auto* values : {&world.means, &world.quats, &world.scales, &world.opacities, &world.sh}) {
+  for (auto* values : {&world.means, &world.quats, &world.scales, &world.opacities}) {
     const std::vector<double> before = *values;
     std::fill(values->begin(), values->end(), nan);
-    REQUIRE(project(world.inputs()).counts.rows == 0);
+    REQUIRE(project(world.inputs()).sizes.rows == 0);
     *values = before;
   }
+  world.sh[3 * World::kBasis * 7 + 4] = nan;
+  const Projected p = project(world.inputs());
+  const auto hidden = std::find(p.gaussian_ids.begin(), p.gaussian_ids.end(), 7) - p.gaussian_ids.begin();
+  REQUIRE(hidden < p.sizes.rows);
+  REQUIRE((p.opacities[hidden] == 0 && p.colors[3 * hidden] == 0 && p.tiles[hidden] == 0));
 }

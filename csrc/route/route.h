@@ -15,16 +15,10 @@
 #include <cstdint>
 
 #include "common/stream.h"
+#include "math/rank_tiles.h"
 #include "math/tiles.h"
 
 namespace blitzgs {
-
-constexpr int kMaxRanks = 63;
-
-struct RankTiles {
-  std::int64_t begin[kMaxRanks], end[kMaxRanks];
-  int n_ranks;
-};
 
 template <class T>
 struct RouteInput {
@@ -43,19 +37,14 @@ BLITZGS_HD std::int64_t route_row(const RouteInput<T>& in, std::int64_t row, con
   const TileGrid& grid = in.grid;
   const std::int64_t first_tile = in.camera_ids[row] * grid.per_image();
   std::int64_t mask = 0;
-  int rank = 0;  // tile rows come in ascending order, so the search never goes back
   for_each_tile_row(in.means2d + 2 * row, in.conics + 3 * row, in.opacities[row], grid.width, grid.height,
                     grid.tile_size, [&](int ty, int tx_begin, int tx_end) {
                       const std::int64_t start = first_tile + static_cast<std::int64_t>(ty) * grid.tiles_x;
-                      const std::int64_t begin = start + tx_begin, end = start + tx_end;
-                      while (rank < in.ranks.n_ranks && in.ranks.end[rank] <= begin) ++rank;
-                      for (int m = rank; m < in.ranks.n_ranks && in.ranks.begin[m] < end; ++m) {
-                        const std::int64_t low = in.ranks.begin[m], high = in.ranks.end[m];
-                        const std::int64_t tiles = (high < end ? high : end) - (low > begin ? low : begin);
-                        if (tiles <= 0) continue;
-                        mask |= std::int64_t{1} << m;
-                        f(m, tiles);
-                      }
+                      for_each_rank(in.ranks, start + tx_begin, start + tx_end,
+                                    [&](int m, std::int64_t tiles) {
+                                      mask |= std::int64_t{1} << m;
+                                      f(m, tiles);
+                                    });
                     });
   return mask;
 }

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401
+from blitzgs.ops.project import Rows, project_rows
 
 ops = torch.ops.blitzgs
 
@@ -33,11 +33,11 @@ class Scene:
         names = ("means", "quats", "scales", "opacities", "sh", "viewmats", "Ks")
         return [getattr(self, name).to(device, dtype) for name in names]
 
-    def project(self, device: str, dtype: torch.dtype = torch.float32, **changes: Any) -> tuple[Tensor, ...]:
+    def project(self, device: str, dtype: torch.dtype = torch.float32, **changes: Any) -> Rows:
         options = {"near_plane": 0.1, "far_plane": 1e10, "eps2d": 0.3, "radius_clip": 0.0}
         options |= {"antialiased": False, "raw": True, "active_ids": None, "active_views": None} | changes
         ids, views = (options.pop(k) for k in ("active_ids", "active_views"))
-        return ops.project_fwd(
+        return project_rows(
             *self.parameters(device, dtype), ids, views, self.width, self.height, 16, self.degree,
             *options.values(),
         )  # fmt: skip

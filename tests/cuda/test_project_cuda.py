@@ -16,7 +16,7 @@ def test_rows_match_the_cpu(degree, antialiased):
     scene.degree = degree
     expected = scene.project("cpu", antialiased=antialiased)
     rows = scene.project("cuda", antialiased=antialiased)
-    assert torch.equal(rows[11], expected[11])
+    assert torch.equal(rows.counts, expected.counts)
     for i in range(4):
         assert torch.equal(rows[i].cpu(), expected[i]), NAMES[i]
     for i in range(4, 9):
@@ -79,7 +79,7 @@ def test_nothing_visible(case):
     if case == "no views":
         scene.viewmats, scene.Ks = scene.viewmats[:0], scene.Ks[:0]
     rows = scene.project("cuda")
-    assert rows[11].tolist() == [0, 0, 0]
+    assert rows.counts.tolist() == [0, 0, 0]
     assert rows[3].tolist() == [0]
     gradients = ops.project_bwd(
         *scene.parameters("cuda"), *(rows[i] for i in (1, 2, 3)), 150, 100, 3, 0.3, False, True,
@@ -95,9 +95,30 @@ def test_rows_with_nan_vanish_and_spread_nowhere(scene):
     for k, name in enumerate(("means", "quats", "scales", "opacities", "sh")):
         getattr(broken, name)[k::50] = float("nan")
     bad = torch.zeros(3000, dtype=torch.bool)
-    for k in range(5):
+    for k in range(4):
         bad[k::50] = True
     rows = broken.project("cuda")
-    kept = ~bad.cuda()[clean[0].long()]
+    kept = ~bad.cuda()[clean.gaussian_ids.long()]
+    assert torch.equal(rows.gaussian_ids, clean.gaussian_ids[kept])
+    # Where only the colour is not finite there are rows, but nothing composites them.
+    hidden = rows.gaussian_ids % 50 == 4
+    assert hidden.any()
+    for i in (7, 8, 9, 10):
+        assert not rows[i][hidden].any()
     for i in (0, 1, 4, 5, 6, 7, 8, 9, 10):
-        assert torch.equal(rows[i], clean[i][kept])
+        assert torch.equal(rows[i][~hidden], clean[i][kept][~hidden])
+
+
+def test_ranks_of_rows_match_the_cpu(scene):
+    arguments = (
+        *scene.parameters("cpu"), None, None, scene.width, scene.height, 16, scene.degree, 0.1, 1e10, 0.3,
+        0.0, False, True, [0, 30, 30, 50], [40, 30, 90, 140],
+    )  # fmt: skip
+    plan, carry, totals = ops.project_count(*arguments)
+    expected = ops.project_emit(*arguments, plan, carry, totals)
+    on_gpu = [a.cuda() if torch.is_tensor(a) else a for a in arguments]
+    plan, carry, counted = ops.project_count(*on_gpu)
+    assert torch.equal(counted.cpu(), totals)
+    rows = ops.project_emit(*on_gpu, plan, carry, counted.cpu())
+    assert torch.equal(rows[11].cpu(), expected[11])
+    assert totals[5::2].tolist() == [(expected[11] >> m & 1).sum().item() for m in range(4)]

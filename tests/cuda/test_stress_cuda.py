@@ -10,7 +10,7 @@ def render(scene, device, dtype=torch.float32):
     """Project, list and composite; returns (rows, lists, saved)."""
     rows = scene.project(device, dtype)
     means2d, conics, depths, opacities, colors = rows[4:9]
-    count = int(rows[11][2])
+    count = int(rows.counts[2])
     lists = ops.intersect(means2d, conics, opacities, depths, rows[1], None, *scene.grid(), count)
     saved = ops.rasterize_fwd(means2d, conics, opacities, colors, None, *lists, *scene.grid())
     return rows, lists, saved

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from blitzgs.ops.project import project
+from blitzgs.ops.route import route_count
 from tests.helpers import PARAMETERS, orbit_camera, random_scene, reference_images, relative_error
 
 FLOATS = ("means2d", "conics", "depths", "opacities", "colors")
@@ -193,16 +194,38 @@ def test_nothing_finite_is_lost_and_nothing_else_spreads():
         getattr(scene, name)[row] = math.nan if row % 2 else math.inf
     scene.means[19] = math.inf
     scene.scales[23, 1] = -math.inf
-    gone = torch.tensor([*poisoned, 19, 23], dtype=torch.int32)
+    gone = torch.tensor([*(set(poisoned) - {17}), 19, 23], dtype=torch.int32)
     leaves = scene.leaves()
     rows = project_scene(leaves)
     keep = ~torch.isin(clean.gaussian_ids, gone)
     assert torch.equal(rows.gaussian_ids, clean.gaussian_ids[keep])
+    # Where only the colour is not finite there are rows, but nothing composites them.
+    hidden = rows.gaussian_ids == 17
+    assert hidden.any()
+    for name in ("opacities", "colors", "radii", "tiles_touched"):
+        assert (getattr(rows, name)[hidden] == 0).all()
+    for name in FLOATS:
+        assert torch.equal(getattr(rows, name)[~hidden], getattr(clean, name)[keep][~hidden]), name
     sum(getattr(rows, name).square().sum() for name in FLOATS).backward()
     for name in PARAMETERS:
         assert getattr(leaves, name).grad.isfinite().all(), name
         if name != "viewmats":
             assert (getattr(leaves, name).grad[gone.long()] == 0).all()
+    assert (leaves.colors.grad[17] == 0).all()
+
+
+def test_each_row_knows_the_ranks_that_composite_its_tiles():
+    scene = random_scene(n=500, cameras=2, width=70, height=40)  # 5 x 3 tiles a view
+    arguments = opcheck_arguments(scene)
+    ranges = [(0, 18), (12, 12), (12, 30)]
+    begins, ends = [begin for begin, _ in ranges], [end for _, end in ranges]
+    plan, carry, totals = torch.ops.blitzgs.project_count(*arguments, begins, ends)
+    rows = torch.ops.blitzgs.project_emit(*arguments, begins, ends, plan, carry, totals)
+    masks, counts = route_count(rows[4], rows[5], rows[7], rows[1], ranges, 70, 40)
+    assert torch.equal(rows[11], masks) and masks.unique().numel() > 2
+    assert torch.equal(totals[5:].view(3, 2), counts)
+    assert torch.equal(totals[3:5], torch.bincount(rows[1], minlength=2))
+    assert totals[:3].tolist() == [len(rows[2]), len(rows[0]), rows[10].sum()]
 
 
 @pytest.mark.parametrize("quat", [[0.0, 0, 0, 0], [1e30, -1e30, 2e30, 0], [1e-30, 0, 3e-30, 1e-30]])
@@ -251,7 +274,7 @@ def test_radius_clip_drops_small_splats_only():
 
 def test_errors_name_the_argument():
     scene = random_scene(n=4, cameras=1)
-    with pytest.raises(RuntimeError, match=r"project_fwd: quats must have shape \[4, 4\], got \[4, 3\]"):
+    with pytest.raises(RuntimeError, match=r"project_count: quats must have shape \[4, 4\], got \[4, 3\]"):
         project(
             scene.means, scene.means, scene.scales, scene.opacities, None, scene.viewmats, scene.Ks, 8, 8
         )  # fmt: skip
@@ -285,11 +308,15 @@ def opcheck_arguments(scene):
 
 def test_opcheck():
     scene = random_scene(n=10, cameras=2)
-    op = torch.ops.blitzgs.project_fwd
-    torch.library.opcheck(op, opcheck_arguments(scene))
+    count, emit = torch.ops.blitzgs.project_count, torch.ops.blitzgs.project_emit
+    arguments = (*opcheck_arguments(scene), [0], [6])
+    torch.library.opcheck(count, arguments)
+    counted = count(*arguments)
+    torch.library.opcheck(emit, (*arguments, *counted))
     # With gradients opcheck's own traced comparison cannot sum integer outputs; the next test is that check.
     utilities = ("test_schema", "test_autograd_registration", "test_faketensor")
-    torch.library.opcheck(op, opcheck_arguments(scene.leaves()), test_utils=utilities)
+    arguments = (*opcheck_arguments(scene.leaves()), [0], [6])
+    torch.library.opcheck(emit, (*arguments, *counted), test_utils=utilities)
 
 
 def test_compiles_into_one_graph_with_the_same_gradients():
