@@ -35,8 +35,8 @@ def arguments(
 ) -> tuple[Any, ...]:
     raw = scene.raw()
     return (
-        *raw.values(), scene.viewmats, scene.Ks, active_ids, active_views, scene.width, scene.height, 16, 3, 0.01,
-        1e10, 0.3, 0.0, False, True,
+        *raw.values(), scene.viewmats, scene.Ks, active_ids, active_views, scene.width, scene.height, 16, 3,
+        0.01, 1e10, 0.3, 0.0, False, True,
     )  # fmt: skip
 
 
