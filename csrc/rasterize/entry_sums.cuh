@@ -7,8 +7,9 @@
 
 namespace blitzgs::cuda {
 
-inline constexpr int kGroup = 16;            // entries transposed at a time
-inline constexpr int kGroupStride = 32 + 1;  // float2 per entry; odd, so that columns spread over the banks
+inline constexpr int kGroup = 16;  // entries transposed at a time, one for each lane of a half-warp
+// float2 per entry: its pixels, and a pad that spreads the entries over the banks.
+inline constexpr int kGroupStride = kSubtile * kSubtile + 2;
 
 __device__ __forceinline__ void add_quad(float* address, float a, float b, float c, float d) {
 #if __CUDA_ARCH__ >= 900
@@ -23,9 +24,11 @@ __device__ __forceinline__ void add_quad(float* address, float a, float b, float
 #endif
 }
 
-__device__ __forceinline__ float add_halves(float value) {
-  return value + __shfl_xor_sync(kFullWarp, value, kGroup);
-}
+// Gradients of a subtile's pixels, channel by channel.
+template <int CHANNELS>
+struct __align__(16) SubtileGradient {
+  float v[CHANNELS][kSubtile * kSubtile];
+};
 
 // Sums of one entry over pixels: weights times v_render, moments of g about the subtile's centre, and
 // |gradient of the mean|.
@@ -36,49 +39,62 @@ struct EntrySums {
   float abs_x = 0.f, abs_y = 0.f;
 };
 
-// The two pixel rows of this half of the subtile.
+// Sums over four values at the offsets -1.5, -0.5, 0.5 and 1.5.
+struct Moments {
+  float zeroth, first, second;
+  __device__ __forceinline__ Moments(float a, float b, float c, float d) {
+    const float outer = a + d, inner = b + c;
+    zeroth = outer + inner;
+    first = 1.5f * (d - a) + 0.5f * (c - b);
+    second = 2.25f * outer + 0.25f * inner;
+  }
+};
+
+// x and y: the subtile's centre from the entry's mean.
 template <int CHANNELS, bool ABSOLUTE>
-__device__ __forceinline__ EntrySums<CHANNELS> sum_half(const float2* group, const float4* v_render,
-                                                        const Entry& shape, float centre_x, float centre_y,
-                                                        int half) {
+__device__ __forceinline__ EntrySums<CHANNELS> sum_pixels(const float2* group,
+                                                          const SubtileGradient<CHANNELS>& gradient,
+                                                          const Entry& shape, float x, float y) {
   EntrySums<CHANNELS> sums;
+  float zeroth[kSubtile], first[kSubtile];
 #pragma unroll
-  for (int y = 0; y < 2; ++y) {
-    const float offset_y = static_cast<float>(2 * half + y) - 1.5f;
-    float g0 = 0.f, g1 = 0.f, g2 = 0.f;
+  for (int row = 0; row < kSubtile; ++row) {
+    const float4 left = reinterpret_cast<const float4*>(group)[2 * row];
+    const float4 right = reinterpret_cast<const float4*>(group)[2 * row + 1];
 #pragma unroll
-    for (int x = 0; x < kSubtileWidth; ++x) {
-      const int pixel = half * 16 + y * kSubtileWidth + x;
-      const float offset_x = static_cast<float>(x) - 3.5f;
-      const float2 value = group[pixel];
-      const float4 v = v_render[pixel];
+    for (int k = 0; k < CHANNELS; ++k) {
+      const float4 v = reinterpret_cast<const float4*>(gradient.v[k])[row];
+      sums.color[k] += left.x * v.x + left.z * v.y + right.x * v.z + right.z * v.w;
+    }
+    const Moments moments(left.y, left.w, right.y, right.w);
+    zeroth[row] = moments.zeroth;
+    first[row] = moments.first;
+    sums.gxx += moments.second;
+    if constexpr (ABSOLUTE) {
+      const float g[kSubtile] = {left.y, left.w, right.y, right.w};
 #pragma unroll
-      for (int k = 0; k < CHANNELS; ++k) sums.color[k] += value.x * channel(v, k);
-      g0 += value.y;
-      g1 += value.y * offset_x;
-      g2 += value.y * (offset_x * offset_x);
-      if constexpr (ABSOLUTE) {
-        const float dx = centre_x + offset_x - shape.x, dy = centre_y + offset_y - shape.y;
+      for (int column = 0; column < kSubtile; ++column) {
+        const float dx = x + (static_cast<float>(column) - 1.5f), dy = y + (static_cast<float>(row) - 1.5f);
         const float u = shape.l11 * dx + shape.l21 * dy, w = shape.l22 * dy;
-        sums.abs_x += fabsf(value.y * (shape.l11 * u));
-        sums.abs_y += fabsf(value.y * (shape.l21 * u + shape.l22 * w));
+        sums.abs_x += fabsf(g[column] * (shape.l11 * u));
+        sums.abs_y += fabsf(g[column] * (shape.l21 * u + shape.l22 * w));
       }
     }
-    sums.g += g0;
-    sums.gx += g1;
-    sums.gxx += g2;
-    sums.gy += g0 * offset_y;
-    sums.gxy += g1 * offset_y;
-    sums.gyy += g0 * (offset_y * offset_y);
   }
+  const Moments columns(zeroth[0], zeroth[1], zeroth[2], zeroth[3]);
+  const Moments mixed(first[0], first[1], first[2], first[3]);
+  sums.g = columns.zeroth;
+  sums.gy = columns.first;
+  sums.gyy = columns.second;
+  sums.gx = mixed.zeroth;
+  sums.gxy = mixed.first;
   return sums;
 }
 
 // Moments about the subtile's centre to gradients of the row.
 template <int CHANNELS, bool ABSOLUTE>
-__device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, const Entry& shape,
-                                                 float centre_x, float centre_y) {
-  const float x = centre_x - shape.x, y = centre_y - shape.y;
+__device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, const Entry& shape, float x,
+                                                 float y) {
   const float mx = s.gx + x * s.g, my = s.gy + y * s.g;
   const float mxx = s.gxx + x * (2.f * s.gx + x * s.g);
   const float mxy = s.gxy + x * s.gy + y * (s.gx + x * s.g);

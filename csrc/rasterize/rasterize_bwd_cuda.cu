@@ -1,16 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-// The gradient of compositing. A warp walks its subtile's list from the back, a lane a pixel, so the pixel's
-// state is a transmittance and one number (what lies behind, dotted with the pixel's gradient), and nothing
-// but the final transmittance has to be kept from the forward pass. Per entry and pixel that leaves two
-// numbers: the weight alpha T and g = dL/d(ln alpha). Sixteen entries at a time, the warp transposes them
-// through shared memory, and each lane then sums for one entry over half of the pixels: the weights against
-// the pixels' gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic
-// follow.
+// The gradient of compositing. A half-warp walks its subtile's list from the back, a lane a pixel, so the
+// pixel's state is a transmittance and one number (what lies behind, dotted with the pixel's gradient), and
+// nothing but the final transmittance has to be kept from the forward pass. Per entry and pixel that leaves
+// two numbers: the weight alpha T and g = dL/d(ln alpha). Sixteen entries at a time, the half-warp transposes
+// them through shared memory, and each lane then sums for one entry: the weights against the pixels'
+// gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic follow.
 #include <algorithm>
 #include <cub/device/device_radix_sort.cuh>
 #include <string>
 
-#include "rasterize/entry_sums.cuh"
+#include "rasterize/backward_pixel.cuh"
 
 namespace blitzgs::cuda {
 
@@ -28,175 +27,164 @@ struct BackwardArguments {
   PackedGradient* entry_gradients;  // [I], written once each (deterministic)
 };
 
-template <int TILE, bool DETERMINISTIC>
+template <int TILE, int CHANNELS, bool DETERMINISTIC>
 struct BackwardShared {
-  static constexpr int kBatch = DETERMINISTIC       ? (TILE == 32 ? 32 : 64)
-                                : TILE * TILE < 256 ? TILE * TILE
-                                                    : 256;
-  static constexpr int kWarps = Tile<TILE>::kWarps;
+  static constexpr int kBatch = DETERMINISTIC ? (TILE == 32 ? 32 : 64) : 256;
+  static constexpr int kWarps = Tile<TILE>::kWarps, kSubtiles = Tile<TILE>::kSubtiles;
   EntryBatch<TILE, kBatch> batch;
-  std::int32_t row[kBatch];
-  float4 v_render[kWarps][32];
-  float2 group[kWarps][kGroup * kGroupStride];  // weight, g
+  SubtileGradient<CHANNELS> v_render[kSubtiles];
+  float2 group[kSubtiles][kGroup * kGroupStride];  // weight, g
   PackedGradient partial[DETERMINISTIC ? kWarps : 1][DETERMINISTIC ? kBatch : 1];
+  std::int32_t row[kBatch + 1];  // -1 where there is no entry
   int last;
 };
 
-// Sums the group's entries, list[0 .. filled) of the warp's list, and hands the results on.
+__device__ __forceinline__ float4 add_halves(float4 a) {
+  return {a.x + __shfl_xor_sync(kFullWarp, a.x, kHalfWarp), a.y + __shfl_xor_sync(kFullWarp, a.y, kHalfWarp),
+          a.z + __shfl_xor_sync(kFullWarp, a.z, kHalfWarp), a.w + __shfl_xor_sync(kFullWarp, a.w, kHalfWarp)};
+}
+
+// Sums the group's entries, list[0 .. filled) of the half-warp's list, and hands the results on.
 template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
-__device__ __forceinline__ void flush_group(BackwardShared<TILE, DETERMINISTIC>& shared,
-                                            const BackwardArguments& args, const Pixel& pixel, int warp,
-                                            int lane, int filled, const std::uint16_t* list) {
+__device__ __forceinline__ void flush_group(BackwardShared<TILE, CHANNELS, DETERMINISTIC>& shared,
+                                            const BackwardArguments& args, const TilePlace& tile,
+                                            const Pixel& pixel, int filled, const std::uint16_t* list) {
   __syncwarp();
-  const int slot = lane % kGroup, half = lane / kGroup;
-  const std::uint32_t offset = slot < filled ? list[slot] : 0;
+  const int slot = threadIdx.x % kGroup;
+  const std::uint32_t offset = slot < filled ? list[slot] : shared.batch.kNothing;
   const Entry& shape = shared.batch.at(offset);
   const int my_entry = static_cast<int>(offset / sizeof(Entry));
-  const float centre_x = static_cast<float>(pixel.left + kSubtileWidth / 2);
-  const float centre_y = static_cast<float>(pixel.top + kSubtileHeight / 2);
-  EntrySums<CHANNELS> sums = sum_half<CHANNELS, ABSOLUTE>(
-      shared.group[warp] + slot * kGroupStride, shared.v_render[warp], shape, centre_x, centre_y, half);
-#pragma unroll
-  for (int k = 0; k < CHANNELS; ++k) sums.color[k] = add_halves(sums.color[k]);
-  sums.g = add_halves(sums.g);
-  sums.gx = add_halves(sums.gx);
-  sums.gy = add_halves(sums.gy);
-  sums.gxx = add_halves(sums.gxx);
-  sums.gxy = add_halves(sums.gxy);
-  sums.gyy = add_halves(sums.gyy);
-  if constexpr (ABSOLUTE) {
-    sums.abs_x = add_halves(sums.abs_x);
-    sums.abs_y = add_halves(sums.abs_y);
-  }
-  const PackedGradient gradient = finish<CHANNELS, ABSOLUTE>(sums, shape, centre_x, centre_y);
-  bool touched = sums.g != 0.f;
+  constexpr int kColumns = Tile<TILE>::kColumns, kMiddle = kSubtile / 2;
+  const float x = static_cast<float>(tile.left + pixel.subtile % kColumns * kSubtile + kMiddle) - shape.x;
+  const float y = static_cast<float>(tile.top + pixel.subtile / kColumns * kSubtile + kMiddle) - shape.y;
+  const EntrySums<CHANNELS> sums = sum_pixels<CHANNELS, ABSOLUTE>(
+      shared.group[pixel.subtile] + slot * kGroupStride, shared.v_render[pixel.subtile], shape, x, y);
+  PackedGradient gradient = finish<CHANNELS, ABSOLUTE>(sums, shape, x, y);
+  bool touched = sums.g != 0.f || (ABSOLUTE && (sums.abs_x != 0.f || sums.abs_y != 0.f));
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) touched |= sums.color[k] != 0.f;
-  if (slot < filled && (touched || DETERMINISTIC || ABSOLUTE)) {
-    if constexpr (DETERMINISTIC) {
-      float4* target = shared.partial[warp][my_entry].quads;
+  touched &= slot < filled;
+  if constexpr (DETERMINISTIC) {  // both halves have the same list
+    const bool half = threadIdx.x & kHalfWarp;
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+      if (!touched) gradient.quads[i] = {0.f, 0.f, 0.f, 0.f};
+      gradient.quads[i] = add_halves(gradient.quads[i]);
+    }
+    if (offset != shared.batch.kNothing) {
+      float4* target = shared.partial[threadIdx.x / 32][my_entry].quads;
       target[half] = half ? gradient.quads[1] : gradient.quads[0];
-      if (half == 0) target[2] = gradient.quads[2];
+      if (!half) target[2] = gradient.quads[2];
+    }
+  } else if (touched) {
+    float* target = reinterpret_cast<float*>(args.row_gradients + shared.row[my_entry]);
+    const float4 a = gradient.quads[0], b = gradient.quads[1], c = gradient.quads[2];
+    add_quad(target, a.x, a.y, a.z, a.w);
+    add_quad(target + 4, b.x, b.y, b.z, b.w);
+    if constexpr (CHANNELS > 3 || ABSOLUTE) {
+      add_quad(target + 8, c.x, c.y, c.z, c.w);
     } else {
-      float* target = reinterpret_cast<float*>(args.row_gradients + shared.row[my_entry]);
-      const float4 quad = half ? gradient.quads[1] : gradient.quads[0];
-      add_quad(target + 4 * half, quad.x, quad.y, quad.z, quad.w);
-      if constexpr (CHANNELS > 3 || ABSOLUTE) {
-        const float4 tail = gradient.quads[2];
-        if (half == 0) add_quad(target + 8, tail.x, tail.y, tail.z, tail.w);
-      } else {
-        if (half == 0) atomicAdd(target + 8, gradient.quads[2].x);
-      }
+      atomicAdd(target + 8, c.x);
     }
   }
   __syncwarp();
 }
 
-// One pixel's state while its list is walked from the back.
-template <int CHANNELS>
-struct BackwardPixel {
-  float transmittance;  // in front of the entries walked so far
-  float behind;         // v . (what lies behind, background included)
-  float v[CHANNELS];
-  int last;
-
-  // last: offset in the batch from which on the pixel has composited nothing.
-  __device__ __forceinline__ float2 add(const Entry& entry, std::uint32_t offset, std::uint32_t last,
-                                        const Pixel& pixel) {
-    const float log2_a = log2_alpha(entry, pixel);
-    const float raw = exp2_approx(log2_a);
-    const bool touched = log2_a >= kLog2Cut && offset < last;
-    const float alpha = touched ? fminf(raw, static_cast<float>(kAlphaMax)) : 0.f;
-    const float inverse = reciprocal_approx(1.f - alpha);
-    transmittance *= inverse;
-    const float weight = alpha * transmittance;
-    const float4 row_color = entry.color;
-    float dot = v[0] * row_color.x;
-#pragma unroll
-    for (int k = 1; k < CHANNELS; ++k) dot = __fmaf_rn(v[k], channel(row_color, k), dot);
-    const float v_alpha = __fmaf_rn(transmittance, dot, -behind * inverse);
-    if (touched) behind = __fmaf_rn(weight, dot, behind);  // not 0 * NaN where the row's color is NaN
-    const bool differentiable = touched && raw <= static_cast<float>(kAlphaMax);
-    return {weight, differentiable ? v_alpha * alpha : 0.f};
-  }
-};
-
-template <int TILE, int CHANNELS, bool DETERMINISTIC>
-__device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(BackwardShared<TILE, DETERMINISTIC>& shared,
-                                                               const BackwardArguments& args,
-                                                               const Pixel& pixel, int camera, int warp,
-                                                               int lane) {
+template <int TILE, int CHANNELS, bool WIDE, class Shared>
+__device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, const BackwardArguments& args,
+                                                               const Pixel& pixel, int camera) {
   BackwardPixel<CHANNELS> state;
-  state.last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
   state.transmittance = pixel.inside ? args.saved.transmittances[pixel.index] : 1.f;
+  const ChannelChunk& chunk = args.chunk;
+  const float* v_render = args.saved.v_renders + pixel.index * chunk.n_channels;
   float open = 0.f;  // gradient of the final transmittance
-  if (pixel.inside && args.saved.v_alphas && args.chunk.first == 0) open = -args.saved.v_alphas[pixel.index];
+  if (pixel.inside && args.saved.v_alphas && chunk.first == 0) open = -args.saved.v_alphas[pixel.index];
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) {
-    const bool present = pixel.inside && k < args.chunk.count;
-    state.v[k] =
-        present ? args.saved.v_renders[pixel.index * args.chunk.n_channels + args.chunk.first + k] : 0.f;
-    if (present && args.backgrounds) {
-      open += state.v[k] * args.backgrounds[camera * args.chunk.n_channels + args.chunk.first + k];
-    }
+    const bool present = pixel.inside && k < chunk.count;
+    state.v[k] = present ? v_render[chunk.first + k] : 0.f;
+    shared.v_render[pixel.subtile].v[k][threadIdx.x % kHalfWarp] = state.v[k];
+  }
+  if (pixel.inside && args.backgrounds) {
+    const float* background = args.backgrounds + static_cast<std::int64_t>(camera) * chunk.n_channels;
+    const int first = WIDE ? 0 : chunk.first, end = WIDE ? chunk.n_channels : chunk.first + chunk.count;
+    for (int k = first; k < end; ++k) open += v_render[k] * background[k];
   }
   state.behind = open * state.transmittance;
-  shared.v_render[warp][lane] = {state.v[0], state.v[1], state.v[2],
-                                 CHANNELS > 3 ? state.v[CHANNELS - 1] : 0.f};
   return state;
 }
 
-template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
-__global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 1024 / (TILE * TILE) : 1)
+// WIDE: g is of all channels, not of the chunk's alone, which absolute sums need.
+template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
+__global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) : 1)
     backward_kernel(const BackwardArguments args) {
-  using Shared = BackwardShared<TILE, DETERMINISTIC>;
+  using Shared = BackwardShared<TILE, CHANNELS, DETERMINISTIC>;
   constexpr int kBatch = Shared::kBatch;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
   Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);
-  const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
-  const TilePlace tile = locate_tile<TILE>(args.grid);
+  const int thread = threadIdx.x, lane = thread % kHalfWarp;
+  const TilePlace tile = locate_tile<TILE>(args.grid, args.grid.tile_begin + blockIdx.x);
   const std::int64_t start = args.tile_offsets[tile.tile];
   if (args.tile_offsets[tile.tile + 1] == start) return;
-  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, warp, lane);
+  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
 
-  if (thread == 0) shared.last = 0;
+  if (thread == 0) {
+    shared.last = 0;
+    shared.row[kBatch] = -1;
+  }
   shared.batch.init(thread);
-  BackwardPixel<CHANNELS> state =
-      start_pixel<TILE, CHANNELS, DETERMINISTIC>(shared, args, pixel, tile.camera, warp, lane);
-  const int warp_last = __reduce_max_sync(kFullWarp, state.last);
+  auto state = start_pixel<TILE, CHANNELS, WIDE>(shared, args, pixel, tile.camera);
+  const int pixel_last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
+  int list_last = pixel_last;  // of the pixels that share a list
+  for (int step = DETERMINISTIC ? kHalfWarp : kHalfWarp / 2; step > 0; step /= 2) {
+    list_last = max(list_last, __shfl_xor_sync(kFullWarp, list_last, step));
+  }
   __syncthreads();
-  if (lane == 0) atomicMax(&shared.last, warp_last);
+  if (lane == 0) atomicMax(&shared.last, list_last);
   __syncthreads();
   const int count = shared.last;
+  const auto dot = [&](std::uint32_t offset) {
+    if constexpr (WIDE) {
+      const int row = pixel.inside ? shared.row[offset / sizeof(Entry)] : -1;
+      return row < 0 ? 0.f
+                     : wide_dot(args.saved.v_renders + pixel.index * args.chunk.n_channels,
+                                args.chunk.colors + static_cast<std::int64_t>(row) * args.chunk.n_channels,
+                                args.chunk.n_channels);
+    } else {
+      const float* color = shared.batch.at(offset).color;
+      float sum = state.v[0] * color[0];
+#pragma unroll
+      for (int k = 1; k < CHANNELS; ++k) sum = __fmaf_rn(state.v[k], color[k], sum);
+      return sum;
+    }
+  };
 
   for (int base = (count - 1) / kBatch * kBatch; base >= 0 && count > 0; base -= kBatch) {
     __syncthreads();
-    const bool present = thread < kBatch && base + thread < count;
-    const std::int32_t row = present ? args.isect_rows[start + base + thread] : -1;
-    if (thread < kBatch) shared.row[thread] = row;
-    shared.batch.load(args.rows, args.chunk, row, tile, thread);
+    for (int at = thread; at < kBatch; at += TILE * TILE) {
+      const std::int32_t row = base + at < count ? args.isect_rows[start + base + at] : -1;
+      shared.row[at] = row;
+      shared.batch.load(args.rows, args.chunk, row, tile, at);
+    }
     if constexpr (DETERMINISTIC) {
-      float4* mine = shared.partial[warp][0].quads;
-      for (int i = lane; i < 3 * kBatch; i += 32) mine[i] = {0.f, 0.f, 0.f, 0.f};
+      float4* mine = shared.partial[thread / 32][0].quads;
+      for (int i = thread % 32; i < 3 * kBatch; i += 32) mine[i] = {0.f, 0.f, 0.f, 0.f};
     }
     __syncthreads();
 
-    const int warp_limit = warp_last - base, pixel_limit = min(max(state.last - base, 0), kBatch);
-    const std::uint32_t last = static_cast<std::uint32_t>(pixel_limit * sizeof(Entry));
-    const int n = shared.batch.template list<true>(warp, lane, warp_limit);
+    const std::uint32_t last =
+        static_cast<std::uint32_t>(min(max(pixel_last - base, 0), kBatch) * static_cast<int>(sizeof(Entry)));
+    const int n = shared.batch.template list<true, DETERMINISTIC>(pixel.subtile, lane, list_last - base);
     for (int first = 0; first < n; first += kGroup) {
       const int filled = min(kGroup, n - first);
-      float2* slot = shared.group[warp] + lane;
-      for (int i = 0; i < filled; i += 4, slot += 4 * kGroupStride) {
+      float2* slots = shared.group[pixel.subtile] + lane;
+      for (int i = 0; i < filled; i += 4, slots += 4 * kGroupStride) {
         std::uint32_t offsets[4];
-        shared.batch.quad(warp, first + i, offsets);
-#pragma unroll
-        for (int k = 0; k < 4; ++k) {
-          slot[k * kGroupStride] = state.add(shared.batch.at(offsets[k]), offsets[k], last, pixel);
-        }
+        shared.batch.quad(pixel.subtile, first + i, offsets);
+        state.add(shared.batch, offsets, last, pixel, dot, slots);
       }
-      flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, pixel, warp, lane, filled,
-                                                           &shared.batch.lists[warp][first]);
+      flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, tile, pixel, filled,
+                                                           &shared.batch.lists[pixel.subtile][first]);
     }
     if constexpr (DETERMINISTIC) {
       __syncthreads();
@@ -212,14 +200,16 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 1024 / (TILE * TILE) 
   }
 }
 
+// colors_only: an earlier chunk gave the gradient of everything else.
 __global__ void unpack_kernel(const PackedGradient* packed, std::int64_t n, ChannelChunk chunk,
-                              RasterizeGradients<float> out) {
+                              bool colors_only, RasterizeGradients<float> out) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
   if (i >= n) return;
   const float4 a = packed[i].quads[0], b = packed[i].quads[1], c = packed[i].quads[2];
   const float color[4] = {b.z, b.w, c.x, c.y};
   float* v_color = out.v_colors + i * chunk.n_channels + chunk.first;
   for (int k = 0; k < chunk.count; ++k) v_color[k] = color[k];
+  if (colors_only) return;
   const bool add = chunk.first > 0;  // later channels add to what the first ones gave
   const auto store = [add](float* address, float value) { *address = add ? *address + value : value; };
   store(out.v_means2d + 2 * i, a.x);
@@ -257,10 +247,10 @@ __global__ void sum_entries_kernel(const std::int32_t* sorted_rows, const std::i
   row_gradients[row].quads[quad] = sum;
 }
 
-template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
+template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
 void launch_backward(const BackwardArguments& args, CudaStream stream) {
-  const auto kernel = backward_kernel<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>;
-  constexpr int kBytes = sizeof(BackwardShared<TILE, DETERMINISTIC>);
+  const auto kernel = backward_kernel<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>;
+  constexpr int kBytes = sizeof(BackwardShared<TILE, CHANNELS, DETERMINISTIC>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_bwd");
   const auto tiles = static_cast<unsigned>(args.grid.tile_end - args.grid.tile_begin);
   kernel<<<tiles, TILE * TILE, kBytes, stream>>>(args);
@@ -269,14 +259,18 @@ void launch_backward(const BackwardArguments& args, CudaStream stream) {
 
 template <int TILE>
 void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream stream) {
+  const bool wide = absolute && args.chunk.n_channels > 4 && args.chunk.first == 0;
   if (args.entry_gradients) {
-    launch_backward<TILE, 4, true, true>(args, stream);
-  } else if (absolute) {
-    launch_backward<TILE, 4, true, false>(args, stream);
+    wide ? launch_backward<TILE, 4, true, true, true>(args, stream)
+         : launch_backward<TILE, 4, true, true, false>(args, stream);
+  } else if (wide) {
+    launch_backward<TILE, 4, true, false, true>(args, stream);
+  } else if (absolute && args.chunk.first == 0) {
+    launch_backward<TILE, 4, true, false, false>(args, stream);
   } else if (args.chunk.count == 4) {
-    launch_backward<TILE, 4, false, false>(args, stream);
+    launch_backward<TILE, 4, false, false, false>(args, stream);
   } else {
-    launch_backward<TILE, 3, false, false>(args, stream);
+    launch_backward<TILE, 3, false, false, false>(args, stream);
   }
 }
 
@@ -310,15 +304,11 @@ EntriesByRow sort_entries(const std::int32_t* isect_rows, std::int64_t n, std::i
   return sorted;
 }
 
-void check_supported(const RasterizeInput<float>& in, bool absolute) {
+void check_supported(const RasterizeInput<float>& in) {
   const int size = in.grid.tile_size;
   if (size != 8 && size != 16 && size != 32) {
     throw std::runtime_error("blitzgs::rasterize_bwd: tile_size must be 8, 16 or 32 on CUDA, got " +
                              std::to_string(size));
-  }
-  if (absolute && in.n_channels > 4) {
-    throw std::runtime_error("blitzgs::rasterize_bwd: absgrad takes at most 4 channels on CUDA, got " +
-                             std::to_string(in.n_channels));
   }
 }
 
@@ -331,7 +321,7 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
                           CudaStream stream) {
   if (in.n_rows == 0) return;
   const bool absolute = gradients.v_means2d_abs != nullptr;
-  check_supported(in, absolute);
+  check_supported(in);
   const bool empty = n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin;
   const std::size_t row_bytes = static_cast<std::size_t>(in.n_rows) * sizeof(PackedGradient);
   auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(row_bytes));
@@ -363,7 +353,8 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
         check_launch("rasterize_bwd");
       }
     }
-    unpack_kernel<<<blocks_for(in.n_rows, 256), 256, 0, stream>>>(packed, in.n_rows, chunk, gradients);
+    unpack_kernel<<<blocks_for(in.n_rows, 256), 256, 0, stream>>>(packed, in.n_rows, chunk,
+                                                                  absolute && first > 0, gradients);
     check_launch("rasterize_bwd");
   }
 }

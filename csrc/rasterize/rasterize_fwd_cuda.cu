@@ -31,7 +31,8 @@ __global__ void pack_rows_kernel(RasterizeInput<float> in, PackedRow* rows, floa
   row.l22 = kFactorScale * factor.l22;
   row.log2_opacity = log2f(in.opacities[i]);
   row.dx_per_dy = -conic[1] / conic[0];
-  row.dy_per_dx = -conic[1] / conic[2];
+  const float width = sqrtf(conic[2] / static_cast<float>(conic_determinant(conic)));
+  row.turn = conic[1] == 0.f ? 0.f : -(conic[1] / conic[2]) * (width / kFactorScale);
   rows[i] = row;
   if (!colors) return;
   const float* color = in.colors + i * in.n_channels;
@@ -52,24 +53,48 @@ struct Compositor {
   std::uint32_t last = kNone;   // composited last
   std::uint32_t ended = kNone;  // at which the pixel ended
 
-  __device__ __forceinline__ void add(const Entry& entry, std::uint32_t offset, const Pixel& pixel) {
-    const float log2_a = log2_alpha(entry, pixel);
-    const float alpha = fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax));
-    const float next = __fmaf_rn(-alpha, transmittance, transmittance);
-    const bool touched = log2_a >= limit;
-    const bool ends = touched && next < static_cast<float>(kMinTransmittance);
-    if (ends) {
-      limit = INFINITY;
-      ended = offset;
-    }
-    if (touched && !ends) {
-      const float weight = alpha * transmittance;
-      const float4 row_color = entry.color;
-      transmittance = next;
-      last = offset;
+  // Composites four entries. Whether the pixel ends is asked once for all of them.
+  template <class Batch>
+  __device__ __forceinline__ void add(const Batch& batch, const std::uint32_t (&offsets)[4],
+                                      const Pixel& pixel) {
+    float alpha[4];
+    bool touched[4];
+    float after = transmittance;
 #pragma unroll
-      for (int k = 0; k < CHANNELS; ++k) color[k] = __fmaf_rn(weight, channel(row_color, k), color[k]);
+    for (int k = 0; k < 4; ++k) {
+      const float log2_a = log2_alpha(batch.at(offsets[k]), pixel);
+      touched[k] = log2_a >= limit;
+      alpha[k] = touched[k] ? fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax)) : 0.f;
+      after = __fmaf_rn(-alpha[k], after, after);
     }
+    if (after < static_cast<float>(kMinTransmittance)) end(alpha, touched, offsets);
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      const float weight = alpha[k] * transmittance;
+      transmittance = __fmaf_rn(-alpha[k], transmittance, transmittance);
+      if (touched[k]) {
+        const float* row_color = batch.at(offsets[k]).color;
+        last = offsets[k];
+#pragma unroll
+        for (int c = 0; c < CHANNELS; ++c) color[c] = __fmaf_rn(weight, row_color[c], color[c]);
+      }
+    }
+  }
+
+  // Takes the entry that would end the pixel, and those behind it, out of the four.
+  __device__ __forceinline__ void end(float (&alpha)[4], bool (&touched)[4],
+                                      const std::uint32_t (&offsets)[4]) {
+    float after = transmittance;
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      after = __fmaf_rn(-alpha[k], after, after);
+      if (ended == kNone && after < static_cast<float>(kMinTransmittance)) ended = offsets[k];
+      if (ended != kNone) {
+        alpha[k] = 0.f;
+        touched[k] = false;
+      }
+    }
+    limit = INFINITY;
   }
 
   __device__ __forceinline__ bool done() const { return limit == INFINITY; }
@@ -79,14 +104,43 @@ __device__ __forceinline__ int entry_number(std::uint32_t offset) {
   return static_cast<int>(offset / sizeof(Entry));
 }
 
+template <int CHANNELS>
+__device__ __forceinline__ void write_pixel(const ForwardArguments& args, const Pixel& pixel, int camera,
+                                            const float* color, float transmittance, int last) {
+  const ChannelChunk& chunk = args.chunk;
+  float* render = args.out.renders + pixel.index * chunk.n_channels + chunk.first;
+  const std::int64_t background = static_cast<std::int64_t>(camera) * chunk.n_channels + chunk.first;
+#pragma unroll
+  for (int k = 0; k < CHANNELS; ++k) {
+    if (k >= chunk.count) break;
+    render[k] =
+        args.backgrounds ? __fmaf_rn(transmittance, args.backgrounds[background + k], color[k]) : color[k];
+  }
+  if (chunk.first > 0) return;
+  args.out.transmittances[pixel.index] = transmittance;
+  args.out.last_ids[pixel.index] = last;
+}
+
+// The first blocks are the owned tiles; the rest write zeros.
 template <int TILE, int CHANNELS>
-__global__ void __launch_bounds__(TILE* TILE) forward_kernel(const ForwardArguments args) {
-  constexpr int kBatch = TILE * TILE < 256 ? TILE * TILE : 256;
+__global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 6 : 1)
+    forward_kernel(const ForwardArguments args) {
+  constexpr int kBatch = 256;
   __shared__ EntryBatch<TILE, kBatch> batch;
   __shared__ int tile_work;
-  const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
-  const TilePlace tile = locate_tile<TILE>(args.grid);
-  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, warp, lane);
+  const int thread = threadIdx.x, lane = thread % kHalfWarp;
+  const std::int64_t owned = args.grid.tile_end - args.grid.tile_begin;
+  std::int64_t index = args.grid.tile_begin + blockIdx.x;
+  if (blockIdx.x >= owned)
+    index = blockIdx.x - owned < args.grid.tile_begin ? blockIdx.x - owned : blockIdx.x;
+  const TilePlace tile = locate_tile<TILE>(args.grid, index);
+  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
+  if (blockIdx.x >= owned) {
+    constexpr float kBlack[CHANNELS] = {};
+    if (pixel.inside) write_pixel<CHANNELS>(args, pixel, tile.camera, kBlack, 0.f, 0);
+    if (thread == 0 && args.chunk.first == 0) args.out.tile_work[tile.tile] = 0;
+    return;
+  }
   const std::int64_t start = args.tile_offsets[tile.tile];
   const int count = static_cast<int>(args.tile_offsets[tile.tile + 1] - start);
   if (thread == 0) tile_work = 0;
@@ -97,16 +151,18 @@ __global__ void __launch_bounds__(TILE* TILE) forward_kernel(const ForwardArgume
   int last = 0, work = pixel.inside ? count : 0;
   for (int base = 0; base < count; base += kBatch) {
     if (__syncthreads_and(state.done())) break;
-    const bool present = thread < kBatch && base + thread < count;
-    batch.load(args.rows, args.chunk, present ? args.isect_rows[start + base + thread] : -1, tile, thread);
+    for (int at = thread; at < kBatch; at += TILE * TILE) {
+      batch.load(args.rows, args.chunk, base + at < count ? args.isect_rows[start + base + at] : -1, tile,
+                 at);
+    }
     __syncthreads();
-    const int n = batch.template list<false>(warp, lane, kBatch);
+    const unsigned done = __ballot_sync(kFullWarp, state.done()) >> (thread & kHalfWarp) & 0xffffu;
+    const int n = batch.template list<false, false>(pixel.subtile, lane, done == 0xffffu ? 0 : kBatch);
     for (int i = 0; i < n; i += 4) {
       if (i % 32 == 0 && __all_sync(kFullWarp, state.done())) break;
       std::uint32_t offsets[4];
-      batch.quad(warp, i, offsets);
-#pragma unroll
-      for (int k = 0; k < 4; ++k) state.add(batch.at(offsets[k]), offsets[k], pixel);
+      batch.quad(pixel.subtile, i, offsets);
+      state.add(batch, offsets, pixel);
     }
     if (state.last != state.kNone) last = base + entry_number(state.last) + 1;
     if (state.ended != state.kNone) work = base + entry_number(state.ended) + 1;
@@ -114,48 +170,25 @@ __global__ void __launch_bounds__(TILE* TILE) forward_kernel(const ForwardArgume
   }
 
   if (pixel.inside) {
-    float* render = args.out.renders + pixel.index * args.chunk.n_channels + args.chunk.first;
-    const float* background =
-        args.backgrounds ? args.backgrounds + static_cast<std::int64_t>(tile.camera) * args.chunk.n_channels +
-                               args.chunk.first
-                         : nullptr;
-#pragma unroll
-    for (int k = 0; k < CHANNELS; ++k) {
-      if (k >= args.chunk.count) break;
-      render[k] = background ? __fmaf_rn(state.transmittance, background[k], state.color[k]) : state.color[k];
-    }
+    write_pixel<CHANNELS>(args, pixel, tile.camera, state.color, state.transmittance, last);
   }
   if (args.chunk.first > 0) return;
-  if (pixel.inside) {
-    args.out.transmittances[pixel.index] = state.transmittance;
-    args.out.last_ids[pixel.index] = last;
-  }
   work = __reduce_max_sync(kFullWarp, work);
   __syncthreads();
-  if (lane == 0) atomicMax(&tile_work, work);
+  if (thread % 32 == 0) atomicMax(&tile_work, work);
   __syncthreads();
   if (thread == 0) args.out.tile_work[tile.tile] = tile_work;
 }
 
 template <int TILE>
 void launch_forward(const ForwardArguments& args, CudaStream stream) {
-  const auto tiles = static_cast<unsigned>(args.grid.tile_end - args.grid.tile_begin);
+  const auto tiles = static_cast<unsigned>(args.grid.count());
   if (args.chunk.count == 4) {
     forward_kernel<TILE, 4><<<tiles, TILE * TILE, 0, stream>>>(args);
   } else {
     forward_kernel<TILE, 3><<<tiles, TILE * TILE, 0, stream>>>(args);
   }
   check_launch("rasterize_fwd");
-}
-
-void clear_unowned(const RasterizeInput<float>& in, const RasterizeOutput<float>& out, CudaStream stream) {
-  const TileGrid& grid = in.grid;
-  if (grid.tile_begin == 0 && grid.tile_end == grid.count()) return;
-  const std::size_t pixels = static_cast<std::size_t>(grid.n_cameras) * grid.height * grid.width;
-  check(cudaMemsetAsync(out.renders, 0, pixels * in.n_channels * sizeof(float), stream), "rasterize_fwd");
-  check(cudaMemsetAsync(out.transmittances, 0, pixels * sizeof(float), stream), "rasterize_fwd");
-  check(cudaMemsetAsync(out.last_ids, 0, pixels * sizeof(std::int32_t), stream), "rasterize_fwd");
-  check(cudaMemsetAsync(out.tile_work, 0, grid.count() * sizeof(std::int32_t), stream), "rasterize_fwd");
 }
 
 }  // namespace
@@ -167,8 +200,7 @@ std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, std::int6
 template <>
 void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out, std::int64_t,
                           void* aux, Workspace&, CudaStream stream) {
-  clear_unowned(in, out, stream);
-  if (in.grid.tile_end <= in.grid.tile_begin) return;
+  if (in.grid.count() == 0) return;
   float4* colors = in.n_channels <= 4 ? const_cast<float4*>(aux_colors(aux, in.n_rows)) : nullptr;
   if (in.n_rows > 0) {
     pack_rows_kernel<<<blocks_for(in.n_rows, 256), 256, 0, stream>>>(in, static_cast<PackedRow*>(aux),

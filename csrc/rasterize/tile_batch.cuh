@@ -2,10 +2,11 @@
 // What the CUDA rasteriser's forward and backward share: packed rows, the arithmetic of alpha, and how a
 // block reads a batch of its tile's list.
 //
-// A block is a tile, a warp an 8x4 subtile of it, a lane a pixel. The block fetches the list in batches; each
-// thread tests its entry against every subtile, and the ballots of those tests tell each warp which entries
-// it has to look at: a splat of a few pixels touches three of the eight subtiles of a 16x16 tile. The test is
-// conservative, so it changes no pixel.
+// A block is a tile, half a warp a 4x4 subtile of it, a lane a pixel. The block fetches the list in batches;
+// each thread tests its entry against every subtile, and from those tests each half-warp makes the list of
+// the entries it has to look at: a splat of a few pixels touches three of the sixteen subtiles of a 16x16
+// tile. The two halves of a warp walk different lists in step. The test is conservative, so it changes no
+// pixel.
 #pragma once
 #include <cstdint>
 
@@ -18,7 +19,8 @@ inline constexpr unsigned kFullWarp = 0xffffffffu;
 inline constexpr float kLog2Cut = -7.99435343685886f;    // log2(1/255)
 inline constexpr float kFactorScale = 0.849321800288f;   // sqrt(log2(e) / 2)
 inline constexpr float kInverseScale2 = 1.38629436112f;  // 1 / kFactorScale^2
-inline constexpr int kSubtileWidth = 8, kSubtileHeight = 4;
+inline constexpr int kSubtile = 4;                       // edge in pixels
+inline constexpr int kHalfWarp = 16;
 
 // A row as the kernels read it: one 32-byte sector, so a gather moves no byte it does not use. With
 // conic = L^T L (factor_conic), l11, l21, l22 are scaled by sqrt(log2(e) / 2), so that
@@ -27,7 +29,7 @@ struct __align__(32) PackedRow {
   float x, y, l11, l21;
   float l22, log2_opacity;
   float dx_per_dy;  // where alpha peaks along a row of pixels: dx = dx_per_dy * dy
-  float dy_per_dx;  // and along a column
+  float turn;       // the ellipse {log2(alpha) >= log2_opacity - r^2} reaches furthest right at dy = turn * r
 };
 
 // Gradients of one row: v_mean2d x y, v_conic a b | v_conic c, v_opacity, v_color 0 1 | v_color 2 3, v_abs x
@@ -75,20 +77,28 @@ __device__ __forceinline__ float reciprocal_approx(float x) {
   return y;
 }
 
+__device__ __forceinline__ float sqrt_approx(float x) {
+  float y;
+  asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+
 template <int TILE>
 struct Tile {
   static constexpr int kThreads = TILE * TILE;
   static constexpr int kWarps = kThreads / 32;
-  static constexpr int kColumns = TILE / kSubtileWidth;
+  static constexpr int kColumns = TILE / kSubtile;
+  static constexpr int kSubtiles = kColumns * kColumns;
+  static constexpr int kMaskWords = (kSubtiles + 31) / 32;
 };
 
 // Where a thread's pixel lies.
 struct Pixel {
   int x, y;            // in the image
-  int left, top;       // of the subtile
+  int subtile;         // in the tile
   bool inside;         // of the image
   std::int64_t index;  // (camera, y, x) flattened
-  float centre_x, centre_y;
+  float dx, dy;        // of its centre from the tile's: multiples of 1/2, so exact
 };
 
 struct TilePlace {
@@ -97,9 +107,9 @@ struct TilePlace {
 };
 
 template <int TILE>
-__device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid) {
+__device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid, std::int64_t tile) {
   TilePlace place;
-  place.tile = grid.tile_begin + blockIdx.x;
+  place.tile = tile;
   place.camera = static_cast<int>(place.tile / grid.per_image());
   const int in_image = static_cast<int>(place.tile - place.camera * grid.per_image());
   place.top = in_image / grid.tiles_x * TILE;
@@ -107,18 +117,21 @@ __device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid) {
   return place;
 }
 
+// A warp is two subtiles side by side.
 template <int TILE>
-__device__ __forceinline__ Pixel locate_pixel(const TileGrid& grid, const TilePlace& place, int warp,
-                                              int lane) {
+__device__ __forceinline__ Pixel locate_pixel(const TileGrid& grid, const TilePlace& place, int thread) {
+  constexpr int kColumns = Tile<TILE>::kColumns;
+  const int lane = thread % kHalfWarp;
   Pixel pixel;
-  pixel.left = place.left + warp % Tile<TILE>::kColumns * kSubtileWidth;
-  pixel.top = place.top + warp / Tile<TILE>::kColumns * kSubtileHeight;
-  pixel.x = pixel.left + lane % kSubtileWidth;
-  pixel.y = pixel.top + lane / kSubtileWidth;
+  pixel.subtile = thread / kHalfWarp;
+  const int x = pixel.subtile % kColumns * kSubtile + lane % kSubtile;
+  const int y = pixel.subtile / kColumns * kSubtile + lane / kSubtile;
+  pixel.x = place.left + x;
+  pixel.y = place.top + y;
   pixel.inside = pixel.x < grid.width && pixel.y < grid.height;
   pixel.index = (static_cast<std::int64_t>(place.camera) * grid.height + pixel.y) * grid.width + pixel.x;
-  pixel.centre_x = static_cast<float>(pixel.x) + 0.5f;
-  pixel.centre_y = static_cast<float>(pixel.y) + 0.5f;
+  pixel.dx = static_cast<float>(x) + (0.5f - TILE / 2);
+  pixel.dy = static_cast<float>(y) + (0.5f - TILE / 2);
   return pixel;
 }
 
@@ -126,36 +139,70 @@ __device__ __forceinline__ float clamp_between(float value, float low, float hig
   return fminf(fmaxf(value, low), high);
 }
 
-// One bit per subtile: can alpha reach 1/255 at one of its pixel centres? The quadratic form is convex, so
-// over a rectangle its least value is the better of the nearest row's and the nearest column's.
-template <int TILE>
-__device__ __forceinline__ std::uint32_t subtile_mask(const PackedRow& row, const TilePlace& place) {
-  const float left = static_cast<float>(place.left) + 0.5f - row.x;
-  const float top = static_cast<float>(place.top) + 0.5f - row.y;
-  // The slack covers the rounding of this test and of log2_alpha().
-  const float terms = fabsf(row.l11) * (fabsf(left) + TILE) + fabsf(row.l21) * (fabsf(top) + TILE);
-  const float cut = (row.log2_opacity - kLog2Cut) * 1.00003f + 3e-5f + 2e-6f * terms;
-  std::uint32_t mask = 0;
-#pragma unroll
-  for (int i = 0; i < Tile<TILE>::kWarps; ++i) {
-    const float x0 = left + i % Tile<TILE>::kColumns * kSubtileWidth, x1 = x0 + (kSubtileWidth - 1);
-    const float y0 = top + i / Tile<TILE>::kColumns * kSubtileHeight, y1 = y0 + (kSubtileHeight - 1);
-    const float near_x = clamp_between(0.f, x0, x1), near_y = clamp_between(0.f, y0, y1);
-    const float peak_x = clamp_between(row.dx_per_dy * near_y, x0, x1);
-    const float peak_y = clamp_between(row.dy_per_dx * near_x, y0, y1);
-    const float u1 = row.l11 * peak_x + row.l21 * near_y, v1 = row.l22 * near_y;
-    const float u2 = row.l11 * near_x + row.l21 * peak_y, v2 = row.l22 * peak_y;
-    const float q = fminf(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2);
-    mask |= static_cast<std::uint32_t>(q <= cut) << i;
-  }
-  return mask;
+// The least integer >= value in the lowest bits, for |value| < 2^22.
+__device__ __forceinline__ std::uint32_t ceil_bits(float scale, float value, float shift) {
+  return __float_as_uint(__fmaf_ru(scale, value, shift + 12582912.f));
 }
 
-// A list entry in shared memory.
+// One bit per subtile, row by row: can alpha reach 1/255 at one of its pixel centres? Over each row of
+// subtiles, the ellipse of those points spans an interval of x with ends in closed form (as in math/tiles.h).
+template <int TILE>
+__device__ __forceinline__ void subtile_mask(const PackedRow& row, const TilePlace& place,
+                                             std::uint32_t* masks) {
+  constexpr int kColumns = Tile<TILE>::kColumns;
+  constexpr std::uint32_t kRow = (1u << kColumns) - 1u;
+  // From the centre of the tile's first pixel to the mean.
+  const float x = row.x - (static_cast<float>(place.left) + 0.5f);
+  const float y = row.y - (static_cast<float>(place.top) + 0.5f);
+  // The slack covers the rounding of this test and of log2_alpha().
+  const float terms = fabsf(row.l11) * (fabsf(x) + TILE) + fabsf(row.l21) * (fabsf(y) + TILE);
+  const float cut = (row.log2_opacity - kLog2Cut) * 1.00003f + 3e-5f + 2e-6f * terms;
+  const float slack = 2e-6f * (fabsf(x) + fabsf(row.dx_per_dy) * (fabsf(y) + TILE)) + 1e-5f;
+  const float inverse = 1.000003f * reciprocal_approx(row.l11);
+  const float turn = row.turn * sqrt_approx(cut);
+  const float left = x - slack - (kSubtile - 1), right = x + slack;
+#pragma unroll
+  for (int word = 0; word < Tile<TILE>::kMaskWords; ++word) masks[word] = 0;
+#pragma unroll
+  for (int i = 0; i < kColumns; ++i) {
+    const float y0 = static_cast<float>(i * kSubtile) - y, y1 = y0 + (kSubtile - 1);
+    const float dy_left = clamp_between(-turn, y0, y1), dy_right = clamp_between(turn, y0, y1);
+    const float v_left = row.l22 * dy_left, v_right = row.l22 * dy_right;
+    const float rest_left = cut - v_left * v_left, rest_right = cut - v_right * v_right;
+    const float reach_left = sqrt_approx(fmaxf(rest_left, 0.f)) * inverse;
+    const float reach_right = sqrt_approx(fmaxf(rest_right, 0.f)) * inverse;
+    const float end_left = row.dx_per_dy * dy_left - reach_left + left;
+    const float end_right = row.dx_per_dy * dy_right + reach_right + right;
+    // Subtile c holds the pixels 4 c to 4 c + 3. A NaN bound does not bound.
+    const std::uint32_t skip_left =
+        ceil_bits(0.25f, fminf(fmaxf(end_left, 1.f - kSubtile), static_cast<float>(TILE)), 0.f);
+    const std::uint32_t skip_right =
+        ceil_bits(-0.25f, fmaxf(fminf(end_right, static_cast<float>(TILE - 1)), -4.f), kColumns - 1.f);
+    const std::uint32_t bits = __funnelshift_l(0u, kRow, skip_left) & __funnelshift_r(kRow, 0u, skip_right);
+    if (rest_right >= 0.f) masks[i * kColumns / 32] |= bits << (i * kColumns % 32);
+  }
+}
+
+// Bit r of lane c's result is bit c of lane r's.
+__device__ __forceinline__ std::uint32_t transpose_bits(std::uint32_t bits, int lane) {
+  constexpr std::uint32_t kLow[5] = {0x55555555u, 0x33333333u, 0x0f0f0f0fu, 0x00ff00ffu, 0x0000ffffu};
+#pragma unroll
+  for (int i = 4; i >= 0; --i) {
+    const int step = 1 << i;
+    const bool high = lane & step;
+    const std::uint32_t other = __shfl_xor_sync(kFullWarp, bits, step);
+    const std::uint32_t keep = high ? ~kLow[i] : kLow[i];
+    const std::uint32_t moved = __funnelshift_l(other, other, high ? 32 - step : step);
+    bits = (bits & keep) | (moved & ~keep);
+  }
+  return bits;
+}
+
+// A list entry in shared memory: what alpha needs, relative to the tile's centre, first.
 struct __align__(16) Entry {
-  float x, y, l11, l21;
-  float l22, log2_opacity, unused[2];
-  float4 color;
+  float l11, l21, u, l22;
+  float v, log2_opacity, color[4];
+  float x, y;  // the mean
 };
 
 // log2 of the unclipped alpha at a pixel. Written out with the fused operations, because forward and backward
@@ -163,75 +210,85 @@ struct __align__(16) Entry {
 __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pixel) {
   const float4 a = reinterpret_cast<const float4*>(&entry)[0];
   const float2 b = reinterpret_cast<const float2*>(&entry)[2];
-  const float dx = pixel.centre_x - a.x, dy = pixel.centre_y - a.y;
-  const float u = __fmaf_rn(a.z, dx, __fmul_rn(a.w, dy));
-  const float v = __fmul_rn(b.x, dy);
+  const float u = __fmaf_rn(a.x, pixel.dx, __fmaf_rn(a.y, pixel.dy, a.z));
+  const float v = __fmaf_rn(a.w, pixel.dy, b.x);
   return __fmaf_rn(-u, u, __fmaf_rn(-v, v, b.y));
 }
 
 // A batch of list entries in shared memory, and for each subtile the list of those it has to look at, as byte
-// offsets so that the loops over them spend nothing on addresses. The lists are filled up to whole quads with
-// an entry that touches nothing.
+// offsets so that the loops over them spend nothing on addresses. The lists are filled up to whole quads, and
+// to the length of the list that the warp's other half walks, with an entry that touches nothing.
 template <int TILE, int BATCH>
 struct EntryBatch {
   static constexpr int kWords = BATCH / 32;
+  static constexpr int kLaneBits = BATCH / kHalfWarp;  // entries that each lane lists
+  static constexpr std::uint32_t kNothing = BATCH * sizeof(Entry);
   Entry entries[BATCH + 1];
-  std::uint32_t hits[Tile<TILE>::kWarps][kWords];
-  std::uint16_t lists[Tile<TILE>::kWarps][BATCH + 4];
+  std::uint32_t hits[Tile<TILE>::kSubtiles][kWords];
+  std::uint16_t lists[Tile<TILE>::kSubtiles][BATCH + 4];
 
   // Once per block, before the first load.
   __device__ __forceinline__ void init(int thread) {
-    if (thread == 0) entries[BATCH] = {0.f, 0.f, 0.f, 0.f, 0.f, -INFINITY, {0.f, 0.f}, {0.f, 0.f, 0.f, 0.f}};
+    if (thread == 0) entries[BATCH] = {0.f, 0.f, 0.f, 0.f, 0.f, -INFINITY, {0.f, 0.f, 0.f, 0.f}, 0.f, 0.f};
   }
 
-  // Called by the whole block, threads >= BATCH included; row < 0 where there is no entry.
+  // Loads entry `at`, called by whole warps; row < 0 where there is none.
   __device__ __forceinline__ void load(const PackedRow* rows, const ChannelChunk& chunk, std::int32_t row,
-                                       const TilePlace& tile, int thread) {
-    if (thread >= BATCH) return;
-    const int lane = thread & 31;
-    std::uint32_t mask = 0;
+                                       const TilePlace& tile, int at) {
+    const int lane = at & 31;
+    std::uint32_t masks[Tile<TILE>::kMaskWords] = {};
     if (row >= 0) {
       const float4* source = reinterpret_cast<const float4*>(rows + row);
       const float4 a = __ldg(source), b = __ldg(source + 1);
-      float4* target = reinterpret_cast<float4*>(entries + thread);
-      target[2] = load_color(chunk, row);
-      target[0] = a;
-      target[1] = b;
-      mask = subtile_mask<TILE>({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile);
+      const float4 color = load_color(chunk, row);
+      const float x = a.x - static_cast<float>(tile.left + TILE / 2);
+      const float y = a.y - static_cast<float>(tile.top + TILE / 2);
+      float4* target = reinterpret_cast<float4*>(entries + at);
+      target[0] = {a.z, a.w, -__fmaf_rn(a.z, x, __fmul_rn(a.w, y)), b.x};
+      target[1] = {-__fmul_rn(b.x, y), b.y, color.x, color.y};
+      target[2] = {color.z, color.w, a.x, a.y};
+      subtile_mask<TILE>({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile, masks);
     }
-    std::uint32_t mine = 0;
 #pragma unroll
-    for (int i = 0; i < Tile<TILE>::kWarps; ++i) {
-      const std::uint32_t word = __ballot_sync(kFullWarp, mask >> i & 1u);
-      if (lane == i) mine = word;
+    for (int i = 0; i < Tile<TILE>::kMaskWords; ++i) {
+      const std::uint32_t mine = transpose_bits(masks[i], lane);
+      if (32 * i + lane < Tile<TILE>::kSubtiles) hits[32 * i + lane][at >> 5] = mine;
     }
-    if (lane < Tile<TILE>::kWarps) hits[lane][thread >> 5] = mine;
   }
 
-  // Writes the warp's list, of the batch's first `limit` entries, and returns its length.
-  template <bool BACKWARDS>
-  __device__ __forceinline__ int list(int warp, int lane, int limit) {
-    int n = 0;
+  // Writes the subtile's list, of the batch's first `limit` entries, and returns the length that both halves
+  // of the warp walk. SHARED: both list what either has to look at (limit must agree).
+  template <bool BACKWARDS, bool SHARED>
+  __device__ __forceinline__ int list(int subtile, int lane, int limit) {
+    const int piece = BACKWARDS ? kHalfWarp - 1 - lane : lane;
+    const int first = piece * kLaneBits;
+    std::uint32_t word = hits[subtile][first / 32];
+    if constexpr (SHARED) word |= hits[subtile ^ 1][first / 32];
+    const int wanted = min(max(limit - first, 0), kLaneBits);
+    std::uint32_t bits = word >> first % 32 & static_cast<std::uint32_t>((std::uint64_t{1} << wanted) - 1);
+    const int count = __popc(bits);
+    int end = count;
 #pragma unroll
-    for (int i = 0; i < kWords; ++i) {
-      const int word = BACKWARDS ? kWords - 1 - i : i;
-      if (word * 32 >= limit) continue;
-      std::uint32_t bits = hits[warp][word];
-      if (limit - word * 32 < 32) bits &= (1u << (limit - word * 32)) - 1u;
-      const std::uint32_t before = BACKWARDS ? bits & (0xfffffffeu << lane) : bits & ((1u << lane) - 1u);
-      if (bits >> lane & 1u) {
-        lists[warp][n + __popc(before)] = static_cast<std::uint16_t>((word * 32 + lane) * sizeof(Entry));
-      }
-      n += __popc(bits);
+    for (int step = 1; step < kHalfWarp; step *= 2) {
+      const int before = __shfl_up_sync(kFullWarp, end, step, kHalfWarp);
+      if (lane >= step) end += before;
     }
-    if (lane < 4) lists[warp][n + lane] = static_cast<std::uint16_t>(BATCH * sizeof(Entry));
+    const int n = __shfl_sync(kFullWarp, end, kHalfWarp - 1, kHalfWarp);
+    std::uint16_t* target = lists[subtile];
+    for (int i = end - count; bits; ++i) {
+      const int bit = BACKWARDS ? 31 - __clz(bits) : __ffs(bits) - 1;
+      bits ^= 1u << bit;
+      target[i] = static_cast<std::uint16_t>((first + bit) * sizeof(Entry));
+    }
+    const int both = max(n, __shfl_xor_sync(kFullWarp, n, kHalfWarp));
+    for (int i = n + lane; i < (both + 3) / 4 * 4; i += kHalfWarp) target[i] = kNothing;
     __syncwarp();
-    return n;
+    return both;
   }
 
   // Four offsets of a list.
-  __device__ __forceinline__ void quad(int warp, int at, std::uint32_t* offsets) const {
-    const uint2 packed = *reinterpret_cast<const uint2*>(&lists[warp][at]);
+  __device__ __forceinline__ void quad(int subtile, int at, std::uint32_t* offsets) const {
+    const uint2 packed = *reinterpret_cast<const uint2*>(&lists[subtile][at]);
     offsets[0] = packed.x & 0xffffu;
     offsets[1] = packed.x >> 16;
     offsets[2] = packed.y & 0xffffu;
