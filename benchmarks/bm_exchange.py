@@ -32,6 +32,7 @@ import torch
 from scenes import aerial
 
 from blitzgs import pipeline
+from blitzgs.distributed.exchange import Traffic
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import LOSS_REACH, TILE_COST, Share, TileOwners, TileRanges, cost_balance
 from blitzgs.distributed.pixels import collect_images
@@ -185,7 +186,7 @@ class Workload:
         return {
             "rows": len(frame.rows.gaussian_ids),
             "visible": len(frame.rows.visible_ids),
-            "sent": 0 if frame.route is None else sum(frame.route.sent) - frame.route.sent[self.ranks.rank],
+            "sent": 0 if frame.route is None else _sent_elsewhere(frame.route.traffic),
             "work": sums,
             "ranges": batch.ranges,
         }
@@ -215,6 +216,10 @@ def balance_of(result: dict[str, Any]) -> float:
     ranges = result["ranges"]
     work = result["work"].read()[-ranges.n_views * ranges.tiles_per_view :].double().numpy()
     return cost_balance(work + TILE_COST, ranges.bounds)
+
+
+def _sent_elsewhere(traffic: Traffic) -> int:
+    return sum(traffic.sent) - traffic.sent[traffic.rank]
 
 
 def half_precision_error(load: Workload) -> dict[str, float]:

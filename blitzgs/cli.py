@@ -10,13 +10,14 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from blitzgs import __version__
-from blitzgs.distributed.group import MismatchError, Ranks
+from blitzgs.distributed.group import MismatchError, Ranks, Transport
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.scene import ply
 from blitzgs.scene.pictures import save_image
@@ -161,7 +162,9 @@ def _train(args: argparse.Namespace) -> int:
         return 0
     if args.out is None:
         args.parser.error("the following arguments are required: --out")
-    with Ranks.from_environment(args.device, config.ranks.timeout_seconds) as ranks:
+    with Ranks.from_environment(
+        args.device, config.ranks.timeout_seconds, cast(Transport, config.ranks.transport)
+    ) as ranks:
         capture, images = run.open_capture(config, ranks)
         summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
         if summary is not None and ranks.rank == 0:

@@ -21,7 +21,6 @@ from blitzgs.distributed.ownership import Share
 from blitzgs.model import GaussianTable
 from blitzgs.ops.host import to_host
 from blitzgs.ops.project import Rows
-from blitzgs.ops.route import route_rows
 
 Mark = Callable[[str], None]
 
@@ -256,18 +255,10 @@ def _project(
         rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
         table["id"][rows.gaussian_ids],
     )  # fmt: skip
-    if traffic is not None:
-        route = Route(
-            route_rows(rows.rank_masks, traffic.sent),
-            traffic.sent,
-            traffic.received,
-            int(counts[1]),
-            traffic.n_isects,
-            traffic.visible,
-            None,
-        )
+    if asking is not None and traffic is not None:
+        route = Route(traffic, rows.rank_masks, peers=asking.ranks.peers)
     elif share is not None:
         route = plan_route(splats, share.ranges, share.ranks, share.half)
     else:
         return rows, splats, None, int(counts[2]), totals[3 : 3 + len(views)]
-    return rows, splats, route, route.n_isects, route.visible
+    return rows, splats, route, route.traffic.n_isects, route.traffic.visible

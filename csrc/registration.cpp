@@ -49,10 +49,20 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "route_count(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor camera_ids, int[] "
       "tile_begins, int[] tile_ends, int width, int height, int tile_size) -> (Tensor masks, Tensor counts)");
-  m.def("route_rows(Tensor masks, int[] rows_per_rank) -> Tensor rows");
-  m.def("pack_rows(Tensor[] columns, Tensor rows) -> Tensor packed");
-  m.def("unpack_rows(Tensor packed, int[] widths) -> Tensor[] columns");
-  m.def("add_rows(Tensor values, Tensor rows, int[] rows_per_rank, int n_rows) -> Tensor total");
+
+  // Rows on their way between ranks, packed for a collective or written straight into peers' memory (CUDA).
+  m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor bases)");
+  m.def("gather_rows(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
+  m.def(
+      "sum_rows(Tensor values, Tensor masks, Tensor bases, int[] group_sizes, int[] widths) -> Tensor[] "
+      "columns");
+  m.def(
+      "scatter_to_peers_(Tensor[] columns, Tensor masks, Tensor(a!)[] buffers, int capacity, int[] starts, "
+      "int[] group_sizes) -> Tensor bases");
+  m.def(
+      "return_to_peers_(Tensor[] columns, int[] group_sizes, Tensor(a!)[] buffers, int offset, int[] starts) "
+      "-> ()");
+  m.def("meet_peers_(Tensor(a!)[] mail, int rank, int meeting, Tensor? values, float timeout_seconds) -> ()");
 
   // Alpha compositing.
   m.def(

@@ -2,16 +2,23 @@
 """The exchange of a step: projected splats from their owners to the ranks whose tiles they touch, and back.
 
 Each rank projects its own Gaussians. The counting pass of the projection finds where each row will have to
-go, and `read_traffic` tells everyone (one small collective, which is all the host waits for); `send` carries
-the rows there in one all-to-all of packed buffers; `send_back` returns their gradients along the same routes
-and adds them up at the owner, by rank, so that the sum does not depend on who was faster (paper §3.1).
-`exchange` is the differentiable form for use with autograd, `plan_route` for rows that are there already.
+go, and `read_traffic` shows everyone's counts to all, which is all the host waits for; `send` brings the rows
+there; `send_back` returns their gradients along the same routes and adds them up at the owner, by rank, so
+that the sum does not depend on who was faster (paper §3.1). `exchange` is the differentiable form for use
+with autograd, `plan_route` for rows that are there already.
+
+Rows travel in one of two ways. Ranks with peer access write them straight into the columns that the others
+composite from (`blitzgs.distributed.peers`). Otherwise they are packed, carried by one all-to-all and taken
+apart. Either way the place of a row among those of its rank follows from the masks and one number per block
+of rows, and serves the way back too.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -19,8 +26,19 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileRanges
-from blitzgs.ops.pack import add_rows, pack_rows, unpack_rows
-from blitzgs.ops.route import route_count, route_rows
+from blitzgs.distributed.peers import Peers
+from blitzgs.ops.route import route_count
+from blitzgs.ops.scatter import (
+    as_column,
+    gather_rows,
+    scatter_rows,
+    sum_rows,
+    words_of,
+    words_per_row,
+)
+
+# A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
+_ALIGNMENT = 32
 
 
 class Splats(NamedTuple):
@@ -45,45 +63,60 @@ class Splats(NamedTuple):
     ids: Tensor
 
 
-class Route(NamedTuple):
-    """Where the rows of one rank go and what it gets.
-
-    Attributes:
-        rows: int32 [S], rows to send, grouped by destination, ascending within a group.
-        sent: rows for each rank.
-        received: rows from each rank.
-        n_rows: P, rows before the exchange.
-        n_isects: row-tile intersections among the rows received.
-        visible: int64 [B], rows of each view before the exchange, over all ranks.
-        halves: float16 [P, 4 + D], what to send for conic, opacity and colour in half precision; None: send
-            them as they are.
-    """
-
-    rows: Tensor
-    sent: list[int]
-    received: list[int]
-    n_rows: int
-    n_isects: int
-    visible: Tensor
-    halves: Tensor | None
-
-
-class Traffic(NamedTuple):
-    """What the host has to know before rows are written and exchanged.
+@dataclass(frozen=True)
+class Traffic:
+    """How many rows go where: what the host has to know before rows are written and exchanged.
 
     Attributes:
         counts: int64 [3] on the CPU: this rank's visible Gaussians, rows and tiles they touch.
-        sent: rows for each rank.
-        received: rows from each rank.
-        n_isects: row-tile intersections among the rows to receive.
-        visible: int64 [B], rows of each view over all ranks.
+        rows: rows[s][d] that rank s sends to rank d.
+        rank: this rank.
+        n_isects: row-tile intersections among the rows received, or a few more.
+        visible: int64 [B], rows of each view before the exchange, over all ranks.
     """
 
     counts: Tensor
-    sent: list[int]
-    received: list[int]
+    rows: list[list[int]]
+    rank: int
     n_isects: int
     visible: Tensor
+
+    @property
+    def sent(self) -> list[int]:
+        """Rows for each rank."""
+        return self.rows[self.rank]
+
+    @property
+    def received(self) -> list[int]:
+        """Rows from each rank."""
+        return [row[self.rank] for row in self.rows]
+
+    @property
+    def most(self) -> int:
+        """Most rows that any rank sends or gets."""
+        return max(*map(sum, self.rows), *map(sum, zip(*self.rows, strict=True)))
+
+
+@dataclass
+class Route:
+    """Where the rows of one rank go.
+
+    Attributes:
+        traffic: what goes where over all ranks.
+        masks: int64 [P], bit m set for rows that go to rank m.
+        halves: float16 [P, 4 + D], what to send for conic, opacity and colour in half precision; None: send
+            them as they are.
+        peers: how rows travel; None: by collectives.
+        bases: int32, places of the rows sent, see `blitzgs.ops.scatter`; set by `send`.
+        exchange: which exchange over peers this is; set by `send`.
+    """
+
+    traffic: Traffic
+    masks: Tensor
+    halves: Tensor | None = None
+    peers: Peers | None = None
+    bases: Tensor | None = None
+    exchange: int = 0
 
 
 def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
@@ -94,15 +127,14 @@ def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
         n_views: B.
         ranks: the job.
     """
-    everyone = ranks.gather_counts(totals)
-    by_rank = ranks.read(everyone)
-    first, mine = 3 + n_views, ranks.rank
-    to_me = first + 2 * mine
+    everyone = ranks.share(totals)
+    known = ranks.read(everyone)
+    first = 3 + n_views
     return Traffic(
-        counts=torch.tensor(by_rank[mine][:3]),
-        sent=by_rank[mine][first::2],
-        received=[counts[to_me] for counts in by_rank],
-        n_isects=sum(counts[to_me + 1] for counts in by_rank),
+        counts=torch.tensor(known[ranks.rank][:3]),
+        rows=[numbers[first::2] for numbers in known],
+        rank=ranks.rank,
+        n_isects=sum(numbers[first + 2 * ranks.rank + 1] for numbers in known),
         visible=everyone[:, 3:first].sum(0),
     )
 
@@ -116,7 +148,8 @@ def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = Fa
         ranks: the job.
         half: send conics (as Cholesky factors, which stay positive definite), opacities and colours in
             float16, and their gradients in bfloat16; positions and depths stay as they are. A row of three
-            colours then takes 40 bytes instead of 52 one way, and 20 instead of 36 back.
+            colours then takes 40 bytes instead of 52 one way, and 20 instead of 36 back. For slow links, so
+            always by collectives.
     """
     halves, conics, opacities = None, splats.conics.detach(), splats.opacities.detach()
     if half:
@@ -133,25 +166,12 @@ def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = Fa
         ranges.height,
         ranges.tile_size,
     )
-    # What every rank needs to know of the others rides along, so that one exchange is enough.
-    seen = count_by_view(splats.camera_ids, ranges.n_views).expand(ranks.world_size, -1)
-    arriving = ranks.exchange_counts(torch.cat((counts, seen), 1))
-    sent, received = ranks.read(torch.stack((counts, arriving[:, :2])))
-    rows_sent = [rows for rows, _ in sent]
-    return Route(
-        rows=route_rows(masks, rows_sent),
-        sent=rows_sent,
-        received=[rows for rows, _ in received],
-        n_rows=len(masks),
-        n_isects=sum(isects for _, isects in received),
-        visible=arriving[:, 2:].sum(0),
-        halves=halves,
-    )
-
-
-def count_by_view(camera_ids: Tensor, n_views: int) -> Tensor:
-    """Count the rows of each view, int64 [B], without waiting for the device."""
-    return torch.stack([(camera_ids == view).sum() for view in range(n_views)])
+    views = torch.arange(ranges.n_views, dtype=torch.int32, device=masks.device)
+    seen = (splats.camera_ids == views[:, None]).sum(1)
+    # As `project_count` would have it; nobody asks for the first three.
+    totals = torch.cat((counts.new_zeros(3), seen, counts.flatten()))
+    traffic = read_traffic(totals, ranges.n_views, ranks)
+    return Route(traffic, masks, halves, None if half else ranks.peers)
 
 
 def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
@@ -159,19 +179,25 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
 
     Args:
         splats: this rank's rows.
-        route: from `plan_route`.
+        route: of these rows; remembers their places.
         ranks: the job.
 
     Returns:
-        The rows that touch the tiles this rank composites, grouped by source rank.
+        The rows that touch the tiles this rank composites, grouped by source rank. Where peers write them,
+        they are valid until the next exchange.
     """
+    if route.peers is not None:
+        return _write_rows(splats, route, route.peers)
     columns = [splats.means2d, splats.depths, splats.camera_ids, splats.ids]
     if route.halves is None:
         columns += [splats.conics, splats.opacities, splats.colors]
     else:
         columns += [route.halves]
-    arrived = ranks.all_to_all(pack_rows(columns, route.rows), route.sent, route.received)
-    means2d, depths, camera_ids, ids, *rest = unpack_rows(arrived, columns)
+    sent, received = route.traffic.sent, route.traffic.received
+    packed, route.bases = scatter_rows(columns, route.masks, sent)
+    words = sum(map(words_per_row, columns))
+    arrived = ranks.all_to_all(packed, [words * n for n in sent], [words * n for n in received])
+    means2d, depths, camera_ids, ids, *rest = gather_rows(arrived, columns, received)
     conics, opacities, colors = rest if route.halves is None else _from_halves(rest[0], means2d.dtype)
     return Splats(means2d, conics, opacities, colors, depths, camera_ids, ids)
 
@@ -186,23 +212,71 @@ def send_back(gradients: Sequence[Tensor], route: Route, ranks: Ranks) -> list[T
 
     Returns:
         Gradients [P, ...] of this rank's own rows; zero for rows that touch no tile.
+
+    Raises:
+        RuntimeError: another exchange has taken the place of this one.
     """
-    widths = [math.prod(gradient.shape[1:]) for gradient in gradients]
-    sent, dtype = list(gradients), gradients[0].dtype
-    if route.halves is not None:
+    if route.bases is None:
+        raise RuntimeError("send_back: the route's rows have not been sent")
+    flat = [g.reshape(len(g), math.prod(g.shape[1:])) for g in gradients]
+    widths, dtype = [g.shape[1] for g in flat], gradients[0].dtype
+    sent, received = route.traffic.sent, route.traffic.received
+    if route.peers is not None:
+        returned = _write_gradients(flat, route, route.peers)
+    elif route.halves is None:
+        returned = ranks.all_to_all(torch.cat(flat, 1), received, sent).view(-1, sum(widths))
+    else:
         # Gradients span too many magnitudes for float16.
-        flat = [g.reshape(len(g), width) for g, width in zip(gradients, widths, strict=True)]
-        sent = [torch.cat(flat, 1).bfloat16()]
-    every = torch.arange(len(sent[0]), dtype=torch.int32, device=sent[0].device)
-    words = ranks.all_to_all(pack_rows(sent, every), route.received, route.sent)
-    arrived = words.view(dtype) if route.halves is None else unpack_rows(words, sent)[0].to(dtype)
-    total = add_rows(arrived, route.rows, route.sent, route.n_rows)
-    parts = total.split(widths, 1)
-    return [part.reshape(-1, *g.shape[1:]) for part, g in zip(parts, gradients, strict=True)]
+        halves = torch.cat(flat, 1).bfloat16()
+        returned = as_column(ranks.all_to_all(words_of(halves), received, sent), halves).to(dtype)
+    sums = sum_rows(returned, route.masks, route.bases, sent, widths)
+    return [part.reshape(-1, *g.shape[1:]) for part, g in zip(sums, gradients, strict=True)]
+
+
+def _write_rows(splats: Splats, route: Route, peers: Peers) -> Splats:
+    """`send`, into the memory of the others."""
+    traffic, columns = route.traffic, [words_of(column) for column in splats]
+    ends = list(itertools.accumulate(column.shape[1] for column in columns))
+    needed = -(-traffic.most // _ALIGNMENT) * _ALIGNMENT
+    peers.reserve(2 * needed * ends[-1])  # a gradient is never wider than its row
+    # The first half of a buffer is for rows, the second for gradients.
+    capacity = len(peers.buffers[0]) // 2 // ends[-1] // _ALIGNMENT * _ALIGNMENT
+    before = [sum(row[d] for row in traffic.rows[: peers.rank]) for d in range(peers.world_size)]
+    peers.exchanges += 1
+    route.exchange = peers.exchanges
+    route.bases = torch.ops.blitzgs.scatter_to_peers_(
+        columns, route.masks, peers.buffers, capacity, before, traffic.sent
+    )
+    peers.meet()
+    mine, count, arrived = peers.buffers[peers.rank], sum(traffic.received), []
+    for like, words, end in zip(splats, columns, ends, strict=True):
+        width = words.shape[1]
+        begin = capacity * (end - width)
+        arrived.append(as_column(mine[begin : begin + count * width].view(count, width), like))
+    return Splats(*arrived)
+
+
+def _write_gradients(flat: list[Tensor], route: Route, peers: Peers) -> Tensor:
+    """Write gradients [R, w] to the owners of their rows; return what came back here, [S, sum w]."""
+    if route.exchange != peers.exchanges:
+        raise RuntimeError(
+            "send_back: a later exchange has overwritten this one's rows: run the backward pass of a frame "
+            "before the next forward pass"
+        )
+    traffic, width = route.traffic, sum(column.shape[1] for column in flat)
+    offset = len(peers.buffers[0]) // 2
+    before = [sum(row[: peers.rank]) for row in traffic.rows]
+    torch.ops.blitzgs.return_to_peers_(flat, traffic.received, peers.buffers, offset, before)
+    peers.meet()
+    count = sum(traffic.sent)
+    mine = peers.buffers[peers.rank][offset : offset + count * width]
+    return mine.view(torch.float32).view(count, width)
 
 
 def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> tuple[Splats, Route]:
     """Differentiable exchange: `plan_route` and `send`, with `send_back` as the backward pass.
+
+    Several may be open at once, so their rows travel by collectives.
 
     Args:
         splats: this rank's rows; gradients flow to means2d, conics, opacities, colors and depths.
@@ -214,6 +288,7 @@ def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = Fals
         The rows that touch this rank's tiles, and the route.
     """
     route = plan_route(splats, ranges, ranks, half)
+    route.peers = None
     return Splats(*_Exchange.apply(*splats, route, ranks)), route  # type: ignore[no-untyped-call]
 
 

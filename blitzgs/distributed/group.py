@@ -9,17 +9,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
 from types import TracebackType
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from blitzgs.distributed.peers import Peers, connect
 from blitzgs.distributed.watchdog import Watchdog, open_store
 from blitzgs.ops.host import to_host
 
 T = TypeVar("T")
 ReduceOp = Literal["sum", "min", "max"]
+Transport = Literal["auto", "peer", "collective"]
 _REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "min": dist.ReduceOp.MIN, "max": dist.ReduceOp.MAX}
 
 DEFAULT_TIMEOUT_SECONDS = 120.0
@@ -42,6 +44,8 @@ class Ranks:
         local_world_size: number of processes on this host.
         device: where this rank computes.
         timeout_seconds: a rank that does not show up at a collective for this long ends the job.
+        peers: memory shared between the ranks; None: rows travel by collectives.
+        transport: how rows travel, in words, for the log.
     """
 
     rank: int = 0
@@ -51,25 +55,34 @@ class Ranks:
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
     watchdog: Watchdog | None = None
+    peers: Peers | None = None
+    transport: str = "none: one rank"
     _side: torch.cuda.Stream | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
     def from_environment(
-        cls, device: str = "auto", timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
+        cls,
+        device: str = "auto",
+        timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS,
+        transport: Transport = "auto",
     ) -> Ranks:
         """Join the job that torchrun's environment describes: Gloo on the CPU, NCCL on CUDA.
 
         Args:
             device: "auto" (CUDA when this torch has a GPU), "cpu", "cuda" or "cuda:INDEX".
             timeout_seconds: see the class.
+            transport: of rows between ranks: "peer" writes them to the other GPUs' memory, "collective"
+                lets NCCL or Gloo carry them, "auto" prefers the former where it works.
 
         Returns:
             The ranks; the trivial object when torchrun started a single process or none.
 
         Raises:
-            ValueError: a CUDA device was asked for that does not exist.
-            RuntimeError: the other ranks did not appear.
+            ValueError: a CUDA device was asked for that does not exist, or a transport that is not known.
+            RuntimeError: the other ranks did not appear, or "peer" was asked for and is impossible.
         """
+        if transport not in get_args(Transport):
+            raise ValueError(f"transport must be one of {', '.join(get_args(Transport))}, not {transport!r}")
         world_size = int(os.environ.get("WORLD_SIZE", "1"))
         rank = int(os.environ.get("RANK", "0"))
         local_rank = int(os.environ.get("LOCAL_RANK", "0"))
@@ -85,10 +98,10 @@ class Ranks:
         if place.type == "cuda":
             torch.cuda.set_device(place)
         if world_size > 1:
-            ranks._join()
+            ranks._join(transport)
         return ranks
 
-    def _join(self) -> None:
+    def _join(self, transport: Transport) -> None:
         on_gpu = self.device.type == "cuda"
         dist.init_process_group(
             backend="nccl" if on_gpu else "gloo",
@@ -105,6 +118,18 @@ class Ranks:
             timedelta(seconds=self.timeout_seconds + margin), dist.group.WORLD
         )
         self.watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
+        self._choose_transport(transport, self.timeout_seconds + margin)
+
+    def _choose_transport(self, transport: Transport, timeout_seconds: float) -> None:
+        peers: Peers | str = "not asked for"
+        if transport != "collective":
+            peers = connect(self, timeout_seconds)
+        if isinstance(peers, Peers):
+            self.peers, self.transport = peers, "peer: rows are written to the other GPUs' memory"
+        elif transport == "peer":
+            raise RuntimeError(f"transport peer is impossible: {peers}; use auto or collective")
+        else:
+            self.transport = f"collective ({dist.get_backend()}); peer memory: {peers}"
 
     def __enter__(self) -> Ranks:
         return self
@@ -125,6 +150,7 @@ class Ranks:
         if self.watchdog is not None:
             self.watchdog.stop()
             self.watchdog = None
+        self.peers = None
         if self.world_size > 1 and dist.is_initialized():
             dist.destroy_process_group()
 
@@ -146,6 +172,23 @@ class Ranks:
         if self.world_size > 1:
             self._collective("all_reduce", lambda: dist.all_reduce(tensor, op=_REDUCE_OPS[op]))
         return tensor
+
+    def share(self, values: Tensor) -> Tensor:
+        """Show a few numbers to all ranks.
+
+        Args:
+            values: int64 [n] on `device`; the same n on all ranks, at most 256.
+
+        Returns:
+            int64 [M, n], those of each rank; valid until the next call.
+        """
+        if self.world_size == 1:
+            return values[None]
+        if self.peers is not None:
+            return self.peers.share(values)
+        everyone = values.new_empty(self.world_size * len(values))
+        self._collective("share", lambda: dist.all_gather_into_tensor(everyone, values))
+        return everyone.view(self.world_size, -1)
 
     def exchange_counts(self, counts: Tensor) -> Tensor:
         """Tell every rank how many items it will get from this one.
@@ -195,21 +238,6 @@ class Ranks:
             lambda: dist.all_to_all_single(result, rows.contiguous(), list(received), list(sent)),
         )
         return result
-
-    def gather_counts(self, counts: Tensor) -> Tensor:
-        """Tell every rank every rank's numbers.
-
-        Args:
-            counts: int64 [C] on `device`, the same C everywhere.
-
-        Returns:
-            int64 [M, C] on `device`, by rank. Does not wait for the device.
-        """
-        if self.world_size == 1:
-            return counts[None].clone()
-        gathered = counts.new_empty(self.world_size * len(counts))
-        self._collective("gather_counts", lambda: dist.all_gather_into_tensor(gathered, counts))
-        return gathered.view(self.world_size, -1)
 
     def exchange_rows(self, rows: Tensor, sent: Sequence[int]) -> tuple[Tensor, list[int]]:
         """`all_to_all` with its own size exchange; returns the rows and how many came from each rank."""

@@ -50,19 +50,6 @@ def route_count(
     return masks, counts
 
 
-def route_rows(masks: Tensor, rows_per_rank: Sequence[int]) -> Tensor:
-    """List the rows for each rank.
-
-    Args:
-        masks: int64 [P] from `route_count`.
-        rows_per_rank: how many go to each rank, column 0 of `route_count`'s counts.
-
-    Returns:
-        int32 [sum(rows_per_rank)]: the rows for rank 0 in ascending order, then those for rank 1, ...
-    """
-    return torch.ops.blitzgs.route_rows(masks, list(rows_per_rank))
-
-
 @torch.library.register_fake("blitzgs::route_count")
 def _(
     means2d: Tensor,
@@ -77,8 +64,3 @@ def _(
 ) -> tuple[Tensor, Tensor]:
     masks = means2d.new_empty(means2d.shape[0], dtype=torch.int64)
     return masks, means2d.new_empty((len(tile_begins), 2), dtype=torch.int64)
-
-
-@torch.library.register_fake("blitzgs::route_rows")
-def _(masks: Tensor, rows_per_rank: Sequence[int]) -> Tensor:
-    return masks.new_empty(sum(rows_per_rank), dtype=torch.int32)

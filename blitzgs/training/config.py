@@ -185,12 +185,16 @@ class RanksConfig:
 
     Attributes:
         timeout_seconds: a rank that does not show up at a collective for this long ends the job.
-        half_exchange: exchange projected Gaussians in half precision (faster on slow links, less exact).
+        transport: how Gaussians travel: "peer" (written to the other GPUs' memory), "collective" (NCCL or
+            Gloo) or "auto" (the former where it works).
+        half_exchange: exchange projected Gaussians in half precision (for slow links, less exact; always
+            collective).
         max_imbalance: Gaussians move between ranks when the largest shard exceeds the smallest by this
             factor.
     """
 
     timeout_seconds: float = 120.0
+    transport: str = "auto"
     half_exchange: bool = False
     max_imbalance: float = 1.1
 

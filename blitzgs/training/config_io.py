@@ -11,10 +11,11 @@ import types
 import typing
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import yaml
 
+from blitzgs.distributed.group import Transport
 from blitzgs.training.config import Config
 
 
@@ -194,6 +195,12 @@ def _check(config: Config) -> None:
             "population.max_gaussians",
             population.max_gaussians,
             "0 (no cap) or more",
+        ),
+        (
+            config.ranks.transport in get_args(Transport),
+            "ranks.transport",
+            config.ranks.transport,
+            "one of " + ", ".join(get_args(Transport)),
         ),
         (config.log.every >= 1, "log.every", config.log.every, "1 or more"),
         (config.log.keep_checkpoints >= 1, "log.keep_checkpoints", config.log.keep_checkpoints, "1 or more"),

@@ -184,7 +184,9 @@ class Trainer:
             f"{self._population():,} Gaussians on {self.progress.level_count} levels; "
             f"{views['train']} training views, {views['test']} held out"
         )
-        values = views | run.versions(self.ranks.device)
+        if self.ranks.world_size > 1:
+            text += f"; {self.ranks.world_size} ranks, transport {self.ranks.transport}"
+        values = views | run.versions(self.ranks.device) | {"transport": self.ranks.transport}
         log.event(self.progress.step * self.schedule.batch_size, "start", values, text)
 
     def _step(self, step: int, log: RunLog) -> None:

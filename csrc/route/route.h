@@ -8,7 +8,6 @@
 //   means2d [P, 2] pixels, conics [P, 3], opacities [P], camera_ids int32 [P]
 //   -> masks int64 [P], bit m set for rank m; counts int64 [M, 2]: rows for rank m, and the row-tile
 //      intersections they make there.
-//   route_rows: masks, rows per rank -> int32 [sum], the rows for rank 0 in ascending order, then rank 1, ...
 //
 // Integers only, so deterministic on every backend. O(tile rows of the splats) and O(P M). M <= 63.
 #pragma once
@@ -52,15 +51,11 @@ BLITZGS_HD std::int64_t route_row(const RouteInput<T>& in, std::int64_t row, con
 namespace cpu {
 template <class T>
 void route_count(const RouteInput<T>& in, std::int64_t* masks, std::int64_t* counts, Workspace&, CudaStream);
-void route_rows(const std::int64_t* masks, std::int64_t n_rows, const std::int64_t* rows_per_rank,
-                int n_ranks, std::int32_t* rows, Workspace&, CudaStream);
 }  // namespace cpu
 
 namespace cuda {
 template <class T>
 void route_count(const RouteInput<T>& in, std::int64_t* masks, std::int64_t* counts, Workspace&, CudaStream);
-void route_rows(const std::int64_t* masks, std::int64_t n_rows, const std::int64_t* rows_per_rank,
-                int n_ranks, std::int32_t* rows, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -28,20 +28,4 @@ template void route_count<float>(const RouteInput<float>&, std::int64_t*, std::i
 template void route_count<double>(const RouteInput<double>&, std::int64_t*, std::int64_t*, Workspace&,
                                   CudaStream);
 
-void route_rows(const std::int64_t* masks, std::int64_t n_rows, const std::int64_t* rows_per_rank,
-                int n_ranks, std::int32_t* rows, Workspace&, CudaStream) {
-  parallel_for(0, n_ranks, 1, [&](std::int64_t begin, std::int64_t end) {
-    std::int32_t* out = rows;
-    for (std::int64_t m = 0; m < begin; ++m) out += rows_per_rank[m];
-    for (std::int64_t m = begin; m < end; ++m) {
-      std::int64_t written = 0;
-      // Never past what was announced, whatever the masks say.
-      for (std::int64_t row = 0; row < n_rows && written < rows_per_rank[m]; ++row) {
-        if ((masks[row] >> m) & 1) out[written++] = static_cast<std::int32_t>(row);
-      }
-      out += rows_per_rank[m];
-    }
-  });
-}
-
 }  // namespace blitzgs::cpu

@@ -1,7 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <thrust/iterator/counting_iterator.h>
-#include <cub/device/device_select.cuh>
-
 #include "common/cuda_check.h"
 #include "route/route.h"
 
@@ -36,12 +33,6 @@ __global__ void route_count_kernel(RouteInput<T> in, std::int64_t* masks, Counte
   }
 }
 
-struct GoesTo {
-  const std::int64_t* masks;
-  int rank;
-  __host__ __device__ bool operator()(std::int32_t row) const { return (masks[row] >> rank) & 1; }
-};
-
 }  // namespace
 
 template <class T>
@@ -56,24 +47,5 @@ void route_count(const RouteInput<T>& in, std::int64_t* masks, std::int64_t* cou
 
 template void route_count<float>(const RouteInput<float>&, std::int64_t*, std::int64_t*, Workspace&,
                                  CudaStream);
-
-void route_rows(const std::int64_t* masks, std::int64_t n_rows, const std::int64_t* rows_per_rank,
-                int n_ranks, std::int32_t* rows, Workspace& workspace, CudaStream stream) {
-  if (n_rows == 0) return;
-  const thrust::counting_iterator<std::int32_t> all(0);
-  std::int32_t* selected = workspace.allocate<std::int32_t>(1);
-  std::size_t bytes = 0;
-  check(cub::DeviceSelect::If(nullptr, bytes, all, rows, selected, static_cast<int>(n_rows), GoesTo{masks, 0},
-                              stream),
-        "route_rows");
-  void* scratch = workspace.allocate_bytes(bytes);
-  for (int m = 0; m < n_ranks; ++m) {
-    if (rows_per_rank[m] == 0) continue;
-    check(cub::DeviceSelect::If(scratch, bytes, all, rows, selected, static_cast<int>(n_rows),
-                                GoesTo{masks, m}, stream),
-          "route_rows");
-    rows += rows_per_rank[m];
-  }
-}
 
 }  // namespace blitzgs::cuda

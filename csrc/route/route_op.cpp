@@ -66,29 +66,7 @@ std::tuple<Tensor, Tensor> route_count(const Tensor& means2d, const Tensor& coni
   return {masks, counts};
 }
 
-Tensor route_rows(const Tensor& masks, const std::vector<std::int64_t>& rows_per_rank) {
-  constexpr const char* kOp = "route_rows";
-  check_shape(kOp, "masks", masks, {-1});
-  check_dtype(kOp, "masks", masks, ScalarType::Long);
-  const Tensor masks_c = as_contiguous(masks);
-  std::int64_t total = 0;
-  for (const std::int64_t count : rows_per_rank) {
-    STD_TORCH_CHECK(count >= 0 && count <= masks.size(0), "blitzgs::route_rows: ", count, " rows of ",
-                    masks.size(0), " cannot go to one rank");
-    total += count;
-  }
-  Tensor rows = make_empty(masks_c, {total}, ScalarType::Int);
-  DeviceScope scope(masks_c);
-  backend::route_rows(data<std::int64_t>(masks_c), masks_c.size(0), rows_per_rank.data(),
-                      static_cast<int>(rows_per_rank.size()), mutable_data<std::int32_t>(rows),
-                      scope.workspace, scope.stream);
-  return rows;
-}
-
 }  // namespace
 }  // namespace blitzgs
 
-BLITZGS_REGISTER(m) {
-  m.impl("route_count", TORCH_BOX(&blitzgs::route_count));
-  m.impl("route_rows", TORCH_BOX(&blitzgs::route_rows));
-}
+BLITZGS_REGISTER(m) { m.impl("route_count", TORCH_BOX(&blitzgs::route_count)); }

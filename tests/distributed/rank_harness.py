@@ -21,7 +21,7 @@ CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli"])
 
 
-def _child(function, rank, world_size, port, timeout_seconds, join, device, arguments, pipe):
+def _child(function, rank, world_size, port, timeout_seconds, join, device, transport, arguments, pipe):
     torch.set_num_threads(1)
     os.environ.update(
         RANK=str(rank),
@@ -34,7 +34,7 @@ def _child(function, rank, world_size, port, timeout_seconds, join, device, argu
     )
     try:
         if join:
-            with Ranks.from_environment(device, timeout_seconds) as ranks:
+            with Ranks.from_environment(device, timeout_seconds, transport) as ranks:
                 result = function(ranks, *pickle.loads(arguments))
         else:
             result = function(rank, *pickle.loads(arguments))
@@ -71,7 +71,16 @@ def on_each_device(*world_sizes):
     ]
 
 
-def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.0, join=True, device="cpu"):
+def run_ranks(
+    function,
+    world_size,
+    *arguments,
+    timeout_seconds=60.0,
+    limit=120.0,
+    join=True,
+    device="cpu",
+    transport="auto",
+):
     """Return [function(ranks, *arguments) of each rank]; raise RankError if any rank fails.
 
     With `join` false the function gets its rank's number and joins the job itself, as a command does.
@@ -86,7 +95,18 @@ def run_ranks(function, world_size, *arguments, timeout_seconds=60.0, limit=120.
         receiver, sender = context.Pipe(duplex=False)
         process = context.Process(
             target=_child,
-            args=(function, rank, world_size, store.port, timeout_seconds, join, device, payload, sender),
+            args=(
+                function,
+                rank,
+                world_size,
+                store.port,
+                timeout_seconds,
+                join,
+                device,
+                transport,
+                payload,
+                sender,
+            ),
         )
         process.start()
         sender.close()

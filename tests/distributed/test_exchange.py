@@ -64,7 +64,7 @@ def _round_trip(ranks, half):
     # The explicit form gives the same.
     plain = send(mine, plan_route(mine, ranges, ranks, half), ranks)
     assert all(torch.equal(a, b) for a, b in zip(plain, got, strict=True))
-    n_bytes = sum(route.sent)
+    n_bytes = sum(route.traffic.sent)
     return mine.ids, [g.detach() for g in grads], {k: v.detach() for k, v in got._asdict().items()}, n_bytes
 
 
@@ -133,7 +133,7 @@ def test_one_rank_and_no_rows():
     whole = scene()
     route = plan_route(whole, ranges, alone)
     got = send(whole, route, alone)
-    assert torch.equal(got.ids, whole.ids[route.rows])
+    assert torch.equal(got.ids, whole.ids[route.masks == 1])
     back = send_back([torch.ones(len(got.ids), 2), torch.ones(len(got.ids))], route, alone)
     assert back[0].sum() == 2 * len(got.ids)
     assert back[1].shape == (len(whole.ids),)

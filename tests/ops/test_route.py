@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.route import route_count, route_rows
+from blitzgs.ops.route import route_count
 
 WIDTH, HEIGHT, CAMERAS = 100, 60, 2
 TILES = 7 * 4
@@ -48,9 +48,6 @@ def test_a_row_that_reaches_a_pixel_of_a_rank_is_sent_there(dtype, ranges):
             assert (sent & ~wanted).sum() <= 0.02 * len(sent)
         assert counts[m, 0] == sent.sum()
     assert counts[1].tolist() == [0, 0]
-    chosen = route_rows(masks, counts[:, 0].tolist())
-    expected = torch.cat([((masks >> m) & 1).nonzero().squeeze(1) for m in range(4)])
-    assert torch.equal(chosen.long(), expected)
 
 
 def test_one_rank_gets_every_intersection():
@@ -67,18 +64,13 @@ def test_empty_and_errors():
     masks, counts = route_count(*none, cut(0, 20, 56), WIDTH, HEIGHT)
     assert masks.shape == (0,)
     assert counts.tolist() == [[0, 0], [0, 0]]
-    assert route_rows(masks, [0, 0]).shape == (0,)
     with pytest.raises(RuntimeError, match=r"ranges must begin in ascending .* got \[3, 9\) for rank 1"):
         route_count(*rows(4), [(5, 6), (3, 9)], WIDTH, HEIGHT)
     with pytest.raises(RuntimeError, match=r"end before they begin, got \[5, 3\) for rank 1"):
         route_count(*rows(4), [(0, 5), (5, 3)], WIDTH, HEIGHT)
     with pytest.raises(RuntimeError, match="1 to 63 ranks are supported, got 64"):
         route_count(*rows(4), cut(*range(65)), WIDTH, HEIGHT)
-    with pytest.raises(RuntimeError, match="5 rows of 4 cannot go to one rank"):
-        route_rows(torch.zeros(4, dtype=torch.int64), [5])
 
 
 def test_opcheck():
     torch.library.opcheck(torch.ops.blitzgs.route_count, (*rows(9), [0, 20], [31, 56], WIDTH, HEIGHT, 16))
-    masks, counts = route_count(*rows(9), [(0, 31), (20, 56)], WIDTH, HEIGHT)
-    torch.library.opcheck(torch.ops.blitzgs.route_rows, (masks, counts[:, 0].tolist()))

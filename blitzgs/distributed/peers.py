@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Memory that the ranks of one host share: a rank writes rows straight to where another needs them.
+
+Each rank owns two buffers that all others have mapped (NVLink or PCIe peer access). `mail` is small: the
+number of the last meeting each rank came to, and the numbers it brought. `rows` is large and grows: first the
+rows that arrive for this rank's tiles, column by column, so that intersection and compositing read them where
+they lie; behind them the gradients that come back for the rows this rank sent.
+
+A step is, in stream order on every rank: meeting A with the counts (`share`), rows written to the others,
+meeting B, compositing and its gradient, gradients written to the others, meeting C, their sum. A meeting is a
+barrier between streams: work queued behind it, on any rank, finds done what any rank queued before it. Hence
+
+- rows and gradients are read after the meeting that follows their writing: B and C;
+- arriving rows of a step overwrite those of the step before after A; whoever read those had queued that
+  before its own A;
+- returning gradients are written after A and B, and those of the step before were summed up before A;
+- the counts of a step are copied to the host before B, and the next ones are written at the next A.
+
+Between A and the writing every rank waits for the counts on the host, so when buffers have to grow, no kernel
+of any rank uses them. A rank that dies leaves the others in a meeting: their hosts wait in `Ranks.read`,
+where the watchdog finds them, and a meeting that lasts longer than that aborts the process's kernels.
+"""
+
+from __future__ import annotations
+
+import socket
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.distributed import _symmetric_memory as symmetric
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+if TYPE_CHECKING:
+    from blitzgs.distributed.group import Ranks
+
+MAX_PEERS = 16
+# Numbers that a rank may bring to a meeting.
+MAX_VALUES = 256
+# Buffers grow to this many times what is needed, so that they seldom do.
+HEADROOM = 1.25
+_LEAST_WORDS = 1 << 20
+
+
+class Peers:
+    """The shared memory of the ranks; make it with `connect`.
+
+    Args:
+        ranks: the job.
+        mail: this rank's mail, symmetric memory, zeros.
+        timeout_seconds: longest wait in a meeting.
+
+    Attributes:
+        buffers: int32 [words] of each rank, mapped here.
+        exchanges: how often rows were written: tells whose rows are in the buffers.
+    """
+
+    def __init__(self, ranks: Ranks, mail: Tensor, timeout_seconds: float) -> None:
+        self.rank, self.world_size, self.device = ranks.rank, ranks.world_size, ranks.device
+        self.timeout_seconds = timeout_seconds
+        self.buffers: list[Tensor] = []
+        self.exchanges = 0
+        self._meetings = 0
+        self._handles: dict[str, Any] = {}  # the mappings live as long as these
+        self._mail = self._map("mail", mail)
+
+    def _map(self, name: str, mine: Tensor) -> list[Tensor]:
+        """Map every rank's counterpart of a symmetric tensor; collective."""
+        handle = symmetric.rendezvous(mine, dist.distributed_c10d._get_default_group())
+        self._handles[name] = handle
+        mapped = [handle.get_buffer(rank, mine.shape, mine.dtype) for rank in range(self.world_size)]
+        mapped[self.rank] = mine
+        return mapped
+
+    def meet(self, values: Tensor | None = None) -> None:
+        """Meet the other ranks, in stream order.
+
+        Args:
+            values: int64 [n] that every rank gets to see, n <= MAX_VALUES, the same on all; None: nothing.
+        """
+        self._meetings += 1
+        torch.ops.blitzgs.meet_peers_(self._mail, self.rank, self._meetings, values, self.timeout_seconds)
+
+    def share(self, values: Tensor) -> Tensor:
+        """Show numbers to all ranks.
+
+        Args:
+            values: int64 [n], n <= MAX_VALUES, the same on all ranks.
+
+        Returns:
+            int64 [M, n], valid until `share` is called again.
+        """
+        self.meet(values)
+        count = self.world_size * len(values)
+        return self._mail[self.rank][self.world_size : self.world_size + count].view(self.world_size, -1)
+
+    def reserve(self, words: int) -> None:
+        """Make every rank's buffer hold `words` 32-bit words. Collective: all ranks ask for the same.
+
+        What the buffers held is lost.
+        """
+        if self.buffers and len(self.buffers[0]) >= words:
+            return
+        self.buffers = []
+        size = max(_LEAST_WORDS, -(-int(HEADROOM * words) // 4096) * 4096)
+        self.buffers = self._map("rows", symmetric.empty(size, dtype=torch.int32, device=self.device))
+
+
+def connect(ranks: Ranks, timeout_seconds: float) -> Peers | str:
+    """Set up shared memory between all ranks, or say, the same on every rank, why that is impossible.
+
+    Collective.
+
+    Args:
+        ranks: the job, joined.
+        timeout_seconds: longest wait in a meeting.
+    """
+    place = (socket.gethostname(), ranks.device.index if ranks.device.type == "cuda" else None)
+    places = ranks.all_gather_object(place)
+    obstacle, mail = _obstacle(places, ranks.rank), None
+    if obstacle is None:
+        try:
+            words = ranks.world_size * (1 + MAX_VALUES)
+            mail = symmetric.empty(words, dtype=torch.int64, device=ranks.device).zero_()
+        except RuntimeError as error:
+            obstacle = f"rank {ranks.rank}: {error}"
+    obstacles = [text for text in ranks.all_gather_object(obstacle) if text is not None]
+    if obstacles or mail is None:
+        return obstacles[0]
+    peers = Peers(ranks, mail, timeout_seconds)
+    ranks.barrier()
+    return peers
+
+
+def _obstacle(places: list[tuple[str, Any]], rank: int) -> str | None:
+    """Say what keeps a rank from the others' memory."""
+    hosts, devices = {host for host, _ in places}, [device for _, device in places]
+    if None in devices:
+        return "not every rank computes on a GPU"
+    if len(hosts) > 1:
+        return f"the ranks are on {len(hosts)} hosts"
+    if len(set(devices)) < len(devices):
+        return "some ranks see their GPU under the same number"
+    if len(devices) > MAX_PEERS:
+        return f"at most {MAX_PEERS} ranks can share memory, not {len(devices)}"
+    for other in devices:
+        if other != devices[rank] and not torch.cuda.can_device_access_peer(devices[rank], other):
+            return f"cuda:{devices[rank]} has no access to the memory of cuda:{other}"
+    return None

@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "scatter/scatter_op.h"
+
+#include <tuple>
+
+namespace blitzgs {
+namespace {
+
+std::tuple<Tensor, Tensor> scatter_rows(const std::vector<Tensor>& columns, const Tensor& masks,
+                                        const std::vector<std::int64_t>& group_sizes) {
+  constexpr const char* kOp = "scatter_rows";
+  HeldRows held(kOp, columns, masks);
+  const RowGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
+  const auto& columns_in = held.rows.columns;
+  const std::int64_t words = columns_in.begin[columns_in.count];
+  Tensor packed = make_empty(held.masks, {total_rows(groups) * words}, ScalarType::Int);
+  Tensor bases = make_empty(held.masks, {scatter_blocks(held.rows.count), groups.count}, ScalarType::Int);
+  ScatterTargets targets{};
+  for (int m = 0; m < groups.count; ++m) {
+    for (int c = 0; c < columns_in.count; ++c) {
+      targets.words[m][c] =
+          mutable_data<std::int32_t>(packed) + groups.start[m] * words + groups.size[m] * columns_in.begin[c];
+    }
+  }
+  DeviceScope scope(held.masks);
+  backend::scatter(held.rows, groups, targets, mutable_data<std::int32_t>(bases), scope.workspace,
+                   scope.stream);
+  return {packed, bases};
+}
+
+std::vector<Tensor> gather_rows(const Tensor& packed, const std::vector<std::int64_t>& widths,
+                                const std::vector<std::int64_t>& group_sizes) {
+  constexpr const char* kOp = "gather_rows";
+  const RowGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
+  const Tensor words = as_contiguous(packed);
+  const std::int64_t n_rows = total_rows(groups);
+  std::vector<Tensor> held;
+  RowColumns<std::int32_t> columns{};
+  for (const std::int64_t width : widths) {
+    STD_TORCH_CHECK(width >= 0, "blitzgs::gather_rows: widths must not be negative, got ", width);
+    held.push_back(make_empty(words, {n_rows, width}, ScalarType::Int));
+    add_column(kOp, columns, mutable_data<std::int32_t>(held.back()), width);
+  }
+  check_shape(kOp, "packed", packed, {n_rows * columns.begin[columns.count]});
+  check_dtype(kOp, "packed", packed, ScalarType::Int);
+  DeviceScope scope(words);
+  if (columns.count > 0) {
+    backend::gather(data<std::int32_t>(words), groups, columns, scope.workspace, scope.stream);
+  }
+  return held;
+}
+
+std::vector<Tensor> sum_rows(const Tensor& values, const Tensor& masks, const Tensor& bases,
+                             const std::vector<std::int64_t>& group_sizes,
+                             const std::vector<std::int64_t>& widths) {
+  constexpr const char* kOp = "sum_rows";
+  const RowGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
+  const Tensor values_c = as_contiguous(values), masks_c = as_contiguous(masks),
+               bases_c = as_contiguous(bases);
+  check_floating(kOp, "values", values);
+  check_shape(kOp, "masks", masks, {-1});
+  check_dtype(kOp, "masks", masks, ScalarType::Long);
+  const std::int64_t n_rows = masks.size(0);
+  check_shape(kOp, "bases", bases, {scatter_blocks(n_rows), groups.count});
+  check_dtype(kOp, "bases", bases, ScalarType::Int);
+  std::vector<Tensor> sums;
+  for (const std::int64_t width : widths) {
+    STD_TORCH_CHECK(width >= 0, "blitzgs::sum_rows: widths must not be negative, got ", width);
+    sums.push_back(make_empty(values_c, {n_rows, width}));
+  }
+  DeviceScope scope(values_c);
+  dispatch_floating(values_c, [&](auto zero) {
+    using T = decltype(zero);
+    RowColumns<T> columns{};
+    for (Tensor& sum : sums) add_column(kOp, columns, mutable_data<T>(sum), sum.size(1));
+    const int width = columns.begin[columns.count];
+    check_shape(kOp, "values", values, {total_rows(groups), width});
+    const ReturnedRows<T> returned{data<T>(values_c),           width,  data<std::int64_t>(masks_c),
+                                   data<std::int32_t>(bases_c), n_rows, groups};
+    backend::sum(returned, columns, scope.workspace, scope.stream);
+  });
+  return sums;
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) {
+  m.impl("scatter_rows", TORCH_BOX(&blitzgs::scatter_rows));
+  m.impl("gather_rows", TORCH_BOX(&blitzgs::gather_rows));
+  m.impl("sum_rows", TORCH_BOX(&blitzgs::sum_rows));
+}
