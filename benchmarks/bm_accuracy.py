@@ -1,33 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
 """Accuracy against time: each option's image and gradient error next to what it costs.
 
-python benchmarks/bm_accuracy.py [--device cuda] [--gaussians 1000000] [--out runs/accuracy]
+python benchmarks/bm_accuracy.py [--device cuda] [--gaussians 4000000] [--out runs/accuracy]
 
-Errors are against the float64 reference of the same mode on a small aerial scene (--exact-gaussians at
---exact-width): the largest absolute error of the image away from the declared cut pixels, and the largest
-relative error of any parameter's gradient (max |difference| / max |reference|). Times are medians of
-forward + backward on a large one. Writes a table (Markdown), the figures (JSON) and, with matplotlib, a
-Pareto plot.
+Renders the aerial scene with each option, forward and backward. Times are medians, per view. Errors are
+against the float64 reference of the same mode in a few windows of the same images: the largest absolute error
+of the image away from the declared cut pixels (depths: relative to the deepest), and the largest error of any
+parameter's gradient (max |difference| / max |reference|). Fails when the default setting misses its bounds.
+Writes a table (Markdown), the figures (JSON) and, with matplotlib, a Pareto plot.
+
+The row "exact exponential" needs a second build of the kernels, whose folder --exact-library names:
+
+cmake -S . -B build-exact -G Ninja -DBLITZGS_EXACT_EXP=ON -DBLITZGS_OUTPUT_DIR=$PWD/build-exact/lib
+cmake --build build-exact
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import time
-from dataclasses import asdict, dataclass, field
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
+from exact_windows import PARAMETERS, ExactWindows
 from scenes import BenchmarkScene, aerial
 from timing import median_ms
 from torch import Tensor
 
 import blitzgs
-from blitzgs.reference import ReferenceImage, render
+from blitzgs.distributed.exchange import Splats, exchange
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileRanges
+from blitzgs.ops.intersect import intersect, tile_counts
+from blitzgs.ops.project import project
+from blitzgs.ops.rasterize import rasterize
 
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "viewmats")
+IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # of the default setting
 
 
 @dataclass(frozen=True)
@@ -38,7 +53,9 @@ class Option:
     arguments: dict[str, Any] = field(default_factory=dict)
     dtype: torch.dtype = torch.float32
     deterministic: bool = False
-    half_colors: bool = False  # SH coefficients rounded to float16, as when they are stored or sent so
+    views: int = 1
+    exchanged: bool = False  # through the exchange of the ranks, of which there is one: all but the wire
+    half: bool = False
 
 
 @dataclass
@@ -46,7 +63,7 @@ class Figures:
     """What an option costs and how far it is from the definition."""
 
     name: str
-    milliseconds: float
+    milliseconds: float  # per view
     image_error: float
     gradient_error: float
     cut_pixels: float  # share of the pixels that sit on a cut and are left out
@@ -59,10 +76,12 @@ def options_for(device: str) -> list[Option]:
         Option("antialiased", {"rasterize_mode": "antialiased"}),
         Option("tiles of 8", {"tile_size": 8}),
         Option("tiles of 32", {"tile_size": 32}),
+        Option("batch of 4 views", views=4),
         Option("dense meta (packed=False)", {"packed": False}),
         Option("absolute gradients", {"absgrad": True}),
         Option("colour and expected depth", {"render_mode": "RGB+ED"}),
-        Option("SH rounded to half precision", half_colors=True),
+        Option("exchange", exchanged=True),
+        Option("exchange in half precision", exchanged=True, half=True),
     ]
     if device == "cpu":
         return [*options, Option("float64", dtype=torch.float64)]
@@ -70,85 +89,121 @@ def options_for(device: str) -> list[Option]:
 
 
 def leaves(scene: BenchmarkScene, option: Option) -> list[Tensor]:
-    tensors = [getattr(scene, name) for name in PARAMETERS]
-    if option.half_colors:
-        tensors[4] = tensors[4].half()
-    return [t.to(option.dtype).detach().requires_grad_() for t in tensors]
+    return [getattr(scene, name).to(option.dtype).detach().requires_grad_() for name in PARAMETERS]
 
 
-def image(scene: BenchmarkScene, option: Option, inputs: list[Tensor]) -> Tensor:
-    *gaussians, viewmats = inputs
+def images(scene: BenchmarkScene, option: Option, inputs: list[Tensor]) -> Tensor:
     Ks = scene.Ks.to(option.dtype)
+    if option.exchanged:
+        return _exchanged(scene, option, inputs, Ks)
     arguments = {"sh_degree": 3, **option.arguments}
-    return blitzgs.rasterization(*gaussians, viewmats, Ks, scene.width, scene.height, **arguments)[0]
+    return blitzgs.rasterization(*inputs, Ks, scene.width, scene.height, **arguments)[0]
 
 
-def reference_of(scene: BenchmarkScene, option: Option) -> tuple[ReferenceImage, list[Tensor]]:
-    inputs = [getattr(scene, name).double().cpu().requires_grad_() for name in PARAMETERS]
-    *gaussians, viewmats = inputs
-    result = render(
-        *gaussians,
-        viewmats[0],
-        scene.Ks[0].cpu(),
-        scene.width,
-        scene.height,
-        sh_degree=3,
-        render_mode=option.arguments.get("render_mode", "RGB"),
-        antialiased=option.arguments.get("rasterize_mode") == "antialiased",
+def _exchanged(scene: BenchmarkScene, option: Option, inputs: list[Tensor], Ks: Tensor) -> Tensor:
+    width, height, views = scene.width, scene.height, len(Ks)
+    rows = project(*inputs, Ks, width, height, sh_degree=3, raw=False)
+    splats = Splats(
+        rows.means2d,
+        rows.conics,
+        rows.opacities,
+        rows.colors,
+        rows.depths,
+        rows.camera_ids,
+        rows.gaussian_ids.long(),
     )
-    return result, inputs
+    columns, lines = tile_counts(width, height, 16)
+    ranges = TileRanges((0, views * columns * lines), views, width, height)
+    s, route = exchange(splats, ranges, Ranks(device=Ks.device), option.half)
+    grid = {"n_cameras": views, "width": width, "height": height}
+    lists = intersect(
+        s.means2d, s.conics, s.opacities, s.depths, s.camera_ids, s.ids, n_isects=route.n_isects, **grid
+    )
+    return rasterize(s.means2d, s.conics, s.opacities, s.colors, *lists, **grid)[0]
+
+
+@cache
+def exact_windows(scene: BenchmarkScene, antialiased: bool) -> ExactWindows:
+    return ExactWindows(scene, antialiased)
 
 
 def errors(scene: BenchmarkScene, option: Option) -> tuple[float, float, float]:
     """Return the image error, the gradient error and the share of cut pixels."""
-    reference, reference_inputs = reference_of(scene, option)
+    exact = exact_windows(scene, option.arguments.get("rasterize_mode") == "antialiased")
     inputs = leaves(scene, option)
-    actual = image(scene, option, inputs)[0]
-    keep = ~reference.cut
-    # Depth is compared relative to the largest one, colour as it is.
-    size = reference.image.detach().abs().amax(dim=(0, 1)).clamp(min=1.0)
-    difference = (actual.detach().double().cpu() - reference.image.detach()).abs() / size
+    actual = images(scene, option, inputs)
     generator = torch.Generator().manual_seed(0)
-    weights = torch.randn(actual.shape, generator=generator, dtype=torch.float64) * keep[..., None] / size
-    gradients = torch.autograd.grad((actual.double() * weights.to(actual.device)).sum(), inputs)
-    expected = torch.autograd.grad((reference.image * weights).sum(), reference_inputs)
-    worst = max(
-        ((a.double().cpu() - e).abs().max() / e.abs().max()).item()
-        for a, e in zip(gradients, expected, strict=True)
-    )
-    return difference[keep].max().item(), worst, reference.cut.double().mean().item()
+    v_actual = torch.zeros_like(actual)
+    image_error, expected_loss, cut = 0.0, torch.zeros((), dtype=torch.float64), 0.0
+    for (view, rows, columns), image, alpha, cut_here in zip(
+        exact.places, exact.images, exact.alphas, exact.cuts, strict=True
+    ):
+        expected = image[..., :3]
+        if "ED" in option.arguments.get("render_mode", ""):
+            depth = image[..., 3:] / alpha[..., None].clamp(min=1e-10)
+            expected = torch.cat([expected, depth], dim=-1)
+        size = expected.detach().abs().amax(dim=(0, 1)).clamp(min=1.0)
+        difference = (actual[view, rows, columns].detach().double().cpu() - expected.detach()) / size
+        keep = ~cut_here
+        if keep.any():
+            image_error = max(image_error, difference[keep].abs().max().item())
+        cut += cut_here.double().mean().item() / len(exact.places)
+        weights = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
+        weights *= keep[..., None] / size
+        expected_loss = expected_loss + (expected * weights).sum()
+        v_actual[view, rows, columns] = weights.to(v_actual)
+    gradients = torch.autograd.grad(actual, inputs, v_actual)
+    expected_gradients = torch.autograd.grad(expected_loss, exact.inputs, retain_graph=True)
+    return image_error, _gradient_error(gradients, expected_gradients, exact.ids), cut
+
+
+def _gradient_error(actual: tuple[Tensor, ...], expected: tuple[Tensor, ...], ids: Tensor) -> float:
+    worst = 0.0
+    for name, value, target in zip(PARAMETERS, actual, expected, strict=True):
+        error = 0.0
+        if name != "viewmats":
+            others = value.clone()  # Gaussians that reach no window: their gradient is zero
+            others[ids.to(value.device)] = 0
+            error, value = others.abs().max().item(), value[ids.to(value.device)]
+        error = max(error, (value.double().cpu() - target).abs().max().item())
+        worst = max(worst, error / target.abs().max().item())
+    return worst
 
 
 def step_ms(scene: BenchmarkScene, option: Option, repeats: int) -> float:
     inputs = leaves(scene, option)
-    weights = torch.randn_like(image(scene, option, inputs))
-    return median_ms(
-        lambda w: torch.autograd.grad((image(scene, option, inputs) * w).sum(), inputs),
-        [(weights,)],
-        repeats,
-        warm_up=2,
+    weights = torch.randn_like(images(scene, option, inputs))
+    milliseconds = median_ms(
+        lambda w: torch.autograd.grad(images(scene, option, inputs), inputs, w), [(weights,)], repeats, 2
     )
+    return milliseconds / option.views
 
 
-def measure(option: Option, exact: BenchmarkScene, large: BenchmarkScene, repeats: int) -> Figures:
+def measure(option: Option, scenes: dict[int, BenchmarkScene], repeats: int) -> Figures:
+    scene = scenes[option.views]
     torch.use_deterministic_algorithms(option.deterministic, warn_only=True)
-    image_error, gradient_error, cut = errors(exact, option)
-    result = Figures(option.name, step_ms(large, option, repeats), image_error, gradient_error, cut)
+    image_error, gradient_error, cut = errors(scene, option)
+    result = Figures(option.name, step_ms(scene, option, repeats), image_error, gradient_error, cut)
     torch.use_deterministic_algorithms(False)
     return result
 
 
-def reference_ms(scene: BenchmarkScene) -> float:
-    """Return the milliseconds of forward + backward of the plain PyTorch reference."""
-    begin = time.perf_counter()
-    result, inputs = reference_of(scene, Option("default"))
-    torch.autograd.grad(result.image.sum(), inputs)
-    return 1e3 * (time.perf_counter() - begin)
+def measure_library(folder: Path, arguments: list[str]) -> Figures:
+    """Measure the default setting in a process that loads the kernels of another build."""
+    with tempfile.TemporaryDirectory() as out:
+        subprocess.run(
+            [sys.executable, __file__, *arguments, "--only", "default", "--out", out],
+            env={**os.environ, "BLITZGS_LIBRARY_DIR": str(folder)},
+            stdout=subprocess.DEVNULL,
+            check=True,
+        )
+        (row,) = json.loads((Path(out) / "accuracy.json").read_text())
+    return replace(Figures(**row), name="exact exponential")
 
 
 def table(rows: list[Figures]) -> str:
     lines = [
-        "| option | forward + backward, ms | image error | gradient error | cut pixels |",
+        "| option | forward + backward, ms a view | image error | gradient error | cut pixels |",
         "|---|---|---|---|---|",
     ]
     lines += [
@@ -159,8 +214,8 @@ def table(rows: list[Figures]) -> str:
     return "\n".join(lines)
 
 
-def plot(rows: list[Figures], path: Path) -> None:
-    """Draw time against error, both axes better towards the lower left; skipped without matplotlib."""
+def plot(rows: list[Figures], title: str, path: Path) -> None:
+    """Draw time against error, better towards the lower left, and the line of what nothing beats in both."""
     try:
         import matplotlib
 
@@ -169,17 +224,36 @@ def plot(rows: list[Figures], path: Path) -> None:
     except ImportError:
         print("matplotlib is not installed: no plot")
         return
-    figure, axes = plt.subplots(1, 2, figsize=(12, 5), sharex=True)
-    for axis, name in zip(axes, ("image_error", "gradient_error"), strict=True):
-        for row in rows:
-            axis.scatter(row.milliseconds, max(getattr(row, name), 1e-17), s=40, label=row.name)
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharex=True)
+    bounds = (("image_error", IMAGE_BOUND), ("gradient_error", GRADIENT_BOUND))
+    for axis, (name, bound) in zip(axes, bounds, strict=True):
+        best = float("inf")
+        front = []
+        for i, row in enumerate(sorted(rows, key=lambda row: row.milliseconds)):
+            error = max(getattr(row, name), 1e-17)
+            axis.scatter(
+                row.milliseconds, error, s=36, color=f"C{i % 10}", marker="osD^"[i // 10], label=row.name
+            )
+            if error < best:
+                best = error
+                front.append((row.milliseconds, error))
+        axis.step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=0)
+        axis.axhline(bound, color="0.3", linestyle=":", linewidth=1)
         axis.set_yscale("log")
-        axis.set_xlabel("forward + backward, ms")
-        axis.set_ylabel(name.replace("_", " "))
-        axis.grid(True, which="both", alpha=0.2)
-    axes[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
+        axis.set_xlabel("forward + backward, ms a view")
+        axis.set_title(f"{name.replace('_', ' ')} (dotted: bound of the default)", fontsize=9)
+        axis.grid(True, which="major", alpha=0.2)
+    axes[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5), fontsize=8, title=title, title_fontsize=8)
     figure.tight_layout()
-    figure.savefig(path, dpi=130)
+    figure.savefig(path, dpi=80)
+
+
+def require_bounds(default: Figures) -> None:
+    if default.image_error > IMAGE_BOUND or default.gradient_error > GRADIENT_BOUND:
+        raise SystemExit(
+            f"the default setting misses its bounds: image {default.image_error:.1e} of {IMAGE_BOUND:.0e}, "
+            f"gradients {default.gradient_error:.1e} of {GRADIENT_BOUND:.0e}"
+        )
 
 
 def main() -> None:
@@ -188,32 +262,41 @@ def main() -> None:
     )
     cuda = torch.cuda.is_available()
     parser.add_argument("--device", default="cuda" if cuda else "cpu")
-    parser.add_argument("--gaussians", type=int, default=1_000_000 if cuda else 100_000)
-    parser.add_argument("--width", type=int, default=1600 if cuda else 400)
-    parser.add_argument("--exact-gaussians", type=int, default=1_000)
-    parser.add_argument("--exact-width", type=int, default=72)
+    parser.add_argument("--gaussians", type=int, help="default: 4 million on CUDA, 100 thousand on the CPU")
+    parser.add_argument("--width", type=int, help="default: 1600 px on CUDA, 400 px on the CPU")
     parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--only", help="the one option to measure")
+    parser.add_argument("--exact-library", type=Path, help="kernels built with BLITZGS_EXACT_EXP=ON")
     parser.add_argument("--out", type=Path, help="folder for accuracy.json, accuracy.md and accuracy.png")
     args = parser.parse_args()
-    exact_height, height = args.exact_width * 2 // 3, args.width * 2 // 3
-    exact = aerial(args.exact_gaussians, args.device, width=args.exact_width, height=exact_height)
-    large = aerial(args.gaussians, args.device, width=args.width, height=height)
-    print(
-        f"{args.device}: errors with {args.exact_gaussians} Gaussians at {exact.width} x {exact.height}, "
-        f"times with {args.gaussians} at {large.width} x {large.height}"
-    )
-    rows = [measure(option, exact, large, args.repeats) for option in options_for(args.device)]
+    on_gpu = args.device.startswith("cuda")
+    gaussians = args.gaussians or (4_000_000 if on_gpu else 100_000)
+    width = args.width or (1600 if on_gpu else 400)
+    batch = aerial(gaussians, args.device, views=4, width=width, height=width * 2 // 3)
+    scenes = {1: batch.first_views(1), 4: batch}
+    title = f"{args.device}, {gaussians:,} Gaussians, {batch.width} x {batch.height}"
+    print(title)
+    options = [o for o in options_for(args.device) if args.only in (None, o.name)]
+    rows = [measure(option, scenes, args.repeats) for option in options]
+    if args.exact_library:
+        repeated = [
+            "--device",
+            args.device,
+            "--gaussians",
+            gaussians,
+            "--width",
+            width,
+            "--repeats",
+            args.repeats,
+        ]
+        rows.append(measure_library(args.exact_library, [str(value) for value in repeated]))
     print(table(rows))
-    ours, plain = step_ms(exact, Option("default"), args.repeats), reference_ms(exact)
-    print(
-        f"the small scene, forward + backward: {ours:.2f} ms; "
-        f"the reference (float64 PyTorch, no culling, CPU): {plain:.0f} ms"
-    )
     if args.out:
         args.out.mkdir(parents=True, exist_ok=True)
         (args.out / "accuracy.md").write_text(table(rows) + "\n")
         (args.out / "accuracy.json").write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
-        plot(rows, args.out / "accuracy.png")
+        plot(rows, title, args.out / "accuracy.png")
+    require_bounds(rows[0])
 
 
 if __name__ == "__main__":

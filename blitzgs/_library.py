@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads the op libraries once, when `blitzgs.ops` is first imported."""
+"""Loads the op libraries once, when `blitzgs.ops` is first imported.
+
+BLITZGS_LIBRARY_DIR names another folder to load them from: that of a build with other options.
+"""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import torch
 
-LIBRARY_DIR = Path(__file__).parent / "_lib"
+LIBRARY_DIR = Path(os.environ.get("BLITZGS_LIBRARY_DIR") or Path(__file__).parent / "_lib")
 
 
 def load_libraries() -> None:

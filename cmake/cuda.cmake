@@ -30,6 +30,11 @@ set_source_files_properties(
   PROPERTIES COMPILE_OPTIONS "-fmad=false"
 )
 
+if(BLITZGS_EXACT_EXP)
+  file(GLOB rasterize_kernels csrc/rasterize/*_cuda.cu)
+  set_source_files_properties(${rasterize_kernels} PROPERTIES COMPILE_DEFINITIONS BLITZGS_EXACT_EXP)
+endif()
+
 # The library needs libtorch_cuda.so when it is loaded. A CPU-only torch has none to link against, so
 # a stub of the same soname stands in; the real one is found when the library is loaded.
 file(

@@ -197,6 +197,45 @@ TEST_CASE("a row: derivative with respect to mean, axes and pose") {
   }
 }
 
+TEST_CASE("needles: the stored conic keeps its determinant, the gradient its digits") {
+  const Columns3<float> axes{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+  const Columns3<double> wide_axes{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+  for (const float length : {3.0f, 15.0f, 50.0f, 1e5f}) {
+    for (int i = 0; i < 60; ++i) {
+      const float angle = 0.01f + 0.052f * float(i), x = length * std::cos(angle),
+                  y = length * std::sin(angle);
+      const PixelGradients<float> g{{x, -0.01f * y, 0.03f}, {y, 0.01f * x, 0.02f}, 0, 0, 1, true, true};
+      const PixelGradients<double> wide{{double(g.gx.x), double(g.gx.y), double(g.gx.z)},
+                                        {double(g.gy.x), double(g.gy.y), double(g.gy.z)},
+                                        0,
+                                        0,
+                                        1,
+                                        true,
+                                        true};
+      const Splat<double> exact = make_splat(wide, wide_axes, 0.3);
+      const Splat<float> splat = make_splat(g, axes, 0.3f);
+      INFO("length " << length << ", angle " << angle);
+      float conic[3];
+      store_conic(splat, conic);
+      for (int k = 0; k < 3; ++k) {
+        REQUIRE(conic[k] ==
+                Approx(exact.conic[k]).epsilon(1e-5).margin(1e-6 * (exact.conic[0] + exact.conic[2])));
+      }
+      const double root = exact.root_det * exact.magnitude;
+      if (length < 1e4f) REQUIRE(conic_determinant(conic) * root * root == Approx(1.0).epsilon(3e-5));
+      const float v_conic[3] = {1.0f, -2.0f, 3.0f};
+      const double wide_v[3] = {1.0, -2.0, 3.0};
+      Vec3<float> v0, v1;
+      Vec3<double> w0, w1;
+      splat_vjp(splat, v_conic, 0.5f, &v0, &v1);
+      splat_vjp(exact, wide_v, 0.5, &w0, &w1);
+      const double size = std::sqrt(dot(w0, w0) + dot(w1, w1));
+      const Values got{v0.x, v0.y, v0.z, v1.x, v1.y, v1.z}, wanted{w0.x, w0.y, w0.z, w1.x, w1.y, w1.z};
+      for (int k = 0; k < 6; ++k) REQUIRE(got[k] == Approx(wanted[k]).margin(3e-5 * size));
+    }
+  }
+}
+
 TEST_CASE("elongated and extreme splats keep their float determinant") {
   const ProjectOptions<double> exact{64, 48, 16, 0, 1, 0.01, 1e10, 0.3, 0.0, true, false};
   const ProjectOptions<float> rounded{64, 48, 16, 0, 1, 0.01f, 1e10f, 0.3f, 0.0f, true, false};

@@ -96,6 +96,7 @@ struct Splat {
   T normal_length;  // |normal|
   T root_det;       // sqrt(det Sigma'), divided by `magnitude`
   T magnitude;      // larger of cov_xx, cov_yy
+  T blur;           // eps2d, divided by `magnitude`
 };
 
 // Quantities are divided by the larger diagonal entry before they are multiplied, so that neither 1e-8 nor
@@ -110,7 +111,7 @@ BLITZGS_HD Splat<T> make_splat(const PixelGradients<T>& g, const Columns3<T>& ax
   s.cov_yy = yy + eps2d;
   s.magnitude = larger(s.cov_xx, s.cov_yy);
   const T inverse = T(1) / s.magnitude;
-  const T shrink = std::sqrt(inverse), eps = eps2d * inverse;
+  const T shrink = std::sqrt(inverse), eps = s.blur = eps2d * inverse;
   s.normal = cross(shrink * s.m0, shrink * s.m1);
   const T unblurred = dot(s.normal, s.normal);
   const T det = unblurred + eps * ((xx + yy) * inverse + eps);
@@ -123,27 +124,57 @@ BLITZGS_HD Splat<T> make_splat(const PixelGradients<T>& g, const Columns3<T>& ax
   return s;
 }
 
+// The conic as it is stored. What a splat is along its axis hangs on ac - b^2, which rounding a, b and c
+// moves by up to ac / (ac - b^2) as many roundings: 1e-3 of it for a splat a hundred times longer than wide.
+// Among the floats next to a, some have a c beside them that keeps the determinant; b follows a, as the axis
+// has the direction (-b, a).
+template <class T>
+BLITZGS_HD void store_conic(const Splat<T>& s, T* conic) {
+  for (int i = 0; i < 3; ++i) conic[i] = s.conic[i];
+  if constexpr (sizeof(T) == sizeof(float)) {
+    constexpr T kLong = 64;  // ac / (ac - b^2)
+    constexpr double kGood = 4e-6;
+    constexpr int kTries = 64;
+    if (!(smaller(s.cov_xx, s.cov_yy) > kLong * s.root_det * s.root_det * s.magnitude)) return;
+    const double root = double(s.root_det) * double(s.magnitude), det = 1.0 / (root * root);
+    double best = std::fabs(double(conic[0]) * double(conic[2]) - double(conic[1]) * double(conic[1]) - det);
+    for (int i = 1; i <= kTries && best > kGood * det; ++i) {
+      const double nudge = 1.0 + (i % 2 ? i : -i) * 6e-8;
+      const T a = T(double(s.conic[0]) * nudge), b = T(double(s.conic[1]) * nudge);
+      const double bb = double(b) * double(b);
+      const T c = T((det + bb) / double(a));
+      const double error = std::fabs(double(a) * double(c) - bb - det);
+      if (error >= best) continue;
+      best = error;
+      conic[0] = a;
+      conic[1] = b;
+      conic[2] = c;
+    }
+  }
+}
+
 // sqrt(det Sigma / det Sigma'): the share of its peak that the blur leaves a splat in antialiased mode.
 template <class T>
 BLITZGS_HD T compensation(const Splat<T>& s) {
   return s.normal_length / s.root_det;
 }
 
-// Gradients of the rows of M from those of the conic (b counted once) and of the compensation.
+// Gradients of the rows of M from those of the conic (b counted once) and of the compensation. With Q the
+// conic matrix, d(Sigma'^-1) = -Q dSigma' Q and d log det Sigma' = tr(Q dSigma'), so v_M = -2 (Q V + v / 2) Q
+// M. Multiplied out, Q M loses every digit for a splat a thousand times longer than wide; written as (m1 x n
+// + eps m0, n x m0 + eps m1) / det with n = m0 x m1 it loses none.
 template <class T>
 BLITZGS_HD void splat_vjp(const Splat<T>& s, const T* v_conic, T v_compensation, Vec3<T>* v_m0,
                           Vec3<T>* v_m1) {
   const T a = s.conic[0], b = s.conic[1], c = s.conic[2];
-  // d(Sigma'^-1) = -Q dSigma' Q with Q the conic matrix.
   const T p = v_conic[0], q = T(0.5) * v_conic[1], r = v_conic[2];
-  const T left_xx = a * p + b * q, left_xy = a * q + b * r, left_yx = b * p + c * q, left_yy = b * q + c * r;
-  // d log det Sigma' = tr(Q dSigma').
+  const T shrink = T(1) / (s.root_det * s.root_det * s.magnitude);
+  const Vec3<T> qm0 = shrink * (cross(s.m1, s.normal) + s.blur * s.m0);
+  const Vec3<T> qm1 = shrink * (cross(s.normal, s.m0) + s.blur * s.m1);
   const T half = T(0.5) * v_compensation * compensation(s);
-  const T v_xx = -(left_xx * a + left_xy * b) - half * a;
-  const T v_xy = -(left_xx * b + left_xy * c) - half * b;
-  const T v_yy = -(left_yx * b + left_yy * c) - half * c;
-  *v_m0 = T(2) * (v_xx * s.m0 + v_xy * s.m1);
-  *v_m1 = T(2) * (v_xy * s.m0 + v_yy * s.m1);
+  const T xx = a * p + b * q + half, xy = a * q + b * r, yx = b * p + c * q, yy = b * q + c * r + half;
+  *v_m0 = T(-2) * (xx * qm0 + xy * qm1);
+  *v_m1 = T(-2) * (yx * qm0 + yy * qm1);
   if (v_compensation == T(0) || !(s.normal_length > T(0))) return;
   // d|m0 x m1|; a splat seen exactly edge-on has no such derivative, and takes zero.
   const T scale = v_compensation / (s.root_det * s.magnitude * s.normal_length);

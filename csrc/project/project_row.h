@@ -117,7 +117,7 @@ BLITZGS_HD bool project_row(const Camera<T>& camera, const ActiveGaussian<T>& ga
   if (!in_depth_range(row->depth, options)) return false;
   pixel_position(camera, p, row->mean2d);
   const Splat<T> splat = make_splat(pixel_gradients(camera, p), gaussian.axes, options.eps2d);
-  for (int i = 0; i < 3; ++i) row->conic[i] = splat.conic[i];
+  store_conic(splat, row->conic);
   row->opacity = options.antialiased ? gaussian.opacity * compensation(splat) : gaussian.opacity;
   const T sigmas = reach(row->opacity);
   if (sigmas < T(0) || !is_finite(splat.conic[0] + splat.conic[1] + splat.conic[2])) return false;

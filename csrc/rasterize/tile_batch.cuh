@@ -65,16 +65,26 @@ __device__ __forceinline__ float channel(const float4& c, int k) {
   return k == 0 ? c.x : k == 1 ? c.y : k == 2 ? c.z : c.w;
 }
 
+// To within 2 and 1 units in the last place; correctly rounded in a build with BLITZGS_EXACT_EXP, which is
+// there to measure the difference (benchmarks/bm_accuracy.py).
 __device__ __forceinline__ float exp2_approx(float x) {
+#ifdef BLITZGS_EXACT_EXP
+  return static_cast<float>(exp2(static_cast<double>(x)));
+#else
   float y;
   asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y;
+#endif
 }
 
 __device__ __forceinline__ float reciprocal_approx(float x) {
+#ifdef BLITZGS_EXACT_EXP
+  return __frcp_rn(x);
+#else
   float y;
   asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y;
+#endif
 }
 
 __device__ __forceinline__ float sqrt_approx(float x) {

@@ -14,6 +14,9 @@ from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
 
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
+
 
 @pytest.fixture(autouse=True)
 def one_thread():
@@ -142,8 +145,9 @@ def test_views_that_see_nothing(tmp_path):
     assert torch.equal(trainer.table["means"], before)
 
 
-def test_non_finite_values_stop_the_run_by_name(tmp_path):
-    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+@pytest.mark.parametrize("device", DEVICES)
+def test_non_finite_values_stop_the_run_by_name(tmp_path, device):
+    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(device=torch.device(device)))
     trainer.table["scales"][trainer.table["id"] == 7, 1] = float("nan")
     with pytest.raises(
         NonFiniteError, match=r"step 20: column 'scales' is not finite in 1 Gaussians \(ids 7\)"
@@ -179,7 +183,7 @@ def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_r
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@needs_cuda
 def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path, monkeypatch):
     ranks = Ranks(device=torch.device("cuda"))
     config = tiny_config("model.deterministic=true")

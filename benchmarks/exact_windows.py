@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exact images and gradients of scenes far too large for the float64 reference, in a few small windows.
+
+The splats that reach a window are found by their exact bounding boxes; the reference composites those alone,
+which is what it would have made of all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from scenes import BenchmarkScene
+from torch import Tensor
+
+from blitzgs.reference import Composite, Splats, composite, project_splats
+
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "viewmats")
+EPS2D = 0.3
+
+
+class ExactWindows:
+    """A scene's images in windows: corners, centre and between, in every view.
+
+    Attributes:
+        ids: int64 [U], the Gaussians that reach a window of some view.
+        inputs: their PARAMETERS in float64, requiring gradients.
+        places: (view, rows, columns) of each window.
+        images: [h, w, 4] of each window: colour and accumulated depth, float64, differentiable.
+        alphas: [h, w], likewise.
+        cuts: bool [h, w]: pixels where rounding may decide.
+    """
+
+    def __init__(self, scene: BenchmarkScene, antialiased: bool = False, size: int = 24):
+        self.scene, self.antialiased = scene, antialiased
+        self.places = list(_places(scene, size))
+        with torch.no_grad():
+            everything = [getattr(scene, name).double().cpu() for name in PARAMETERS]
+            self.ids = self._reaching(everything)
+        *gaussians, viewmats = everything
+        self.inputs = [t[self.ids].requires_grad_() for t in gaussians] + [viewmats.requires_grad_()]
+        results = self._composite()
+        self.images = [result.values for result in results]
+        self.alphas = [1 - result.transmittances for result in results]
+        self.cuts = [result.cut for result in results]
+
+    def _project(self, inputs: list[Tensor], view: int) -> Splats:
+        *gaussians, viewmats = inputs
+        scene = self.scene
+        return project_splats(
+            *gaussians,
+            viewmats[view],
+            scene.Ks[view].double().cpu(),
+            scene.width,
+            scene.height,
+            sh_degree=3,
+            near_plane=0.01,
+            far_plane=1e10,
+            eps2d=EPS2D,
+            antialiased=self.antialiased,
+        )
+
+    def _reaching(self, inputs: list[Tensor]) -> Tensor:
+        found = torch.zeros(len(inputs[0]), dtype=torch.bool)
+        for view in range(len(self.scene.viewmats)):
+            splats = self._project(inputs, view)
+            variances = splats.factors.square().sum(dim=-1) + EPS2D
+            reach = (2 * torch.log(255 * splats.opacities).clamp(min=0)[:, None] * variances).sqrt()
+            low, high = splats.means2d - reach, splats.means2d + reach
+            for _, rows, columns in (place for place in self.places if place[0] == view):
+                first = torch.tensor([columns.start, rows.start])
+                last = torch.tensor([columns.stop, rows.stop])
+                found[splats.ids[((low < last) & (high > first)).all(dim=1)]] = True
+        return found.nonzero()[:, 0]
+
+    def _composite(self) -> list[Composite]:
+        splats = [self._project(self.inputs, view) for view in range(len(self.scene.viewmats))]
+        results = []
+        for view, rows, columns in self.places:
+            s = splats[view]
+            channels = torch.cat([s.colors, s.depths[:, None]], dim=1)
+            offset = torch.tensor([columns.start, rows.start])
+            size = columns.stop - columns.start, rows.stop - rows.start
+            results.append(composite(s.means2d - offset, s.conics, s.opacities, channels, s.depths, *size))
+        return results
+
+
+def _places(scene: BenchmarkScene, size: int) -> Iterator[tuple[int, slice, slice]]:
+    width, height = min(size, scene.width), min(size, scene.height)
+    right, bottom = scene.width - width, scene.height - height
+    corners = {(0, 0), (right, 0), (0, bottom), (right, bottom)}
+    inner = {(right // 2, bottom // 2), (right // 3, 2 * bottom // 3), (3 * right // 4, bottom // 4)}
+    for view in range(len(scene.viewmats)):
+        for x, y in sorted(corners | inner):
+            yield view, slice(y, y + height), slice(x, x + width)
