@@ -117,7 +117,14 @@ def _exchanged(scene: BenchmarkScene, option: Option, inputs: list[Tensor], Ks: 
     s, route = exchange(splats, ranges, Ranks(device=Ks.device), option.half)
     grid = {"n_cameras": views, "width": width, "height": height}
     lists = intersect(
-        s.means2d, s.conics, s.opacities, s.depths, s.camera_ids, s.ids, n_isects=route.n_isects, **grid
+        s.means2d,
+        s.conics,
+        s.opacities,
+        s.depths,
+        s.camera_ids,
+        s.ids,
+        n_isects=route.traffic.n_isects,
+        **grid,
     )
     return rasterize(s.means2d, s.conics, s.opacities, s.colors, *lists, **grid)[0]
 
@@ -151,7 +158,7 @@ def errors(scene: BenchmarkScene, option: Option) -> tuple[float, float, float]:
         weights = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
         weights *= keep[..., None] / size
         expected_loss = expected_loss + (expected * weights).sum()
-        v_actual[view, rows, columns] = weights.to(v_actual)
+        v_actual[view, rows, columns] += weights.to(v_actual)
     gradients = torch.autograd.grad(actual, inputs, v_actual)
     expected_gradients = torch.autograd.grad(expected_loss, exact.inputs, retain_graph=True)
     return image_error, _gradient_error(gradients, expected_gradients, exact.ids), cut

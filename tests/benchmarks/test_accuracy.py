@@ -18,19 +18,37 @@ def scene():
     return aerial(600, width=24, height=16)
 
 
-def test_the_default_is_exact_to_float_rounding_and_rounded_sh_is_not(scene):
-    default, *_, half = (option for option in bm_accuracy.options_for("cuda") if not option.deterministic)
-    image_error, gradient_error, cut = bm_accuracy.errors(scene, default)
+def named(name):
+    return next(option for option in bm_accuracy.options_for("cpu") if option.name == name)
+
+
+def test_the_default_is_exact_to_float_rounding_and_half_precision_is_not(scene):
+    image_error, gradient_error, cut = bm_accuracy.errors(scene, named("default"))
     assert 0 < image_error < 1e-5 and 0 < gradient_error < 1e-4 and cut < 0.05
-    worse, _, _ = bm_accuracy.errors(scene, half)
-    assert worse > 3 * image_error
+    same, _, _ = bm_accuracy.errors(scene, named("exchange"))
+    assert same == image_error
+    worse, _, _ = bm_accuracy.errors(scene, named("exchange in half precision"))
+    assert worse > 30 * image_error
+
+
+def test_windows_of_a_large_image_are_the_image():
+    scene = aerial(5_000, views=2, width=150, height=100)
+    option = bm_accuracy.Option("depth", {"render_mode": "RGB+ED"}, torch.float64, views=2)
+    windows = bm_accuracy.exact_windows(scene, antialiased=False)
+    assert 0 < len(windows.ids) < 5_000 and len(windows.places) == 14
+    image_error, gradient_error, _ = bm_accuracy.errors(scene, option)
+    assert image_error < 1e-12 and gradient_error < 1e-12
 
 
 def test_table_and_figures(scene, tmp_path):
     exact = bm_accuracy.Option("float64", dtype=torch.float64)
-    figures = bm_accuracy.measure(exact, scene, scene, repeats=1)
+    figures = bm_accuracy.measure(exact, {1: scene}, repeats=1)
     assert figures.image_error < 1e-12 and figures.milliseconds > 0
     assert bm_accuracy.table([figures]).splitlines()[-1].startswith("| float64 |")
+    bm_accuracy.require_bounds(figures)
+    figures.gradient_error = 2e-4
+    with pytest.raises(SystemExit, match="gradients 2.0e-04 of 1e-04"):
+        bm_accuracy.require_bounds(figures)
     pytest.importorskip("matplotlib")
-    bm_accuracy.plot([figures], tmp_path / "plot.png")
+    bm_accuracy.plot([figures], "title", tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 1000
