@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build io demo test test-python test-cxx test-slow lint format clean
+.PHONY: venv venv-test build io demo test test-python test-cxx test-slow sanitize lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -70,6 +70,15 @@ test-cxx:
 
 test-slow: venv-test build
 	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests
+
+# The CUDA kernels under compute-sanitizer, every allocation with bounds of its own.
+SANITIZE_TESTS ?= tests/cuda tests/ops tests/view tests/stress
+sanitize:
+	@for tool in memcheck racecheck initcheck synccheck; do \
+	  echo "$$tool:"; \
+	  PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool $$tool --error-exitcode 1 \
+	    $(PYTHON) -m pytest -q -m "cuda and not slow" $(SANITIZE_TESTS) || exit 1; \
+	done
 
 lint:
 	$(RUN) ruff check .

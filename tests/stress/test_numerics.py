@@ -184,7 +184,7 @@ SCENES = {
 }
 IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # float32, as shares of the largest value
 # The gradient of a needle's conic loses what lies across the needle beside what lies along it.
-GRADIENT_BOUNDS = {"needles of 300 px": 2e-3}
+GRADIENT_BOUNDS = {"needles of 80 px": 5e-4, "needles of 300 px": 2e-3}
 
 
 def require_finite_and_correct(
