@@ -53,7 +53,7 @@ def main() -> None:
     bandwidth = copy_bandwidth(args.device, 2048 if args.device == "cuda" else 256)
     print(f"{args.views} view(s) of {args.width} x {args.height}, {args.device}, copy {bandwidth:.0f} GB/s")
 
-    def report(name: str, milliseconds: float, bytes_per_value: int) -> None:
+    def report(name: str, milliseconds: float, bytes_per_value: float) -> None:
         floor = bytes_per_value * values / bandwidth / 1e6
         print(f"{name:36s} {milliseconds:8.3f} ms   byte floor {floor:7.4f} ms")
 
@@ -63,6 +63,10 @@ def main() -> None:
     forward = median_ms(photometric_sums, [s[:2] for s in sets], args.repeats)
     report("forward (sums)", forward, 5)
     report("forward + backward (one op)", median_ms(photometric_fwd_bwd, sets, args.repeats), 9)
+    tiles = args.views * -(-args.height // 16) * -(-args.width // 16)
+    middle = (16, 3 * tiles // 8, 5 * tiles // 8)
+    quarter = [(*s, *middle) for s in sets]
+    report("the same, the middle quarter", median_ms(photometric_fwd_bwd, quarter, args.repeats), 9 / 4)
     leaves = [(x.clone().requires_grad_(), y) for x, y, *_ in sets]
     report("plain PyTorch, forward + backward", median_ms(plain, leaves, args.repeats), 9)
 

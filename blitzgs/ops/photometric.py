@@ -100,6 +100,8 @@ def photometric_fwd_bwd(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return `photometric_sums` and the gradient of their weighted total in one go, without autograd.
 
+    The gradient is that of `photometric_sums`, but only the owned pixels of it are defined.
+
     For the loss of `photometric_loss`, summed over views: ``l1_weights = (1 - w) / counts`` and
     ``ssim_weights = -w / counts`` with ``counts = pixel_counts(renders, masks)``.
 
@@ -114,7 +116,7 @@ def photometric_fwd_bwd(
         tile_end: as in `photometric_sums`.
 
     Returns:
-        (l1 sums [B], SSIM sums [B], v_renders [B, H, W, 3]).
+        (l1 sums [B], SSIM sums [B], v_renders [B, H, W, 3], undefined beyond the owned pixels).
 
     Raises:
         RuntimeError: wrong shapes or dtypes.

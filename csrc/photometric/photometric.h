@@ -11,8 +11,9 @@
 // views, tile index (b * tiles_y + ty) * tiles_x + tx; the forward reads x up to 5 pixels beyond them.
 //
 // v_renders = d(sum_b l1_weights[b] l1[b] + ssim_weights[b] ssim[b]) / dx for the sums over ALL tiles,
-// written for the owned pixels and zero elsewhere, so that the owners' gradients add up to the whole; it
-// reads x up to 10 pixels beyond the owned tiles. The derivative of |x - y| at 0 is 0.
+// written for the owned pixels: the owners' gradients add up to the whole. Elsewhere v_renders is zero with
+// clear_rest, otherwise zero or not written. It reads x up to 10 pixels beyond the owned tiles. The
+// derivative of |x - y| at 0 is 0.
 //
 // With e = mean(x) - mean(y), P = E[x^2 + y^2], Q = E[(x - y)^2] under the window, SSIM is computed as
 //   (1 - e^2 / A) (1 - V / S),  A = mean(x)^2 + mean(y)^2 + C1,
@@ -42,6 +43,7 @@ struct PhotometricArgs {
   T* l1_sums;                 // [B]; null: no sums
   T* ssim_sums;               // [B]
   T* v_renders;               // with l1_weights
+  bool clear_rest;
   std::int64_t views;
   int width, height, tile_size, tiles_x, tiles_y;
   std::int64_t tile_begin, tile_end;
@@ -71,11 +73,13 @@ struct SsimTerms {
   T value, by_mean, by_p, by_q;
 };
 
-// On the GPU within 1 ulp.
+// On the GPU within 1 ulp; of normal numbers.
 template <class T>
 BLITZGS_HD T reciprocal(T x) {
 #ifdef __CUDA_ARCH__
-  return __fdividef(T(1), x);
+  T result;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
+  return result;
 #else
   return T(1) / x;
 #endif

@@ -43,7 +43,7 @@ void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStrea
         first + ((end - 1) / args.tile_size + 1) * std::int64_t{args.tiles_x} > args.tile_begin;
     if (owned) {
       strips[count++] = strip;
-    } else if (args.v_renders) {
+    } else if (args.v_renders && args.clear_rest) {
       const std::int64_t row = 3 * std::int64_t{args.width};
       T* rows = args.v_renders + (strip / per_view * args.height + begin) * row;
       std::fill_n(rows, (end - begin) * row, T(0));

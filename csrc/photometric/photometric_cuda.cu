@@ -1,11 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// Two kernels a view. Both stream a strip of rows downwards: a thread holds one column and keeps the partial
-// sums of the 10 windows that are open there in registers (the shift to the next row is free: it is the
-// destination of the multiply-add), so an input is read once. Every four finished rows go through shared
-// memory, where a thread convolves four neighbouring pixels horizontally from four 16-byte loads a quantity.
-//   windows_kernel   images -> SSIM of each pixel, its sums, its three derivatives (planar maps)
-//   gradient_kernel  maps -> v_renders
-// A pixel's arithmetic does not depend on how the image is cut into strips.
+// One kernel for all owned pixels of all views; nothing between the images and the gradient leaves the chip.
+// A block streams a strip of rows downwards, four rows a round, through five steps:
+//   1 vertical windows of the images: a thread holds one column and keeps the partial sums of the 10 windows
+//     that are open there in registers (the shift to the next row is free: it is the destination of the
+//     multiply-add), so an input is read once;
+//   2 horizontal windows, four neighbouring pixels a thread from four 16-byte shared loads a quantity;
+//     SSIM of each pixel, its sums and its three derivatives;
+//   3 vertical windows of the derivatives, as 1;
+//   4 horizontal windows of those, as 2;
+//   5 the gradient, written with the threads on the columns again.
+// All five run together, each one round behind the step before it: one barrier a round. A pixel's arithmetic
+// does not depend on how the image is cut into strips.
 #include <algorithm>
 #include <climits>
 
@@ -17,100 +22,253 @@ namespace blitzgs::cuda {
 
 namespace {
 
+// Of one round; two take turns.
+struct Shared {
+  float inputs[4][kRows][3][kInPitch];    // 1 -> 2
+  float maps[3][kRows][3][kMidPitch];     // 2 -> 3
+  float columns[3][kRows][3][kMidPitch];  // 3 -> 4
+  float results[3][kRows][3][kOutPitch];  // 4 -> 5
+};
+
+// Rows above a strip's first at which it starts to read, and the round of its first window. Chosen so that
+// sums are added in the same order with and without a gradient.
+template <bool kGradient>
+constexpr int kLead = kGradient ? 2 * kSsimRadius : kSsimRadius + 1;
+constexpr int kWindowRound = 2;
+constexpr int kOutRound = 5;
+static_assert(kRows * kOutRound == 4 * kSsimRadius);
+
+// Steps come in two forms. The plain one is for rounds whose rows all exist and are owned whole, without a
+// mask: nearly all of them.
 template <bool kBytes, bool kGradient, bool kSums>
-__global__ void __launch_bounds__(kThreads, 2)
-    windows_kernel(const PhotometricArgs<float> args, const Launch launch) {
-  __shared__ alignas(16) float shared[2][4][kRows][3][kPitch];
-  const int view = launch.view, begin = blockIdx.y * launch.rows_per_strip;
-  const int end = min(args.height, begin + launch.rows_per_strip);
-  const int first_pixel = blockIdx.x * kOut;
-  const OwnedRows rows = owned_rows(args, view);
-  const int reach = kGradient ? kSsimRadius : 0;
-  const bool needed = rows.begin < rows.end && begin < rows.end + reach && end > rows.begin - reach;
+class StripWalk {
+ public:
+  __device__ __forceinline__ StripWalk(const PhotometricArgs<float>& args, const Launch& launch,
+                                       Shared* shared)
+      : args_(args),
+        shared_(shared),
+        strip_(strip_of(launch, args.height, blockIdx.y)),
+        whole_(whole_rows(args, strip_)),
+        first_pixel_(blockIdx.x * kOut),
+        width_(min(kOut, args.width - first_pixel_)),
+        first_row_(strip_.begin - kLead<kGradient>),
+        stride_(3 * args.width),
+        image_(std::int64_t{strip_.view} * args.height * args.width),
+        channel_(threadIdx.x % 3),
+        local_(threadIdx.x / 3) {
+    const int pixel = first_pixel_ - 2 * kSsimRadius + local_;
+    has_column_ = threadIdx.x < 3 * kIn && pixel >= 0 && pixel < args.width;
+    in_core_ = has_column_ && local_ >= 2 * kSsimRadius && local_ < 2 * kSsimRadius + kOut;
+    next_ = 3 * (image_ + std::int64_t{first_row_} * args.width + pixel) + channel_;
+    out_ = 3 * (image_ + std::int64_t{strip_.begin} * args.width + first_pixel_ + local_) + channel_;
+    if constexpr (kGradient) {
+      ssim_weight_ = args.ssim_weights[strip_.view];
+      l1_weight_ = args.l1_weights[strip_.view];
+      // Windows centred outside the image have no derivative.
+      for (int i = threadIdx.x; i < 3 * kRows * 3 * kMidPitch; i += kThreads) {
+        (&shared[0].columns[0][0][0][0])[i] = (&shared[1].columns[0][0][0][0])[i] = 0;
+      }
+      const int map_pixel = first_pixel_ - kSsimRadius + static_cast<int>(threadIdx.x) % kMid;
+      has_map_column_ = threadIdx.x < 3 * kMid && map_pixel >= 0 && map_pixel < args.width;
+      __syncthreads();
+    }
+  }
+
+  __device__ __forceinline__ void run() {
+    const int rows = strip_.end - strip_.begin;
+    const int lead = kGradient ? 4 * kSsimRadius : 2 * kSsimRadius + 1;
+    const int rounds = (rows + lead + kRows - 1) / kRows;
+    load(first_row_);
+    for (int round = 0; round < rounds + (kGradient ? 4 : 1); ++round) {
+      const int row = first_row_ + round * kRows;
+      Shared &even = shared_[round % 2], &odd = shared_[1 - round % 2];
+      if (round < rounds) {
+        image_columns(even, row, round >= kWindowRound);
+        if (round + 1 < rounds) load(row + kRows);
+      }
+      if (round >= kWindowRound + 1 && round < rounds + 1) {
+        const int top = row - kRows - kSsimRadius;
+        // Without sums, and beyond the strip, it does not matter who owns a row.
+        const bool simple = !args_.masks && (kSums && top + kRows > strip_.begin && top < strip_.end
+                                                 ? plain(top)
+                                                 : top >= 0 && top + kRows <= args_.height);
+        simple ? windows<true>(odd, top) : windows<false>(odd, top);
+      }
+      if constexpr (kGradient) {
+        if (round >= kWindowRound + 2 && round < rounds + 2) map_columns(even);
+        if (round >= kOutRound + 3 && round < rounds + 3) map_rows(odd);
+        if (round >= kOutRound + 4) {
+          const int top = strip_.begin + (round - 4 - kOutRound) * kRows;
+          plain(top) ? write_gradient<true>(even, top) : write_gradient<false>(even, top);
+        }
+      }
+      __syncthreads();
+    }
+  }
+
   float l1_sum = 0, ssim_sum = 0;
 
-  if (needed) {
-    const bool whole = owns_whole_view(args, view);
-    const std::int64_t image = std::int64_t{view} * args.height * args.width;
-    const float weight = kGradient ? args.ssim_weights[view] : 0.0f;
-    // The column of this thread, channels interleaved.
-    const int channel = threadIdx.x % 3, local = threadIdx.x / 3, pixel = first_pixel - kSsimRadius + local;
-    const bool has_column = threadIdx.x < 3 * kIn && pixel >= 0 && pixel < args.width;
-    const bool in_core = has_column && local >= kSsimRadius && local < kSsimRadius + kOut;
-    const Item item = item_of(threadIdx.x);
-    float pending[4][kPending] = {};
-    float x[kRows];
-    Target<kBytes> y[kRows];
-    const int stride = 3 * args.width;
-    const std::int64_t top_of_column = 3 * (image + pixel) + channel;
-    const auto load = [&](int row) {
-      const std::int64_t at = top_of_column + std::int64_t{row} * stride;
+ private:
+  // Whether the rows from `top` on are all in the strip and owned whole, without a mask.
+  __device__ __forceinline__ bool plain(int top) const {
+    return !args_.masks && top >= whole_.begin && top + kRows <= whole_.end;
+  }
+
+  __device__ __forceinline__ bool counted(int row, int pixel) const {
+    return !args_.masks || args_.masks[image_ + std::int64_t{row} * args_.width + pixel];
+  }
+
+  __device__ __forceinline__ void load(int row) {
+    const bool all = row >= 0 && row + kRows <= args_.height;
+#pragma unroll
+    for (int i = 0; i < kRows; ++i, next_ += stride_) {
+      const bool inside =
+          has_column_ && (all || static_cast<unsigned>(row + i) < static_cast<unsigned>(args_.height));
+      x_[i] = inside ? args_.renders[next_] : 0.0f;
+      y_[i] = inside ? targets_of<kBytes>(args_)[next_] : Target<kBytes>(0);
+    }
+  }
+
+  __device__ __forceinline__ void image_columns(Shared& shared, int top, bool keep) {
+    float differences[kRows];
+#pragma unroll
+    for (int i = 0; i < kRows; ++i) {
+      const float target = target_value(y_[i]), difference = x_[i] - target;
+      differences[i] = difference;
+      const float values[4] = {x_[i], difference, fmaf(x_[i], x_[i], target * target),
+                               difference * difference};
+#pragma unroll
+      for (int q = 0; q < 4; ++q) {
+        const float complete = advance(args_.window, image_pending_[q], values[q]);
+        if (keep && threadIdx.x < 3 * kIn) shared.inputs[q][i][channel_][local_] = complete;
+      }
+    }
+    if constexpr (kSums) {
+      if (!in_core_) return;
+      const bool all = plain(top);
 #pragma unroll
       for (int i = 0; i < kRows; ++i) {
-        const bool inside = has_column && static_cast<unsigned>(row + i) < static_cast<unsigned>(args.height);
-        x[i] = inside ? args.renders[at + i * stride] : 0.0f;
-        y[i] = inside ? targets_of<kBytes>(args)[at + i * stride] : Target<kBytes>(0);
-      }
-    };
-    const int first_row = begin - kSsimRadius - 2;
-    const int rounds = kLeadRounds + (end - begin + kRows - 1) / kRows;
-    load(first_row);
-    for (int round = 0; round < rounds; ++round) {
-      float (&buffer)[4][kRows][3][kPitch] = shared[round % 2];
-#pragma unroll
-      for (int i = 0; i < kRows; ++i) {
-        const float target = target_value(y[i]), difference = x[i] - target;
-        const float values[4] = {x[i], difference, fmaf(x[i], x[i], target * target),
-                                 difference * difference};
-#pragma unroll
-        for (int q = 0; q < 4; ++q) {
-          const float complete = advance(args.window, pending[q], values[q]);
-          if (round >= kLeadRounds && threadIdx.x < 3 * kIn) buffer[q][i][channel][local] = complete;
-        }
-        if constexpr (kSums) {
-          const int row = first_row + round * kRows + i;
-          if (in_core && row >= begin && row < end && owns_pixel(args, whole, view, row, pixel) &&
-              (!args.masks || args.masks[image + std::int64_t{row} * args.width + pixel])) {
-            l1_sum += fabsf(difference);
-          }
-        }
-      }
-      if (round + 1 < rounds) load(first_row + (round + 1) * kRows);
-      if (round < kLeadRounds) continue;
-      __syncthreads();
-      const int row = begin + (round - kLeadRounds) * kRows + item.row, column = first_pixel + item.pixel;
-      if (threadIdx.x < kItems && row < end && column < args.width) {
-        float windows[4][4];
-#pragma unroll
-        for (int q = 0; q < 4; ++q)
-          convolve4(args.window, &buffer[q][item.row][item.channel][item.pixel], windows[q]);
-        float by_mean[4], by_p[4], by_q[4];
-#pragma unroll
-        for (int j = 0; j < 4; ++j) {
-          const SsimTerms<float> terms =
-              ssim_terms(windows[0][j], windows[1][j], windows[2][j], windows[3][j]);
-          const bool exists = column + j < args.width;
-          const bool counts =
-              exists && (!args.masks || args.masks[image + std::int64_t{row} * args.width + column + j]);
-          if (kSums && counts && owns_pixel(args, whole, view, row, column + j)) ssim_sum += terms.value;
-          const float factor = counts ? weight : 0.0f;
-          by_mean[j] = factor * terms.by_mean, by_p[j] = factor * terms.by_p, by_q[j] = factor * terms.by_q;
-        }
-        if constexpr (kGradient) {
-          const std::int64_t at =
-              (std::int64_t{item.channel} * args.height + row) * launch.map_pitch + column;
-          float* map = launch.maps + at;
-          *reinterpret_cast<float4*>(map) = make_float4(by_mean[0], by_mean[1], by_mean[2], by_mean[3]);
-          map += launch.map_size;
-          *reinterpret_cast<float4*>(map) = make_float4(by_p[0], by_p[1], by_p[2], by_p[3]);
-          map += launch.map_size;
-          *reinterpret_cast<float4*>(map) = make_float4(by_q[0], by_q[1], by_q[2], by_q[3]);
+        const int row = top + i, pixel = first_pixel_ - 2 * kSsimRadius + local_;
+        if (all || (row >= strip_.begin && row < strip_.end && owns_pixel(args_, strip_.view, row, pixel) &&
+                    counted(row, pixel))) {
+          l1_sum += fabsf(differences[i]);
         }
       }
     }
   }
+
+  // Windows centred on the rows from `top` on.
+  template <bool kPlain>
+  __device__ __forceinline__ void windows(Shared& shared, int top) {
+    if (threadIdx.x >= kRows * 3 * kMidGroups) return;
+    const Item item = item_of<kMidGroups>(threadIdx.x);
+    float sums[4][4];
+#pragma unroll
+    for (int q = 0; q < 4; ++q)
+      convolve4(args_.window, &shared.inputs[q][item.row][item.channel][item.pixel], sums[q]);
+    const int row = top + item.row, column = item.pixel - kSsimRadius;  // in the block
+    const bool in_rows = kPlain || (row >= 0 && row < args_.height);
+    const bool in_strip = kSums && row >= strip_.begin && row < strip_.end;
+    float by_mean[4], by_p[4], by_q[4];
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+      const SsimTerms<float> terms = ssim_terms(sums[0][j], sums[1][j], sums[2][j], sums[3][j]);
+      const int pixel = first_pixel_ + column + j;
+      const bool counts =
+          kPlain || (in_rows && static_cast<unsigned>(pixel) < static_cast<unsigned>(args_.width) &&
+                     counted(row, pixel));
+      if (in_strip && static_cast<unsigned>(column + j) < static_cast<unsigned>(width_) &&
+          (kPlain || (counts && owns_pixel(args_, strip_.view, row, pixel)))) {
+        ssim_sum += terms.value;
+      }
+      const float factor = counts ? ssim_weight_ : 0.0f;
+      by_mean[j] = factor * terms.by_mean, by_p[j] = factor * terms.by_p, by_q[j] = factor * terms.by_q;
+    }
+    if constexpr (kGradient) {
+      const auto store = [&](int map, const float (&values)[4]) {
+        *reinterpret_cast<float4*>(&shared.maps[map][item.row][item.channel][item.pixel]) =
+            make_float4(values[0], values[1], values[2], values[3]);
+      };
+      store(0, by_mean), store(1, by_p), store(2, by_q);
+    }
+  }
+
+  __device__ __forceinline__ void map_columns(Shared& shared) {
+    if (!has_map_column_) return;
+    const int channel = threadIdx.x / kMid, local = threadIdx.x % kMid;
+#pragma unroll
+    for (int i = 0; i < kRows; ++i) {
+#pragma unroll
+      for (int q = 0; q < 3; ++q) {
+        shared.columns[q][i][channel][local] =
+            advance(args_.window, map_pending_[q], shared.maps[q][i][channel][local]);
+      }
+    }
+  }
+
+  __device__ __forceinline__ void map_rows(Shared& shared) {
+    if (threadIdx.x >= kRows * 3 * kOutGroups) return;
+    const Item item = item_of<kOutGroups>(threadIdx.x);
+#pragma unroll
+    for (int q = 0; q < 3; ++q) {
+      float out[4];
+      convolve4(args_.window, &shared.columns[q][item.row][item.channel][item.pixel], out);
+      *reinterpret_cast<float4*>(&shared.results[q][item.row][item.channel][item.pixel]) =
+          make_float4(out[0], out[1], out[2], out[3]);
+    }
+  }
+
+  // Rows from `top` on.
+  template <bool kPlain>
+  __device__ __forceinline__ void write_gradient(const Shared& shared, int top) {
+    if (local_ >= width_) return;
+    float x[kRows];
+    Target<kBytes> y[kRows];
+#pragma unroll
+    for (int i = 0; i < kRows; ++i) {
+      const bool present = kPlain || top + i < strip_.end;
+      x[i] = present ? __ldg(args_.renders + out_ + i * std::int64_t{stride_}) : 0.0f;
+      y[i] =
+          present ? __ldg(targets_of<kBytes>(args_) + out_ + i * std::int64_t{stride_}) : Target<kBytes>(0);
+    }
+#pragma unroll
+    for (int i = 0; i < kRows; ++i, out_ += stride_) {
+      const int row = top + i, pixel = first_pixel_ + local_;
+      if (!kPlain && row >= strip_.end) break;
+      const float difference = x[i] - target_value(y[i]);
+      const float l1 = difference == 0.0f ? 0.0f : copysignf(l1_weight_, difference);
+      const float* result = &shared.results[0][i][channel_][local_];
+      constexpr int kMap = kRows * 3 * kOutPitch;
+      const float value = (kPlain || counted(row, pixel) ? l1 : 0.0f) + result[0] +
+                          2.0f * fmaf(x[i], result[kMap], difference * result[2 * kMap]);
+      args_.v_renders[out_] = kPlain || owns_pixel(args_, strip_.view, row, pixel) ? value : 0.0f;
+    }
+  }
+
+  const PhotometricArgs<float>& args_;
+  Shared* shared_;
+  const Strip strip_, whole_;
+  const int first_pixel_, width_, first_row_, stride_;
+  const std::int64_t image_;
+  const int channel_, local_;  // of this thread's column: channels interleaved, as in memory
+  bool has_column_, in_core_, has_map_column_ = false;
+  std::int64_t next_, out_;  // what this thread reads and writes next
+  float ssim_weight_ = 0, l1_weight_ = 0;
+  float x_[kRows];
+  Target<kBytes> y_[kRows];
+  float image_pending_[4][kPending] = {};
+  float map_pending_[3][kPending] = {};
+};
+
+template <bool kBytes, bool kGradient, bool kSums>
+__global__ void __launch_bounds__(kThreads, 2)
+    photometric_kernel(const __grid_constant__ PhotometricArgs<float> args,
+                       const __grid_constant__ Launch launch) {
+  extern __shared__ __align__(16) unsigned char shared[];
+  StripWalk<kBytes, kGradient, kSums> walk(args, launch, reinterpret_cast<Shared*>(shared));
+  walk.run();
   if constexpr (kSums) {
-    const double l1 = block_sum(l1_sum), ssim = block_sum(ssim_sum);
+    const double l1 = block_sum(walk.l1_sum), ssim = block_sum(walk.ssim_sum);
     if (threadIdx.x == 0) {
       double* out = launch.partials + 2 * (std::int64_t{blockIdx.y} * gridDim.x + blockIdx.x);
       out[0] = l1, out[1] = ssim;
@@ -118,120 +276,52 @@ __global__ void __launch_bounds__(kThreads, 2)
   }
 }
 
-template <bool kBytes>
-__global__ void __launch_bounds__(kThreads, 3)
-    gradient_kernel(const PhotometricArgs<float> args, const Launch launch) {
-  __shared__ alignas(16) float columns[3][kRows][3][kPitch];
-  __shared__ alignas(16) float results[3][kRows][3][kOutPitch];
-  const int view = launch.view, begin = blockIdx.y * launch.rows_per_strip;
-  const int end = min(args.height, begin + launch.rows_per_strip);
-  const int first_pixel = blockIdx.x * kOut;
-  const int width = min(kOut, args.width - first_pixel);
-  const std::int64_t image = std::int64_t{view} * args.height * args.width;
-  const OwnedRows rows = owned_rows(args, view);
-  if (rows.begin >= rows.end || begin >= rows.end || end <= rows.begin) {
-    for (int row = begin; row < end; ++row) {
-      float* out = args.v_renders + 3 * (image + std::int64_t{row} * args.width + first_pixel);
-      for (int i = threadIdx.x; i < 3 * width; i += kThreads) out[i] = 0.0f;
-    }
-    return;
-  }
-  const bool whole = owns_whole_view(args, view);
-  const float weight = args.l1_weights[view];
-  // Maps hold the rows within a window of an owned pixel.
-  const int low = max(0, rows.begin - kSsimRadius), high = min(args.height, rows.end + kSsimRadius);
-  const int channel = threadIdx.x / kIn, local = threadIdx.x % kIn, pixel = first_pixel - kSsimRadius + local;
-  const bool has_column = channel < 3 && pixel >= 0 && pixel < args.width;
-  const Item item = item_of(threadIdx.x);
-  float pending[3][kPending] = {};
-  float values[3][kRows];
-  const auto load = [&](int row) {
-#pragma unroll
-    for (int i = 0; i < kRows; ++i, ++row) {
-      const bool inside = has_column && row >= low && row < high;
-      const float* map = launch.maps + (std::int64_t{channel} * args.height + row) * launch.map_pitch + pixel;
-#pragma unroll
-      for (int q = 0; q < 3; ++q) values[q][i] = inside ? map[q * launch.map_size] : 0.0f;
-    }
-  };
-  // The output column of this thread, channels interleaved.
-  const int out_channel = threadIdx.x % 3, out_local = threadIdx.x / 3;
-  const bool writes = static_cast<int>(threadIdx.x) < 3 * width;
-  const std::int64_t out_column = image + first_pixel + out_local;
-  const int first_row = begin - kSsimRadius - 2;
-  const int rounds = kLeadRounds + (end - begin + kRows - 1) / kRows;
-  load(first_row);
-  for (int round = 0; round < rounds; ++round) {
-    const int top = begin + (round - kLeadRounds) * kRows;
-#pragma unroll
-    for (int i = 0; i < kRows; ++i) {
-#pragma unroll
-      for (int q = 0; q < 3; ++q) {
-        const float complete = advance(args.window, pending[q], values[q][i]);
-        if (round >= kLeadRounds && channel < 3) columns[q][i][channel][local] = complete;
-      }
-    }
-    if (round + 1 < rounds) load(first_row + (round + 1) * kRows);
-    if (round < kLeadRounds) continue;
-    float x[kRows];
-    Target<kBytes> y[kRows];
-#pragma unroll
-    for (int i = 0; i < kRows; ++i) {
-      const bool used = writes && top + i < end;
-      const std::int64_t at = 3 * (out_column + std::int64_t{top + i} * args.width) + out_channel;
-      x[i] = used ? args.renders[at] : 0.0f;
-      y[i] = used ? targets_of<kBytes>(args)[at] : Target<kBytes>(0);
-    }
-    __syncthreads();
-    if (threadIdx.x < kItems) {
-#pragma unroll
-      for (int q = 0; q < 3; ++q) {
-        float out[4];
-        convolve4(args.window, &columns[q][item.row][item.channel][item.pixel], out);
-        *reinterpret_cast<float4*>(&results[q][item.row][item.channel][item.pixel]) =
-            make_float4(out[0], out[1], out[2], out[3]);
-      }
-    }
-    __syncthreads();
-#pragma unroll
-    for (int i = 0; i < kRows; ++i) {
-      const int row = top + i;
-      if (!writes || row >= end) continue;
-      const std::int64_t at = out_column + std::int64_t{row} * args.width;
-      const bool counts = !args.masks || args.masks[at];
-      const float difference = x[i] - target_value(y[i]);
-      const float sign = difference > 0 ? 1.0f : (difference < 0 ? -1.0f : 0.0f);
-      const float* result = &results[0][i][out_channel][out_local];
-      constexpr int kMap = kRows * 3 * kOutPitch;
-      const float value = (counts ? weight * sign : 0.0f) + result[0] +
-                          2.0f * fmaf(x[i], result[kMap], difference * result[2 * kMap]);
-      args.v_renders[3 * at + out_channel] =
-          owns_pixel(args, whole, view, row, first_pixel + out_local) ? value : 0.0f;
-    }
-  }
-}
-
 // One block per view adds its partial sums in order.
-__global__ void finish_sums(const double* partials, int blocks, float* l1_sums, float* ssim_sums) {
-  const double* mine = partials + 2 * std::int64_t{blockIdx.x} * blocks;
+__global__ void finish_sums(const Launch launch, int strips, int blocks_per_strip, float* l1_sums,
+                            float* ssim_sums) {
+  const int view = blockIdx.x, place = view - launch.first_view;
   double l1 = 0, ssim = 0;
-  for (int i = threadIdx.x; i < blocks; i += kThreads) l1 += mine[2 * i], ssim += mine[2 * i + 1];
+  if (place >= 0 && view <= launch.last_view) {
+    const int begin = place == 0 ? 0 : launch.first_strips + (place - 1) * launch.view_strips;
+    const int end = view == launch.last_view ? strips : launch.first_strips + place * launch.view_strips;
+    const double* mine = launch.partials + 2 * std::int64_t{begin} * blocks_per_strip;
+    for (int i = threadIdx.x; i < (end - begin) * blocks_per_strip; i += kThreads) {
+      l1 += mine[2 * i], ssim += mine[2 * i + 1];
+    }
+  }
   l1 = block_sum(l1), ssim = block_sum(ssim);
-  if (threadIdx.x == 0)
-    l1_sums[blockIdx.x] = static_cast<float>(l1), ssim_sums[blockIdx.x] = static_cast<float>(ssim);
+  if (threadIdx.x == 0) l1_sums[view] = static_cast<float>(l1), ssim_sums[view] = static_cast<float>(ssim);
 }
 
-// Rows per strip: whole waves of blocks, with few rows read twice.
-int rows_per_strip(int height, int strips_x, int slots) {
+int cut(int rows, int rows_per_strip) { return (rows + rows_per_strip - 1) / rows_per_strip; }
+
+// Cuts the owned rows into strips: whole waves of blocks, with few rows read twice. Returns how many.
+int cut_strips(const PhotometricArgs<float>& args, int columns, int slots, Launch* launch) {
+  const std::int64_t tiles = std::int64_t{args.tiles_x} * args.tiles_y;
+  const std::int64_t last = args.tile_end - 1;
+  launch->first_view = static_cast<int>(args.tile_begin / tiles);
+  launch->last_view = static_cast<int>(last / tiles);
+  launch->begin_row = static_cast<int>(args.tile_begin % tiles / args.tiles_x * args.tile_size);
+  launch->end_row =
+      std::min(args.height, static_cast<int>((last % tiles / args.tiles_x + 1) * args.tile_size));
+  const int views = launch->last_view - launch->first_view;
+  const int first_rows = (views ? args.height : launch->end_row) - launch->begin_row;
+  constexpr int kLeadCost = 24;  // rows of work before the first output
   std::int64_t best_cost = LLONG_MAX;
-  int best = height;
-  for (int strips = 1; strips <= (height + 15) / 16; ++strips) {
-    const int rows = ((height + strips - 1) / strips + kRows - 1) / kRows * kRows;
-    const std::int64_t blocks = std::int64_t{strips_x} * ((height + rows - 1) / rows);
-    const std::int64_t cost = (blocks + slots - 1) / slots * (rows + kLead);
-    if (cost < best_cost) best_cost = cost, best = rows;
+  int best_strips = 0;
+  for (int pieces = 1; pieces <= cut(args.height, 16); ++pieces) {
+    const int rows = cut(cut(args.height, pieces), kRows) * kRows;
+    int strips = cut(first_rows, rows);
+    if (views) strips += (views - 1) * cut(args.height, rows) + cut(launch->end_row, rows);
+    const std::int64_t waves = (std::int64_t{columns} * strips + slots - 1) / slots;
+    const std::int64_t cost = waves * (rows + kLeadCost);
+    if (cost >= best_cost) continue;
+    best_cost = cost, best_strips = strips;
+    launch->rows_per_strip = rows;
+    launch->first_strips = cut(first_rows, rows);
+    launch->view_strips = cut(args.height, rows);
   }
-  return best;
+  return best_strips;
 }
 
 int multiprocessors() {
@@ -241,51 +331,55 @@ int multiprocessors() {
   return count;
 }
 
+template <bool kBytes, bool kGradient, bool kSums>
+void launch_kernel(dim3 grid, const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
+  const auto kernel = photometric_kernel<kBytes, kGradient, kSums>;
+  constexpr int kSharedBytes = 2 * sizeof(Shared);
+  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kSharedBytes),
+        "photometric");
+  kernel<<<grid, kThreads, kSharedBytes, stream>>>(args, launch);
+  check_launch("photometric");
+}
+
 template <bool kBytes>
-void launch_windows(dim3 grid, const PhotometricArgs<float>& args, const Launch& launch,
-                    cudaStream_t stream) {
+void launch_strips(dim3 grid, const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
   if (args.v_renders && args.l1_sums) {
-    windows_kernel<kBytes, true, true><<<grid, kThreads, 0, stream>>>(args, launch);
+    launch_kernel<kBytes, true, true>(grid, args, launch, stream);
   } else if (args.v_renders) {
-    windows_kernel<kBytes, true, false><<<grid, kThreads, 0, stream>>>(args, launch);
+    launch_kernel<kBytes, true, false>(grid, args, launch, stream);
   } else {
-    windows_kernel<kBytes, false, true><<<grid, kThreads, 0, stream>>>(args, launch);
+    launch_kernel<kBytes, false, true>(grid, args, launch, stream);
   }
+}
+
+// Zeros v_renders before and after the rows that hold an owned pixel.
+void clear_rest(const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
+  const std::int64_t row = 3 * std::int64_t{args.width};
+  const std::int64_t begin = (std::int64_t{launch.first_view} * args.height + launch.begin_row) * row;
+  const std::int64_t end = (std::int64_t{launch.last_view} * args.height + launch.end_row) * row;
+  const std::int64_t total = args.views * args.height * row;
+  check(cudaMemsetAsync(args.v_renders, 0, begin * sizeof(float), stream), "photometric");
+  check(cudaMemsetAsync(args.v_renders + end, 0, (total - end) * sizeof(float), stream), "photometric");
 }
 
 }  // namespace
 
 template <class T>
 void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStream stream) {
-  const int strips_x = (args.width + kOut - 1) / kOut, sms = multiprocessors();
-  const int window_rows = rows_per_strip(args.height, strips_x, 2 * sms);
-  const int gradient_rows = rows_per_strip(args.height, strips_x, 3 * sms);
-  const dim3 window_grid(strips_x, (args.height + window_rows - 1) / window_rows);
-  const dim3 gradient_grid(strips_x, (args.height + gradient_rows - 1) / gradient_rows);
-  const int blocks = static_cast<int>(window_grid.x * window_grid.y);
-
   Launch launch{};
-  launch.map_pitch = (args.width + 3) / 4 * 4;
-  launch.map_size = 3 * launch.map_pitch * args.height;
-  // One view at a time: the maps are reused and mostly stay in the L2 cache.
-  if (args.v_renders) launch.maps = workspace.allocate<float>(3 * launch.map_size);
-  double* partials = args.l1_sums ? workspace.allocate<double>(2 * args.views * blocks) : nullptr;
-  for (int view = 0; view < args.views; ++view) {
-    launch.view = view;
-    launch.partials = partials + 2 * std::int64_t{view} * blocks;
-    launch.rows_per_strip = window_rows;
-    args.targets_u8 ? launch_windows<true>(window_grid, args, launch, stream)
-                    : launch_windows<false>(window_grid, args, launch, stream);
-    check_launch("photometric windows");
-    if (!args.v_renders) continue;
-    launch.rows_per_strip = gradient_rows;
-    args.targets_u8 ? gradient_kernel<true><<<gradient_grid, kThreads, 0, stream>>>(args, launch)
-                    : gradient_kernel<false><<<gradient_grid, kThreads, 0, stream>>>(args, launch);
-    check_launch("photometric gradient");
+  int strips = 0;
+  const int columns = (args.width + kOut - 1) / kOut;
+  if (args.tile_begin < args.tile_end) {
+    strips = cut_strips(args, columns, 2 * multiprocessors(), &launch);
+    if (args.l1_sums) launch.partials = workspace.allocate<double>(std::int64_t{2} * strips * columns);
+    const dim3 grid(columns, strips);
+    args.targets_u8 ? launch_strips<true>(grid, args, launch, stream)
+                    : launch_strips<false>(grid, args, launch, stream);
   }
+  if (args.v_renders && args.clear_rest) clear_rest(args, launch, stream);
   if (!args.l1_sums) return;
-  finish_sums<<<static_cast<unsigned>(args.views), kThreads, 0, stream>>>(partials, blocks, args.l1_sums,
-                                                                          args.ssim_sums);
+  finish_sums<<<static_cast<unsigned>(args.views), kThreads, 0, stream>>>(launch, strips, columns,
+                                                                          args.l1_sums, args.ssim_sums);
   check_launch("photometric sums");
 }
 

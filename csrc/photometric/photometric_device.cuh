@@ -10,47 +10,57 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kOut = 72;                     // pixels of a block's row
-constexpr int kIn = kOut + 2 * kSsimRadius;  // with the windows' margin
-constexpr int kRows = 4;                     // rows per round
-constexpr int kGroups = kOut / 4;            // horizontal items of a row and channel
-constexpr int kItems = kRows * 3 * kGroups;  // horizontal items of a round
-constexpr int kPitch = 84;                   // shared row: the last item reads 16 values from pixel 68
-constexpr int kOutPitch = 76;
-constexpr int kLead = 2 * kSsimRadius + 2;  // rows read before the first output, a multiple of kRows
-constexpr int kLeadRounds = kLead / kRows;
+constexpr int kOut = 64;                      // pixels of a block's row
+constexpr int kMid = kOut + 2 * kSsimRadius;  // windows that see them
+constexpr int kIn = kMid + 2 * kSsimRadius;   // pixels that those see
+constexpr int kRows = 4;                      // rows per round
+constexpr int kMidGroups = (kMid + 3) / 4;    // horizontal items of a row and channel: four windows each
+constexpr int kOutGroups = kOut / 4;
+constexpr int kInPitch = 88;  // shared rows: the last item reads 16 values from pixel 72
+constexpr int kMidPitch = 76;
+constexpr int kOutPitch = 68;
 constexpr int kPending = kSsimTaps - 1;
-static_assert(3 * kIn <= kThreads && kItems <= kThreads && kOut % 4 == 0 && kLead % kRows == 0);
+static_assert(3 * kIn <= kThreads && kRows * 3 * kMidGroups <= kThreads && kOut % 4 == 0);
 
+// The rows that hold an owned pixel, cut into strips: those of the first view, then of the next, ...
 struct Launch {
-  int view, rows_per_strip;
-  std::int64_t map_pitch, map_size;  // floats per map row; floats per map (three channels of a view)
-  float* maps;                       // [3 maps][3 channels][height][map_pitch]
-  double* partials;                  // [blocks, 2] of this view
+  int first_view, last_view;
+  int begin_row, end_row;  // of the first view; one past the last of the last view
+  int rows_per_strip, first_strips, view_strips;
+  double* partials;  // [strips, columns of blocks, 2]
 };
 
-struct OwnedRows {
-  int begin, end;
+// Rows [begin, end) of a view.
+struct Strip {
+  int view, begin, end;
 };
 
-// Rows of the view that hold an owned pixel.
-__device__ OwnedRows owned_rows(const PhotometricArgs<float>& args, std::int64_t view) {
-  const std::int64_t tiles = std::int64_t{args.tiles_x} * args.tiles_y;
-  const std::int64_t begin = max(args.tile_begin - view * tiles, std::int64_t{0});
-  const std::int64_t end = min(args.tile_end - view * tiles, tiles);
-  if (begin >= end) return {0, 0};
-  const std::int64_t last = (end + args.tiles_x - 1) / args.tiles_x * args.tile_size;
-  return {static_cast<int>(begin / args.tiles_x * args.tile_size),
-          static_cast<int>(min(last, static_cast<std::int64_t>(args.height)))};
+__device__ inline Strip strip_of(const Launch& launch, int height, int index) {
+  Strip strip{launch.first_view, launch.begin_row, 0};
+  if (index >= launch.first_strips) {
+    index -= launch.first_strips;
+    strip.view += 1 + index / launch.view_strips;
+    index %= launch.view_strips;
+    strip.begin = 0;
+  }
+  strip.begin += index * launch.rows_per_strip;
+  strip.end =
+      min(strip.begin + launch.rows_per_strip, strip.view == launch.last_view ? launch.end_row : height);
+  return strip;
 }
 
-__device__ bool owns_whole_view(const PhotometricArgs<float>& args, std::int64_t view) {
-  const std::int64_t tiles = std::int64_t{args.tiles_x} * args.tiles_y;
-  return args.tile_begin <= view * tiles && args.tile_end >= (view + 1) * tiles;
+// The strip's rows whose pixels are all owned.
+__device__ inline Strip whole_rows(const PhotometricArgs<float>& args, const Strip& strip) {
+  const std::int64_t first = std::int64_t{strip.view} * args.tiles_x * args.tiles_y;
+  const std::int64_t begin = max(args.tile_begin - first, std::int64_t{0});
+  const std::int64_t end = max(args.tile_end - first, std::int64_t{0});
+  const std::int64_t top = (begin + args.tiles_x - 1) / args.tiles_x * args.tile_size;
+  const std::int64_t bottom = end / args.tiles_x * args.tile_size;
+  return {strip.view, static_cast<int>(min(max(top, std::int64_t{strip.begin}), std::int64_t{strip.end})),
+          static_cast<int>(min(bottom, std::int64_t{strip.end}))};
 }
 
-__device__ bool owns_pixel(const PhotometricArgs<float>& args, bool whole, int view, int row, int column) {
-  if (whole) return true;
+__device__ inline bool owns_pixel(const PhotometricArgs<float>& args, int view, int row, int column) {
   const OwnedColumns owned = owned_columns(args, view, row);
   return column >= owned.begin && column < owned.end;
 }
@@ -70,7 +80,8 @@ __device__ __forceinline__ const Target<kBytes>* targets_of(const PhotometricArg
 
 // Rounded before it is subtracted: contracted into the difference, equal pixels would not cancel.
 __device__ __forceinline__ float target_value(std::uint8_t target) {
-  return __fmul_rn(static_cast<float>(target), 1.0f / 255.0f);
+  const float value = __uint_as_float(0x4b000000u | target) - 8388608.0f;  // a conversion by other units
+  return __fmul_rn(value, 1.0f / 255.0f);
 }
 __device__ __forceinline__ float target_value(float target) { return target; }
 
@@ -87,17 +98,19 @@ __device__ __forceinline__ float advance(const float (&window)[kSsimTaps], float
 // Four neighbouring horizontal windows from a shared row; `row` points at the first pixel of the first.
 __device__ __forceinline__ void convolve4(const float (&window)[kSsimTaps], const float* row,
                                           float (&out)[4]) {
-  float in[16];
 #pragma unroll
   for (int i = 0; i < 4; ++i) {
     const float4 pack = *reinterpret_cast<const float4*>(row + 4 * i);
-    in[4 * i] = pack.x, in[4 * i + 1] = pack.y, in[4 * i + 2] = pack.z, in[4 * i + 3] = pack.w;
-  }
+    const float in[4] = {pack.x, pack.y, pack.z, pack.w};
 #pragma unroll
-  for (int j = 0; j < 4; ++j) {
-    out[j] = window[0] * in[j];
+    for (int e = 0; e < 4; ++e) {
 #pragma unroll
-    for (int k = 1; k < kSsimTaps; ++k) out[j] = fmaf(window[k], in[j + k], out[j]);
+      for (int j = 0; j < 4; ++j) {
+        const int k = 4 * i + e - j;
+        if (k == 0) out[j] = window[0] * in[e];
+        if (k > 0 && k < kSsimTaps) out[j] = fmaf(window[k], in[e], out[j]);
+      }
+    }
   }
 }
 
@@ -115,10 +128,11 @@ __device__ double block_sum(double value) {
   return total;
 }
 
-// Where a horizontal item of a round lies.
+// Where a horizontal item of a round lies; `pixel` is the first of its four.
 struct Item {
   int row, channel, pixel;
 };
+template <int kGroups>
 __device__ __forceinline__ Item item_of(int thread) {
   const int row = thread / (3 * kGroups), rest = thread - row * 3 * kGroups;
   return {row, rest / kGroups, 4 * (rest % kGroups)};

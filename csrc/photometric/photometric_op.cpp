@@ -80,6 +80,7 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     args.l1_sums = sums ? mutable_data<T>(*outputs.l1_sums) : nullptr;
     args.ssim_sums = sums ? mutable_data<T>(*outputs.ssim_sums) : nullptr;
     args.v_renders = outputs.v_renders ? mutable_data<T>(*outputs.v_renders) : nullptr;
+    args.clear_rest = !sums;
     args.views = views;
     args.width = static_cast<int>(width);
     args.height = static_cast<int>(height);
@@ -87,7 +88,11 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     args.tiles_x = static_cast<int>((width + tile_size - 1) / tile_size);
     args.tiles_y = static_cast<int>((height + tile_size - 1) / tile_size);
     args.tile_begin = tile_begin;
-    args.tile_end = tile_end < 0 ? views * args.tiles_x * args.tiles_y : tile_end;
+    const std::int64_t tiles = views * args.tiles_x * args.tiles_y;
+    args.tile_end = tile_end < 0 ? tiles : tile_end;
+    STD_TORCH_CHECK(0 <= tile_begin && tile_begin <= args.tile_end && args.tile_end <= tiles, "blitzgs::", op,
+                    ": tile_begin and tile_end must be a range of the ", tiles, " tiles, got [", tile_begin,
+                    ", ", tile_end, ")");
     fill_window(args.window);
     backend::photometric(args, scope.workspace, scope.stream);
   });

@@ -101,6 +101,21 @@ def test_tile_ranges_are_the_image_bit_for_bit(scene):
     assert torch.equal(work, whole[3])
 
 
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_gradients_of_some_of_the_composited_tiles(scene, deterministic):
+    """As in training on several ranks: the ring around the tiles is composited, but not differentiated."""
+    job = Job(scene, 3, 16, 8, 100)
+    exact, ours, decided = close_images(job)
+    g = torch.Generator().manual_seed(8)
+    v_renders = torch.randn(exact[0].shape, generator=g) * decided[..., None]
+    v_alphas = torch.randn(decided.shape, generator=g) * decided
+    job.grid = scene.grid(16, 31, 77)
+    expected = job.backward("cpu", torch.float64, exact, v_renders, v_alphas, False, True)
+    gradients = job.backward("cuda", torch.float32, ours, v_renders, v_alphas, False, deterministic)
+    for value, target in zip(gradients[:4], expected[:4], strict=True):
+        assert target.any() and relative_error(value, target) < 1e-4
+
+
 def test_empty_lists_give_the_background(scene):
     scene.means[:, 2] = -100.0
     job = Job(scene, 3)
