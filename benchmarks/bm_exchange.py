@@ -175,13 +175,11 @@ class Workload:
         samples, targets = self.samples[: len(keys)], self.targets[: len(keys)]
         return Batch(keys, targets, None, samples, self.divide(keys, views))
 
-    def step(self, keys: list[int], views: Views, mark: pipeline.Mark = unmarked) -> dict[str, Any]:
+    def step(self, batch: Batch, views: Views, mark: pipeline.Mark = unmarked) -> dict[str, Any]:
         """Take one training step."""
         self.steps += 1
-        batch = self.batch(keys, views)
-        mark("other")
         frame, terms, sums = self.stepper.forward(self.steps, views, self.options, batch, mark)
-        self.guard.check(self.steps, [str(key) for key in keys], sums, self.table, frame)
+        self.guard.check(self.steps, [str(key) for key in batch.indices], sums, self.table, frame)
         self.stepper.backward(self.steps, frame, terms, mark)
         return {
             "rows": len(frame.rows.gaussian_ids),
@@ -194,9 +192,10 @@ class Workload:
     def staged(self) -> Iterator[tuple[list[float], dict[str, Any]]]:
         """Visit all batches, each step behind a barrier; yield its stages' ms and what it did."""
         for keys, views in self.batches:
+            batch = self.batch(keys, views)
             self.ranks.barrier()
             clock = Clock(self.ranks.device)
-            result = self.step(keys, views, clock.mark)
+            result = self.step(batch, views, clock.mark)
             yield clock.milliseconds(), result
 
     def in_a_row(self) -> float:
@@ -204,7 +203,7 @@ class Workload:
         self.ranks.barrier()
         begin = time.perf_counter()
         for keys, views in self.batches:
-            self.step(keys, views)
+            self.step(self.batch(keys, views), views)
         self.ranks.barrier()
         return 1000 * (time.perf_counter() - begin) / len(self.batches)
 
