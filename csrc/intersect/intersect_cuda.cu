@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Rows are sorted by depth once (32-bit keys, P of them); their entries are written in that order with the
 // tile as a key, 16 bits where the tiles of the launch fit, and a stable radix sort over just the bits in use
-// brings each tile's entries together without disturbing their order. Compiled without FMA contraction
-// (cmake/cuda.cmake), as the projection is: both count the same tiles.
+// brings each tile's entries together without disturbing their order. Which tiles a row touches is found
+// once, in row order, and kept in 16 bytes: those of all rows fit into the L2 cache, where depth order
+// gathers them. Compiled without FMA contraction (cmake/cuda.cmake), as the projection is: both count the
+// same tiles.
 #include <thrust/iterator/counting_iterator.h>
 #include <thrust/iterator/transform_iterator.h>
 #include <cub/device/device_radix_sort.cuh>
@@ -24,6 +26,7 @@ constexpr int kWideRow = 24;  // entries from which a warp writes a row's list t
 
 struct Owned {
   std::int64_t first, last;  // tiles [first, last)
+  int ty;                    // the tile row in its image
 };
 
 // Calls f(owned tiles) for each tile row the splat touches.
@@ -37,33 +40,90 @@ __device__ __forceinline__ void for_each_owned(const Input& in, std::int64_t row
   for_each_tile_row(center, conic, in.opacities[row], grid.width, grid.height, grid.tile_size,
                     [&](int ty, int begin, int end) {
                       const std::int64_t base = image + static_cast<std::int64_t>(ty) * grid.tiles_x;
-                      Owned owned{base + begin, base + end};
+                      Owned owned{base + begin, base + end, ty};
                       if (owned.first < grid.tile_begin) owned.first = grid.tile_begin;
                       if (owned.last > grid.tile_end) owned.last = grid.tile_end;
                       if (owned.first < owned.last) f(owned);
                     });
 }
 
-__device__ __forceinline__ std::int32_t count_owned(const Input& in, std::int64_t row) {
-  std::int64_t count = 0;
-  for_each_owned(in, row, [&](const Owned& owned) { count += owned.last - owned.first; });
-  return static_cast<std::int32_t>(count);
+// The owned tiles that a row touches. Compact: tile `first` (from tile_begin on) and up to twelve tile rows,
+// a byte each: in the low half the number of tiles, in the high half 8 + their shift against the first row's.
+// Other shapes have first = kWalk, and the number of tiles in rows[0].
+struct alignas(16) Touched {
+  static constexpr std::uint32_t kWalk = ~0u;
+  static constexpr int kWords = 3;
+  std::uint32_t first, rows[kWords];
+
+  __host__ __device__ std::int32_t count() const {
+    if (first == kWalk) return static_cast<std::int32_t>(rows[0]);
+    constexpr std::uint32_t kCounts = 0x0f0f0f0fu;
+    const std::uint32_t sums = (rows[0] & kCounts) + (rows[1] & kCounts) + (rows[2] & kCounts);
+    return static_cast<std::int32_t>(sums * 0x01010101u >> 24);
+  }
+};
+
+__device__ __forceinline__ Touched find_touched(const Input& in, std::int64_t row) {
+  std::int64_t count = 0, first = in.grid.tile_begin;
+  int top = 0;
+  bool compact = true;
+  Touched touched{};
+  for_each_owned(in, row, [&](const Owned& owned) {
+    if (count == 0) {
+      first = owned.first;
+      top = owned.ty;
+    }
+    const std::int64_t n = owned.last - owned.first;
+    const int down = owned.ty - top;
+    const std::int64_t shift = owned.first - first - static_cast<std::int64_t>(down) * in.grid.tiles_x + 8;
+    compact &= down < 4 * Touched::kWords && n < 16 && shift >= 0 && shift < 16;
+    const std::uint32_t bits = static_cast<std::uint32_t>(shift << 4 | n) << 8 * (down & 3);
+#pragma unroll
+    for (int i = 0; i < Touched::kWords; ++i) touched.rows[i] |= down >> 2 == i ? bits : 0u;
+    count += n;
+  });
+  first -= in.grid.tile_begin;
+  touched.first = static_cast<std::uint32_t>(first);
+  if (!compact || first >= Touched::kWalk) {
+    touched.first = Touched::kWalk;
+    touched.rows[0] = static_cast<std::uint32_t>(count);
+  }
+  return touched;
+}
+
+// Calls f(first tile, from tile_begin on; number of tiles) for each tile row of find_touched().
+template <class F>
+__device__ __forceinline__ void for_each_touched(const Input& in, std::int64_t row, const Touched& touched,
+                                                 const F& f) {
+  if (touched.first == Touched::kWalk) {
+    for_each_owned(in, row, [&](const Owned& owned) {
+      f(owned.first - in.grid.tile_begin, static_cast<int>(owned.last - owned.first));
+    });
+    return;
+  }
+  std::int64_t start = static_cast<std::int64_t>(touched.first) - 8;
+#pragma unroll
+  for (int i = 0; i < Touched::kWords; ++i, start += 4 * in.grid.tiles_x) {
+    std::int64_t tile = start;
+    for (std::uint32_t rows = touched.rows[i]; rows; rows >>= 8, tile += in.grid.tiles_x) {
+      f(tile + (rows >> 4 & 15u), static_cast<int>(rows & 15u));
+    }
+  }
 }
 
 __global__ void count_kernel(const Input in, std::int32_t* counts) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
-  if (i < in.n_rows) counts[i] = count_owned(in, i);
+  if (i < in.n_rows) counts[i] = find_touched(in, i).count();
 }
 
-// Depths as unsigned integers in the same order, and the rows' indices.
-__global__ void depth_keys_kernel(const Input in, std::uint32_t* keys, std::int32_t* rows,
-                                  std::int32_t* counts) {
+// Depths as unsigned integers in the same order, the rows' indices and what they touch.
+__global__ void depth_keys_kernel(const Input in, std::uint32_t* keys, std::int32_t* rows, Touched* touched) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
   if (i >= in.n_rows) return;
   const std::uint32_t bits = __float_as_uint(in.depths[i]);
   keys[i] = bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
   rows[i] = static_cast<std::int32_t>(i);
-  counts[i] = count_owned(in, i);
+  touched[i] = find_touched(in, i);
 }
 
 __device__ void sift_down(std::int32_t* rows, const std::int64_t* ids, std::int64_t root, std::int64_t n) {
@@ -107,26 +167,30 @@ __global__ void order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows,
 }
 
 struct GatherCount {
-  const std::int32_t* counts;
+  const Touched* touched;
   const std::int32_t* rows;
   std::int64_t n;
-  __host__ __device__ std::int64_t operator()(std::int64_t i) const { return i < n ? counts[rows[i]] : 0; }
+  __host__ __device__ std::int64_t operator()(std::int64_t i) const {
+    return i < n ? touched[rows[i]].count() : 0;
+  }
 };
 
 // Entries in depth order. offsets [P + 1].
 template <class Key>
-__global__ void emit_kernel(const Input in, const std::int32_t* rows, const std::int64_t* offsets,
-                            std::int64_t capacity, Key* keys, std::int32_t* entries) {
+__global__ void emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows,
+                            const std::int64_t* offsets, std::int64_t capacity, Key* keys,
+                            std::int32_t* entries) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
   const bool present = i < in.n_rows;
   const std::int32_t row = present ? rows[i] : 0;
   const std::int64_t offset = present ? offsets[i] : 0;
-  const bool wide = present && offsets[i + 1] - offset >= kWideRow;
+  const Touched touched = all_touched[row];
+  const bool wide = present && touched.count() >= kWideRow;
   if (present && !wide) {
     std::int64_t at = offset;
-    for_each_owned(in, row, [&](const Owned& owned) {
-      for (std::int64_t tile = owned.first; tile < owned.last && at < capacity; ++tile, ++at) {
-        keys[at] = static_cast<Key>(tile - in.grid.tile_begin);
+    for_each_touched(in, row, touched, [&](std::int64_t first, int n) {
+      for (int k = 0; k < n && at < capacity; ++k, ++at) {
+        keys[at] = static_cast<Key>(first + k);
         entries[at] = row;
       }
     });
@@ -136,13 +200,17 @@ __global__ void emit_kernel(const Input in, const std::int32_t* rows, const std:
   for (unsigned left = __ballot_sync(0xffffffffu, wide); left; left &= left - 1) {
     const int source = __ffs(left) - 1;
     const std::int32_t wide_row = __shfl_sync(0xffffffffu, row, source);
+    Touched wide_touched{__shfl_sync(0xffffffffu, touched.first, source), {}};
+    for (int k = 0; k < Touched::kWords; ++k) {
+      wide_touched.rows[k] = __shfl_sync(0xffffffffu, touched.rows[k], source);
+    }
     std::int64_t at = __shfl_sync(0xffffffffu, offset, source);
-    for_each_owned(in, wide_row, [&](const Owned& owned) {
-      for (std::int64_t k = lane; k < owned.last - owned.first && at + k < capacity; k += 32) {
-        keys[at + k] = static_cast<Key>(owned.first + k - in.grid.tile_begin);
+    for_each_touched(in, wide_row, wide_touched, [&](std::int64_t first, int n) {
+      for (int k = lane; k < n && at + k < capacity; k += 32) {
+        keys[at + k] = static_cast<Key>(first + k);
         entries[at + k] = wide_row;
       }
-      at += owned.last - owned.first;
+      at += n;
     });
   }
 }
@@ -193,6 +261,7 @@ void sort_pairs(const Key* keys, Key* sorted_keys, const Value* values, Value* s
 }
 
 struct DepthOrder {
+  Touched* touched;       // [P] of each row
   std::int32_t* rows;     // [P] by (depth, id)
   std::int64_t* offsets;  // [P + 1] first entry of each
 };
@@ -202,9 +271,9 @@ DepthOrder order_by_depth(const Input& in, Workspace& workspace, CudaStream stre
   auto* keys = workspace.allocate<std::uint32_t>(n);
   auto* sorted_keys = workspace.allocate<std::uint32_t>(n);
   auto* unsorted = workspace.allocate<std::int32_t>(n);
-  auto* counts = workspace.allocate<std::int32_t>(n);
-  DepthOrder order{workspace.allocate<std::int32_t>(n), workspace.allocate<std::int64_t>(n + 1)};
-  depth_keys_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, keys, unsorted, counts);
+  DepthOrder order{workspace.allocate<Touched>(n), workspace.allocate<std::int32_t>(n),
+                   workspace.allocate<std::int64_t>(n + 1)};
+  depth_keys_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, keys, unsorted, order.touched);
   check_launch("intersect");
   sort_pairs(keys, sorted_keys, unsorted, order.rows, n, 32, workspace, stream);
   if (in.ids) {
@@ -212,7 +281,7 @@ DepthOrder order_by_depth(const Input& in, Workspace& workspace, CudaStream stre
     check_launch("intersect");
   }
   const auto counted = thrust::make_transform_iterator(thrust::make_counting_iterator(std::int64_t{0}),
-                                                       GatherCount{counts, order.rows, n});
+                                                       GatherCount{order.touched, order.rows, n});
   std::size_t bytes = 0;
   check(cub::DeviceScan::ExclusiveSum(nullptr, bytes, counted, order.offsets, n + 1, stream), "intersect");
   void* scratch = workspace.allocate_bytes(bytes);
@@ -227,8 +296,8 @@ void list_entries(const Input& in, const DepthOrder& order, std::int64_t capacit
   auto* keys = workspace.allocate<Key>(capacity);
   auto* sorted_keys = workspace.allocate<Key>(capacity);
   auto* entries = workspace.allocate<std::int32_t>(capacity);
-  emit_kernel<<<blocks_for(in.n_rows, kThreads), kThreads, 0, stream>>>(in, order.rows, order.offsets,
-                                                                        capacity, keys, entries);
+  emit_kernel<<<blocks_for(in.n_rows, kThreads), kThreads, 0, stream>>>(
+      in, order.touched, order.rows, order.offsets, capacity, keys, entries);
   check_launch("intersect");
   fill_tail_kernel<<<64, kThreads, 0, stream>>>(order.offsets + in.n_rows, capacity,
                                                 static_cast<Key>(n_tiles), keys, entries);
