@@ -29,13 +29,13 @@ struct BackwardArguments {
 
 template <int TILE, int CHANNELS, bool DETERMINISTIC>
 struct BackwardShared {
-  static constexpr int kBatch = DETERMINISTIC ? (TILE == 32 ? 32 : 64) : 256;
+  static constexpr int kBatch = DETERMINISTIC ? (TILE == 32 ? 32 : 64) : TILE == 8 ? 64 : 256;
   static constexpr int kWarps = Tile<TILE>::kWarps, kSubtiles = Tile<TILE>::kSubtiles;
   EntryBatch<TILE, kBatch> batch;
   SubtileGradient<CHANNELS> v_render[kSubtiles];
   float2 group[kSubtiles][kGroup * kGroupStride];  // weight, g
   PackedGradient partial[DETERMINISTIC ? kWarps : 1][DETERMINISTIC ? kBatch : 1];
-  std::int32_t row[kBatch + 1];  // -1 where there is no entry
+  std::int32_t row[2][kBatch + 1];  // -1 where there is no entry
   int last;
 };
 
@@ -48,11 +48,12 @@ __device__ __forceinline__ float4 add_halves(float4 a) {
 template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
 __device__ __forceinline__ void flush_group(BackwardShared<TILE, CHANNELS, DETERMINISTIC>& shared,
                                             const BackwardArguments& args, const TilePlace& tile,
-                                            const Pixel& pixel, int filled, const std::uint16_t* list) {
+                                            const Pixel& pixel, int buffer, int filled,
+                                            const std::uint16_t* list) {
   __syncwarp();
   const int slot = threadIdx.x % kGroup;
   const std::uint32_t offset = slot < filled ? list[slot] : shared.batch.kNothing;
-  const Entry& shape = shared.batch.at(offset);
+  const Entry& shape = entry_at(reinterpret_cast<const char*>(shared.batch.entries[buffer]), offset);
   const int my_entry = static_cast<int>(offset / sizeof(Entry));
   constexpr int kColumns = Tile<TILE>::kColumns, kMiddle = kSubtile / 2;
   const float x = static_cast<float>(tile.left + pixel.subtile % kColumns * kSubtile + kMiddle) - shape.x;
@@ -77,7 +78,7 @@ __device__ __forceinline__ void flush_group(BackwardShared<TILE, CHANNELS, DETER
       if (!half) target[2] = gradient.quads[2];
     }
   } else if (touched) {
-    float* target = reinterpret_cast<float*>(args.row_gradients + shared.row[my_entry]);
+    float* target = reinterpret_cast<float*>(args.row_gradients + shared.row[buffer][my_entry]);
     const float4 a = gradient.quads[0], b = gradient.quads[1], c = gradient.quads[2];
     add_quad(target, a.x, a.y, a.z, a.w);
     add_quad(target + 4, b.x, b.y, b.z, b.w);
@@ -110,8 +111,18 @@ __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, c
     const int first = WIDE ? 0 : chunk.first, end = WIDE ? chunk.n_channels : chunk.first + chunk.count;
     for (int k = first; k < end; ++k) open += v_render[k] * background[k];
   }
-  state.behind = open * state.transmittance;
+  state.behind = open;
   return state;
+}
+
+// v_render . color over all channels.
+__device__ __noinline__ float wide_dot(const BackwardArguments& args, const Pixel& pixel, std::int32_t row) {
+  const int n = args.chunk.n_channels;
+  const float* v = args.saved.v_renders + pixel.index * n;
+  const float* color = args.chunk.colors + static_cast<std::int64_t>(row) * n;
+  float sum = 0.f;
+  for (int k = 0; k < n; ++k) sum = __fmaf_rn(v[k], color[k], sum);
+  return sum;
 }
 
 // WIDE: g is of all channels, not of the chunk's alone, which absolute sums need.
@@ -128,10 +139,8 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) :
   if (args.tile_offsets[tile.tile + 1] == start) return;
   const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
 
-  if (thread == 0) {
-    shared.last = 0;
-    shared.row[kBatch] = -1;
-  }
+  if (thread == 0) shared.last = 0;
+  if (thread < 2) shared.row[thread][kBatch] = -1;
   shared.batch.init(thread);
   auto state = start_pixel<TILE, CHANNELS, WIDE>(shared, args, pixel, tile.camera);
   const int pixel_last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
@@ -143,48 +152,53 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) :
   if (lane == 0) atomicMax(&shared.last, list_last);
   __syncthreads();
   const int count = shared.last;
-  const auto dot = [&](std::uint32_t offset) {
-    if constexpr (WIDE) {
-      const int row = pixel.inside ? shared.row[offset / sizeof(Entry)] : -1;
-      return row < 0 ? 0.f
-                     : wide_dot(args.saved.v_renders + pixel.index * args.chunk.n_channels,
-                                args.chunk.colors + static_cast<std::int64_t>(row) * args.chunk.n_channels,
-                                args.chunk.n_channels);
-    } else {
-      const float* color = shared.batch.at(offset).color;
-      float sum = state.v[0] * color[0];
-#pragma unroll
-      for (int k = 1; k < CHANNELS; ++k) sum = __fmaf_rn(state.v[k], color[k], sum);
-      return sum;
-    }
+  const auto row_at = [&](int at) {
+    return thread < kBatch && at >= 0 && at < count ? args.isect_rows[start + at] : -1;
   };
-
-  for (int base = (count - 1) / kBatch * kBatch; base >= 0 && count > 0; base -= kBatch) {
-    __syncthreads();
-    for (int at = thread; at < kBatch; at += TILE * TILE) {
-      const std::int32_t row = base + at < count ? args.isect_rows[start + base + at] : -1;
-      shared.row[at] = row;
-      shared.batch.load(args.rows, args.chunk, row, tile, at);
+  int base = (count - 1) / kBatch * kBatch, buffer = 0;
+  std::int32_t row = row_at(base + thread), next_row = row_at(base - kBatch + thread);
+  shared.batch.fetch(0, args.rows, args.chunk, row, thread);
+  for (; base >= 0 && count > 0; base -= kBatch, buffer ^= 1) {
+    if (thread < kBatch) {
+      shared.row[buffer][thread] = row;
+      shared.batch.place(buffer, row >= 0, tile, thread);
     }
     if constexpr (DETERMINISTIC) {
       float4* mine = shared.partial[thread / 32][0].quads;
       for (int i = thread % 32; i < 3 * kBatch; i += 32) mine[i] = {0.f, 0.f, 0.f, 0.f};
     }
     __syncthreads();
+    row = next_row;
+    shared.batch.fetch(buffer ^ 1, args.rows, args.chunk, row, thread);
+    next_row = row_at(base - 2 * kBatch + thread);
 
+    const char* entries = reinterpret_cast<const char*>(shared.batch.entries[buffer]);
+    const auto dot = [&](std::uint32_t offset) {
+      if constexpr (WIDE) {
+        const int wide_row = pixel.inside ? shared.row[buffer][offset / sizeof(Entry)] : -1;
+        return wide_row < 0 ? 0.f : wide_dot(args, pixel, wide_row);
+      } else {
+        const float4 color = *reinterpret_cast<const float4*>(entry_at(entries, offset).color);
+        float sum = state.v[0] * color.x;
+#pragma unroll
+        for (int k = 1; k < CHANNELS; ++k) sum = __fmaf_rn(state.v[k], channel(color, k), sum);
+        return sum;
+      }
+    };
     const std::uint32_t last =
         static_cast<std::uint32_t>(min(max(pixel_last - base, 0), kBatch) * static_cast<int>(sizeof(Entry)));
-    const int n = shared.batch.template list<true, DETERMINISTIC>(pixel.subtile, lane, list_last - base);
-    for (int first = 0; first < n; first += kGroup) {
-      const int filled = min(kGroup, n - first);
+    const int quads =
+        shared.batch.template list<true, DETERMINISTIC>(buffer, pixel.subtile, lane, list_last - base);
+    const uint2* list = shared.batch.quads(pixel.subtile);
+    for (int i = 0; i < quads;) {
+      const uint2* const group = list + i;
       float2* slots = shared.group[pixel.subtile] + lane;
-      for (int i = 0; i < filled; i += 4, slots += 4 * kGroupStride) {
-        std::uint32_t offsets[4];
-        shared.batch.quad(pixel.subtile, first + i, offsets);
-        state.add(shared.batch, offsets, last, pixel, dot, slots);
+      const int filled = min(kGroup / 4, quads - i);
+      for (const int stop = i + filled; i < stop; ++i, slots += 4 * kGroupStride) {
+        state.add(entries, QuadOffsets(list[i]), last, pixel, dot, slots);
       }
-      flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, tile, pixel, filled,
-                                                           &shared.batch.lists[pixel.subtile][first]);
+      flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, tile, pixel, buffer, 4 * filled,
+                                                           reinterpret_cast<const std::uint16_t*>(group));
     }
     if constexpr (DETERMINISTIC) {
       __syncthreads();
@@ -196,6 +210,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) :
         }
         args.entry_gradients[start + base].quads[i] = sum;
       }
+      __syncthreads();
     }
   }
 }

@@ -53,48 +53,45 @@ struct Compositor {
   std::uint32_t last = kNone;   // composited last
   std::uint32_t ended = kNone;  // at which the pixel ended
 
-  // Composites four entries. Whether the pixel ends is asked once for all of them.
-  template <class Batch>
-  __device__ __forceinline__ void add(const Batch& batch, const std::uint32_t (&offsets)[4],
-                                      const Pixel& pixel) {
+  // Composites four entries of a batch. Whether the pixel ends is asked once for all of them.
+  __device__ __forceinline__ void add(const char* entries, const QuadOffsets& offsets, const Pixel& pixel) {
     float alpha[4];
     bool touched[4];
     float after = transmittance;
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
-      const float log2_a = log2_alpha(batch.at(offsets[k]), pixel);
+      const float log2_a = log2_alpha(entry_at(entries, offsets.at[k]), pixel);
       touched[k] = log2_a >= limit;
       alpha[k] = touched[k] ? fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax)) : 0.f;
       after = __fmaf_rn(-alpha[k], after, after);
     }
-    if (after < static_cast<float>(kMinTransmittance)) end(alpha, touched, offsets);
+    if (__any_sync(kFullWarp, after < static_cast<float>(kMinTransmittance))) end(alpha, touched, offsets);
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
       const float weight = alpha[k] * transmittance;
       transmittance = __fmaf_rn(-alpha[k], transmittance, transmittance);
+      const float4 row_color = *reinterpret_cast<const float4*>(entry_at(entries, offsets.at[k]).color);
       if (touched[k]) {
-        const float* row_color = batch.at(offsets[k]).color;
-        last = offsets[k];
+        last = offsets.at[k];
 #pragma unroll
-        for (int c = 0; c < CHANNELS; ++c) color[c] = __fmaf_rn(weight, row_color[c], color[c]);
+        for (int c = 0; c < CHANNELS; ++c) color[c] = __fmaf_rn(weight, channel(row_color, c), color[c]);
       }
     }
   }
 
   // Takes the entry that would end the pixel, and those behind it, out of the four.
-  __device__ __forceinline__ void end(float (&alpha)[4], bool (&touched)[4],
-                                      const std::uint32_t (&offsets)[4]) {
+  __device__ __forceinline__ void end(float (&alpha)[4], bool (&touched)[4], const QuadOffsets& offsets) {
     float after = transmittance;
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
       after = __fmaf_rn(-alpha[k], after, after);
-      if (ended == kNone && after < static_cast<float>(kMinTransmittance)) ended = offsets[k];
+      if (ended == kNone && after < static_cast<float>(kMinTransmittance)) ended = offsets.at[k];
       if (ended != kNone) {
         alpha[k] = 0.f;
         touched[k] = false;
+        limit = INFINITY;
       }
     }
-    limit = INFINITY;
   }
 
   __device__ __forceinline__ bool done() const { return limit == INFINITY; }
@@ -121,12 +118,16 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
   args.out.last_ids[pixel.index] = last;
 }
 
+template <int TILE>
+inline constexpr int kForwardBatch = TILE == 8 ? 64 : 256;
+
 // The first blocks are the owned tiles; the rest write zeros.
 template <int TILE, int CHANNELS>
-__global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 6 : 1)
+__global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
     forward_kernel(const ForwardArguments args) {
-  constexpr int kBatch = 256;
-  __shared__ EntryBatch<TILE, kBatch> batch;
+  constexpr int kBatch = kForwardBatch<TILE>;
+  extern __shared__ __align__(16) unsigned char shared_bytes[];
+  auto& batch = *reinterpret_cast<EntryBatch<TILE, kBatch>*>(shared_bytes);
   __shared__ int tile_work;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   const std::int64_t owned = args.grid.tile_end - args.grid.tile_begin;
@@ -149,20 +150,24 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 6 : 1)
   Compositor<CHANNELS> state;
   state.limit = pixel.inside ? kLog2Cut : INFINITY;
   int last = 0, work = pixel.inside ? count : 0;
-  for (int base = 0; base < count; base += kBatch) {
+  const auto row_at = [&](int at) {
+    return thread < kBatch && at < count ? args.isect_rows[start + at] : -1;
+  };
+  std::int32_t row = row_at(thread), next_row = row_at(thread + kBatch);
+  batch.fetch(0, args.rows, args.chunk, row, thread);
+  for (int base = 0, buffer = 0; base < count; base += kBatch, buffer ^= 1) {
+    if (thread < kBatch) batch.place(buffer, row >= 0, tile, thread);
     if (__syncthreads_and(state.done())) break;
-    for (int at = thread; at < kBatch; at += TILE * TILE) {
-      batch.load(args.rows, args.chunk, base + at < count ? args.isect_rows[start + base + at] : -1, tile,
-                 at);
-    }
-    __syncthreads();
+    row = next_row;
+    batch.fetch(buffer ^ 1, args.rows, args.chunk, row, thread);
+    next_row = row_at(base + 2 * kBatch + thread);
     const unsigned done = __ballot_sync(kFullWarp, state.done()) >> (thread & kHalfWarp) & 0xffffu;
-    const int n = batch.template list<false, false>(pixel.subtile, lane, done == 0xffffu ? 0 : kBatch);
-    for (int i = 0; i < n; i += 4) {
-      if (i % 32 == 0 && __all_sync(kFullWarp, state.done())) break;
-      std::uint32_t offsets[4];
-      batch.quad(pixel.subtile, i, offsets);
-      state.add(batch, offsets, pixel);
+    const int quads =
+        batch.template list<false, false>(buffer, pixel.subtile, lane, done == 0xffffu ? 0 : kBatch);
+    const char* entries = reinterpret_cast<const char*>(batch.entries[buffer]);
+    const uint2* list = batch.quads(pixel.subtile);
+    for (int i = 0; i < quads && !__all_sync(kFullWarp, state.done());) {
+      for (const int stop = min(i + 8, quads); i < stop; ++i) state.add(entries, QuadOffsets(list[i]), pixel);
     }
     if (state.last != state.kNone) last = base + entry_number(state.last) + 1;
     if (state.ended != state.kNone) work = base + entry_number(state.ended) + 1;
@@ -183,11 +188,10 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 6 : 1)
 template <int TILE>
 void launch_forward(const ForwardArguments& args, CudaStream stream) {
   const auto tiles = static_cast<unsigned>(args.grid.count());
-  if (args.chunk.count == 4) {
-    forward_kernel<TILE, 4><<<tiles, TILE * TILE, 0, stream>>>(args);
-  } else {
-    forward_kernel<TILE, 3><<<tiles, TILE * TILE, 0, stream>>>(args);
-  }
+  const auto kernel = args.chunk.count == 4 ? forward_kernel<TILE, 4> : forward_kernel<TILE, 3>;
+  constexpr int kBytes = sizeof(EntryBatch<TILE, kForwardBatch<TILE>>);
+  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_fwd");
+  kernel<<<tiles, TILE * TILE, kBytes, stream>>>(args);
   check_launch("rasterize_fwd");
 }
 

@@ -51,14 +51,32 @@ struct ChannelChunk {
   int n_channels, first, count;
 };
 
-__device__ __forceinline__ float4 load_color(const ChannelChunk& chunk, std::int32_t row) {
-  if (chunk.packed) return __ldg(chunk.packed + row);
+// Asynchronous copies to shared memory; the thread that made them waits with copies_done().
+__device__ __forceinline__ void copy_quad(void* shared, const void* global) {
+  const auto address = static_cast<std::uint32_t>(__cvta_generic_to_shared(shared));
+  asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address), "l"(global) : "memory");
+}
+
+__device__ __forceinline__ void copy_float(void* shared, const void* global) {
+  const auto address = static_cast<std::uint32_t>(__cvta_generic_to_shared(shared));
+  asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(address), "l"(global) : "memory");
+}
+
+__device__ __forceinline__ void copies_done() { asm volatile("cp.async.wait_all;" ::: "memory"); }
+
+__device__ __forceinline__ void copy_color(float* shared, const ChannelChunk& chunk, std::int32_t row) {
+  if (chunk.packed) {
+    copy_quad(shared, chunk.packed + row);
+    return;
+  }
   const float* color = chunk.colors + static_cast<std::int64_t>(row) * chunk.n_channels + chunk.first;
-  float4 c{color[0], 0.f, 0.f, 0.f};
-  if (chunk.count > 1) c.y = color[1];
-  if (chunk.count > 2) c.z = color[2];
-  if (chunk.count > 3) c.w = color[3];
-  return c;
+  for (int k = 0; k < 4; ++k) {
+    if (k < chunk.count) {
+      copy_float(shared + k, color + k);
+    } else {
+      shared[k] = 0.f;
+    }
+  }
 }
 
 __device__ __forceinline__ float channel(const float4& c, int k) {
@@ -120,10 +138,13 @@ template <int TILE>
 __device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid, std::int64_t tile) {
   TilePlace place;
   place.tile = tile;
-  place.camera = static_cast<int>(place.tile / grid.per_image());
-  const int in_image = static_cast<int>(place.tile - place.camera * grid.per_image());
-  place.top = in_image / grid.tiles_x * TILE;
-  place.left = in_image % grid.tiles_x * TILE;
+  // Tiles are blocks of a launch, so their number has 32 bits.
+  const auto number = static_cast<std::uint32_t>(tile), columns = static_cast<std::uint32_t>(grid.tiles_x);
+  const auto per_image = static_cast<std::uint32_t>(grid.per_image());
+  const std::uint32_t in_image = number % per_image;
+  place.camera = static_cast<int>(number / per_image);
+  place.top = static_cast<int>(in_image / columns * TILE);
+  place.left = static_cast<int>(in_image % columns * TILE);
   return place;
 }
 
@@ -211,8 +232,8 @@ __device__ __forceinline__ std::uint32_t transpose_bits(std::uint32_t bits, int 
 // A list entry in shared memory: what alpha needs, relative to the tile's centre, first.
 struct __align__(16) Entry {
   float l11, l21, u, l22;
-  float v, log2_opacity, color[4];
-  float x, y;  // the mean
+  float v, log2_opacity, x, y;  // x, y: the mean
+  float color[4];
 };
 
 // log2 of the unclipped alpha at a pixel. Written out with the fused operations, because forward and backward
@@ -225,55 +246,68 @@ __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pix
   return __fmaf_rn(-u, u, __fmaf_rn(-v, v, b.y));
 }
 
-// A batch of list entries in shared memory, and for each subtile the list of those it has to look at, as byte
-// offsets so that the loops over them spend nothing on addresses. The lists are filled up to whole quads, and
-// to the length of the list that the warp's other half walks, with an entry that touches nothing.
+// Two batches of list entries in shared memory, one being copied while the other is composited, and for each
+// subtile the list of those it has to look at, as byte offsets so that the loops over them spend nothing on
+// addresses. The lists are filled up to whole quads, and to the length of the list that the warp's other half
+// walks, with an entry that touches nothing. Thread i < BATCH sees to entry i of each batch: fetch(first),
+// then for each batch place(it), barrier, fetch(next), list(it). One barrier is enough: fetch() overwrites
+// what was last read before it, and place() what was last read before the previous one.
 template <int TILE, int BATCH>
 struct EntryBatch {
   static constexpr int kWords = BATCH / 32;
   static constexpr int kLaneBits = BATCH / kHalfWarp;  // entries that each lane lists
   static constexpr std::uint32_t kNothing = BATCH * sizeof(Entry);
-  Entry entries[BATCH + 1];
-  std::uint32_t hits[Tile<TILE>::kSubtiles][kWords];
+  Entry entries[2][BATCH + 1];
+  std::uint32_t hits[2][Tile<TILE>::kSubtiles][kWords];
   std::uint16_t lists[Tile<TILE>::kSubtiles][BATCH + 4];
 
-  // Once per block, before the first load.
+  // Once per block, before the first barrier.
   __device__ __forceinline__ void init(int thread) {
-    if (thread == 0) entries[BATCH] = {0.f, 0.f, 0.f, 0.f, 0.f, -INFINITY, {0.f, 0.f, 0.f, 0.f}, 0.f, 0.f};
+    if (thread < 2) {
+      entries[thread][BATCH] = {0.f, 0.f, 0.f, 0.f, 0.f, -INFINITY, 0.f, 0.f, {0.f, 0.f, 0.f, 0.f}};
+    }
   }
 
-  // Loads entry `at`, called by whole warps; row < 0 where there is none.
-  __device__ __forceinline__ void load(const PackedRow* rows, const ChannelChunk& chunk, std::int32_t row,
-                                       const TilePlace& tile, int at) {
+  // Starts to copy entry `at` of a batch that nobody reads; row < 0 where there is none.
+  __device__ __forceinline__ void fetch(int buffer, const PackedRow* rows, const ChannelChunk& chunk,
+                                        std::int32_t row, int at) {
+    if (row < 0) return;
+    auto* target = reinterpret_cast<float4*>(&entries[buffer][at]);
+    const auto* source = reinterpret_cast<const float4*>(rows + row);
+    copy_quad(target, source);
+    copy_quad(target + 1, source + 1);
+    copy_color(entries[buffer][at].color, chunk, row);
+  }
+
+  // Turns what fetch() copied into an entry and tests it; called by whole warps.
+  __device__ __forceinline__ void place(int buffer, bool present, const TilePlace& tile, int at) {
     const int lane = at & 31;
+    copies_done();
     std::uint32_t masks[Tile<TILE>::kMaskWords] = {};
-    if (row >= 0) {
-      const float4* source = reinterpret_cast<const float4*>(rows + row);
-      const float4 a = __ldg(source), b = __ldg(source + 1);
-      const float4 color = load_color(chunk, row);
+    if (present) {
+      auto* target = reinterpret_cast<float4*>(&entries[buffer][at]);
+      const float4 a = target[0], b = target[1];
       const float x = a.x - static_cast<float>(tile.left + TILE / 2);
       const float y = a.y - static_cast<float>(tile.top + TILE / 2);
-      float4* target = reinterpret_cast<float4*>(entries + at);
       target[0] = {a.z, a.w, -__fmaf_rn(a.z, x, __fmul_rn(a.w, y)), b.x};
-      target[1] = {-__fmul_rn(b.x, y), b.y, color.x, color.y};
-      target[2] = {color.z, color.w, a.x, a.y};
+      target[1] = {-__fmul_rn(b.x, y), b.y, a.x, a.y};
       subtile_mask<TILE>({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile, masks);
     }
 #pragma unroll
     for (int i = 0; i < Tile<TILE>::kMaskWords; ++i) {
       const std::uint32_t mine = transpose_bits(masks[i], lane);
-      if (32 * i + lane < Tile<TILE>::kSubtiles) hits[32 * i + lane][at >> 5] = mine;
+      if (32 * i + lane < Tile<TILE>::kSubtiles) hits[buffer][32 * i + lane][at >> 5] = mine;
     }
   }
 
-  // Writes the subtile's list, of the batch's first `limit` entries, and returns the length that both halves
-  // of the warp walk. SHARED: both list what either has to look at (limit must agree).
+  // Writes the subtile's list, of the batch's first `limit` entries, and returns the number of quads that
+  // both halves of the warp walk. SHARED: both list what either has to look at (limit must agree).
   template <bool BACKWARDS, bool SHARED>
-  __device__ __forceinline__ int list(int subtile, int lane, int limit) {
+  __device__ __forceinline__ int list(int buffer, int subtile, int lane, int limit) {
     const int piece = BACKWARDS ? kHalfWarp - 1 - lane : lane;
     const int first = piece * kLaneBits;
-    std::uint32_t word = hits[subtile][first / 32];
-    if constexpr (SHARED) word |= hits[subtile ^ 1][first / 32];
+    std::uint32_t word = hits[buffer][subtile][first / 32];
+    if constexpr (SHARED) word |= hits[buffer][subtile ^ 1][first / 32];
     const int wanted = min(max(limit - first, 0), kLaneBits);
     std::uint32_t bits = word >> first % 32 & static_cast<std::uint32_t>((std::uint64_t{1} << wanted) - 1);
     const int count = __popc(bits);
@@ -284,30 +318,33 @@ struct EntryBatch {
       if (lane >= step) end += before;
     }
     const int n = __shfl_sync(kFullWarp, end, kHalfWarp - 1, kHalfWarp);
-    std::uint16_t* target = lists[subtile];
-    for (int i = end - count; bits; ++i) {
-      const int bit = BACKWARDS ? 31 - __clz(bits) : __ffs(bits) - 1;
+    std::uint16_t* target = lists[subtile] + (BACKWARDS ? end - count : end - 1);
+    while (bits) {  // the last of the piece first
+      const int bit = 31 - __clz(bits);
       bits ^= 1u << bit;
-      target[i] = static_cast<std::uint16_t>((first + bit) * sizeof(Entry));
+      *target = static_cast<std::uint16_t>((first + bit) * static_cast<int>(sizeof(Entry)));
+      target += BACKWARDS ? 1 : -1;
     }
-    const int both = max(n, __shfl_xor_sync(kFullWarp, n, kHalfWarp));
-    for (int i = n + lane; i < (both + 3) / 4 * 4; i += kHalfWarp) target[i] = kNothing;
+    const int quads = (max(n, __shfl_xor_sync(kFullWarp, n, kHalfWarp)) + 3) / 4;
+    for (int i = n + lane; i < 4 * quads; i += kHalfWarp) lists[subtile][i] = kNothing;
     __syncwarp();
-    return both;
+    return quads;
   }
 
-  // Four offsets of a list.
-  __device__ __forceinline__ void quad(int subtile, int at, std::uint32_t* offsets) const {
-    const uint2 packed = *reinterpret_cast<const uint2*>(&lists[subtile][at]);
-    offsets[0] = packed.x & 0xffffu;
-    offsets[1] = packed.x >> 16;
-    offsets[2] = packed.y & 0xffffu;
-    offsets[3] = packed.y >> 16;
+  // The lists' quads of offsets.
+  __device__ __forceinline__ const uint2* quads(int subtile) const {
+    return reinterpret_cast<const uint2*>(lists[subtile]);
   }
+};
 
-  __device__ __forceinline__ const Entry& at(std::uint32_t offset) const {
-    return *reinterpret_cast<const Entry*>(reinterpret_cast<const char*>(entries) + offset);
-  }
+__device__ __forceinline__ const Entry& entry_at(const char* entries, std::uint32_t offset) {
+  return *reinterpret_cast<const Entry*>(entries + offset);
+}
+
+struct QuadOffsets {
+  std::uint32_t at[4];
+  __device__ __forceinline__ explicit QuadOffsets(uint2 packed)
+      : at{packed.x & 0xffffu, packed.x >> 16, packed.y & 0xffffu, packed.y >> 16} {}
 };
 
 }  // namespace blitzgs::cuda
