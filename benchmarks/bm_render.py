@@ -4,8 +4,9 @@
     python benchmarks/bm_render.py [--scenes aerial1 aerial4 aerial16 garden] [--repeats 30]
 
 Gradients for every parameter; SH degree 3, float32. Ours: the ops of the training step in order (project,
-intersect, rasterize and their gradients, in compact rows). gsplat: `rasterization` and autograd, packed and
-not. Each figure is a median over repeats of CUDA event times; memory is the peak above the inputs.
+intersect, rasterize and their gradients, in compact rows), and the same through `blitzgs.rasterization` and
+autograd (with its meta, and dense gradients). gsplat: `rasterization` and autograd, packed and not. Each
+figure is a median over repeats of CUDA event times; memory is the peak above the inputs.
 """
 
 from __future__ import annotations
@@ -21,7 +22,13 @@ import torch
 from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
+from blitzgs import rasterization
 from blitzgs.ops.project import project_rows
+
+try:
+    import gsplat
+except ImportError:
+    gsplat = None
 
 ops = torch.ops.blitzgs
 TILE_SIZE = 16
@@ -94,12 +101,10 @@ class OurRender:
         del self.rows, self.v_rows, self.gradients
 
 
-class GsplatRender:
-    """The same work by gsplat."""
+class CallRender:
+    """The same work by one call, `rasterization` of gsplat or of BlitzGS, and autograd."""
 
-    def __init__(self, scene: BenchmarkScene, packed: bool) -> None:
-        from gsplat import rasterization
-
+    def __init__(self, scene: BenchmarkScene, rasterization: Callable[..., Any], packed: bool) -> None:
         self.rasterization, self.packed, self.scene = rasterization, packed, scene
         s = scene
         self.parameters = [
@@ -136,7 +141,7 @@ def event_times(steps: list[Callable[[], Any]], repeats: int, warmup: int = 5) -
     return [statistics.median(sample) for sample in samples]
 
 
-def measure(render: OurRender | GsplatRender, v_renders: Tensor, repeats: int) -> dict[str, float]:
+def measure(render: OurRender | CallRender, v_renders: Tensor, repeats: int) -> dict[str, float]:
     """Return ms of forward, backward and both, and peak GB above what is allocated now."""
     torch.cuda.synchronize()
     torch.cuda.empty_cache()
@@ -166,13 +171,11 @@ def run(name: str, repeats: int) -> dict[str, Any]:
     result["visible"], result["rows"], result["intersections"] = ours.rows.counts.tolist()
     result["stages"] = stages(ours, v, repeats)
     del ours.saved, ours.splats, ours.lists, ours.rows, ours.v_rows, ours.gradients
-    try:
-        import gsplat  # noqa: F401
-    except ImportError:
-        return result
-    for packed in (False, True):
-        theirs = GsplatRender(scene, packed)
-        label = "gsplat packed" if packed else "gsplat"
+    calls = {"rasterization": (rasterization, True)}
+    if gsplat is not None:
+        calls |= {"gsplat": (gsplat.rasterization, False), "gsplat packed": (gsplat.rasterization, True)}
+    for label, call in calls.items():
+        theirs = CallRender(scene, *call)
         result[label] = measure(theirs, v, repeats)
         result[label]["image_difference"] = float((theirs.forward().detach() - image).abs().mean())
         del theirs
@@ -195,7 +198,7 @@ def main() -> None:
         rows, entries = result["rows"], result["intersections"]
         print(f"{result['scene']}: {result['visible']} visible, {rows} rows, {entries} intersections")
         print("  " + "  ".join(f"{k} {v:.3f}" for k, v in result["stages"].items()))
-        for label in ("blitzgs", "gsplat", "gsplat packed"):
+        for label in ("blitzgs", "rasterization", "gsplat", "gsplat packed"):
             if label in result:
                 r = result[label]
                 print(f"  {label:14s} forward {r['forward']:7.3f}  backward {r['backward']:7.3f}  "

@@ -16,7 +16,7 @@ import argparse
 from dataclasses import replace
 
 import torch
-from bm_render import GsplatRender, event_times
+from bm_render import CallRender, event_times
 from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
@@ -148,7 +148,9 @@ class GsplatStep:
     names = ("forward", "loss", "backward", "adam")
 
     def __init__(self, scene: BenchmarkScene) -> None:
-        self.render = GsplatRender(scene, packed=False)
+        from gsplat import rasterization
+
+        self.render = CallRender(scene, rasterization, packed=False)
         self.loss = Loss(scene)
         self.optimiser = torch.optim.Adam(self.render.parameters, lr=RATE, eps=1e-15, fused=True)
 
