@@ -141,24 +141,3 @@ def test_a_hundred_thousand_layers():
     gradients = job.backward("cuda", torch.float32, ours, *v, False, False)
     for value, target in zip(gradients[:4], expected[:4], strict=True):
         assert relative_error(value, target) < 1e-3
-
-
-def test_gradients_of_some_of_the_composited_tiles(scene):
-    """Over fewer tiles than were composited: the gradient of an image gradient that is zero elsewhere."""
-    begin, end = 25, 60
-    wide = Job(scene, 3, 16, begin - 9, end + 11)
-    saved = wide.forward("cuda")
-    owned = Job(scene, 3, 16, begin, end)
-    owned.lists = wide.lists
-    tiles_x, tiles_y = -(-scene.width // 16), -(-scene.height // 16)
-    tiles = torch.arange(len(saved[3])).view(-1, tiles_y, tiles_x)
-    mask = ((tiles >= begin) & (tiles < end)).repeat_interleave(16, 1).repeat_interleave(16, 2)
-    mask = mask[:, : scene.height, : scene.width]
-    g = torch.Generator().manual_seed(8)
-    v_renders = torch.randn(saved[0].shape, generator=g)
-    v_alphas = torch.randn(saved[1].shape, generator=g)
-    ours = owned.backward("cuda", torch.float32, saved, v_renders, v_alphas, False, True)
-    v_renders, v_alphas = v_renders * mask[..., None], v_alphas * mask
-    expected = wide.backward("cuda", torch.float32, saved, v_renders, v_alphas, False, True)
-    for value, target in zip(ours[:4], expected[:4], strict=True):
-        assert relative_error(value, target) < 1e-6
