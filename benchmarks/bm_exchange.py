@@ -171,14 +171,14 @@ class Workload:
         return self.owners.divide(keys, views.width, views.height, self.options.tile_size, LOSS_REACH)
 
     def batch(self, keys: list[int], views: Views) -> Batch:
-        """Return grey photographs."""
+        """Return views with grey photographs."""
         samples, targets = self.samples[: len(keys)], self.targets[: len(keys)]
-        return Batch(keys, targets, None, samples, self.divide(keys, views))
+        return Batch(keys, views, targets, None, samples, self.divide(keys, views))
 
-    def step(self, batch: Batch, views: Views, mark: pipeline.Mark = unmarked) -> dict[str, Any]:
+    def step(self, batch: Batch, mark: pipeline.Mark = unmarked) -> dict[str, Any]:
         """Take one training step."""
         self.steps += 1
-        frame, terms, sums = self.stepper.forward(self.steps, views, self.options, batch, mark)
+        frame, terms, sums = self.stepper.forward(self.steps, self.options, batch, mark)
         self.guard.check(self.steps, [str(key) for key in batch.indices], sums, self.table, frame)
         self.stepper.backward(self.steps, frame, terms, mark)
         return {
@@ -195,7 +195,7 @@ class Workload:
             batch = self.batch(keys, views)
             self.ranks.barrier()
             clock = Clock(self.ranks.device)
-            result = self.step(batch, views, clock.mark)
+            result = self.step(batch, clock.mark)
             yield clock.milliseconds(), result
 
     def in_a_row(self) -> float:
@@ -203,7 +203,7 @@ class Workload:
         self.ranks.barrier()
         begin = time.perf_counter()
         for keys, views in self.batches:
-            self.step(self.batch(keys, views), views)
+            self.step(self.batch(keys, views))
         self.ranks.barrier()
         return 1000 * (time.perf_counter() - begin) / len(self.batches)
 

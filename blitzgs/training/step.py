@@ -48,22 +48,21 @@ class Stepper:
         self._blocks = BlockIndex(self._table, self._optimiser.pending_table)
 
     def forward(
-        self, step: int, views: Views, options: RenderOptions, batch: Batch, mark: Mark = unmarked
+        self, step: int, options: RenderOptions, batch: Batch, mark: Mark = unmarked
     ) -> tuple[Frame, LossTerms, HostSum]:
         """Catch up what the views may see, render them and compare them with their photographs.
 
         Args:
             step: number of the step, from 1.
-            views: B views of the batch.
             options: how to render.
-            batch: the photographs, and who composites which tiles.
+            batch: B views, their photographs, and who composites which tiles.
             mark: called with its name at the end of each stage.
 
         Returns:
             The frame, the loss's terms, and the sums of its `LossTerms.sums` over all ranks, which
             begin with [2 B].
         """
-        table, ranks = self._table, self._owners.ranks
+        table, ranks, views = self._table, self._owners.ranks, batch.views
         active = self._active(views, options)
         mark("other")
         self._optimiser.catch_up(table, active.ids, step - 1)

@@ -105,7 +105,7 @@ class Trainer:
         self._owners = TileOwners(ranks)
         self._loader = BatchLoader(
             images,
-            sizes,
+            self._views,
             capture.train,
             sampler,
             ranks.device,
@@ -147,6 +147,7 @@ class Trainer:
             step=0, sh_degree=0, level_count=levels.count, peak_gaussians=count, seconds=0.0
         )
 
+    @torch.no_grad()
     def train(self) -> dict[str, Any] | None:
         """Train to the end, evaluate, and write the summary.
 
@@ -193,10 +194,9 @@ class Trainer:
         """Take one optimiser step (from 1)."""
         config, begin = self.config, (step - 1) * self.schedule.batch_size
         batch = self._loader.get(step - 1, self.schedule.steps)
-        views = self._views.pick(batch.indices)
         degree = self.schedule.sh_degree(begin, config.model.sh_degree)
         options = render_options(config, self.space, degree)
-        frame, terms, sums = self._stepper.forward(step, views, options, batch)
+        frame, terms, sums = self._stepper.forward(step, options, batch)
         names = [self.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, self.table, frame)
         report = None

@@ -81,18 +81,31 @@ def viewmat(camera: CameraLike, space: Space) -> npt.NDArray[np.float64]:
     return pose
 
 
+# A view as numbers: viewmat [4, 4], then K [3, 3].
+VIEW_NUMBERS = 16 + 9
+
+
+def unpack_views(numbers: Tensor, width: int, height: int) -> Views:
+    """Return views that `ViewSet.write` wrote; they share the memory of `numbers`, float32 [B * 25]."""
+    viewmats, Ks = numbers.split_with_sizes(  # noqa: N806
+        [16 * (len(numbers) // VIEW_NUMBERS), 9 * (len(numbers) // VIEW_NUMBERS)]
+    )
+    return Views(viewmats.view(-1, 4, 4), Ks.view(-1, 3, 3), width, height)
+
+
 class ViewSet:
-    """The cameras of a capture on the device, ready to be picked into batches."""
+    """The cameras of a capture, ready to be picked into batches."""
 
     def __init__(self, cameras: list[CameraLike], space: Space, device: torch.device) -> None:
-        """Upload all poses and intrinsics; they are small."""
+        """Bring all poses into the trained world; `device` is where `pick` puts its views."""
         poses = np.stack([viewmat(camera, space) for camera in cameras])
-        self._viewmats = torch.from_numpy(poses).float().to(device)
-        self._Ks = torch.from_numpy(np.stack([camera.K for camera in cameras])).float().to(device)
+        self._viewmats = poses.astype(np.float32)
+        self._Ks = np.stack([camera.K for camera in cameras]).astype(np.float32)
         self._sizes = [(camera.width, camera.height) for camera in cameras]
+        self._device = device
 
-    def pick(self, indices: list[int]) -> Views:
-        """Return the views of same-size cameras as one batch.
+    def size(self, indices: list[int]) -> tuple[int, int]:
+        """Return the width and height that cameras share.
 
         Raises:
             ValueError: the cameras differ in size.
@@ -100,9 +113,23 @@ class ViewSet:
         sizes = {self._sizes[index] for index in indices}
         if len(sizes) != 1:
             raise ValueError(f"the views of a batch must share one image size, got {sorted(sizes)}")
-        width, height = sizes.pop()
-        viewmats = torch.stack([self._viewmats[index] for index in indices])
-        return Views(viewmats, torch.stack([self._Ks[index] for index in indices]), width, height)
+        return sizes.pop()
+
+    def write(self, indices: list[int], numbers: npt.NDArray[np.float32]) -> None:
+        """Write B views into `numbers` [B * 25], for `unpack_views`."""
+        count = 16 * len(indices)
+        numbers[:count] = self._viewmats[indices].ravel()
+        numbers[count:] = self._Ks[indices].ravel()
+
+    def pick(self, indices: list[int]) -> Views:
+        """Return the views of same-size cameras as one batch on the device.
+
+        Raises:
+            ValueError: the cameras differ in size.
+        """
+        numbers = torch.empty(VIEW_NUMBERS * len(indices))
+        self.write(indices, numbers.numpy())
+        return unpack_views(numbers.to(self._device), *self.size(indices))
 
 
 def render_options(config: Config, space: Space, sh_degree: int) -> RenderOptions:

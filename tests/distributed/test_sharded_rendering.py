@@ -92,7 +92,7 @@ def _render(ranks):
                 y0, y1 = ranges.pixel_rows(ranks.rank, view)
                 targets[view, :y0], targets[view, y1:] = 77, 77
         on_device = [tensor.to(ranks.device) for tensor in (targets, masks, samples)]
-        batch = Batch(list(range(n_views)), *on_device, ranges)
+        batch = Batch(list(range(n_views)), views, *on_device, ranges)
         terms = loss_terms(frame, batch, LossConfig(), 3.0)
         sums = torch.cat(terms.sums).cpu()
         if ranges is not None:
@@ -169,7 +169,7 @@ def _render_plain(ranks):
     mask = ranges.pixel_mask(ranks.rank, torch.device("cpu"))
     outside = frame.renders[~mask].abs().sum().item()
     with pytest.raises(ValueError, match="the loss reads 10 px beyond"):
-        loss_terms(frame, Batch([0, 1, 2], *photographs(3), ranges), LossConfig(), 3.0)
+        loss_terms(frame, Batch([0, 1, 2], views, *photographs(3), ranges), LossConfig(), 3.0)
     collect_images(frame.renders, ranges, ranks, 1)
     return outside, frame.renders
 

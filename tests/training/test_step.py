@@ -21,11 +21,11 @@ def test_a_step_marks_its_stages_and_lowers_the_loss():
     K = torch.tensor([[[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]])
     views, options = Views(viewmat, K, 80, 60), RenderOptions(0, 0.05, 100.0)
     targets = torch.full((1, 60, 80, 3), 90, dtype=torch.uint8)
-    batch = Batch([0], targets, None, torch.full((1,), 3.0 * 60 * 80), None)
+    batch = Batch([0], views, targets, None, torch.full((1,), 3.0 * 60 * 80), None)
     losses = []
     for step in range(1, 30):
         stages = []
-        frame, terms, sums = stepper.forward(step, views, options, batch, stages.append)
+        frame, terms, sums = stepper.forward(step, options, batch, stages.append)
         assert stages == ["other", "optimiser", "project", "exchange", "sort", "raster", "loss", "other"]
         stages.clear()
         stepper.backward(step, frame, terms, stages.append)
