@@ -75,8 +75,8 @@ def schema(sh_degree: int) -> dict[str, Column]:
 class GaussianTable:
     """One rank's Gaussians as named columns of equal length N.
 
-    The four operations `append`, `keep`, `permute` and `exchange` act on every column alike, one column at a
-    time, so that peak memory exceeds the table by one column and not by a second table.
+    The operations `append`, `keep`, `permute`, `renew` and `exchange` act on every column alike, one column
+    at a time, so that peak memory exceeds the table by one column and not by a second table.
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
@@ -161,22 +161,27 @@ class GaussianTable:
         Raises:
             ValueError: a required column is missing, an unknown one is given, or shapes or dtypes differ.
         """
-        if missing := [name for name in REQUIRED if name not in rows]:
-            raise ValueError(f"GaussianTable.append: rows lack the columns {missing}")
-        if unknown := [name for name in rows if name not in self.columns]:
-            raise ValueError(f"GaussianTable.append: the table has no columns {unknown}")
-        count = rows["means"].shape[0]
-        for name, column in self.columns.items():
-            wanted = (count, *column.shape[1:])
-            new = rows[name] if name in rows else column.new_zeros(wanted)
-            if tuple(new.shape) != wanted or new.dtype != column.dtype:
-                raise ValueError(
-                    f"GaussianTable.append: column '{name}' must be {column.dtype} {list(wanted)}, "
-                    f"got {new.dtype} {list(new.shape)}"
-                )
+        count = self._check_new(rows)
         for name, column in self.columns.items():
             new = rows[name] if name in rows else column.new_zeros((count, *column.shape[1:]))
             self.columns[name] = torch.cat((column, new))
+
+    def _check_new(self, rows: Mapping[str, Tensor]) -> int:
+        """Check rows that are to be added; return how many."""
+        if missing := [name for name in REQUIRED if name not in rows]:
+            raise ValueError(f"GaussianTable: new rows lack the columns {missing}")
+        if unknown := [name for name in rows if name not in self.columns]:
+            raise ValueError(f"GaussianTable: the table has no columns {unknown}")
+        count = int(rows["means"].shape[0])
+        for name, new in rows.items():
+            column = self.columns[name]
+            wanted = (count, *column.shape[1:])
+            if tuple(new.shape) != wanted or new.dtype != column.dtype:
+                raise ValueError(
+                    f"GaussianTable: column '{name}' of new rows must be {column.dtype} {list(wanted)}, "
+                    f"got {new.dtype} {list(new.shape)}"
+                )
+        return count
 
     def keep(self, mask: Tensor) -> None:
         """Keep the rows where `mask` (bool [N]) is true, in their order."""
@@ -195,6 +200,27 @@ class GaussianTable:
             )
         self._select(order)
 
+    def renew(self, rows: Tensor, new: Mapping[str, Tensor]) -> None:
+        """Keep, add and reorder in one go: row i becomes the old row `rows[i]`, or the new `rows[i] - N`.
+
+        Args:
+            rows: int64 [N'], each row at most once.
+            new: as for `append`.
+        """
+        self._check_new(new)
+        count = len(self)
+        places = (rows >= count).nonzero().squeeze(1)
+        chosen = rows[places] - count
+        # New rows are written after; until then they are copies of some old one.
+        sources = rows.clamp(max=max(count - 1, 0))
+        for name, column in self.columns.items():
+            if count == 0:
+                renewed = column.new_empty((len(rows), *column.shape[1:]))
+            else:
+                renewed = column.index_select(0, sources)
+            renewed[places] = new[name][chosen] if name in new else 0
+            self.columns[name] = renewed
+
     def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
         """Move every row to a rank. Collective: every rank calls it; rows arrive by source rank, in order.
 
@@ -212,4 +238,4 @@ class GaussianTable:
 
     def _select(self, rows: Tensor) -> None:
         for name, column in self.columns.items():
-            self.columns[name] = column[rows]
+            self.columns[name] = column.index_select(0, rows)

@@ -38,8 +38,12 @@ def uniform(*keys: Tensor | int) -> Tensor:
 
 def normal(*keys: Tensor | int) -> Tensor:
     """Draw float64 standard normal numbers, one per key tuple (Box-Muller); see `hash_keys`."""
-    radius = (-2.0 * uniform(*keys, 0).log()).sqrt()
-    return radius * (2.0 * math.pi * uniform(*keys, 1)).cos()
+    device = next(key.device for key in keys if isinstance(key, Tensor))
+    pairs = uniform(
+        *(key[..., None] if isinstance(key, Tensor) else key for key in keys), torch.arange(2, device=device)
+    )
+    first, second = pairs.unbind(-1)
+    return (-2.0 * first.log()).sqrt() * (2.0 * math.pi * second).cos()
 
 
 def _mix(value: Tensor) -> Tensor:

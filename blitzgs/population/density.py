@@ -13,6 +13,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
+from blitzgs.view.blocks import morton_order
 
 SPLIT_SHRINK = 1.6
 CHILDREN_OF_A_SPLIT = 2
@@ -65,13 +66,11 @@ def densify(
     A candidate's mean gradient `grad_sum / grad_count` reaches the threshold. A small one gets a copy; a
     large one gives way to two children drawn from it, 1.6 times smaller. Children take their parent's level
     (copy) or the next one (split), fresh moments, and an id that follows from the parent's id, `time` and the
-    child's slot alone, as do
-    their random positions: the outcome does not depend on the order of the rows. Pruning applies to old and
-        new rows;
-    a new row has no screen radius yet.
+    child's slot alone, as do their random positions: the outcome does not depend on the order of the rows.
+    Pruning applies to old and new rows; a new row has no screen radius yet.
 
     Args:
-        table: changed in place; new rows come last.
+        table: changed in place; left in `morton_order`.
         rules: thresholds.
         time: of the event, in images.
         step: the optimiser step just taken; new rows stand there.
@@ -81,36 +80,38 @@ def densify(
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = gradient >= rules.grad_threshold
-    wanted = int(candidates.sum())
+    wanted = candidates.sum()
     if rules.max_gaussians is not None:
         candidates = _within_cap(candidates, gradient, table["id"], rules.max_gaussians, ranks)
     small = table["scales"].amax(dim=1) <= math.log(rules.clone_scale)
     clones = (candidates & small).nonzero().squeeze(1)
     splits = (candidates & ~small).nonzero().squeeze(1)
-    new = _join(
-        [_copies(table, clones, time, slot=0, level_count=None)]
-        + [
-            _shrunk(_copies(table, splits, time, slot, level_count), seed, time)
-            for slot in range(1, CHILDREN_OF_A_SPLIT + 1)
-        ]
-    )
+    new = _children(table, clones, splits, time, seed, level_count)
     new["last_step"] = torch.full_like(new["birth"], step)
-    new_fine = ~_superfluous(new, None, rules)
-    gone = _superfluous(table.columns, table["max_radii"], rules)
-    old_fine = ~gone
-    old_fine[splits] = False
-    pruned = len(table) - int(old_fine.sum()) - len(splits) + len(new_fine) - int(new_fine.sum())
-    table.keep(old_fine)
-    table.append({name: column[new_fine] for name, column in new.items()})
+    staying = ~_superfluous(table.columns, table["max_radii"], rules)
+    staying[splits] = False
+    fine = ~_superfluous(new, None, rules)
+    rows = torch.cat((staying.nonzero().squeeze(1), len(table) + fine.nonzero().squeeze(1)))
+    grown = len(clones) + len(splits)
+    report = DensityReport(
+        cloned=len(clones),
+        split=len(splits),
+        pruned=len(table) + grown - len(rows),
+        held_back=int(wanted) - grown,
+    )
+    means = torch.cat((table["means"], new["means"])).index_select(0, rows)
+    table.renew(rows[morton_order(means)], new)
     for name in ("grad_sum", "grad_count", "max_radii"):
         table[name].zero_()
-    grown = len(clones) + len(splits)
-    return DensityReport(cloned=len(clones), split=len(splits), pruned=pruned, held_back=wanted - grown)
+    return report
 
 
-def child_ids(parents: Tensor, time: int, slot: int) -> Tensor:
-    """Return the ids, int64 [M] in [0, 2^63), of children born of `parents` (int64 [M]) in one event."""
-    return hash_keys(parents, time, slot) & _ID_MASK
+def child_ids(parents: Tensor, time: int, slots: Tensor) -> Tensor:
+    """Return the ids, int64 [M] in [0, 2^63), of children born of `parents` (int64 [M]) in one event.
+
+    A copy is born in slot 0, the children of a split in the slots from 1 on (int64 [M]).
+    """
+    return hash_keys(parents, time, slots) & _ID_MASK
 
 
 def _within_cap(candidates: Tensor, gradient: Tensor, ids: Tensor, cap: int, ranks: Ranks) -> Tensor:
@@ -126,33 +127,37 @@ def _within_cap(candidates: Tensor, gradient: Tensor, ids: Tensor, cap: int, ran
     return kept
 
 
-def _copies(
-    table: GaussianTable, rows: Tensor, time: int, slot: int, level_count: int | None
+def _children(
+    table: GaussianTable, clones: Tensor, splits: Tensor, time: int, seed: int, level_count: int
 ) -> dict[str, Tensor]:
-    """New rows like `rows`; one level finer when `level_count` is given."""
+    """New rows: copies of the rows `clones`, then each child of the rows `splits`; without `last_step`."""
+    rows = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
+    slots = torch.zeros_like(rows)
+    for slot in range(1, CHILDREN_OF_A_SPLIT + 1):
+        begin = len(clones) + (slot - 1) * len(splits)
+        slots[begin : begin + len(splits)] = slot
     parents, level = table["id"][rows], table["level"][rows]
-    if level_count is not None:
-        level = (level.int() + 1).clamp(max=level_count - 1).to(level.dtype)
-    return {name: table[name][rows] for name in PARAMETERS} | {
-        "id": child_ids(parents, time, slot),
+    children = {name: table[name].index_select(0, rows) for name in PARAMETERS} | {
+        "id": child_ids(parents, time, slots),
         "parent": parents,
         "birth": torch.full_like(table["birth"][rows], time),
-        "level": level,
+        "level": torch.where(slots > 0, (level.int() + 1).clamp(max=level_count - 1), level).to(level.dtype),
     }
+    _shrink({name: column[len(clones) :] for name, column in children.items()}, seed, time)
+    return children
 
 
-def _shrunk(children: dict[str, Tensor], seed: int, time: int) -> dict[str, Tensor]:
-    """Draw the children's means from their parent's Gaussian and shrink them.
+def _shrink(children: dict[str, Tensor], seed: int, time: int) -> None:
+    """Draw the children's means from their parent's Gaussian and shrink them, in place.
 
     In float64, so that the rounded result does not depend on how the maths library vectorises.
     """
-    ids = children["id"]
-    draws = torch.stack([normal(ids, seed, time, axis) for axis in range(3)], dim=1)
+    ids = children["id"][:, None]
+    draws = normal(ids, seed, time, torch.arange(3, device=ids.device))
     axes = rotations(children["quats"].double())
     offset = (axes * (draws * children["scales"].double().exp())[:, None]).sum(2)
-    children["means"] = (children["means"].double() + offset).float()
-    children["scales"] = (children["scales"].double() - math.log(SPLIT_SHRINK)).float()
-    return children
+    children["means"].copy_(children["means"].double() + offset)
+    children["scales"].copy_(children["scales"].double() - math.log(SPLIT_SHRINK))
 
 
 def rotations(quats: Tensor) -> Tensor:
@@ -175,7 +180,3 @@ def _superfluous(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRu
     if radii is not None and rules.max_screen_radius is not None:
         mask = mask | (radii > rules.max_screen_radius)
     return mask
-
-
-def _join(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

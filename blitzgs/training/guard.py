@@ -76,6 +76,9 @@ def _origin(table: GaussianTable, frame: Frame | None) -> str:
 
 
 def _bad_column(table: GaussianTable) -> str | None:
+    # A value that is not finite makes its column's sum so too: one pass, then a closer look if need be.
+    if bool(torch.stack([table[name].sum() for name in PARAMETERS]).isfinite().all()):
+        return None
     for name in PARAMETERS:
         finite = table[name].isfinite().flatten(1).all(1) if table[name].dim() > 1 else table[name].isfinite()
         if not bool(finite.all()):

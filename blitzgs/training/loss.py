@@ -98,12 +98,13 @@ def scale_term(frame: Frame, table: GaussianTable, length_unit: float) -> Tensor
 
 def batch_psnr(frame: Frame, batch: Batch) -> Tensor:
     """Return the PSNR of a batch over all its pixels that count, in dB."""
-    error = (frame.renders.clamp(0, 1) - batch.targets.float() / 255.0) ** 2
-    counted = torch.ones_like(error[..., 0], dtype=torch.bool) if batch.masks is None else batch.masks != 0
+    error = ((frame.renders.clamp(0, 1) - batch.targets.float() / 255.0) ** 2).sum(-1)
+    if batch.masks is not None:
+        error *= batch.masks != 0
     if frame.share is not None:
         ranks, ranges = frame.share.ranks, frame.share.ranges
-        counted &= ranges.pixel_mask(ranks.rank, error.device)
-    total = error[counted].sum()
+        error *= ranges.pixel_mask(ranks.rank, error.device)
+    total = error.sum()
     if frame.share is not None:
         frame.share.ranks.all_reduce(total)
     return -10.0 * (total / batch.samples.sum()).clamp(min=1e-12).log10()

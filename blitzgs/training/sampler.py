@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from functools import lru_cache
 
 import torch
 
@@ -15,8 +16,8 @@ class BatchSampler:
 
     Views are grouped by image size. Each group runs through its views epoch by epoch, reshuffled each time,
     and gives B consecutive ones per batch, so that every view is drawn equally often. Rounds mix the groups
-    in proportion to their sizes. Nothing is remembered between calls: a resumed run, and every rank, sees the
-    same batches.
+    in proportion to their sizes. What a call returns depends on no other call: a resumed run, and every rank,
+    sees the same batches.
     """
 
     def __init__(self, sizes: Sequence[Hashable], batch_size: int, seed: int) -> None:
@@ -38,22 +39,14 @@ class BatchSampler:
         self._groups = [torch.tensor(views) for views in groups.values()]
         self._batch_size = batch_size
         self._seed = seed
+        # Only the newest are asked for: consecutive steps share them.
+        self._round = lru_cache(maxsize=2)(self._make_round)
+        self._epoch = lru_cache(maxsize=2 * len(groups))(self._make_epoch)
 
     def batch(self, step: int) -> list[int]:
         """Return the B views of a step (0-based); a view repeats only where its group's epochs meet."""
         index = self._round_of(step)
-        first = self._batches_before(index)
-        slots = torch.tensor(
-            [
-                (g, k)
-                for g, views in enumerate(self._groups)
-                for k in range(
-                    self._group_batches(len(views), index), self._group_batches(len(views), index + 1)
-                )
-            ]
-        )
-        order = hash_keys(torch.arange(len(slots)), self._seed, index, 1).argsort()
-        group, batch = slots[order[step - first]].tolist()
+        group, batch = self._round(index)[step - self._batches_before(index)]
         begin = batch * self._batch_size
         return [self._view(group, position) for position in range(begin, begin + self._batch_size)]
 
@@ -73,8 +66,22 @@ class BatchSampler:
             low, high = (middle, high) if self._batches_before(middle) <= step else (low, middle)
         return low
 
-    def _view(self, group: int, position: int) -> int:
+    def _make_round(self, index: int) -> list[tuple[int, int]]:
+        """List the batches of a round in their order: group, and number within the group."""
+        slots = [
+            (g, k)
+            for g, views in enumerate(self._groups)
+            for k in range(self._group_batches(len(views), index), self._group_batches(len(views), index + 1))
+        ]
+        order = hash_keys(torch.arange(len(slots)), self._seed, index, 1).argsort()
+        return [slots[position] for position in order.tolist()]
+
+    def _make_epoch(self, group: int, epoch: int) -> list[int]:
+        """List the views of a group in the order of an epoch."""
         views = self._groups[group]
-        epoch, slot = divmod(position, len(views))
-        order = hash_keys(views, self._seed, epoch, 0).argsort()
-        return int(views[order[slot]])
+        order: list[int] = views[hash_keys(views, self._seed, epoch, 0).argsort()].tolist()
+        return order
+
+    def _view(self, group: int, position: int) -> int:
+        epoch, slot = divmod(position, len(self._groups[group]))
+        return self._epoch(group, epoch)[slot]

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.ops.density_stats import density_stats_
@@ -201,7 +200,7 @@ class Trainer:
         self._guard.check(step, names, sums, self.table, frame)
         report = None
         if self._crosses(begin, config.log.every):
-            report = self._measure(frame, batch, sums)
+            report = self._measure(frame, batch)
         gradients = self._stepper.backward(step, frame, terms)
         if begin < config.schedule.densify_until * config.schedule.scale:
             self._gather(frame, gradients.means2d)
@@ -210,7 +209,8 @@ class Trainer:
         )
         if report is not None:
             check_table(self.table, step)
-            self._log_step(report, step, log)
+            losses = photometric(sums.read()[: 2 * len(names)], batch.samples.cpu(), config.loss)
+            self._log_step(report, losses.mean().item(), step, log)
 
     def _sort(self) -> None:
         """Put neighbours in space next to each other, so that blocks of rows are small."""
@@ -235,23 +235,27 @@ class Trainer:
             float(len(views)),
         )
 
-    def _measure(self, frame: Frame, batch: Batch, sums: HostSum) -> dict[str, float]:
-        """Return the batch's total loss and PSNR."""
-        scale = scale_term(frame, self.table, self._length_unit)
-        images = photometric(sums.read()[: 2 * len(frame.views)], batch.samples.cpu(), self.config.loss)
-        loss = images.mean() + self.config.loss.scale * scale.mean().cpu()
-        visible = self.ranks.all_reduce(frame.rows.counts[:1].to(self.ranks.device))
-        return {
-            "loss": loss.item(),
-            "l_scale": scale.mean().item(),
-            "psnr": batch_psnr(frame, batch).item(),
-            "visible": float(visible.item()),
-        }
+    def _measure(self, frame: Frame, batch: Batch) -> Tensor:
+        """Return the batch's L_scale and PSNR, the visible Gaussians and all, [4]; nobody waits for them."""
+        scale = scale_term(frame, self.table, self._length_unit).mean()
+        counts = [
+            self.ranks.all_reduce(torch.full((), float(count), dtype=torch.float64, device=scale.device))
+            for count in (len(frame.rows.visible_ids), len(self.table))
+        ]
+        return torch.stack([scale.double(), batch_psnr(frame, batch).double(), *counts])
 
-    def _log_step(self, report: dict[str, float], step: int, log: RunLog) -> None:
+    def _log_step(self, report: Tensor, photometric_loss: float, step: int, log: RunLog) -> None:
         images = step * self.schedule.batch_size
-        speed = images / max(self.progress.seconds, 1e-9)
-        log.scalars(images, report | {"gaussians": self._population(), "images_per_second": speed})
+        scale, psnr, visible, population = report.tolist()
+        values = {
+            "loss": photometric_loss + self.config.loss.scale * scale,
+            "l_scale": scale,
+            "psnr": psnr,
+            "visible": visible,
+            "gaussians": int(population),
+            "images_per_second": images / max(self.progress.seconds, 1e-9),
+        }
+        log.scalars(images, values)
 
     def _population(self) -> int:
         count = torch.tensor([len(self.table)], device=self.ranks.device)
@@ -287,17 +291,17 @@ class Trainer:
             level_count=self.progress.level_count,
             ranks=self.ranks,
         )
-        values = torch.tensor(list(dataclasses.astuple(report)), device=self.ranks.device)
-        counts = dict(zip(dataclasses.asdict(report), self.ranks.all_reduce(values).tolist(), strict=True))
+        counts = dataclasses.asdict(report) | {"gaussians": len(self.table)}
+        values = self.ranks.all_reduce(torch.tensor(list(counts.values()), device=self.ranks.device))
+        counts = dict(zip(counts, values.tolist(), strict=True))
         if redistribute(self.table, self.ranks, self.config.ranks.max_imbalance):
             counts["redistributed"] = 1
-        self._sort()
+            self._sort()
         self._stepper.reindex()
-        total = self._population()
         self.progress = dataclasses.replace(
-            self.progress, peak_gaussians=max(self.progress.peak_gaussians, total)
+            self.progress, peak_gaussians=max(self.progress.peak_gaussians, counts["gaussians"])
         )
-        log.event(event.time, "densify", counts | {"gaussians": total})
+        log.event(event.time, "densify", counts)
 
     def _evaluate(self, step: int, log: RunLog) -> dict[str, Any]:
         """Evaluate the held-out views (the training views when there are none)."""
