@@ -43,6 +43,19 @@ def test_permute_keep_and_append_move_whole_rows():
     assert_rows_whole(table)
 
 
+@pytest.mark.parametrize("count, added", [(50, 9), (0, 9), (50, 0)])
+def test_renew_is_append_keep_and_permute_in_one_go(count, added):
+    renewed, expected = filled_table(count), filled_table(count)
+    more = filled_table(added, seed=2)
+    new = {name: more[name] for name in more if not name.startswith("exp_avg")}
+    order = torch.randperm(count + added, generator=torch.Generator().manual_seed(1))
+    rows = order[: len(order) * 2 // 3]
+    renewed.renew(rows, new)
+    expected.append(new)
+    for name in expected:
+        assert torch.equal(renewed[name], expected[name][rows]), name
+
+
 def test_new_rows_start_with_zero_moments_and_statistics():
     source = filled_table(5)
     required = ("means", "quats", "scales", "opacities", "sh", "last_step", "id", "parent", "birth", "level")

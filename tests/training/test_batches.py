@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Batches hold the photographs, masks and views of their cameras, though their memory is used again."""
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.training.batches import BatchLoader
+from blitzgs.training.sampler import BatchSampler
+from blitzgs.training.views import Space, ViewSet
+from tests.training.tiny import Camera, Images, look_at_origin
+
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda",
+        marks=[
+            pytest.mark.cuda,
+            pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+        ],
+    ),
+]
+SIZES = [(48, 32)] * 5 + [(30, 20)] * 3
+STEPS = 25
+
+
+@pytest.fixture
+def capture():
+    """Cameras of two sizes; the first has a mask."""
+    g = torch.Generator().manual_seed(0)
+    cameras, images, masks = [], [], []
+    for i, (width, height) in enumerate(SIZES):
+        K = np.array([[40.0 + i, 0.0, width / 2], [0.0, 41.0, height / 2], [0.0, 0.0, 1.0]])
+        angle = 0.7 * i
+        pose = look_at_origin(np.array([3 * np.cos(angle), 3 * np.sin(angle), 2.5]))
+        cameras.append(Camera(str(i), width, height, K, pose))
+        images.append(torch.randint(0, 256, (height, width, 3), generator=g, dtype=torch.uint8))
+        masks.append((torch.rand(height, width, generator=g) < 0.5).byte() if i == 0 else None)
+    return cameras, Images(images, masks)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("ahead", [0, 1, 3])
+def test_each_step_gets_its_own_views(capture, device, ahead):
+    cameras, images = capture
+    device = torch.device(device)
+    views = ViewSet(cameras, Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
+    train = [7, 6, 5, 4, 3, 2, 1, 0]
+    sampler = BatchSampler([SIZES[camera] for camera in train], 2, seed=3)
+    loader = BatchLoader(images, views, train, sampler, device, ahead)
+    seen = []
+    try:
+        for step in range(STEPS):
+            batch = loader.get(step, STEPS)
+            if device.type == "cuda":
+                torch.cuda._sleep(1_000_000)  # a slow step, which the batches made ahead must not overtake
+            tensors = (batch.targets, batch.masks, batch.samples, batch.views.viewmats, batch.views.Ks)
+            copies = [None if tensor is None else tensor.clone() for tensor in tensors]
+            seen.append((batch.indices, batch.views.width, batch.views.height, *copies))
+    finally:
+        loader.close()
+    for step, (indices, width, height, targets, masks, samples, viewmats, Ks) in enumerate(seen):
+        assert indices == [train[view] for view in sampler.batch(step)]
+        expected = views.pick(indices)
+        assert (width, height) == SIZES[indices[0]] == (expected.width, expected.height)
+        assert torch.equal(viewmats, expected.viewmats) and torch.equal(Ks, expected.Ks)
+        assert torch.equal(targets.cpu(), torch.stack([images.get(index) for index in indices]))
+        counted = [torch.ones(height, width) if (m := images.mask(i)) is None else m for i in indices]
+        assert samples.tolist() == [3 * int(mask.sum()) for mask in counted]
+        if any(images.mask(index) is not None for index in indices):
+            assert torch.equal(masks.cpu(), torch.stack(counted).byte())
+        else:
+            assert masks is None
