@@ -253,7 +253,7 @@ def _project(
     rows = Rows._make((*torch.ops.blitzgs.project_emit(*arguments, plan, carry, counts), counts))
     splats = Splats(
         rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
-        table["id"][rows.gaussian_ids],
+        table["id"].index_select(0, rows.gaussian_ids),
     )  # fmt: skip
     if asking is not None and traffic is not None:
         route = Route(traffic, rows.rank_masks, peers=asking.ranks.peers)

@@ -9,6 +9,7 @@
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <initializer_list>
 #include <optional>
@@ -50,24 +51,22 @@ inline std::string shape_of(const Tensor& tensor) {
   return text.str();
 }
 
-// shape: one entry per dimension, -1 for any size.
+// shape: one entry per dimension, -1 for any size. The text is made when it is needed alone: a step checks
+// some two hundred tensors while the GPU waits for its next kernel.
 inline void check_shape(const char* op, const char* name, const Tensor& tensor,
                         std::initializer_list<std::int64_t> shape) {
   bool ok = tensor.dim() == static_cast<std::int64_t>(shape.size());
   std::int64_t axis = 0;
-  std::ostringstream wanted;
-  wanted << '[';
   for (const std::int64_t size : shape) {
-    if (ok && size >= 0 && tensor.size(axis) != size) ok = false;
-    wanted << (axis ? ", " : "");
-    if (size < 0) {
-      wanted << '*';
-    } else {
-      wanted << size;
-    }
+    ok = ok && (size < 0 || tensor.size(axis) == size);
     ++axis;
   }
-  STD_TORCH_CHECK(ok, "blitzgs::", op, ": ", name, " must have shape ", wanted.str(), "], got ",
+  if (ok) return;
+  std::ostringstream wanted;
+  for (const std::int64_t size : shape) {
+    wanted << (wanted.tellp() > 0 ? ", " : "") << (size < 0 ? "*" : std::to_string(size));
+  }
+  STD_TORCH_CHECK(false, "blitzgs::", op, ": ", name, " must have shape [", wanted.str(), "], got ",
                   shape_of(tensor));
 }
 
@@ -90,11 +89,25 @@ inline void check_floating(const char* op, const char* name, const Tensor& tenso
 #endif
 }
 
-inline Tensor as_contiguous(const Tensor& tensor) { return torch::stable::contiguous(tensor); }
+// Asked first: the call into torch, which finds the op by name, takes microseconds.
+inline Tensor as_contiguous(const Tensor& tensor) {
+  return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
+}
 
-inline Tensor make_empty(const Tensor& like, std::vector<std::int64_t> shape,
+// By the shortest way into torch: a step allocates some sixty tensors.
+inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& shape,
                          std::optional<ScalarType> dtype = std::nullopt) {
-  return torch::stable::new_empty(like, shape, dtype);
+  const auto rank = static_cast<std::int64_t>(shape.size());
+  std::vector<std::int64_t> strides(shape.size(), 1);
+  for (std::int64_t i = rank - 1; i > 0; --i)
+    strides[i - 1] = strides[i] * std::max<std::int64_t>(shape[i], 1);
+  std::int32_t device_type = 0;
+  TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(like.get(), &device_type));
+  AtenTensorHandle handle = nullptr;
+  TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(
+      rank, shape.data(), strides.data(), static_cast<std::int32_t>(dtype.value_or(like.scalar_type())),
+      device_type, like.get_device_index(), &handle));
+  return Tensor(handle);
 }
 
 inline Tensor make_zeros(const Tensor& like, std::vector<std::int64_t> shape,
