@@ -3,10 +3,11 @@
 
 python benchmarks/bm_accuracy.py [--device cuda] [--gaussians 4000000] [--out runs/accuracy]
 
-Renders the aerial scene with each option, forward and backward. Times are medians, per view. Errors are
-against the float64 reference of the same mode in a few windows of the same images: the largest absolute error
-of the image away from the declared cut pixels (depths: relative to the deepest), and the largest error of any
-parameter's gradient (max |difference| / max |reference|). Fails when the default setting misses its bounds.
+Renders the aerial scene with each option as training does, forward and backward. Times are medians, per view.
+Errors are against the float64 reference of the same mode in a few windows of the same images: the largest
+absolute error of the image away from the declared cut pixels, and the largest error of a parameter's gradient
+(max |difference| / max |reference|). Fails when the default setting misses its bounds.
+
 Writes a table (Markdown), the figures (JSON) and, with matplotlib, a Pareto plot.
 
 The row "exact exponential" needs a second build of the kernels, whose folder --exact-library names:
@@ -23,24 +24,21 @@ import os
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import torch
-from exact_windows import PARAMETERS, ExactWindows
+from exact_windows import EPS2D, FAR, NEAR, ExactWindows
 from scenes import BenchmarkScene, aerial
 from timing import median_ms
 from torch import Tensor
 
-import blitzgs
-from blitzgs.distributed.exchange import Splats, exchange
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileRanges
-from blitzgs.ops.intersect import intersect, tile_counts
-from blitzgs.ops.project import project
-from blitzgs.ops.rasterize import rasterize
+from blitzgs.distributed.ownership import Share, TileRanges
+from blitzgs.model import PARAMETERS, GaussianTable, schema
+from blitzgs.ops.intersect import tile_counts
+from blitzgs.pipeline import Frame, RenderOptions, Views, backward, forward
 
 IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # of the default setting
 
@@ -50,12 +48,13 @@ class Option:
     """One setting of the renderer."""
 
     name: str
-    arguments: dict[str, Any] = field(default_factory=dict)
-    dtype: torch.dtype = torch.float32
+    antialiased: bool = False
+    tile_size: int = 16
     deterministic: bool = False
     views: int = 1
     exchanged: bool = False  # through the exchange of the ranks, of which there is one: all but the wire
     half: bool = False
+    dtype: torch.dtype = torch.float32
 
 
 @dataclass
@@ -73,13 +72,10 @@ def options_for(device: str) -> list[Option]:
     """Return what can be chosen on this device; the first is the default."""
     options = [
         Option("default"),
-        Option("antialiased", {"rasterize_mode": "antialiased"}),
-        Option("tiles of 8", {"tile_size": 8}),
-        Option("tiles of 32", {"tile_size": 32}),
+        Option("antialiased", antialiased=True),
+        Option("tiles of 8", tile_size=8),
+        Option("tiles of 32", tile_size=32),
         Option("batch of 4 views", views=4),
-        Option("dense meta (packed=False)", {"packed": False}),
-        Option("absolute gradients", {"absgrad": True}),
-        Option("colour and expected depth", {"render_mode": "RGB+ED"}),
         Option("exchange", exchanged=True),
         Option("exchange in half precision", exchanged=True, half=True),
     ]
@@ -88,45 +84,51 @@ def options_for(device: str) -> list[Option]:
     return [*options, Option("deterministic", deterministic=True)]
 
 
-def leaves(scene: BenchmarkScene, option: Option) -> list[Tensor]:
-    return [getattr(scene, name).to(option.dtype).detach().requires_grad_() for name in PARAMETERS]
+class Renderer:
+    """The training path between parameters and image, with one option."""
 
+    def __init__(self, scene: BenchmarkScene, option: Option) -> None:
+        device = scene.means.device
+        raw = scene.raw()
+        n = len(scene.means)
+        columns = {
+            name: torch.zeros(n, *column.shape, dtype=column.dtype, device=device)
+            for name, column in schema(3).items()
+        }
+        self.table = GaussianTable(columns | {"id": torch.arange(n, device=device)})
+        for name in PARAMETERS:
+            self.table[name] = raw[name].to(option.dtype)
+        viewmats, Ks = scene.viewmats.to(option.dtype), scene.Ks.to(option.dtype)
+        self.views = Views(viewmats, Ks, scene.width, scene.height)
+        self.options = RenderOptions(
+            sh_degree=3,
+            near_plane=NEAR,
+            far_plane=FAR,
+            eps2d=EPS2D,
+            antialiased=option.antialiased,
+            tile_size=option.tile_size,
+            deterministic=option.deterministic,
+        )
+        self.share = None
+        if option.exchanged:
+            columns, lines = tile_counts(scene.width, scene.height, option.tile_size)
+            bounds = (0, len(Ks) * columns * lines)
+            ranges = TileRanges(bounds, len(Ks), scene.width, scene.height, option.tile_size)
+            self.share = Share(Ranks(device=device), ranges, option.half)
 
-def images(scene: BenchmarkScene, option: Option, inputs: list[Tensor]) -> Tensor:
-    Ks = scene.Ks.to(option.dtype)
-    if option.exchanged:
-        return _exchanged(scene, option, inputs, Ks)
-    arguments = {"sh_degree": 3, **option.arguments}
-    return blitzgs.rasterization(*inputs, Ks, scene.width, scene.height, **arguments)[0]
+    def forward(self) -> Frame:
+        """Render."""
+        return forward(self.table, self.views, self.options, share=self.share)
 
+    def backward(self, frame: Frame, v_renders: Tensor) -> tuple[Tensor, ...]:
+        """Return the gradients of the visible Gaussians."""
+        return backward(self.table, frame, v_renders).parameters
 
-def _exchanged(scene: BenchmarkScene, option: Option, inputs: list[Tensor], Ks: Tensor) -> Tensor:
-    width, height, views = scene.width, scene.height, len(Ks)
-    rows = project(*inputs, Ks, width, height, sh_degree=3, raw=False)
-    splats = Splats(
-        rows.means2d,
-        rows.conics,
-        rows.opacities,
-        rows.colors,
-        rows.depths,
-        rows.camera_ids,
-        rows.gaussian_ids.long(),
-    )
-    columns, lines = tile_counts(width, height, 16)
-    ranges = TileRanges((0, views * columns * lines), views, width, height)
-    s, route = exchange(splats, ranges, Ranks(device=Ks.device), option.half)
-    grid = {"n_cameras": views, "width": width, "height": height}
-    lists = intersect(
-        s.means2d,
-        s.conics,
-        s.opacities,
-        s.depths,
-        s.camera_ids,
-        s.ids,
-        n_isects=route.traffic.n_isects,
-        **grid,
-    )
-    return rasterize(s.means2d, s.conics, s.opacities, s.colors, *lists, **grid)[0]
+    def step_ms(self, repeats: int) -> float:
+        """Return the milliseconds of forward and backward, per view."""
+        v_renders = torch.randn_like(self.forward().renders)
+        step = median_ms(lambda v: self.backward(self.forward(), v), [(v_renders,)], repeats, warm_up=3)
+        return step / len(self.views)
 
 
 @cache
@@ -134,65 +136,49 @@ def exact_windows(scene: BenchmarkScene, antialiased: bool) -> ExactWindows:
     return ExactWindows(scene, antialiased)
 
 
-def errors(scene: BenchmarkScene, option: Option) -> tuple[float, float, float]:
+def errors(scene: BenchmarkScene, renderer: Renderer) -> tuple[float, float, float]:
     """Return the image error, the gradient error and the share of cut pixels."""
-    exact = exact_windows(scene, option.arguments.get("rasterize_mode") == "antialiased")
-    inputs = leaves(scene, option)
-    actual = images(scene, option, inputs)
+    exact = exact_windows(scene, renderer.options.antialiased)
+    frame = renderer.forward()
     generator = torch.Generator().manual_seed(0)
-    v_actual = torch.zeros_like(actual)
+    v_renders = torch.zeros_like(frame.renders)
     image_error, expected_loss, cut = 0.0, torch.zeros((), dtype=torch.float64), 0.0
-    for (view, rows, columns), image, alpha, cut_here in zip(
-        exact.places, exact.images, exact.alphas, exact.cuts, strict=True
-    ):
-        expected = image[..., :3]
-        if "ED" in option.arguments.get("render_mode", ""):
-            depth = image[..., 3:] / alpha[..., None].clamp(min=1e-10)
-            expected = torch.cat([expected, depth], dim=-1)
-        size = expected.detach().abs().amax(dim=(0, 1)).clamp(min=1.0)
-        difference = (actual[view, rows, columns].detach().double().cpu() - expected.detach()) / size
+    for place, image, cut_here in zip(exact.places, exact.images, exact.cuts, strict=True):
         keep = ~cut_here
+        difference = frame.renders[place].cpu().double() - image.detach()
         if keep.any():
             image_error = max(image_error, difference[keep].abs().max().item())
         cut += cut_here.double().mean().item() / len(exact.places)
-        weights = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
-        weights *= keep[..., None] / size
-        expected_loss = expected_loss + (expected * weights).sum()
-        v_actual[view, rows, columns] += weights.to(v_actual)
-    gradients = torch.autograd.grad(actual, inputs, v_actual)
-    expected_gradients = torch.autograd.grad(expected_loss, exact.inputs, retain_graph=True)
-    return image_error, _gradient_error(gradients, expected_gradients, exact.ids), cut
+        weights = torch.randn(image.shape, generator=generator, dtype=torch.float64) * keep[..., None]
+        expected_loss = expected_loss + (image * weights).sum()
+        v_renders[place] += weights.to(v_renders)
+    actual = renderer.backward(frame, v_renders)
+    expected = torch.autograd.grad(expected_loss, exact.inputs, retain_graph=True)
+    return image_error, _gradient_error(actual, expected, frame.rows.visible_ids.cpu().long(), exact.ids), cut
 
 
-def _gradient_error(actual: tuple[Tensor, ...], expected: tuple[Tensor, ...], ids: Tensor) -> float:
+def _gradient_error(
+    actual: tuple[Tensor, ...], expected: tuple[Tensor, ...], visible: Tensor, ids: Tensor
+) -> float:
+    """Compare gradients of the Gaussians `visible` with those of `ids`; all others are zero."""
     worst = 0.0
-    for name, value, target in zip(PARAMETERS, actual, expected, strict=True):
-        error = 0.0
-        if name != "viewmats":
-            others = value.clone()  # Gaussians that reach no window: their gradient is zero
-            others[ids.to(value.device)] = 0
-            error, value = others.abs().max().item(), value[ids.to(value.device)]
-        error = max(error, (value.double().cpu() - target).abs().max().item())
+    for value, target in zip(actual, expected, strict=True):
+        difference = value.cpu().double()
+        at = torch.searchsorted(visible, ids).clamp(max=len(visible) - 1)
+        seen = visible[at] == ids
+        difference[at[seen]] -= target[seen]
+        error = difference.abs().max().item()
+        if not seen.all():
+            error = max(error, target[~seen].abs().max().item())
         worst = max(worst, error / target.abs().max().item())
     return worst
 
 
-def step_ms(scene: BenchmarkScene, option: Option, repeats: int) -> float:
-    inputs = leaves(scene, option)
-    weights = torch.randn_like(images(scene, option, inputs))
-    milliseconds = median_ms(
-        lambda w: torch.autograd.grad(images(scene, option, inputs), inputs, w), [(weights,)], repeats, 2
-    )
-    return milliseconds / option.views
-
-
 def measure(option: Option, scenes: dict[int, BenchmarkScene], repeats: int) -> Figures:
     scene = scenes[option.views]
-    torch.use_deterministic_algorithms(option.deterministic, warn_only=True)
-    image_error, gradient_error, cut = errors(scene, option)
-    result = Figures(option.name, step_ms(scene, option, repeats), image_error, gradient_error, cut)
-    torch.use_deterministic_algorithms(False)
-    return result
+    renderer = Renderer(scene, option)
+    image_error, gradient_error, cut = errors(scene, renderer)
+    return Figures(option.name, renderer.step_ms(repeats), image_error, gradient_error, cut)
 
 
 def measure_library(folder: Path, arguments: list[str]) -> Figures:

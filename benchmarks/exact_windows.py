@@ -13,10 +13,10 @@ import torch
 from scenes import BenchmarkScene
 from torch import Tensor
 
+from blitzgs.model import PARAMETERS
 from blitzgs.reference import Composite, Splats, composite, project_splats
 
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "viewmats")
-EPS2D = 0.3
+NEAR, FAR, EPS2D = 0.01, 1e10, 0.3
 
 
 class ExactWindows:
@@ -24,10 +24,9 @@ class ExactWindows:
 
     Attributes:
         ids: int64 [U], the Gaussians that reach a window of some view.
-        inputs: their PARAMETERS in float64, requiring gradients.
+        inputs: their PARAMETERS as trained (log scales, logits), float64, requiring gradients.
         places: (view, rows, columns) of each window.
-        images: [h, w, 4] of each window: colour and accumulated depth, float64, differentiable.
-        alphas: [h, w], likewise.
+        images: float64 [h, w, 3] of each window, differentiable.
         cuts: bool [h, w]: pixels where rounding may decide.
     """
 
@@ -35,27 +34,29 @@ class ExactWindows:
         self.scene, self.antialiased = scene, antialiased
         self.places = list(_places(scene, size))
         with torch.no_grad():
-            everything = [getattr(scene, name).double().cpu() for name in PARAMETERS]
+            everything = [scene.raw()[name].cpu().double() for name in PARAMETERS]
             self.ids = self._reaching(everything)
-        *gaussians, viewmats = everything
-        self.inputs = [t[self.ids].requires_grad_() for t in gaussians] + [viewmats.requires_grad_()]
+        self.inputs = [t[self.ids].requires_grad_() for t in everything]
         results = self._composite()
         self.images = [result.values for result in results]
-        self.alphas = [1 - result.transmittances for result in results]
         self.cuts = [result.cut for result in results]
 
     def _project(self, inputs: list[Tensor], view: int) -> Splats:
-        *gaussians, viewmats = inputs
+        means, quats, scales, opacities, sh = inputs
         scene = self.scene
         return project_splats(
-            *gaussians,
-            viewmats[view],
-            scene.Ks[view].double().cpu(),
+            means,
+            quats,
+            scales.exp(),
+            opacities.sigmoid(),
+            sh,
+            scene.viewmats[view].cpu().double(),
+            scene.Ks[view].cpu().double(),
             scene.width,
             scene.height,
             sh_degree=3,
-            near_plane=0.01,
-            far_plane=1e10,
+            near_plane=NEAR,
+            far_plane=FAR,
             eps2d=EPS2D,
             antialiased=self.antialiased,
         )
@@ -78,10 +79,9 @@ class ExactWindows:
         results = []
         for view, rows, columns in self.places:
             s = splats[view]
-            channels = torch.cat([s.colors, s.depths[:, None]], dim=1)
             offset = torch.tensor([columns.start, rows.start])
             size = columns.stop - columns.start, rows.stop - rows.start
-            results.append(composite(s.means2d - offset, s.conics, s.opacities, channels, s.depths, *size))
+            results.append(composite(s.means2d - offset, s.conics, s.opacities, s.colors, s.depths, *size))
         return results
 
 

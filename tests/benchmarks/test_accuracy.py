@@ -2,6 +2,7 @@
 """The accuracy benchmark must see an error where there is one."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,25 +19,24 @@ def scene():
     return aerial(600, width=24, height=16)
 
 
-def named(name):
-    return next(option for option in bm_accuracy.options_for("cpu") if option.name == name)
+def errors(scene, name, **changes):
+    option = next(option for option in bm_accuracy.options_for("cpu") if option.name == name)
+    return bm_accuracy.errors(scene, bm_accuracy.Renderer(scene, replace(option, **changes)))
 
 
 def test_the_default_is_exact_to_float_rounding_and_half_precision_is_not(scene):
-    image_error, gradient_error, cut = bm_accuracy.errors(scene, named("default"))
+    image_error, gradient_error, cut = errors(scene, "default")
     assert 0 < image_error < 1e-5 and 0 < gradient_error < 1e-4 and cut < 0.05
-    same, _, _ = bm_accuracy.errors(scene, named("exchange"))
-    assert same == image_error
-    worse, _, _ = bm_accuracy.errors(scene, named("exchange in half precision"))
-    assert worse > 30 * image_error
+    assert errors(scene, "exchange")[0] == image_error
+    assert errors(scene, "exchange in half precision")[0] > 30 * image_error
 
 
-def test_windows_of_a_large_image_are_the_image():
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_windows_of_a_large_image_are_the_image(antialiased):
     scene = aerial(5_000, views=2, width=150, height=100)
-    option = bm_accuracy.Option("depth", {"render_mode": "RGB+ED"}, torch.float64, views=2)
-    windows = bm_accuracy.exact_windows(scene, antialiased=False)
+    windows = bm_accuracy.exact_windows(scene, antialiased)
     assert 0 < len(windows.ids) < 5_000 and len(windows.places) == 14
-    image_error, gradient_error, _ = bm_accuracy.errors(scene, option)
+    image_error, gradient_error, _ = errors(scene, "float64", antialiased=antialiased)
     assert image_error < 1e-12 and gradient_error < 1e-12
 
 
