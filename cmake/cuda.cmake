@@ -1,7 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 # The CUDA library: kernels free of torch headers, and the same *_op.cpp files compiled a second time
 # against the CUDA backend.
-set(CMAKE_CUDA_ARCHITECTURES ${BLITZGS_CUDA_ARCHS})
+if(BLITZGS_CUDA_ARCHS STREQUAL "all")
+  # For a library that goes elsewhere; PTX of the last alone, for what comes after it.
+  set(
+    CMAKE_CUDA_ARCHITECTURES
+    80-real
+    86-real
+    89-real
+    90-real
+    100-real
+    120
+  )
+elseif(BLITZGS_CUDA_ARCHS)
+  set(CMAKE_CUDA_ARCHITECTURES ${BLITZGS_CUDA_ARCHS})
+else()
+  execute_process(COMMAND nvidia-smi -L RESULT_VARIABLE no_gpu OUTPUT_QUIET ERROR_QUIET)
+  if(no_gpu)
+    set(CMAKE_CUDA_ARCHITECTURES 90)
+  else()
+    set(CMAKE_CUDA_ARCHITECTURES native)
+  endif()
+endif()
+message(STATUS "blitzgs: CUDA architectures ${CMAKE_CUDA_ARCHITECTURES}")
 enable_language(CUDA)
 find_package(CUDAToolkit REQUIRED)
 set(CMAKE_CUDA_STANDARD 20)
