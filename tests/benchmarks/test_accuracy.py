@@ -31,6 +31,18 @@ def test_the_default_is_exact_to_float_rounding_and_half_precision_is_not(scene)
     assert errors(scene, "exchange in half precision")[0] > 30 * image_error
 
 
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("option", bm_accuracy.options_for("cuda"), ids=lambda option: option.name)
+def test_every_option_but_half_precision_keeps_the_bounds_on_cuda(option):
+    scene = aerial(300_000, "cuda", views=option.views, width=1200, height=800)
+    image_error, gradient_error, _ = bm_accuracy.errors(scene, bm_accuracy.Renderer(scene, option))
+    if option.half:
+        assert image_error < 5e-3 and gradient_error < 5e-2
+    else:
+        assert image_error <= bm_accuracy.IMAGE_BOUND and gradient_error <= bm_accuracy.GRADIENT_BOUND
+
+
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_windows_of_a_large_image_are_the_image(antialiased):
     scene = aerial(5_000, views=2, width=150, height=100)

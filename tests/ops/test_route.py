@@ -59,6 +59,18 @@ def test_one_rank_gets_every_intersection():
     assert parts[:, 0].max() <= whole[0, 0] <= parts[:, 0].sum()
 
 
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("count", [0, 1, 3000])
+def test_cuda_equals_cpu(count):
+    ranges = [(0, 18), (2, 2), (2, 39), (23, CAMERAS * TILES)]
+    expected = route_count(*rows(count), ranges, WIDTH, HEIGHT)
+    actual = route_count(*(t.cuda() for t in rows(count)), ranges, WIDTH, HEIGHT)
+    # Logarithms differ in the last digit, and so may rows that end on a tile's border.
+    assert (actual[0].cpu() != expected[0]).sum() <= count // 1000
+    assert (actual[1].cpu() - expected[1]).abs().max() <= count // 500
+
+
 def test_empty_and_errors():
     none = [t[:0] for t in rows(4)]
     masks, counts = route_count(*none, cut(0, 20, 56), WIDTH, HEIGHT)

@@ -4,13 +4,16 @@ import torch
 
 from blitzgs.ops.voxel_keys import voxel_keys
 
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+CUDA = pytest.param("cuda", torch.float32, marks=[pytest.mark.cuda, needs_cuda])
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_matches_the_formula(dtype):
+
+@pytest.mark.parametrize(("device", "dtype"), [("cpu", torch.float32), ("cpu", torch.float64), CUDA])
+def test_matches_the_formula(device, dtype):
     points = torch.randn(1000, 3, dtype=dtype, generator=torch.Generator().manual_seed(0))
     cells = ((points.double() + 2.0) / 0.1).floor().clamp(0, 2**21 - 1).long()
     expected = cells[:, 0] | cells[:, 1] << 21 | cells[:, 2] << 42
-    assert torch.equal(voxel_keys(points, [-2.0] * 3, 0.1), expected)
+    assert torch.equal(voxel_keys(points.to(device), [-2.0] * 3, 0.1).cpu(), expected)
 
 
 def test_non_finite_points_and_empty_input():
