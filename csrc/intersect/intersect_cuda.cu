@@ -5,16 +5,13 @@
 // once, in row order, and kept in 16 bytes: those of all rows fit into the L2 cache, where depth order
 // gathers them. Compiled without FMA contraction (cmake/cuda.cmake), as the projection is: both count the
 // same tiles.
-#include <thrust/iterator/counting_iterator.h>
-#include <thrust/iterator/transform_iterator.h>
 #include <cub/device/device_radix_sort.cuh>
 #include <cub/device/device_reduce.cuh>
-#include <cub/device/device_scan.cuh>
 
 #include <cuda/std/functional>
 
-#include "common/cuda_check.h"
-#include "intersect/intersect.h"
+#include "intersect/running_sum.cuh"
+#include "intersect/touched_tiles.cuh"
 
 namespace blitzgs::cuda {
 
@@ -23,93 +20,7 @@ namespace {
 using Input = IntersectInput<float>;
 constexpr int kThreads = 256;
 constexpr int kWideRow = 24;  // entries from which a warp writes a row's list together
-
-struct Owned {
-  std::int64_t first, last;  // tiles [first, last)
-  int ty;                    // the tile row in its image
-};
-
-// Calls f(owned tiles) for each tile row the splat touches.
-template <class F>
-__device__ __forceinline__ void for_each_owned(const Input& in, std::int64_t row, const F& f) {
-  const TileGrid& grid = in.grid;
-  const std::int64_t image = in.camera_ids[row] * grid.per_image();
-  const float2 mean2d = reinterpret_cast<const float2*>(in.means2d)[row];
-  const float conic[3] = {in.conics[3 * row], in.conics[3 * row + 1], in.conics[3 * row + 2]};
-  const float center[2] = {mean2d.x, mean2d.y};
-  for_each_tile_row(center, conic, in.opacities[row], grid.width, grid.height, grid.tile_size,
-                    [&](int ty, int begin, int end) {
-                      const std::int64_t base = image + static_cast<std::int64_t>(ty) * grid.tiles_x;
-                      Owned owned{base + begin, base + end, ty};
-                      if (owned.first < grid.tile_begin) owned.first = grid.tile_begin;
-                      if (owned.last > grid.tile_end) owned.last = grid.tile_end;
-                      if (owned.first < owned.last) f(owned);
-                    });
-}
-
-// The owned tiles that a row touches. Compact: tile `first` (from tile_begin on) and up to twelve tile rows,
-// a byte each: in the low half the number of tiles, in the high half 8 + their shift against the first row's.
-// Other shapes have first = kWalk, and the number of tiles in rows[0].
-struct alignas(16) Touched {
-  static constexpr std::uint32_t kWalk = ~0u;
-  static constexpr int kWords = 3;
-  std::uint32_t first, rows[kWords];
-
-  __host__ __device__ std::int32_t count() const {
-    if (first == kWalk) return static_cast<std::int32_t>(rows[0]);
-    constexpr std::uint32_t kCounts = 0x0f0f0f0fu;
-    const std::uint32_t sums = (rows[0] & kCounts) + (rows[1] & kCounts) + (rows[2] & kCounts);
-    return static_cast<std::int32_t>(sums * 0x01010101u >> 24);
-  }
-};
-
-__device__ __forceinline__ Touched find_touched(const Input& in, std::int64_t row) {
-  std::int64_t count = 0, first = in.grid.tile_begin;
-  int top = 0;
-  bool compact = true;
-  Touched touched{};
-  for_each_owned(in, row, [&](const Owned& owned) {
-    if (count == 0) {
-      first = owned.first;
-      top = owned.ty;
-    }
-    const std::int64_t n = owned.last - owned.first;
-    const int down = owned.ty - top;
-    const std::int64_t shift = owned.first - first - static_cast<std::int64_t>(down) * in.grid.tiles_x + 8;
-    compact &= down < 4 * Touched::kWords && n < 16 && shift >= 0 && shift < 16;
-    const std::uint32_t bits = static_cast<std::uint32_t>(shift << 4 | n) << 8 * (down & 3);
-#pragma unroll
-    for (int i = 0; i < Touched::kWords; ++i) touched.rows[i] |= down >> 2 == i ? bits : 0u;
-    count += n;
-  });
-  first -= in.grid.tile_begin;
-  touched.first = static_cast<std::uint32_t>(first);
-  if (!compact || first >= Touched::kWalk) {
-    touched.first = Touched::kWalk;
-    touched.rows[0] = static_cast<std::uint32_t>(count);
-  }
-  return touched;
-}
-
-// Calls f(first tile, from tile_begin on; number of tiles) for each tile row of find_touched().
-template <class F>
-__device__ __forceinline__ void for_each_touched(const Input& in, std::int64_t row, const Touched& touched,
-                                                 const F& f) {
-  if (touched.first == Touched::kWalk) {
-    for_each_owned(in, row, [&](const Owned& owned) {
-      f(owned.first - in.grid.tile_begin, static_cast<int>(owned.last - owned.first));
-    });
-    return;
-  }
-  std::int64_t start = static_cast<std::int64_t>(touched.first) - 8;
-#pragma unroll
-  for (int i = 0; i < Touched::kWords; ++i, start += 4 * in.grid.tiles_x) {
-    std::int64_t tile = start;
-    for (std::uint32_t rows = touched.rows[i]; rows; rows >>= 8, tile += in.grid.tiles_x) {
-      f(tile + (rows >> 4 & 15u), static_cast<int>(rows & 15u));
-    }
-  }
-}
+constexpr int kEmitItems = 2, kEmitRows = kThreads * kEmitItems;  // rows of a thread and of a block
 
 __global__ void count_kernel(const Input in, std::int32_t* counts) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
@@ -166,62 +77,82 @@ __global__ void order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows,
   }
 }
 
-struct GatherCount {
-  const Touched* touched;
-  const std::int32_t* rows;
-  std::int64_t n;
-  __host__ __device__ std::int64_t operator()(std::int64_t i) const {
-    return i < n ? touched[rows[i]].count() : 0;
-  }
-};
-
-// Entries in depth order. offsets [P + 1].
+// Entries in depth order. Blocks take kEmitRows rows each, a warp 32 times kEmitItems of them in a row.
 template <class Key>
-__global__ void emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows,
-                            const std::int64_t* offsets, std::int64_t capacity, Key* keys,
-                            std::int32_t* entries) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
-  const bool present = i < in.n_rows;
-  const std::int32_t row = present ? rows[i] : 0;
-  const std::int64_t offset = present ? offsets[i] : 0;
-  const Touched touched = all_touched[row];
-  const bool wide = present && touched.count() >= kWideRow;
-  if (present && !wide) {
-    std::int64_t at = offset;
-    for_each_touched(in, row, touched, [&](std::int64_t first, int n) {
-      for (int k = 0; k < n && at < capacity; ++k, ++at) {
-        keys[at] = static_cast<Key>(first + k);
-        entries[at] = row;
-      }
-    });
+__global__ void __launch_bounds__(kThreads)
+    emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows, RunningSum running,
+                std::int64_t capacity, Key* keys, std::int32_t* entries) {
+  __shared__ std::int64_t warp_sums[kThreads / 32], entries_before;
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const int block = running.take_turn();
+  const std::int64_t first = static_cast<std::int64_t>(block) * kEmitRows + warp * (32 * kEmitItems) + lane;
+  std::int32_t row[kEmitItems];
+  Touched touched[kEmitItems];
+#pragma unroll
+  for (int k = 0; k < kEmitItems; ++k) row[k] = first + 32 * k < in.n_rows ? rows[first + 32 * k] : -1;
+#pragma unroll
+  for (int k = 0; k < kEmitItems; ++k) touched[k] = row[k] >= 0 ? all_touched[row[k]] : Touched{};
+
+  std::int64_t at[kEmitItems], warp_sum = 0;
+#pragma unroll
+  for (int k = 0; k < kEmitItems; ++k) {
+    const std::int32_t count = touched[k].count();
+    const std::int32_t until = sum_of_lanes_until(count, lane);
+    at[k] = warp_sum + (until - count);
+    warp_sum += __shfl_sync(kFullWarp, until, 31);
   }
-  // Every lane walks a wide row's tile rows, and writes its share of each.
-  const int lane = threadIdx.x % 32;
-  for (unsigned left = __ballot_sync(0xffffffffu, wide); left; left &= left - 1) {
-    const int source = __ffs(left) - 1;
-    const std::int32_t wide_row = __shfl_sync(0xffffffffu, row, source);
-    Touched wide_touched{__shfl_sync(0xffffffffu, touched.first, source), {}};
-    for (int k = 0; k < Touched::kWords; ++k) {
-      wide_touched.rows[k] = __shfl_sync(0xffffffffu, touched.rows[k], source);
+  if (lane == 0) warp_sums[warp] = warp_sum;
+  __syncthreads();
+  std::int64_t before = 0, sum = 0;
+  for (int i = 0; i < kThreads / 32; ++i) {
+    if (i == warp) before = sum;
+    sum += warp_sums[i];
+  }
+  if (warp == 0) {
+    const std::int64_t earlier = running.sum_before(block, sum);
+    if (lane == 0) entries_before = earlier;
+  }
+  __syncthreads();
+  before += entries_before;
+
+#pragma unroll
+  for (int k = 0; k < kEmitItems; ++k) {
+    const bool wide = touched[k].count() >= kWideRow;
+    const std::int64_t offset = before + at[k];
+    if (row[k] >= 0 && !wide) {
+      std::int64_t next = offset;
+      for_each_touched(in, row[k], touched[k], [&](std::int64_t tile, int n) {
+        for (int i = 0; i < n && next < capacity; ++i, ++next) {
+          keys[next] = static_cast<Key>(tile + i);
+          entries[next] = row[k];
+        }
+      });
     }
-    std::int64_t at = __shfl_sync(0xffffffffu, offset, source);
-    for_each_touched(in, wide_row, wide_touched, [&](std::int64_t first, int n) {
-      for (int k = lane; k < n && at + k < capacity; k += 32) {
-        keys[at + k] = static_cast<Key>(first + k);
-        entries[at + k] = wide_row;
-      }
-      at += n;
-    });
+    // Every lane walks a wide row's tile rows, and writes its share of each.
+    for (unsigned left = __ballot_sync(kFullWarp, wide); left; left &= left - 1) {
+      const int source = __ffs(left) - 1;
+      const std::int32_t wide_row = __shfl_sync(kFullWarp, row[k], source);
+      const Touched wide_touched = touched[k].of_lane(source);
+      std::int64_t next = __shfl_sync(kFullWarp, offset, source);
+      for_each_touched(in, wide_row, wide_touched, [&](std::int64_t tile, int n) {
+        for (int i = lane; i < n && next + i < capacity; i += 32) {
+          keys[next + i] = static_cast<Key>(tile + i);
+          entries[next + i] = wide_row;
+        }
+        next += n;
+      });
+    }
   }
 }
 
 // Slots beyond the true count sort behind every tile.
 template <class Key>
-__global__ void fill_tail_kernel(const std::int64_t* total, std::int64_t capacity, Key sentinel, Key* keys,
-                                 std::int32_t* entries) {
+__global__ void fill_tail_kernel(RunningSum running, unsigned n_blocks, std::int64_t capacity, Key sentinel,
+                                 Key* keys, std::int32_t* entries) {
   const std::int64_t step = static_cast<std::int64_t>(gridDim.x) * kThreads;
-  for (std::int64_t i = *total + blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x; i < capacity;
-       i += step) {
+  for (std::int64_t i =
+           running.total(n_blocks) + blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
+       i < capacity; i += step) {
     keys[i] = sentinel;
     entries[i] = 0;
   }
@@ -261,9 +192,8 @@ void sort_pairs(const Key* keys, Key* sorted_keys, const Value* values, Value* s
 }
 
 struct DepthOrder {
-  Touched* touched;       // [P] of each row
-  std::int32_t* rows;     // [P] by (depth, id)
-  std::int64_t* offsets;  // [P + 1] first entry of each
+  Touched* touched;    // [P] of each row
+  std::int32_t* rows;  // [P] by (depth, id)
 };
 
 DepthOrder order_by_depth(const Input& in, Workspace& workspace, CudaStream stream) {
@@ -271,8 +201,7 @@ DepthOrder order_by_depth(const Input& in, Workspace& workspace, CudaStream stre
   auto* keys = workspace.allocate<std::uint32_t>(n);
   auto* sorted_keys = workspace.allocate<std::uint32_t>(n);
   auto* unsorted = workspace.allocate<std::int32_t>(n);
-  DepthOrder order{workspace.allocate<Touched>(n), workspace.allocate<std::int32_t>(n),
-                   workspace.allocate<std::int64_t>(n + 1)};
+  DepthOrder order{workspace.allocate<Touched>(n), workspace.allocate<std::int32_t>(n)};
   depth_keys_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, keys, unsorted, order.touched);
   check_launch("intersect");
   sort_pairs(keys, sorted_keys, unsorted, order.rows, n, 32, workspace, stream);
@@ -280,12 +209,6 @@ DepthOrder order_by_depth(const Input& in, Workspace& workspace, CudaStream stre
     order_ties_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(sorted_keys, order.rows, in.ids, n);
     check_launch("intersect");
   }
-  const auto counted = thrust::make_transform_iterator(thrust::make_counting_iterator(std::int64_t{0}),
-                                                       GatherCount{order.touched, order.rows, n});
-  std::size_t bytes = 0;
-  check(cub::DeviceScan::ExclusiveSum(nullptr, bytes, counted, order.offsets, n + 1, stream), "intersect");
-  void* scratch = workspace.allocate_bytes(bytes);
-  check(cub::DeviceScan::ExclusiveSum(scratch, bytes, counted, order.offsets, n + 1, stream), "intersect");
   return order;
 }
 
@@ -296,11 +219,13 @@ void list_entries(const Input& in, const DepthOrder& order, std::int64_t capacit
   auto* keys = workspace.allocate<Key>(capacity);
   auto* sorted_keys = workspace.allocate<Key>(capacity);
   auto* entries = workspace.allocate<std::int32_t>(capacity);
-  emit_kernel<<<blocks_for(in.n_rows, kThreads), kThreads, 0, stream>>>(
-      in, order.touched, order.rows, order.offsets, capacity, keys, entries);
+  const unsigned blocks = blocks_for(in.n_rows, kEmitRows);
+  const RunningSum running(blocks, workspace, stream);
+  emit_kernel<<<blocks, kThreads, 0, stream>>>(in, order.touched, order.rows, running, capacity, keys,
+                                               entries);
   check_launch("intersect");
-  fill_tail_kernel<<<64, kThreads, 0, stream>>>(order.offsets + in.n_rows, capacity,
-                                                static_cast<Key>(n_tiles), keys, entries);
+  fill_tail_kernel<<<64, kThreads, 0, stream>>>(running, blocks, capacity, static_cast<Key>(n_tiles), keys,
+                                                entries);
   check_launch("intersect");
   int bits = 1;
   while ((std::int64_t{1} << bits) <= n_tiles) ++bits;

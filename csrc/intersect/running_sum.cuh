@@ -1,0 +1,82 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sums of 32-bit counts over lanes, and of block sums over the blocks of one launch while they run.
+#pragma once
+#include <cstdint>
+#include <cuda/atomic>
+
+#include "common/cuda_check.h"
+#include "common/stream.h"
+
+namespace blitzgs::cuda {
+
+inline constexpr unsigned kFullWarp = 0xffffffffu;
+
+__device__ __forceinline__ std::int32_t sum_of_lanes_until(std::int32_t value, int lane) {
+#pragma unroll
+  for (int step = 1; step < 32; step *= 2) {
+    const std::int32_t before = __shfl_up_sync(kFullWarp, value, step);
+    if (lane >= step) value += before;
+  }
+  return value;
+}
+
+// What the blocks before a block add up to, each block a sum in [0, 2^62). A block publishes its own sum,
+// adds up those of its predecessors back to one that already knows the sum up to and including itself, and
+// publishes that: nobody waits for a second launch. Blocks are numbered in the order in which they start, so
+// all predecessors of one that waits run or have run.
+class RunningSum {
+ public:
+  RunningSum(unsigned n_blocks, Workspace& workspace, CudaStream stream)
+      : turn_(workspace.allocate<std::uint64_t>(n_blocks + 1)), states_(turn_ + 1) {
+    check(cudaMemsetAsync(turn_, 0, (n_blocks + 1) * sizeof(std::uint64_t), stream), "running sum");
+  }
+
+  // The block's number; called once by all its threads, and a barrier for them.
+  __device__ int take_turn() const {
+    __shared__ int turn;
+    if (threadIdx.x == 0) turn = static_cast<int>(Word(*turn_).fetch_add(1, ::cuda::memory_order_relaxed));
+    __syncthreads();
+    return turn;
+  }
+
+  // Called by one whole warp of the block.
+  __device__ std::int64_t sum_before(int block, std::int64_t own) const {
+    const int lane = threadIdx.x % 32;
+    if (lane == 0) publish(block, kOwn, own);
+    std::int64_t sum = 0;
+    for (int end = block; end > 0; end -= 32) {
+      const int at = end - 1 - lane;
+      std::uint64_t state = kThrough;  // in front of the first block there is nothing
+      do {
+        if (at >= 0) state = Word(states_[at]).load(::cuda::memory_order_relaxed);
+      } while (__any_sync(kFullWarp, state < kOwn));
+      const unsigned through = __ballot_sync(kFullWarp, state >= kThrough);
+      std::int64_t part = lane <= __ffs(through) - 1 || !through ? value(state) : 0;
+      for (int step = 16; step > 0; step /= 2) part += __shfl_xor_sync(kFullWarp, part, step);
+      sum += part;
+      if (through) break;
+    }
+    if (lane == 0) publish(block, kThrough, sum + own);
+    return sum;
+  }
+
+  // In a later launch: of all blocks.
+  __device__ std::int64_t total(unsigned n_blocks) const { return value(states_[n_blocks - 1]); }
+
+ private:
+  using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
+  // In the two high bits, what the rest is: the block's own sum, or that of all blocks through this one.
+  // State and sum are one word, so no fence orders them.
+  static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kThrough = std::uint64_t{2} << 62;
+
+  __device__ static std::int64_t value(std::uint64_t state) {
+    return static_cast<std::int64_t>(state & (kOwn - 1));
+  }
+  __device__ void publish(int block, std::uint64_t kind, std::int64_t sum) const {
+    Word(states_[block]).store(kind | static_cast<std::uint64_t>(sum), ::cuda::memory_order_relaxed);
+  }
+
+  std::uint64_t *turn_, *states_;
+};
+
+}  // namespace blitzgs::cuda
