@@ -10,6 +10,7 @@
 #include <string>
 
 #include "rasterize/backward_pixel.cuh"
+#include "rasterize/unpack_gradients.cuh"
 
 namespace blitzgs::cuda {
 
@@ -215,30 +216,6 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) :
   }
 }
 
-// colors_only: an earlier chunk gave the gradient of everything else.
-__global__ void unpack_kernel(const PackedGradient* packed, std::int64_t n, ChannelChunk chunk,
-                              bool colors_only, RasterizeGradients<float> out) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
-  if (i >= n) return;
-  const float4 a = packed[i].quads[0], b = packed[i].quads[1], c = packed[i].quads[2];
-  const float color[4] = {b.z, b.w, c.x, c.y};
-  float* v_color = out.v_colors + i * chunk.n_channels + chunk.first;
-  for (int k = 0; k < chunk.count; ++k) v_color[k] = color[k];
-  if (colors_only) return;
-  const bool add = chunk.first > 0;  // later channels add to what the first ones gave
-  const auto store = [add](float* address, float value) { *address = add ? *address + value : value; };
-  store(out.v_means2d + 2 * i, a.x);
-  store(out.v_means2d + 2 * i + 1, a.y);
-  store(out.v_conics + 3 * i, a.z);
-  store(out.v_conics + 3 * i + 1, a.w);
-  store(out.v_conics + 3 * i + 2, b.x);
-  store(out.v_opacities + i, b.y);
-  if (out.v_means2d_abs) {
-    out.v_means2d_abs[2 * i] = c.z;
-    out.v_means2d_abs[2 * i + 1] = c.w;
-  }
-}
-
 __global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
   if (i < n) values[i] = static_cast<std::int32_t>(i);
@@ -368,8 +345,8 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
         check_launch("rasterize_bwd");
       }
     }
-    unpack_kernel<<<blocks_for(in.n_rows, 256), 256, 0, stream>>>(packed, in.n_rows, chunk,
-                                                                  absolute && first > 0, gradients);
+    unpack_kernel<<<blocks_for(in.n_rows, kUnpackThreads), kUnpackThreads, 0, stream>>>(
+        packed, in.n_rows, chunk, absolute && first > 0, gradients);
     check_launch("rasterize_bwd");
   }
 }

@@ -8,6 +8,8 @@ namespace blitzgs::cuda {
 
 namespace {
 
+constexpr int kPackThreads = 256;
+
 struct ForwardArguments {
   const PackedRow* rows;
   ChannelChunk chunk;
@@ -18,9 +20,7 @@ struct ForwardArguments {
   RasterizeOutput<float> out;
 };
 
-__global__ void pack_rows_kernel(RasterizeInput<float> in, PackedRow* rows, float4* colors) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
-  if (i >= in.n_rows) return;
+__device__ __forceinline__ PackedRow pack_row(const RasterizeInput<float>& in, std::int64_t i) {
   const float conic[3] = {in.conics[3 * i], in.conics[3 * i + 1], in.conics[3 * i + 2]};
   const ConicFactor<float> factor = factor_conic(conic);
   PackedRow row;
@@ -33,8 +33,25 @@ __global__ void pack_rows_kernel(RasterizeInput<float> in, PackedRow* rows, floa
   row.dx_per_dy = -conic[1] / conic[0];
   const float width = sqrtf(conic[2] / static_cast<float>(conic_determinant(conic)));
   row.turn = conic[1] == 0.f ? 0.f : -(conic[1] / conic[2]) * (width / kFactorScale);
-  rows[i] = row;
-  if (!colors) return;
+  return row;
+}
+
+// A warp's rows go through shared memory, so that each store fills whole sectors.
+__global__ void pack_rows_kernel(RasterizeInput<float> in, PackedRow* rows, float4* colors) {
+  __shared__ PackedRow stages[kPackThreads];
+  const PackedRow* stage = stages + threadIdx.x / 32 * 32;
+  const int lane = threadIdx.x % 32;
+  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kPackThreads) + threadIdx.x;
+  if (i < in.n_rows) stages[threadIdx.x] = pack_row(in, i);
+  __syncwarp();
+#pragma unroll
+  for (int k = 0; k < 2; ++k) {
+    const std::int64_t at = 2 * (i - lane) + 32 * k + lane;
+    if (at < 2 * in.n_rows) {
+      reinterpret_cast<float4*>(rows)[at] = reinterpret_cast<const float4*>(stage)[32 * k + lane];
+    }
+  }
+  if (!colors || i >= in.n_rows) return;
   const float* color = in.colors + i * in.n_channels;
   float4 c{color[0], 0.f, 0.f, 0.f};
   if (in.n_channels > 1) c.y = color[1];
@@ -207,8 +224,8 @@ void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput
   if (in.grid.count() == 0) return;
   float4* colors = in.n_channels <= 4 ? const_cast<float4*>(aux_colors(aux, in.n_rows)) : nullptr;
   if (in.n_rows > 0) {
-    pack_rows_kernel<<<blocks_for(in.n_rows, 256), 256, 0, stream>>>(in, static_cast<PackedRow*>(aux),
-                                                                     colors);
+    pack_rows_kernel<<<blocks_for(in.n_rows, kPackThreads), kPackThreads, 0, stream>>>(
+        in, static_cast<PackedRow*>(aux), colors);
     check_launch("pack_rows");
   }
   for (int first = 0; first < in.n_channels; first += 4) {
