@@ -48,7 +48,7 @@ def in_morton_order(scene: BenchmarkScene) -> BenchmarkScene:
 
 def active_rows(scene: BenchmarkScene) -> tuple[Tensor, Tensor]:
     raw = scene.raw()
-    bounds = torch.empty(-(-len(scene.means) // BLOCK_ROWS), 7, device=scene.means.device)
+    bounds = torch.empty(-(-len(scene.means) // BLOCK_ROWS), 8, device=scene.means.device)
     update_block_bounds_(bounds, None, raw["means"], raw["scales"])
     return cull_blocks(
         bounds, raw["means"], raw["scales"], scene.viewmats, scene.Ks, scene.width, scene.height, 0.01, 1e10

@@ -14,7 +14,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
       "Tensor? moment_step, Tensor? table, Tensor viewmats, Tensor Ks, int width, int height, "
-      "float near_plane, float far_plane, float eps2d) -> (Tensor active_ids, Tensor active_views)");
+      "float near_plane, float far_plane, float eps2d, int room) -> (Tensor active_ids, "
+      "Tensor active_views)");
 
   // Projection: parameters to screen-space rows, ordered by (Gaussian, view).
   m.def(

@@ -57,8 +57,8 @@ def update_block_bounds_(
     """Recompute the bounds of the blocks that hold the rows `ids` (None: of all blocks), in place.
 
     Args:
-        bounds: float32 [ceil(N / 256), 7]: lowest and highest corner of where the means can be, largest
-            standard deviation.
+        bounds: float32 [ceil(N / 256), 8]: lowest and highest corner of where the means can be, largest
+            standard deviation, 1 when all rows are finite.
         ids: int32 [U], rows that changed.
         means: float32 [N, 3].
         scales: float32 [N, 3], logarithms of the standard deviations.
@@ -82,6 +82,7 @@ def cull_blocks(
     far_plane: float,
     eps2d: float = 0.3,
     pending: PendingSteps | None = None,
+    room: int | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return the rows that may show in at least one of B views, without reading those of blocks outside.
 
@@ -100,6 +101,7 @@ def cull_blocks(
         far_plane: rows at z > far_plane are not seen.
         eps2d: screen-space blur, pixels squared.
         pending: as given to `update_block_bounds_`.
+        room: rows of memory to take for the set; one that turns out larger takes longer. None: N.
 
     Returns:
         (active_ids int32 [A] ascending, active_views int32 [A]: bit v set when view v may see the row).
@@ -119,6 +121,7 @@ def cull_blocks(
         near_plane,
         far_plane,
         eps2d,
+        len(means) if room is None else room,
     )
 
 

@@ -37,8 +37,9 @@ class BlockIndex:
                 pending; None: rows stand where they are.
         """
         self._schedule = schedule
+        self._room = len(table) // 4
         count = -(-len(table) // BLOCK_ROWS)
-        self._bounds = torch.empty(count, 7, dtype=torch.float32, device=table.device)
+        self._bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
         self.update(table, None)
 
     def active(
@@ -57,10 +58,13 @@ class BlockIndex:
         The result depends on each row's own state alone, neither on the order of the rows nor on how they are
         divided among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
         """
-        return cull_blocks(
+        active = cull_blocks(
             self._bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
-            eps2d, self._pending(table),
+            eps2d, self._pending(table), self._room,
         )  # fmt: skip
+        # Views differ; the largest set so far, and some more, is room enough for most that follow.
+        self._room = max(self._room, min(len(active[0]) * 9 // 8, len(table)))
+        return active
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:
         """Take note that the optimiser stepped the rows `ids` (int32 [U]; None: any row may have changed).

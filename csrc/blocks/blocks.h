@@ -12,10 +12,12 @@
 // over the clamped slopes u. Multiplied by z each is a linear inequality n . p + d + k sigma >= 0, which a
 // box fails only if its farthest corner does. Blocks are tested first, then the rows of the blocks that are
 // left, by the same inequalities on the row's own line. Blocks get twice the rounding slack, so the result is
-// the set of rows that pass their own test: it does not depend on how rows are grouped.
+// the set of rows that pass their own test: it does not depend on how rows are grouped. For the same reason
+// the rows of a block need not be read where its box, with sigma = 0, satisfies all inequalities with slack
+// to spare: then all its rows pass. What is left to read are blocks across a view's border.
 //
 // Conservative: every row that projection would emit is in the set (tests/view/test_blocks.py).
-// O(N / 256 + rows of the blocks that are left) per view.
+// O(N / 256 + rows of the blocks across a border + active rows) per view.
 #pragma once
 #include <cfloat>
 #include <cmath>
@@ -29,11 +31,16 @@
 namespace blitzgs {
 
 constexpr int kBlockRows = 256;
-constexpr int kBlockBounds = 7;  // lowest corner, highest corner, largest sigma
+constexpr int kBlockBounds = 8;  // lowest corner, highest corner, largest sigma, whether all rows are finite
 constexpr int kMaxViews = 32;
 constexpr int kPlanes = 6;
 
 BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
+
+BLITZGS_HD int rows_in_block(std::int64_t rows, std::int64_t block) {
+  const std::int64_t rest = rows - block * kBlockRows;
+  return static_cast<int>(rest < kBlockRows ? rest : kBlockRows);
+}
 
 // Where rows are and where pending steps may take them. Moments null: nothing is pending.
 struct BlockRows {
@@ -69,20 +76,24 @@ BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, std::int64_t row) {
     mean_tail = static_cast<float>(decay * entry[kTails]);
     scale_tail = static_cast<float>(decay * entry[kTails + 2]);
   }
+  // All loads before any arithmetic: on the GPU they then wait together.
+  float mean[3], scale[3], moments[2][3] = {}, squares[2][3] = {};
+  for (int axis = 0; axis < 3; ++axis) {
+    const std::int64_t at = 3 * row + axis;
+    mean[axis] = rows.means[at], scale[axis] = rows.scales[at];
+    if (rows.exp_avg_means) {
+      moments[0][axis] = rows.exp_avg_means[at], squares[0][axis] = rows.exp_avg_sq_means[at];
+      moments[1][axis] = rows.exp_avg_scales[at], squares[1][axis] = rows.exp_avg_sq_scales[at];
+    }
+  }
   SweptBox swept;
   float largest = -FLT_MAX, check = 0.0f;
   for (int axis = 0; axis < 3; ++axis) {
-    const std::int64_t at = 3 * row + axis;
-    const float mean = rows.means[at], scale = rows.scales[at];
-    float drift = 0.0f, growth = 0.0f;
-    if (rows.exp_avg_means) {
-      drift = pending_drift(rows.exp_avg_means[at], rows.exp_avg_sq_means[at], mean_tail);
-      growth = pending_drift(rows.exp_avg_scales[at], rows.exp_avg_sq_scales[at], scale_tail);
-    }
-    const float end = mean - drift, shrunk = scale - growth;
-    swept.low[axis] = mean < end ? mean : end;
-    swept.high[axis] = mean < end ? end : mean;
-    largest = scale > largest ? scale : largest;
+    const float end = mean[axis] - pending_drift(moments[0][axis], squares[0][axis], mean_tail);
+    const float shrunk = scale[axis] - pending_drift(moments[1][axis], squares[1][axis], scale_tail);
+    swept.low[axis] = mean[axis] < end ? mean[axis] : end;
+    swept.high[axis] = mean[axis] < end ? end : mean[axis];
+    largest = scale[axis] > largest ? scale[axis] : largest;
     largest = shrunk > largest ? shrunk : largest;
     check += (end - end) + (shrunk - shrunk);
   }
@@ -99,9 +110,12 @@ BLITZGS_HD void extend(SweptBox& box, const SweptBox& other) {
   box.sigma = other.sigma > box.sigma ? other.sigma : box.sigma;
 }
 
-BLITZGS_HD void store_box(const SweptBox& box, float* bounds) {
+BLITZGS_HD bool is_empty(const SweptBox& box) { return box.low[0] > box.high[0]; }
+
+BLITZGS_HD void store_bounds(const SweptBox& box, bool all_finite, float* bounds) {
   for (int axis = 0; axis < 3; ++axis) bounds[axis] = box.low[axis], bounds[3 + axis] = box.high[axis];
   bounds[6] = box.sigma;
+  bounds[7] = all_finite ? 1.0f : 0.0f;
 }
 
 BLITZGS_HD SweptBox load_box(const float* bounds) {
@@ -171,45 +185,73 @@ BLITZGS_HD CullView make_cull_view(const CullCamera& camera, int view) {
   return cull;
 }
 
-// Whether a view may see something of the box. slack: share of each term that rounding may have eaten.
-BLITZGS_HD bool may_see(const CullView& view, const SweptBox& box, float slack) {
+// What a view sees of a box: maybe something of it, for sure all that is in it.
+struct Sight {
+  bool some, all;
+};
+
+// slack: share of each term that rounding may have eaten.
+BLITZGS_HD Sight sight_of(const CullView& view, const SweptBox& box, float slack) {
   float centre[3], half[3];
   for (int axis = 0; axis < 3; ++axis) {
     centre[axis] = 0.5f * box.low[axis] + 0.5f * box.high[axis];
     half[axis] = 0.5f * box.high[axis] - 0.5f * box.low[axis];
-    if (half[axis] < 0.0f) return false;  // empty
+    if (half[axis] < 0.0f) return {false, false};  // empty
     half[axis] += slack * (std::fabs(centre[axis]) + half[axis]);
   }
+  Sight sight{true, true};
   for (int i = 0; i < kPlanes; ++i) {
     const CullPlane& plane = view.planes[i];
-    float value = plane.d + slack * std::fabs(plane.d) + plane.k * box.sigma;
+    float value = plane.d, reach = slack * std::fabs(plane.d);
     for (int axis = 0; axis < 3; ++axis) {
-      value += plane.n[axis] * centre[axis] + std::fabs(plane.n[axis]) * half[axis];
+      value += plane.n[axis] * centre[axis];
+      reach += std::fabs(plane.n[axis]) * half[axis];
     }
-    if (value < 0.0f) return false;
+    if (value + reach + plane.k * box.sigma < 0.0f) sight.some = false;
+    if (!(value - reach >= 0.0f)) sight.all = false;
   }
-  return true;
+  return sight;
 }
 
 constexpr float kRowSlack = 4e-6f, kBlockSlack = 8e-6f;
 
-BLITZGS_HD std::uint32_t views_of(const CullView* views, int count, std::uint32_t candidates,
-                                  const SweptBox& box, float slack) {
-  std::uint32_t mask = 0;
+// The views that may see a block, and those of them that see all its rows, one bit each.
+struct BlockViews {
+  std::uint32_t some, all;
+};
+
+BLITZGS_HD BlockViews views_of_block(const CullView* views, int count, const float* bounds) {
+  const SweptBox box = load_box(bounds);
+  BlockViews result{0, 0};
   for (int view = 0; view < count; ++view) {
-    if ((candidates >> view & 1u) && may_see(views[view], box, slack)) mask |= 1u << view;
+    const Sight sight = sight_of(views[view], box, kBlockSlack);
+    if (sight.some) result.some |= 1u << view;
+    if (sight.some && sight.all) result.all |= 1u << view;
+  }
+  if (bounds[7] == 0.0f) result.all = 0;
+  return result;
+}
+
+// Whether the block's rows have to be tested one by one.
+BLITZGS_HD bool is_mixed(const BlockViews& block) { return block.some != block.all; }
+
+BLITZGS_HD std::uint32_t views_of_row(const CullView* views, int count, const BlockViews& block,
+                                      const SweptBox& box) {
+  std::uint32_t mask = block.all;
+  for (int view = 0; view < count; ++view) {
+    const bool asked = ((block.some & ~block.all) >> view & 1u) != 0;
+    if (asked && sight_of(views[view], box, kRowSlack).some) mask |= 1u << view;
   }
   return mask;
 }
 
-// What cull_count leaves for cull_emit: the blocks that are left, ascending, the views of their rows, and the
-// active rows before each.
+// What cull_count leaves for cull_emit: the views of each block, those of the rows of mixed blocks, and the
+// active rows before each block.
 struct CullPlan {
-  std::int32_t* blocks;        // [count]
-  std::uint32_t* masks;        // [count, 256]
-  std::int64_t* rows_before;   // [count + 1]
-  std::int64_t* device_count;  // CUDA: where `count` lies
-  std::int64_t count, total;   // blocks left (CPU), active rows
+  BlockViews* blocks;         // [blocks_of(n)]
+  std::uint32_t* masks;       // [n]
+  std::int32_t* rows_before;  // [blocks_of(n) + 1]
+  std::int64_t n;
 };
 
 namespace cpu {
@@ -219,8 +261,10 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
                          Workspace&, CudaStream);
 void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
                 CullPlan& plan, Workspace&, CudaStream);
-void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views, Workspace&,
-               CudaStream);
+// Writes the first `room` active rows. Returns how many there are, for which CUDA waits, but not for the
+// rows.
+std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* active_ids,
+                       std::int32_t* active_views, CudaStream);
 }  // namespace cpu
 namespace cuda {
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
@@ -228,8 +272,8 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
                          Workspace&, CudaStream);
 void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
                 CullPlan& plan, Workspace&, CudaStream);
-void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views, Workspace&,
-               CudaStream);
+std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* active_ids,
+                       std::int32_t* active_views, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -8,11 +8,16 @@ namespace blitzgs::cpu {
 
 namespace {
 
-SweptBox sweep_block(const BlockRows& rows, std::int64_t block) {
+void bound_block(const BlockRows& rows, std::int64_t block, float* bounds) {
   SweptBox box = empty_box();
+  bool all_finite = true;
   const std::int64_t end = std::min(rows.n, (block + 1) * kBlockRows);
-  for (std::int64_t row = block * kBlockRows; row < end; ++row) extend(box, sweep_row(rows, row));
-  return box;
+  for (std::int64_t row = block * kBlockRows; row < end; ++row) {
+    const SweptBox swept = sweep_row(rows, row);
+    extend(box, swept);
+    all_finite &= !is_empty(swept);
+  }
+  store_bounds(box, all_finite, bounds + block * kBlockBounds);
 }
 
 }  // namespace
@@ -34,7 +39,7 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
   for (std::int64_t i = 0; ids && i < n_ids; ++i) touched[ids[i] / kBlockRows] = 1;
   parallel_for(0, blocks, 16, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
-      if (touched[block]) store_box(sweep_block(rows, block), bounds + block * kBlockBounds);
+      if (touched[block]) bound_block(rows, block, bounds);
     }
   });
 }
@@ -43,52 +48,54 @@ void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& ca
                 CullPlan& plan, Workspace& workspace, CudaStream) {
   CullView planes[kMaxViews];
   for (int view = 0; view < views; ++view) planes[view] = make_cull_view(camera, view);
-  const std::uint32_t all = views == kMaxViews ? ~0u : (1u << views) - 1;
   const std::int64_t blocks = blocks_of(rows.n);
-  std::uint32_t* block_masks = workspace.allocate<std::uint32_t>(blocks);
+  plan.n = rows.n;
+  plan.blocks = workspace.allocate<BlockViews>(blocks);
+  plan.masks = workspace.allocate<std::uint32_t>(rows.n);
+  plan.rows_before = workspace.allocate<std::int32_t>(blocks + 1);
+  std::int32_t* active = plan.rows_before + 1;
   parallel_for(0, blocks, 1024, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
-      block_masks[block] = views_of(planes, views, all, load_box(bounds + block * kBlockBounds), kBlockSlack);
+      plan.blocks[block] = views_of_block(planes, views, bounds + block * kBlockBounds);
+      active[block] = plan.blocks[block].all ? rows_in_block(rows.n, block) : 0;
     }
   });
-  plan.blocks = workspace.allocate<std::int32_t>(blocks);
-  plan.count = 0;
+  std::int32_t* mixed = workspace.allocate<std::int32_t>(blocks);
+  std::int64_t count = 0;
   for (std::int64_t block = 0; block < blocks; ++block) {
-    if (block_masks[block]) plan.blocks[plan.count++] = static_cast<std::int32_t>(block);
+    if (is_mixed(plan.blocks[block])) mixed[count++] = static_cast<std::int32_t>(block);
   }
-  plan.masks = workspace.allocate<std::uint32_t>(plan.count * kBlockRows);
-  plan.rows_before = workspace.allocate<std::int64_t>(plan.count + 1);
-  parallel_for(0, plan.count, 16, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(0, count, 16, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
-      std::uint32_t* masks = plan.masks + i * kBlockRows;
-      std::int64_t active = 0;
-      for (int local = 0; local < kBlockRows; ++local) {
-        const std::int64_t row = std::int64_t{plan.blocks[i]} * kBlockRows + local;
-        const std::uint32_t candidates = row < rows.n ? block_masks[plan.blocks[i]] : 0;
-        masks[local] = candidates ? views_of(planes, views, candidates, sweep_row(rows, row), kRowSlack) : 0;
-        active += masks[local] != 0;
+      const std::int64_t block = mixed[i], first = block * kBlockRows;
+      active[block] = 0;
+      for (std::int64_t row = first; row < first + rows_in_block(rows.n, block); ++row) {
+        plan.masks[row] = views_of_row(planes, views, plan.blocks[block], sweep_row(rows, row));
+        active[block] += plan.masks[row] != 0;
       }
-      plan.rows_before[i + 1] = active;
     }
   });
   plan.rows_before[0] = 0;
-  for (std::int64_t i = 0; i < plan.count; ++i) plan.rows_before[i + 1] += plan.rows_before[i];
-  plan.total = plan.rows_before[plan.count];
+  for (std::int64_t block = 0; block < blocks; ++block) active[block] += plan.rows_before[block];
 }
 
-void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views, Workspace&,
-               CudaStream) {
-  parallel_for(0, plan.count, 64, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      std::int64_t at = plan.rows_before[i];
-      for (int local = 0; local < kBlockRows; ++local) {
-        const std::uint32_t mask = plan.masks[i * kBlockRows + local];
-        if (!mask) continue;
-        active_ids[at] = plan.blocks[i] * kBlockRows + local;
+std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* active_ids,
+                       std::int32_t* active_views, CudaStream) {
+  parallel_for(0, blocks_of(plan.n), 64, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t block = begin; block < end; ++block) {
+      if (!plan.blocks[block].some) continue;
+      std::int64_t at = plan.rows_before[block];
+      const bool mixed = is_mixed(plan.blocks[block]);
+      const std::int64_t first = block * kBlockRows;
+      for (std::int64_t row = first; row < first + rows_in_block(plan.n, block); ++row) {
+        const std::uint32_t mask = mixed ? plan.masks[row] : plan.blocks[block].all;
+        if (!mask || at >= room) continue;
+        active_ids[at] = static_cast<std::int32_t>(row);
         active_views[at++] = static_cast<std::int32_t>(mask);
       }
     }
   });
+  return plan.rows_before[blocks_of(plan.n)];
 }
 
 }  // namespace blitzgs::cpu

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <thrust/iterator/counting_iterator.h>
+#include <cub/device/device_scan.cuh>
 
-#include <cub/cub.cuh>
+#include <algorithm>
+#include <atomic>
 
 #include "blocks/blocks.h"
 #include "common/cuda_check.h"
@@ -19,98 +20,158 @@ __global__ void make_keys(const float* points, std::int64_t n, const MortonBound
   if (i < n) keys[i] = static_cast<std::int64_t>(morton_code(points + 3 * i, frame_of(*bounds)) >> 1);
 }
 
-__global__ void mark_blocks(const std::int32_t* ids, std::int64_t n, std::uint8_t* touched) {
+// Items of a warp's lanes take neighbouring places in a list: one addition a warp. All lanes call.
+__device__ void append(bool present, std::int32_t item, std::int32_t* list, std::int32_t* length) {
+  const unsigned all = __ballot_sync(~0u, present);
+  if (!all) return;
+  const int lane = threadIdx.x % 32, leader = __ffs(all) - 1;
+  std::int32_t first = 0;
+  if (lane == leader) first = atomicAdd(length, __popc(all));
+  first = __shfl_sync(~0u, first, leader);
+  if (present) list[first + __popc(all & ((1u << lane) - 1))] = item;
+}
+
+// Rows ascend, so a block is listed where its first row is met; otherwise it is listed more often, which
+// costs time alone.
+__global__ void list_blocks(const std::int32_t* ids, std::int64_t n, std::int32_t* list,
+                            std::int32_t* length) {
   const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
-  if (i >= n) return;
-  // Rows ascend, so most have the block of the row before: one store a block.
-  const std::int32_t block = ids[i] / kBlockRows;
-  if (i == 0 || ids[i - 1] / kBlockRows != block) touched[block] = 1;
+  const std::int32_t block = i < n ? ids[i] / kBlockRows : 0;
+  append(i < n && (i == 0 || ids[i - 1] / kBlockRows != block), block, list, length);
 }
 
-// One CUDA block a block, one thread a row. touched null: all.
+// The blocks of the list in turn, a thread a row. list null: all blocks.
 __global__ void __launch_bounds__(kBlockRows)
-    update_bounds(const BlockRows rows, const std::uint8_t* touched, float* bounds) {
-  if (touched && !touched[blockIdx.x]) return;
+    update_bounds(const BlockRows rows, const std::int32_t* list, const std::int32_t* length, float* bounds) {
   __shared__ SweptBox warps[kWarps];
-  const std::int64_t row = blockIdx.x * std::int64_t{kBlockRows} + threadIdx.x;
-  SweptBox box = row < rows.n ? sweep_row(rows, row) : empty_box();
-  for (int offset = 16; offset > 0; offset /= 2) {
-    SweptBox other;
-    for (int axis = 0; axis < 3; ++axis) {
-      other.low[axis] = __shfl_xor_sync(~0u, box.low[axis], offset);
-      other.high[axis] = __shfl_xor_sync(~0u, box.high[axis], offset);
+  const std::int64_t count = list ? *length : blocks_of(rows.n);
+  for (std::int64_t i = blockIdx.x; i < count; i += gridDim.x) {
+    const std::int64_t block = list ? list[i] : i;
+    const bool present = threadIdx.x < rows_in_block(rows.n, block);
+    SweptBox box = present ? sweep_row(rows, block * kBlockRows + threadIdx.x) : empty_box();
+    const bool finite = !present || !is_empty(box);
+    for (int offset = 16; offset > 0; offset /= 2) {
+      SweptBox other;
+      for (int axis = 0; axis < 3; ++axis) {
+        other.low[axis] = __shfl_xor_sync(~0u, box.low[axis], offset);
+        other.high[axis] = __shfl_xor_sync(~0u, box.high[axis], offset);
+      }
+      other.sigma = __shfl_xor_sync(~0u, box.sigma, offset);
+      extend(box, other);
     }
-    other.sigma = __shfl_xor_sync(~0u, box.sigma, offset);
-    extend(box, other);
+    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = box;
+    const bool all_finite = __syncthreads_and(finite);
+    if (threadIdx.x == 0) {
+      for (int warp = 1; warp < kWarps; ++warp) extend(box, warps[warp]);
+      store_bounds(box, all_finite, bounds + block * kBlockBounds);
+    }
+    __syncthreads();
   }
-  if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = box;
-  __syncthreads();
-  if (threadIdx.x != 0) return;
-  for (int warp = 1; warp < kWarps; ++warp) extend(box, warps[warp]);
-  store_box(box, bounds + blockIdx.x * std::int64_t{kBlockBounds});
 }
 
-__device__ void load_views(const CullCamera& camera, int views, CullView* planes) {
-  if (threadIdx.x < views) planes[threadIdx.x] = make_cull_view(camera, threadIdx.x);
-  __syncthreads();
-}
-
-__global__ void test_blocks(const float* bounds, std::int64_t blocks, CullCamera camera, int views,
-                            std::uint32_t* masks) {
+// One thread a block. Lists the mixed blocks, in any order, and counts the active rows of the others. Leaves
+// the planes of the views for test_rows.
+__global__ void test_blocks(const float* bounds, CullCamera camera, int views, const CullPlan plan,
+                            std::int32_t* active, std::int32_t* list, std::int32_t* length,
+                            CullView* planes_out) {
   __shared__ CullView planes[kMaxViews];
-  load_views(camera, views, planes);
-  const std::int64_t block = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
-  const std::uint32_t all = views == kMaxViews ? ~0u : (1u << views) - 1;
+  const int thread = threadIdx.x;
+  if (thread < views) {
+    planes[thread] = make_cull_view(camera, thread);
+    if (blockIdx.x == 0) planes_out[thread] = planes[thread];
+  }
+  __syncthreads();
+  const std::int64_t blocks = blocks_of(plan.n), block = blockIdx.x * std::int64_t{blockDim.x} + thread;
+  BlockViews seen{0, 0};
   if (block < blocks)
-    masks[block] = views_of(planes, views, all, load_box(bounds + block * kBlockBounds), kBlockSlack);
+    plan.blocks[block] = seen = views_of_block(planes, views, bounds + block * kBlockBounds);
+  if (block <= blocks) active[block] = seen.all && !is_mixed(seen) ? rows_in_block(plan.n, block) : 0;
+  append(is_mixed(seen), static_cast<std::int32_t>(block), list, length);
 }
 
-// Blocks of the list in turn, a thread a row. The list's length stays on the device.
+// Blocks of the list in turn, a thread a row.
 __global__ void __launch_bounds__(kBlockRows)
-    test_rows(const BlockRows rows, CullCamera camera, int views, const std::uint32_t* block_masks,
-              const CullPlan plan, std::int64_t* active) {
-  __shared__ CullView planes[kMaxViews];
-  load_views(camera, views, planes);
-  const std::int64_t count = *plan.device_count;
-  for (std::int64_t i = blockIdx.x; i < count; i += gridDim.x) {
-    const std::int32_t block = plan.blocks[i];
-    const std::int64_t row = std::int64_t{block} * kBlockRows + threadIdx.x;
+    test_rows(const BlockRows rows, const CullView* planes, int views, const CullPlan plan,
+              const std::int32_t* list, const std::int32_t* length, std::int32_t* active) {
+  __shared__ CullView shared[kMaxViews];
+  const std::int32_t count = *length;
+  if (static_cast<std::int32_t>(blockIdx.x) >= count) return;
+  if (threadIdx.x < views) shared[threadIdx.x] = planes[threadIdx.x];
+  __syncthreads();
+  for (std::int32_t i = blockIdx.x; i < count; i += gridDim.x) {
+    const std::int64_t block = list[i], row = block * kBlockRows + threadIdx.x;
     std::uint32_t mask = 0;
-    if (row < rows.n) mask = views_of(planes, views, block_masks[block], sweep_row(rows, row), kRowSlack);
-    plan.masks[i * kBlockRows + threadIdx.x] = mask;
+    if (row < rows.n) {
+      mask = views_of_row(shared, views, plan.blocks[block], sweep_row(rows, row));
+      plan.masks[row] = mask;
+    }
     const int total = __syncthreads_count(mask != 0);
-    if (threadIdx.x == 0) active[i] = total;
+    if (threadIdx.x == 0) active[block] = total;
   }
 }
 
-__global__ void __launch_bounds__(kBlockRows)
-    emit_rows(const CullPlan plan, std::int32_t* active_ids, std::int32_t* active_views) {
-  __shared__ int before[kWarps];
-  const std::int64_t count = *plan.device_count;
-  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  for (std::int64_t i = blockIdx.x; i < count; i += gridDim.x) {
-    const std::uint32_t mask = plan.masks[i * kBlockRows + threadIdx.x];
+// A warp a block. The host is told the number of active rows first of all.
+__global__ void emit_rows(const CullPlan plan, std::int64_t room, std::int32_t* active_ids,
+                          std::int32_t* active_views, volatile std::int32_t* total) {
+  if (blockIdx.x == 0 && threadIdx.x == 0) {
+    *total = plan.rows_before[blocks_of(plan.n)];
+    __threadfence_system();
+  }
+  const std::int64_t block = blockIdx.x * std::int64_t{kWarps} + threadIdx.x / 32;
+  if (block >= blocks_of(plan.n)) return;
+  const BlockViews seen = plan.blocks[block];
+  if (!seen.some) return;
+  const bool mixed = is_mixed(seen);
+  const int lane = threadIdx.x % 32, count = rows_in_block(plan.n, block);
+  std::int64_t at = plan.rows_before[block];
+#pragma unroll
+  for (int local = lane; local < kBlockRows; local += 32) {
+    const std::int64_t row = block * kBlockRows + local;
+    const std::uint32_t mask = local >= count ? 0 : mixed ? plan.masks[row] : seen.all;
     const std::uint32_t ballot = __ballot_sync(~0u, mask != 0);
-    __syncthreads();
-    if (lane == 0) before[warp] = __popc(ballot);
-    __syncthreads();
-    if (!mask) continue;
-    std::int64_t at = plan.rows_before[i] + __popc(ballot & ((1u << lane) - 1));
-    for (int w = 0; w < warp; ++w) at += before[w];
-    active_ids[at] = plan.blocks[i] * kBlockRows + threadIdx.x;
-    active_views[at] = static_cast<std::int32_t>(mask);
+    const std::int64_t place = at + __popc(ballot & ((1u << lane) - 1));
+    if (mask && place < room) {
+      active_ids[place] = static_cast<std::int32_t>(row);
+      active_views[place] = static_cast<std::int32_t>(mask);
+    }
+    at += __popc(ballot);
   }
 }
 
-struct IsSet {
-  const std::uint32_t* masks;
-  __device__ bool operator()(std::int32_t block) const { return masks[block] != 0; }
+// A number >= 0 that a kernel writes to the host's memory. The host learns of it while the kernel still runs:
+// sooner than by a copy, which starts after the kernel and takes longer than many of them.
+class ToldNumber {
+ public:
+  ToldNumber() { check(cudaHostAlloc(&place_, sizeof(*place_), cudaHostAllocPortable), "cull_blocks"); }
+  ~ToldNumber() { cudaFreeHost(place_); }
+  ToldNumber(const ToldNumber&) = delete;
+  ToldNumber& operator=(const ToldNumber&) = delete;
+
+  // Where the next kernel shall write; nobody else may be about to.
+  std::int32_t* expect() {
+    std::atomic_ref(*place_).store(-1);
+    return place_;
+  }
+
+  std::int32_t wait(CudaStream stream) {
+    for (int tries = 1;; ++tries) {
+      const std::int32_t number = std::atomic_ref(*place_).load();
+      if (number >= 0) return number;
+      if (tries % 1024 != 0) continue;
+      // A kernel that failed tells nothing.
+      const cudaError_t status = cudaStreamQuery(stream);
+      if (status != cudaErrorNotReady) check(status, "cull_blocks");
+    }
+  }
+
+ private:
+  std::int32_t* place_ = nullptr;
 };
 
 unsigned persistent_blocks(std::int64_t blocks) {
   int device = 0, count = 0;
-  check(cudaGetDevice(&device), "cull_blocks");
-  check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "cull_blocks");
+  check(cudaGetDevice(&device), "blocks");
+  check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "blocks");
   return static_cast<unsigned>(std::min<std::int64_t>(blocks, 8 * count));
 }
 
@@ -128,58 +189,52 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
                          Workspace& workspace, CudaStream stream) {
   const std::int64_t blocks = blocks_of(rows.n);
   if (blocks == 0 || (ids && n_ids == 0)) return;
-  std::uint8_t* touched = nullptr;
+  std::int32_t *list = nullptr, *length = nullptr;
   if (ids) {
-    touched = workspace.allocate<std::uint8_t>(blocks);
-    check(cudaMemsetAsync(touched, 0, blocks, stream), "update_block_bounds");
-    mark_blocks<<<blocks_for(n_ids, 256), 256, 0, stream>>>(ids, n_ids, touched);
+    length = workspace.allocate<std::int32_t>(1 + n_ids);
+    list = length + 1;
+    check(cudaMemsetAsync(length, 0, sizeof(*length), stream), "update_block_bounds");
+    list_blocks<<<blocks_for(n_ids, 256), 256, 0, stream>>>(ids, n_ids, list, length);
   }
-  update_bounds<<<static_cast<unsigned>(blocks), kBlockRows, 0, stream>>>(rows, touched, bounds);
+  update_bounds<<<persistent_blocks(blocks), kBlockRows, 0, stream>>>(rows, list, length, bounds);
   check_launch("update_block_bounds");
 }
 
 void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
                 CullPlan& plan, Workspace& workspace, CudaStream stream) {
   const std::int64_t blocks = blocks_of(rows.n);
-  plan.total = 0;
+  plan.n = rows.n;
   if (blocks == 0) return;
-  std::uint32_t* block_masks = workspace.allocate<std::uint32_t>(blocks);
-  test_blocks<<<blocks_for(blocks, 128), 128, 0, stream>>>(bounds, blocks, camera, views, block_masks);
-  plan.blocks = workspace.allocate<std::int32_t>(blocks);
-  plan.masks = workspace.allocate<std::uint32_t>(blocks * kBlockRows);
-  plan.device_count = workspace.allocate<std::int64_t>(1);
-  std::int64_t* active = workspace.allocate<std::int64_t>(blocks + 1);
-  plan.rows_before = workspace.allocate<std::int64_t>(blocks + 1);
-  check(cudaMemsetAsync(active, 0, (blocks + 1) * sizeof(std::int64_t), stream), "cull_blocks");
-
-  const thrust::counting_iterator<std::int32_t> all(0);
-  std::size_t select_bytes = 0, scan_bytes = 0;
-  check(cub::DeviceSelect::If(nullptr, select_bytes, all, plan.blocks, plan.device_count, blocks,
-                              IsSet{block_masks}, stream),
-        "cull_blocks");
+  plan.blocks = workspace.allocate<BlockViews>(blocks);
+  plan.masks = workspace.allocate<std::uint32_t>(rows.n);
+  plan.rows_before = workspace.allocate<std::int32_t>(blocks + 1);
+  std::int32_t* active = workspace.allocate<std::int32_t>(blocks + 1);
+  std::int32_t* length = workspace.allocate<std::int32_t>(1 + blocks);
+  std::int32_t* list = length + 1;
+  CullView* planes = workspace.allocate<CullView>(views);
+  std::size_t scan_bytes = 0;
   check(cub::DeviceScan::ExclusiveSum(nullptr, scan_bytes, active, plan.rows_before, blocks + 1, stream),
         "cull_blocks");
-  void* scratch = workspace.allocate_bytes(std::max(select_bytes, scan_bytes));
-  check(cub::DeviceSelect::If(scratch, select_bytes, all, plan.blocks, plan.device_count, blocks,
-                              IsSet{block_masks}, stream),
-        "cull_blocks");
-  plan.count = persistent_blocks(blocks);  // launch size; the list's own length is device_count
-  test_rows<<<static_cast<unsigned>(plan.count), kBlockRows, 0, stream>>>(rows, camera, views, block_masks,
-                                                                          plan, active);
+  void* scratch = workspace.allocate_bytes(scan_bytes);
+
+  check(cudaMemsetAsync(length, 0, sizeof(*length), stream), "cull_blocks");
+  test_blocks<<<blocks_for(blocks + 1, 256), 256, 0, stream>>>(bounds, camera, views, plan, active, list,
+                                                               length, planes);
+  test_rows<<<persistent_blocks(blocks), kBlockRows, 0, stream>>>(rows, planes, views, plan, list, length,
+                                                                  active);
   check_launch("cull_blocks");
   check(cub::DeviceScan::ExclusiveSum(scratch, scan_bytes, active, plan.rows_before, blocks + 1, stream),
         "cull_blocks");
-  check(cudaMemcpyAsync(&plan.total, plan.rows_before + blocks, sizeof(plan.total), cudaMemcpyDeviceToHost,
-                        stream),
-        "cull_blocks");
-  check(cudaStreamSynchronize(stream), "cull_blocks");
 }
 
-void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views, Workspace&,
-               CudaStream stream) {
-  if (plan.total == 0) return;
-  emit_rows<<<static_cast<unsigned>(plan.count), kBlockRows, 0, stream>>>(plan, active_ids, active_views);
+std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* active_ids,
+                       std::int32_t* active_views, CudaStream stream) {
+  if (plan.n == 0) return 0;
+  static thread_local ToldNumber total;
+  emit_rows<<<blocks_for(blocks_of(plan.n), kWarps), kBlockRows, 0, stream>>>(plan, room, active_ids,
+                                                                              active_views, total.expect());
   check_launch("cull_blocks");
+  return total.wait(stream);
 }
 
 }  // namespace blitzgs::cuda

@@ -21,7 +21,11 @@ struct Scene {
 
 blitzgs::SweptBox point(float x, float y, float z, float sigma) { return {{x, y, z}, {x, y, z}, sigma}; }
 
-bool seen(const blitzgs::SweptBox& box) { return blitzgs::may_see(Scene().view(), box, blitzgs::kRowSlack); }
+blitzgs::Sight sight(const blitzgs::SweptBox& box) {
+  return blitzgs::sight_of(Scene().view(), box, blitzgs::kRowSlack);
+}
+
+bool seen(const blitzgs::SweptBox& box) { return sight(box).some; }
 
 }  // namespace
 
@@ -35,6 +39,12 @@ TEST_CASE("a box is dropped where no view can see it") {
   REQUIRE(seen(point(20, 0, 5, 20)));  // large enough to reach the image
   REQUIRE(seen({{-30, -30, -30}, {30, 30, 30}, 0.01f}));
   REQUIRE_FALSE(seen(blitzgs::empty_box()));
+}
+
+TEST_CASE("a view sees all of a box whose every point it sees whatever its size") {
+  REQUIRE(sight({{-0.5f, -0.4f, 3}, {0.5f, 0.4f, 5}, 2}).all);
+  REQUIRE_FALSE(sight({{-0.5f, -0.4f, 0.4f}, {0.5f, 0.4f, 5}, 2}).all);
+  REQUIRE_FALSE(sight({{-0.5f, -0.4f, 3}, {20, 0.4f, 5}, 100}).all);
 }
 
 TEST_CASE("pending steps widen a row's box along its drift, and rows that are not finite have none") {
@@ -60,6 +70,7 @@ TEST_CASE("pending steps widen a row's box along its drift, and rows that are no
   blitzgs::cpu::update_block_bounds(rows, nullptr, 0, bounds, workspace, nullptr);
   REQUIRE(bounds[0] == box.low[0]);
   REQUIRE(bounds[3] == 1);
+  REQUIRE(bounds[7] == 0);
 }
 
 TEST_CASE("Morton keys interleave the axes") {

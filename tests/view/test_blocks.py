@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
-from blitzgs.ops.blocks import morton_keys
+from blitzgs.ops.blocks import cull_blocks, morton_keys
 from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.project import project
 from blitzgs.view.blocks import BlockIndex, morton_order
@@ -86,8 +86,9 @@ def test_no_visible_row_is_missed_and_most_others_are_dropped(device, seed):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_the_set_does_not_depend_on_the_order_of_the_rows(device):
-    table = make_table(device=device)
+@pytest.mark.parametrize("n", [3000, 60_000])
+def test_the_set_does_not_depend_on_the_order_of_the_rows(device, n):
+    table = make_table(n, device)
     viewmats, Ks = make_views(device=device)
     sorted_set = allowed(active_of(BlockIndex(table), table, viewmats, Ks))
     persistent = {(int(table["id"][row]), view) for row, view in sorted_set}
@@ -110,6 +111,66 @@ def test_rows_of_culled_blocks_are_not_read(device):
     table["means"][behind] = torch.tensor([5.0, 0.0, 0.0], device=device)
     after = active_of(index, table, viewmats, Ks)
     assert torch.equal(before[0], after[0]) and torch.equal(before[1], after[1])
+
+
+def looking_down(device):
+    """A camera 60 above the origin that looks down at 60 x 45."""
+    viewmat, K = torch.eye(4, device=device)[None], torch.eye(3, device=device)[None]
+    viewmat[0, 1, 1] = viewmat[0, 2, 2] = -1.0
+    viewmat[0, 2, 3] = 60.0
+    K[0, 0, 0] = K[0, 1, 1] = WIDTH
+    K[0, 0, 2], K[0, 1, 2] = 0.5 * WIDTH, 0.5 * HEIGHT
+    return viewmat, K
+
+
+def cull(index, table, views, **options):
+    """The active set of several cameras above the ground, as `BlockIndex.active` asks for it."""
+    return cull_blocks(
+        index._bounds, table["means"], table["scales"], *views, WIDTH, HEIGHT, NEAR, 100.0, **options
+    )
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_rows_of_blocks_inside_all_views_that_see_them_are_not_read(device):
+    table = make_table(30_000, device)
+    views = looking_down(device)
+    index = BlockIndex(table)
+    before = cull(index, table, views)
+    low, high = index._bounds[:, :2], index._bounds[:, 3:5]
+    inside = (low > -20).all(1) & (high < 20).all(1)
+    finite = index._bounds[:, 7] == 1
+    assert (inside & finite).sum() > 10 and (~finite).any()
+    rows = (inside & finite).repeat_interleave(256)[: len(table)]
+    assert torch.isin(rows.nonzero()[:, 0], before[0].long()).all()
+    table["means"][rows] = 1000.0
+    after = cull(index, table, views)
+    assert torch.equal(before[0], after[0]) and torch.equal(before[1], after[1])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_row_that_is_not_finite_is_not_seen_amidst_a_view(device):
+    table = make_table(30_000, device)
+    views = looking_down(device)
+    row = int(table["means"].nan_to_num(1e9).norm(dim=1).argmin())
+    assert row in cull(BlockIndex(table), table, views)[0]
+    table["scales"][row, 1] = math.nan
+    index = BlockIndex(table)
+    assert row not in cull(index, table, views)[0] and index._bounds[row // 256, 7] == 0
+    table["scales"][row, 1] = 0.0
+    index.update(table, torch.tensor([row], dtype=torch.int32, device=device))
+    assert row in cull(index, table, views)[0] and index._bounds[row // 256, 7] == 1
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_set_does_not_depend_on_the_room_for_it(device):
+    table = make_table(5000, device)
+    views, index = make_views(device=device), BlockIndex(table)
+    expected = cull(index, table, views)
+    count = len(expected[0])
+    assert 300 < count < len(table)
+    for room in (0, 1, count - 1, count, count + 1):
+        got = cull(index, table, views, room=room)
+        assert torch.equal(got[0], expected[0]) and torch.equal(got[1], expected[1])
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -194,7 +255,7 @@ def test_errors_name_the_value():
     with pytest.raises(RuntimeError, match="at most 32 views at once, got 33"):
         active_of(index, table, viewmats, Ks)
     table.keep(torch.arange(len(table)) < 100)
-    with pytest.raises(RuntimeError, match=r"bounds must have shape \[1, 7\], got \[12, 7\]"):
+    with pytest.raises(RuntimeError, match=r"bounds must have shape \[1, 8\], got \[12, 8\]"):
         active_of(index, table, *make_views(1))
 
 
@@ -211,5 +272,5 @@ def test_opcheck(device):
     torch.library.opcheck(torch.ops.blitzgs.morton_keys, (table["means"],))
     torch.library.opcheck(torch.ops.blitzgs.update_block_bounds_, (bounds, None, *columns))
     torch.library.opcheck(
-        torch.ops.blitzgs.cull_blocks, (bounds, *columns, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR, 0.3)
+        torch.ops.blitzgs.cull_blocks, (bounds, *columns, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR, 0.3, 100)
     )
