@@ -19,7 +19,6 @@ namespace {
 
 using Input = IntersectInput<float>;
 constexpr int kThreads = 256;
-constexpr int kWideRow = 24;  // entries from which a warp writes a row's list together
 constexpr int kEmitItems = 2, kEmitRows = kThreads * kEmitItems;  // rows of a thread and of a block
 
 __global__ void count_kernel(const Input in, std::int32_t* counts) {
@@ -77,6 +76,48 @@ __global__ void order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows,
   }
 }
 
+// Writes the entries of a warp's rows, a row a lane, from `turn` on; start: of the lane's row behind `turn`.
+template <class Key>
+__device__ __forceinline__ void write_entries(const Input& in, std::int32_t row, const Touched& touched,
+                                              std::int32_t start, std::int64_t turn, std::int64_t capacity,
+                                              Key* keys, std::int32_t* entries) {
+  const int lane = threadIdx.x % 32;
+  // Of compact rows each lane writes every 32nd entry, whosever it is.
+  const std::int32_t count = touched.compact() ? touched.count() : 0;
+  const std::int32_t until = sum_of_lanes_until(count, lane), total = __shfl_sync(kFullWarp, until, 31);
+  const std::int32_t begin = until - count;
+  for (std::int32_t first = 0; first < total; first += 32) {
+    const std::int32_t entry = first + lane;
+    int source = 0;  // the last row that begins there or before
+#pragma unroll
+    for (int step = 16; step > 0; step /= 2) {
+      if (__shfl_sync(kFullWarp, begin, source + step) <= entry) source += step;
+    }
+    const std::int32_t k = entry - __shfl_sync(kFullWarp, begin, source);
+    const std::int64_t at = turn + __shfl_sync(kFullWarp, start, source) + k;
+    const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
+    const Touched its = touched.of_lane(source);
+    if (entry < total && at < capacity) {
+      keys[at] = static_cast<Key>(its.tile(k, in.grid.tiles_x));
+      entries[at] = of_row;
+    }
+  }
+  // The other rows are walked by all lanes together.
+  for (unsigned left = __ballot_sync(kFullWarp, !touched.compact()); left; left &= left - 1) {
+    const int source = __ffs(left) - 1;
+    const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
+    std::int64_t at = turn + __shfl_sync(kFullWarp, start, source);
+    for_each_owned(in, of_row, [&](const Owned& owned) {
+      const std::int64_t n = owned.last - owned.first, tile = owned.first - in.grid.tile_begin;
+      for (std::int64_t k = lane; k < n && at + k < capacity; k += 32) {
+        keys[at + k] = static_cast<Key>(tile + k);
+        entries[at + k] = of_row;
+      }
+      at += n;
+    });
+  }
+}
+
 // Entries in depth order. Blocks take kEmitRows rows each, a warp 32 times kEmitItems of them in a row.
 template <class Key>
 __global__ void __launch_bounds__(kThreads)
@@ -93,12 +134,13 @@ __global__ void __launch_bounds__(kThreads)
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) touched[k] = row[k] >= 0 ? all_touched[row[k]] : Touched{};
 
-  std::int64_t at[kEmitItems], warp_sum = 0;
+  std::int32_t start[kEmitItems];  // of each row, in its warp's turn
+  std::int64_t turn[kEmitItems], warp_sum = 0;
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
-    const std::int32_t count = touched[k].count();
-    const std::int32_t until = sum_of_lanes_until(count, lane);
-    at[k] = warp_sum + (until - count);
+    const std::int32_t count = touched[k].count(), until = sum_of_lanes_until(count, lane);
+    start[k] = until - count;
+    turn[k] = warp_sum;
     warp_sum += __shfl_sync(kFullWarp, until, 31);
   }
   if (lane == 0) warp_sums[warp] = warp_sum;
@@ -117,31 +159,7 @@ __global__ void __launch_bounds__(kThreads)
 
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
-    const bool wide = touched[k].count() >= kWideRow;
-    const std::int64_t offset = before + at[k];
-    if (row[k] >= 0 && !wide) {
-      std::int64_t next = offset;
-      for_each_touched(in, row[k], touched[k], [&](std::int64_t tile, int n) {
-        for (int i = 0; i < n && next < capacity; ++i, ++next) {
-          keys[next] = static_cast<Key>(tile + i);
-          entries[next] = row[k];
-        }
-      });
-    }
-    // Every lane walks a wide row's tile rows, and writes its share of each.
-    for (unsigned left = __ballot_sync(kFullWarp, wide); left; left &= left - 1) {
-      const int source = __ffs(left) - 1;
-      const std::int32_t wide_row = __shfl_sync(kFullWarp, row[k], source);
-      const Touched wide_touched = touched[k].of_lane(source);
-      std::int64_t next = __shfl_sync(kFullWarp, offset, source);
-      for_each_touched(in, wide_row, wide_touched, [&](std::int64_t tile, int n) {
-        for (int i = lane; i < n && next + i < capacity; i += 32) {
-          keys[next + i] = static_cast<Key>(tile + i);
-          entries[next + i] = wide_row;
-        }
-        next += n;
-      });
-    }
+    write_entries(in, row[k], touched[k], start[k], before + turn[k], capacity, keys, entries);
   }
 }
 

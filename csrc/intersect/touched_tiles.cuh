@@ -46,6 +46,23 @@ struct alignas(16) Touched {
     return static_cast<std::int32_t>(sums * 0x01010101u >> 24);
   }
 
+  __device__ bool compact() const { return first != kWalk; }
+
+  // Tile k < count() of a compact row, from tile_begin on.
+  __device__ std::int64_t tile(int k, int tiles_x) const {
+    std::int64_t start = static_cast<std::int64_t>(first) - 8;
+#pragma unroll
+    for (int i = 0; i < kWords; ++i) {
+#pragma unroll
+      for (int bit = 0; bit < 32; bit += 8, start += tiles_x) {
+        const int n = rows[i] >> bit & 15u;
+        if (k < n) return start + (rows[i] >> bit + 4 & 15u) + k;
+        k -= n;
+      }
+    }
+    return start;
+  }
+
   // That of another lane; called by whole warps.
   __device__ Touched of_lane(int lane) const {
     Touched other{__shfl_sync(kFullWarp, first, lane), {}};
@@ -80,26 +97,6 @@ __device__ __forceinline__ Touched find_touched(const IntersectInput<float>& in,
     touched.rows[0] = static_cast<std::uint32_t>(count);
   }
   return touched;
-}
-
-// Calls f(first tile, from tile_begin on; number of tiles) for each tile row of find_touched().
-template <class F>
-__device__ __forceinline__ void for_each_touched(const IntersectInput<float>& in, std::int64_t row,
-                                                 const Touched& touched, const F& f) {
-  if (touched.first == Touched::kWalk) {
-    for_each_owned(in, row, [&](const Owned& owned) {
-      f(owned.first - in.grid.tile_begin, static_cast<int>(owned.last - owned.first));
-    });
-    return;
-  }
-  std::int64_t start = static_cast<std::int64_t>(touched.first) - 8;
-#pragma unroll
-  for (int i = 0; i < Touched::kWords; ++i, start += 4 * in.grid.tiles_x) {
-    std::int64_t tile = start;
-    for (std::uint32_t rows = touched.rows[i]; rows; rows >>= 8, tile += in.grid.tiles_x) {
-      f(tile + (rows >> 4 & 15u), static_cast<int>(rows & 15u));
-    }
-  }
 }
 
 }  // namespace blitzgs::cuda
