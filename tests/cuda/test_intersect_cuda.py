@@ -15,15 +15,7 @@ def lists(rows, grid, device, ids=None, count=-1):
     return entries.cpu(), offsets.cpu()
 
 
-@pytest.mark.parametrize("tile_size", [8, 16, 32])
-@pytest.mark.parametrize("with_ids", [False, True])
-def test_lists_match_the_cpu(scene, tile_size, with_ids):
-    rows = list(scene.project("cpu"))
-    rows[6] = (rows[6] * 8).round() / 8  # many equal depths
-    ids = None
-    if with_ids:
-        ids = torch.randperm(len(rows[0]), generator=torch.Generator().manual_seed(0))
-    grid = scene.grid(tile_size)
+def require_same_lists(rows, grid, ids):
     entries, offsets = lists(rows, grid, "cuda", ids)
     expected, expected_offsets = lists(rows, grid, "cpu", ids)
     different = 0
@@ -34,6 +26,39 @@ def test_lists_match_the_cpu(scene, tile_size, with_ids):
         common = set(ours) & set(theirs)
         assert [r for r in ours if r in common] == [r for r in theirs if r in common]
     assert different <= 1e-4 * len(expected)
+
+
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
+@pytest.mark.parametrize("with_ids", [False, True])
+def test_lists_match_the_cpu(scene, tile_size, with_ids):
+    rows = list(scene.project("cpu"))
+    rows[6] = (rows[6] * 8).round() / 8  # many equal depths
+    ids = None
+    if with_ids:
+        ids = torch.randperm(len(rows[0]), generator=torch.Generator().manual_seed(0))
+    require_same_lists(rows, scene.grid(tile_size), ids)
+
+
+@pytest.mark.parametrize("tiles", [(0, -1), (700, 2600)])
+def test_splats_of_every_shape(tiles):
+    """From a point to the whole image, needles and discs, upright and slanted."""
+    g = torch.Generator().manual_seed(4)
+    n, views, width, height = 3000, 2, 900, 700
+    long = 10 ** (torch.rand(n, generator=g) * 3)  # pixels
+    short = long * 10 ** (-3 * torch.rand(n, generator=g))
+    turn = torch.rand(n, generator=g) * 3.2
+    axes = torch.stack(
+        [torch.stack([turn.cos(), turn.sin()], -1), torch.stack([-turn.sin(), turn.cos()], -1)], -1
+    )
+    variances = torch.stack([long, short], -1).square() + 0.3
+    conics = axes @ torch.diag_embed(1 / variances) @ axes.mT
+    rows = [None] * 8
+    rows[1] = torch.randint(0, views, (n,), generator=g, dtype=torch.int32)
+    rows[4] = torch.rand(n, 2, generator=g) * torch.tensor([width, height]) * 1.4 - 100
+    rows[5] = torch.stack([conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]], -1)
+    rows[6] = torch.rand(n, generator=g)
+    rows[7] = torch.rand(n, generator=g)
+    require_same_lists(rows, (views, width, height, 16, *tiles), None)
 
 
 def test_more_tiles_than_16_bits_hold():
