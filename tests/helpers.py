@@ -6,12 +6,25 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import pytest
 import torch
 from torch import Tensor
 
 from blitzgs.reference import ReferenceImage, render
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
+
+_CUDA_MARKS = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
+DEVICES = ["cpu", pytest.param("cuda", marks=_CUDA_MARKS)]
+# Where the kernels run, and in which dtype.
+BACKENDS = [
+    pytest.param(("cpu", torch.float64), id="cpu-float64"),
+    pytest.param(("cpu", torch.float32), id="cpu-float32"),
+    pytest.param(("cuda", torch.float32), id="cuda-float32", marks=_CUDA_MARKS),
+]
 
 
 @dataclass
@@ -60,6 +73,7 @@ def random_scene(
     seed: int = 0,
     dtype: torch.dtype = torch.float32,
     scale: float = 0.12,
+    device: str = "cpu",
 ) -> Scene:
     """Gaussians in a unit ball seen from a few units away, with off-centre principal points."""
     generator = torch.Generator().manual_seed(seed)
@@ -85,7 +99,7 @@ def random_scene(
         Ks,
         width,
         height,
-    ).to(dtype)
+    ).to(dtype, device)
 
 
 def orbit_camera(angle: float, distance: float = 3.0, lift: float = 0.4) -> Tensor:

@@ -11,20 +11,15 @@ from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.reference import composite, project_splats
-from tests.helpers import PARAMETERS, Scene, image_error, random_scene, reference_images, relative_error
-
-BACKENDS = [
-    pytest.param(("cpu", torch.float64), id="cpu-float64"),
-    pytest.param(("cpu", torch.float32), id="cpu-float32"),
-    pytest.param(
-        ("cuda", torch.float32),
-        id="cuda-float32",
-        marks=[
-            pytest.mark.cuda,
-            pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-        ],
-    ),
-]
+from tests.helpers import (
+    BACKENDS,
+    PARAMETERS,
+    Scene,
+    image_error,
+    random_scene,
+    reference_images,
+    relative_error,
+)
 
 
 def uniform(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
