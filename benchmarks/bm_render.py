@@ -5,8 +5,8 @@
 
 Gradients for every parameter; SH degree 3, float32. Ours: the ops of the training step in order (project,
 intersect, rasterize and their gradients, in compact rows), and the same through `blitzgs.rasterization` and
-autograd (with its meta, and dense gradients). gsplat: `rasterization` and autograd, packed and not. Each
-figure is a median over repeats of CUDA event times; memory is the peak above the inputs.
+autograd (with its meta; with dense gradients, and with sparse ones). gsplat: `rasterization` and autograd,
+packed and not. Each figure is a median over repeats of CUDA event times; memory is the peak above the inputs.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import argparse
 import json
 import statistics
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,8 @@ def run(name: str, repeats: int) -> dict[str, Any]:
     result["visible"], result["rows"], result["intersections"] = ours.rows.counts.tolist()
     result["stages"] = stages(ours, v, repeats)
     del ours.saved, ours.splats, ours.lists, ours.rows, ours.v_rows, ours.gradients
-    calls = {"rasterization": (rasterization, True)}
+    sparse = partial(rasterization, sparse_grad=True)
+    calls = {"rasterization": (rasterization, True), "same, sparse": (sparse, True)}
     if gsplat is not None:
         calls |= {"gsplat": (gsplat.rasterization, False), "gsplat packed": (gsplat.rasterization, True)}
     for label, call in calls.items():
@@ -198,7 +200,7 @@ def main() -> None:
         rows, entries = result["rows"], result["intersections"]
         print(f"{result['scene']}: {result['visible']} visible, {rows} rows, {entries} intersections")
         print("  " + "  ".join(f"{k} {v:.3f}" for k, v in result["stages"].items()))
-        for label in ("blitzgs", "rasterization", "gsplat", "gsplat packed"):
+        for label in ("blitzgs", "rasterization", "same, sparse", "gsplat", "gsplat packed"):
             if label in result:
                 r = result[label]
                 print(f"  {label:14s} forward {r['forward']:7.3f}  backward {r['backward']:7.3f}  "

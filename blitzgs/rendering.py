@@ -71,7 +71,8 @@ def rasterization(
         tile_size: edge of a tile in px, 1 to 64. The image is the same.
         backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
-        sparse_grad: only False is supported.
+        sparse_grad: whether means, quats and scales, and with `sh_degree` opacities and colors, get sparse
+            gradients, over the visible Gaussians alone. Dense ones cost a pass over all N.
         absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased".
         channel_chunk: accepted and not needed: any channel count is rendered in one pass.
@@ -93,7 +94,6 @@ def rasterization(
     """
     _reject_unsupported(
         {
-            "sparse_grad": sparse_grad,
             "distributed": distributed,
             "covars": covars,
             "camera_model": camera_model,
@@ -123,6 +123,7 @@ def rasterization(
         radius_clip=radius_clip,
         antialiased=rasterize_mode == "antialiased",
         raw=False,
+        sparse_grad=sparse_grad,
     )
     n_cameras = viewmats.shape[0]
     cameras, gaussians = rows.camera_ids.long(), rows.gaussian_ids.long()
@@ -158,7 +159,18 @@ def rasterization(
     if render_mode.endswith("ED"):
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
     meta = _meta(
-        rows, means2d, isect_rows, tile_offsets, packed, len(means), n_cameras, width, height, tile_size
+        rows,
+        cameras,
+        gaussians,
+        means2d,
+        isect_rows,
+        tile_offsets,
+        packed,
+        len(means),
+        n_cameras,
+        width,
+        height,
+        tile_size,
     )
     return renders, alphas, meta
 
@@ -254,6 +266,8 @@ def _absolute_gradient_probe(means2d: Tensor, cameras: Tensor, gaussians: Tensor
 
 def _meta(
     rows: Rows,
+    cameras: Tensor,
+    gaussians: Tensor,
     means2d: Tensor,
     isect_rows: Tensor,
     tile_offsets: Tensor,
@@ -264,7 +278,6 @@ def _meta(
     height: int,
     tile_size: int,
 ) -> dict[str, Any]:
-    cameras, gaussians = rows.camera_ids.long(), rows.gaussian_ids.long()
     tile_width, tile_height = -(-width // tile_size), -(-height // tile_size)
     per_row = {
         "radii": rows.radii,
@@ -275,7 +288,7 @@ def _meta(
     }
     if not packed:
         per_row = {k: _dense(v, cameras, gaussians, n_cameras, n) for k, v in per_row.items()}
-    entries = isect_rows.long()
+    depths = rows.depths.detach().index_select(0, isect_rows)
     return {
         "camera_ids": cameras if packed else None,
         "gaussian_ids": gaussians if packed else None,
@@ -283,8 +296,8 @@ def _meta(
         **per_row,
         "tile_width": tile_width,
         "tile_height": tile_height,
-        "isect_ids": _isect_ids(rows.depths[entries], tile_offsets, tile_width * tile_height),
-        "flatten_ids": isect_rows if packed else (cameras * n + gaussians)[entries].int(),
+        "isect_ids": _isect_ids(depths, tile_offsets, n_cameras, tile_width * tile_height),
+        "flatten_ids": isect_rows if packed else (cameras * n + gaussians).index_select(0, isect_rows).int(),
         "isect_offsets": tile_offsets[:-1].reshape(n_cameras, tile_height, tile_width),
         "width": width,
         "height": height,
@@ -294,11 +307,12 @@ def _meta(
     }
 
 
-def _isect_ids(depths: Tensor, tile_offsets: Tensor, n_tiles: int) -> Tensor:
+def _isect_ids(depths: Tensor, tile_offsets: Tensor, n_cameras: int, n_tiles: int) -> Tensor:
     """Return gsplat's sort keys, int64 [I]: camera | tile | float32 depth bits, from high to low."""
+    cameras = torch.arange(n_cameras, device=depths.device) << 32 + n_tiles.bit_length()
+    tiles = torch.arange(0, n_tiles << 32, 1 << 32, device=depths.device)
+    keys = (cameras[:, None] + tiles).flatten()
     counts = tile_offsets[1:] - tile_offsets[:-1]
-    index = torch.arange(len(counts), device=counts.device)
-    tile_bits = n_tiles.bit_length()
-    keys = (index // n_tiles << tile_bits) | index % n_tiles
-    tiles = keys.repeat_interleave(counts, output_size=len(depths))
-    return (tiles << 32) | depths.detach().float().view(torch.int32).long()
+    return keys.repeat_interleave(counts, output_size=len(depths)).bitwise_or_(
+        depths.float().view(torch.int32)
+    )
