@@ -98,7 +98,7 @@ def test_any_number_of_channels(channels, per_view, absgrad):
 
 
 @pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("tile_size", [8, 16, 32])
+@pytest.mark.parametrize("tile_size", [1, 4, 8, 16, 32, 50, 64])
 def test_tile_sizes_and_absolute_gradients(tile_size, packed):
     scene = random_scene(n=200, width=70, height=50)
     require_agreement(scene, tile_size=tile_size, packed=packed, absgrad=True)
