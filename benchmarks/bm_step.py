@@ -3,33 +3,38 @@
 
     python benchmarks/bm_step.py [--scenes aerial4 aerial16] [--views 1] [--order morton] [--repeats 20]
 
-SH degree 3, every parameter trained, gradients of L1 + SSIM. Ours is the trainer's step: find the active
-rows, catch them up (they are 0 to 39 steps behind), render, compare, differentiate, step the visible rows,
-note the blocks that changed. gsplat: `rasterization` (not packed) and autograd, the same loss kernel,
-`torch.optim.Adam(fused=True)` over every row. Both get the same scene, by default in Morton order, as the
-trainer keeps its table. Medians of CUDA event times, ms.
+SH degree 3, every parameter trained, gradients of L1 + SSIM. Ours is the trainer's own step
+(`blitzgs.training.step`): find the active rows, catch them up (they are 0 to 39 steps behind), render,
+compare, differentiate, step the visible rows, note the blocks that changed. gsplat: `rasterization` (not
+packed) and autograd, the same loss kernel, `torch.optim.Adam(fused=True)` over every row. Both get the same
+scene, by default in Morton order, as the trainer keeps its table. Medians of CUDA event times, ms.
 """
 
 from __future__ import annotations
 
 import argparse
+import statistics
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
-from bm_render import CallRender, event_times
+from bm_render import CallRender
 from scenes import BenchmarkScene, aerial, garden_like
-from torch import Tensor
 
-from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.photometric import photometric_fwd_bwd
-from blitzgs.pipeline import Active, RenderOptions, Views
-from blitzgs.training.config import OptimiserConfig, ScheduleConfig
+from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.training.batches import Batch
+from blitzgs.training.config import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
-from blitzgs.view.blocks import BlockIndex, morton_order
+from blitzgs.training.step import Stepper
+from blitzgs.view.blocks import morton_order
 
-SSIM_WEIGHT, STEP, RATE, BEHIND = 0.2, 2000, 1e-6, 40
+LOSS = LossConfig(ssim=0.2, scale=0)
+STEP, RATE, BEHIND, WARM_UP = 2000, 1e-6, 40, 5
 GAUSSIANS = {"aerial1": 1_000_000, "aerial4": 4_000_000, "aerial16": 16_000_000}
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
 
@@ -47,26 +52,37 @@ def make_scene(name: str, views: int, order: str) -> BenchmarkScene:
     return replace(scene, **{column: getattr(scene, column)[rows] for column in columns})
 
 
-class Loss:
-    """(1 - w) L1 + w (1 - SSIM) against a fixed random photo, and its gradient."""
+def random_photographs(scene: BenchmarkScene) -> Batch:
+    """Return what the views are compared with."""
+    count = len(scene.viewmats)
+    targets = torch.randint(0, 256, (count, scene.height, scene.width, 3), dtype=torch.uint8, device="cuda")
+    samples = torch.full((count,), float(targets[0].numel()), device="cuda")
+    views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
+    return Batch(list(range(count)), views, targets, None, samples, None)
 
-    def __init__(self, scene: BenchmarkScene) -> None:
-        shape = (len(scene.viewmats), scene.height, scene.width, 3)
-        self.target = torch.randint(0, 256, shape, dtype=torch.uint8, device="cuda")
-        samples = self.target.numel()
-        self.weights = [
-            torch.full((shape[0],), w / samples, device="cuda") for w in (1 - SSIM_WEIGHT, -SSIM_WEIGHT)
-        ]
 
-    def gradient(self, image: Tensor) -> Tensor:
-        """Return the gradient of the image [B, H, W, 3]."""
-        return photometric_fwd_bwd(image, self.target, None, *self.weights)[2]
+class Clock:
+    """Time between marks on the device."""
+
+    def __init__(self) -> None:
+        self.marks: list[tuple[str, torch.cuda.Event]] = []
+        self.mark("")
+
+    def mark(self, stage: str) -> None:
+        """End a stage."""
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        self.marks.append((stage, event))
+
+    def stages(self) -> list[tuple[str, float]]:
+        """Return name and time of each stage, in order."""
+        torch.cuda.synchronize()
+        return [(name, begin.elapsed_time(end))
+                for (_, begin), (name, end) in zip(self.marks, self.marks[1:], strict=False)]  # fmt: skip
 
 
 class OurStep:
-    """What `blitzgs.training.trainer` does with a batch."""
-
-    names = ("cull", "catch-up", "forward", "loss", "backward", "adam", "bounds")
+    """The trainer's step."""
 
     def __init__(self, scene: BenchmarkScene) -> None:
         n, raw = len(scene.means), scene.raw()
@@ -81,97 +97,67 @@ class OurStep:
             size = 1e-7 * torch.exp(2 * torch.randn_like(self.table[first]))
             self.table[first].copy_(torch.randn_like(size)).mul_(size)
             self.table[second].copy_(size).square_()
-        self.views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
-        self.loss = Loss(scene)
-        rates = OptimiserConfig(RATE, RATE, RATE, RATE, RATE, RATE, RATE)
-        schedule = Schedule(ScheduleConfig(batch_size=len(self.views)))
-        self.optimiser = LazyAdam(rates, schedule, 1.0, "cuda")
+        self.batch = random_photographs(scene)
+        schedule = Schedule(ScheduleConfig(batch_size=len(self.batch.views)))
+        optimiser = LazyAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, "cuda")
+        owners = TileOwners(Ranks(device=torch.device("cuda", torch.cuda.current_device())))
         self.behind = torch.arange(n, device="cuda", dtype=torch.int32) % BEHIND
         self.step = STEP
-        self.rewind()
+        self.stepper = Stepper(self.table, optimiser, owners, LOSS, 1.0)
 
-    def rewind(self) -> None:
+    def prepare(self) -> None:
         """Put every row behind, outside the timed stages."""
         self.step += 1
         for name in ("last_step", "moment_step"):
             self.table[name].copy_(self.step - 1 - self.behind)
-        self.blocks = BlockIndex(self.table, self.optimiser.pending_table)
+        self.stepper.reindex()
 
-    def cull(self) -> None:
-        """Find the rows that the views may see."""
-        v, o = self.views, OPTIONS
-        self.active = Active(
-            *self.blocks.active(
-                self.table, v.viewmats, v.Ks, v.width, v.height, o.near_plane, o.far_plane, o.eps2d
-            )
-        )
-
-    def catch_up(self) -> None:
-        """Give these rows the optimiser steps that they missed."""
-        self.optimiser.catch_up(self.table, self.active.ids, self.step - 1)
-
-    def forward(self) -> None:
-        """Render."""
-        self.frame = pipeline.forward(self.table, self.views, OPTIONS, self.active)
-
-    def differentiate_loss(self) -> None:
-        """Compare with the photo."""
-        self.v_image = self.loss.gradient(self.frame.renders)
-
-    def backward(self) -> None:
-        """Differentiate the render."""
-        self.gradients = pipeline.backward(self.table, self.frame, self.v_image)
-
-    def optimise(self) -> None:
-        """Take the optimiser's step for the rows seen."""
-        ids = self.frame.rows.visible_ids
-        self.optimiser.step(self.table, self.gradients.parameters, ids, self.step)
-
-    def note(self) -> None:
-        """Bound the blocks that changed."""
-        self.blocks.update(self.table, self.frame.rows.visible_ids)
-        self.counts = len(self.active.ids), len(self.frame.rows.visible_ids)
-        del self.frame, self.gradients
-
-    def times(self, repeats: int) -> list[float]:
-        """Return median ms by stage."""
-        stages = [
-            self.rewind, self.cull, self.catch_up, self.forward, self.differentiate_loss, self.backward,
-            self.optimise, self.note,
-        ]  # fmt: skip
-        return event_times(stages, repeats)[1:]
+    def take(self, mark: Callable[[str], None]) -> None:
+        """Take one step."""
+        frame, terms, _ = self.stepper.forward(self.step, OPTIONS, self.batch, mark)
+        self.stepper.backward(self.step, frame, terms, mark)
+        self.visible = len(frame.rows.visible_ids)
 
 
 class GsplatStep:
     """The same step by gsplat and torch."""
 
-    names = ("forward", "loss", "backward", "adam")
-
     def __init__(self, scene: BenchmarkScene) -> None:
         from gsplat import rasterization
 
         self.render = CallRender(scene, rasterization, packed=False)
-        self.loss = Loss(scene)
+        self.batch = random_photographs(scene)
+        weights = ((1 - LOSS.ssim) / self.batch.samples, -LOSS.ssim / self.batch.samples)
+        self.weights = [weight / len(scene.viewmats) for weight in weights]
         self.optimiser = torch.optim.Adam(self.render.parameters, lr=RATE, eps=1e-15, fused=True)
 
-    def forward(self) -> None:
-        """Render."""
-        self.image = self.render.forward()
+    def prepare(self) -> None:
+        """Nothing to prepare."""
 
-    def differentiate_loss(self) -> None:
-        """Compare with the photo."""
-        self.v_image = self.loss.gradient(self.image.detach())
-
-    def backward(self) -> None:
-        """Differentiate the render."""
+    def take(self, mark: Callable[[str], None]) -> None:
+        """Take one step."""
+        image = self.render.forward()
+        mark("render")
+        v_image = photometric_fwd_bwd(image.detach(), self.batch.targets, None, *self.weights)[2]
+        mark("loss")
         self.optimiser.zero_grad(set_to_none=True)
-        self.image.backward(self.v_image)
+        image.backward(v_image)
+        mark("render back")
+        self.optimiser.step()
+        mark("optimiser")
 
-    def times(self, repeats: int) -> list[float]:
-        """Return median ms by stage."""
-        return event_times(
-            [self.forward, self.differentiate_loss, self.backward, self.optimiser.step], repeats
-        )
+
+def measure(step: OurStep | GsplatStep, repeats: int) -> list[tuple[str, float]]:
+    """Return name and median ms of each stage in order, last of the whole step."""
+    samples = []
+    for _ in range(WARM_UP + repeats):
+        step.prepare()
+        clock = Clock()
+        step.take(clock.mark)
+        stages = clock.stages()
+        samples.append([*stages, ("total", sum(ms for _, ms in stages))])
+    columns = zip(*samples[WARM_UP:], strict=True)
+    return [(column[0][0], statistics.median(ms for _, ms in column)) for column in columns]
 
 
 def main() -> None:
@@ -196,14 +182,12 @@ def main() -> None:
                 step = kind(scene)
             except ImportError:
                 continue
-            times = step.times(args.repeats)
-            totals.append(sum(times))
-            stages = "  ".join(f"{stage} {ms:.3f}" for stage, ms in zip(step.names, times, strict=True))
+            times = measure(step, args.repeats)
+            totals.append(times[-1][1])
             peak = torch.cuda.max_memory_allocated() / 1e9
-            print(f"{scene.name}, {args.views} view(s), {args.order} order: {label}")
-            print(f"  {stages}  total {sum(times):.3f} ms  peak {peak:.2f} GB", flush=True)
-            if isinstance(step, OurStep):
-                print("  {} active, {} visible".format(*step.counts))
+            visible = f", {step.visible} visible" if isinstance(step, OurStep) else ""
+            print(f"{scene.name}, {args.views} view(s), {args.order} order{visible}: {label}")
+            print(f"  {', '.join(f'{stage} {ms:.3f}' for stage, ms in times)} ms  peak {peak:.2f} GB")
             del step, scene
         if len(totals) == 2:
             print(f"  ratio {totals[1] / totals[0]:.2f}", flush=True)
