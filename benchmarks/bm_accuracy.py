@@ -122,7 +122,7 @@ class Renderer:
 
     def backward(self, frame: Frame, v_renders: Tensor) -> tuple[Tensor, ...]:
         """Return the gradients of the visible Gaussians."""
-        return backward(self.table, frame, v_renders).parameters
+        return backward(self.table, frame, v_renders)
 
     def step_ms(self, repeats: int) -> float:
         """Return the milliseconds of forward and backward, per view."""

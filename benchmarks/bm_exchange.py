@@ -59,7 +59,6 @@ STAGES = (
     "loss",
     "raster back",
     "exchange back",
-    "project back",
     "optimiser",
     "other",
 )
@@ -229,7 +228,7 @@ def half_precision_error(load: Workload) -> dict[str, float]:
         share = Share(load.ranks, batch.ranges, half) if batch.ranges is not None else None
         frame = pipeline.forward(load.table, views, load.options, share=share)
         terms = loss_terms(frame, batch, load.loss, 1.0)
-        gradients.append(pipeline.backward(load.table, frame, terms.v_renders).parameters[0])
+        gradients.append(pipeline.backward(load.table, frame, terms.v_renders)[0])
         images.append(frame.renders)
         if batch.ranges is not None:
             collect_images(frame.renders, batch.ranges, load.ranks, 0)

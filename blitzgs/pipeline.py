@@ -2,9 +2,10 @@
 """The hot path of training and rendering: views in, images and compact gradients out, without autograd.
 
 `forward` goes from the active Gaussians through projection, tile intersection and compositing to a `Frame`;
-`backward` returns along the same route from image gradients to the gradients of the visible Gaussians alone.
-Nothing here is as long as the table: cost follows what the views see. On several ranks an exchange of the
-projected rows sits between projection and intersection, and its reverse between their gradients.
+`backward_rows` returns along the same route from image gradients to those of the projected rows, and
+`backward` on to the gradients of the visible Gaussians alone. Nothing here is as long as the table: cost
+follows what the views see. On several ranks an exchange of the projected rows sits between projection and
+intersection, and its reverse between their gradients.
 """
 
 from __future__ import annotations
@@ -119,16 +120,20 @@ class Frame(NamedTuple):
     aux: Tensor
 
 
-class Gradients(NamedTuple):
-    """Gradients of the U visible Gaussians, and those of the P rows' 2D means.
+class RowGradients(NamedTuple):
+    """Gradients of this rank's P rows.
 
     Attributes:
-        parameters: of means [U, 3], quats [U, 4], scales [U, 3], opacities [U], sh [U, K, 3].
         means2d: [P, 2], per pixel.
+        conics: [P, 3].
+        opacities: [P].
+        colors: [P, 3].
     """
 
-    parameters: tuple[Tensor, ...]
     means2d: Tensor
+    conics: Tensor
+    opacities: Tensor
+    colors: Tensor
 
 
 def forward(
@@ -188,24 +193,15 @@ def forward(
     )
 
 
-def backward(
-    table: GaussianTable,
-    frame: Frame,
-    v_renders: Tensor,
-    scale_reg: Tensor | None = None,
-    mark: Mark = unmarked,
-) -> Gradients:
-    """Carry image gradients back to the parameters.
+def backward_rows(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> RowGradients:
+    """Carry image gradients back to the projected rows.
 
     Args:
-        table: the table that was rendered, unchanged since.
         frame: from `forward`.
         v_renders: gradient of the loss by the images, [B, H, W, 3]; this rank's tiles matter.
-        scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
-            term.
-        mark: called at the end of each stage: "raster back", "exchange back", "project back".
+        mark: called at the end of each stage: "raster back", "exchange back".
     """
-    views, options, rows, splats, share = frame.views, frame.options, frame.rows, frame.splats, frame.share
+    views, options, splats, share = frame.views, frame.options, frame.splats, frame.share
     tiles = (0, -1) if share is None else share.tiles
     *row_gradients, _ = torch.ops.blitzgs.rasterize_bwd(
         splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
@@ -216,14 +212,39 @@ def backward(
     if share is not None and frame.route is not None:
         row_gradients = send_back(row_gradients, frame.route, share.ranks)
     mark("exchange back")
-    v_means2d, v_conics, v_opacities, v_colors = row_gradients
+    return RowGradients(*row_gradients)
+
+
+def backward(
+    table: GaussianTable,
+    frame: Frame,
+    v_renders: Tensor,
+    scale_reg: Tensor | None = None,
+    mark: Mark = unmarked,
+) -> tuple[Tensor, ...]:
+    """Carry image gradients back to the parameters.
+
+    Args:
+        table: the table that was rendered, unchanged since.
+        frame: from `forward`.
+        v_renders: gradient of the loss by the images, [B, H, W, 3]; this rank's tiles matter.
+        scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
+            term.
+        mark: called at the end of each stage: "raster back", "exchange back", "project back".
+
+    Returns:
+        Gradients of the U visible Gaussians: of means [U, 3], quats [U, 4], scales [U, 3], opacities [U], sh
+        [U, K, 3].
+    """
+    views, options, rows = frame.views, frame.options, frame.rows
+    v = backward_rows(frame, v_renders, mark)
     *parameters, _ = torch.ops.blitzgs.project_bwd(
         *table.parameters, views.viewmats, views.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
-        views.width, views.height, options.sh_degree, options.eps2d, options.antialiased, True, v_means2d,
-        v_conics, None, v_opacities, v_colors, scale_reg, False,
+        views.width, views.height, options.sh_degree, options.eps2d, options.antialiased, True, v.means2d,
+        v.conics, None, v.opacities, v.colors, scale_reg, False,
     )  # fmt: skip
     mark("project back")
-    return Gradients(tuple(parameters), v_means2d)
+    return tuple(parameters)
 
 
 def _project(

@@ -41,13 +41,11 @@ target_compile_options(
     -diag-suppress=20012>
 )
 
-# No contraction where bits must agree: counting and emitting compute the same rows and tiles in different
-# kernels, and the optimiser's state is the CPU's bit for bit. These kernels wait for memory, not for
-# arithmetic.
+# Counting and emitting compute the same rows and tiles in different kernels: no contraction, so that they
+# get the same bits. These kernels wait for memory, not for arithmetic.
 set_source_files_properties(
   ${CMAKE_SOURCE_DIR}/csrc/project/project_fwd_cuda.cu
   ${CMAKE_SOURCE_DIR}/csrc/intersect/intersect_cuda.cu
-  ${CMAKE_SOURCE_DIR}/csrc/lazy_adam/lazy_adam_cuda.cu
   PROPERTIES COMPILE_OPTIONS "-fmad=false"
 )
 

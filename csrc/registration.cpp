@@ -39,6 +39,14 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor? v_depths, Tensor v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats) -> "
       "(Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, Tensor "
       "v_viewmats)");
+  // project_bwd, then lazy_adam_step_ of the visible rows.
+  m.def(
+      "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
+      "Tensor(d!) last_step, Tensor(e!) moment_step, Tensor table, Tensor lr_table, int step, "
+      "int explicit_steps, float beta1, float beta2, float eps, bool sparse, Tensor viewmats, Tensor Ks, "
+      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, int sh_degree, "
+      "float eps2d, bool antialiased, Tensor v_means2d, Tensor v_conics, Tensor v_row_opacities, "
+      "Tensor v_colors, Tensor? scale_reg) -> ()");
 
   // Which rows each tile composites, front to back by (depth, id).
   m.def(

@@ -72,7 +72,7 @@ def lazy_adam_step_(
         table,
         lr_table,
         step,
-        _explicit_steps(beta1, beta2, params[0].dtype),
+        explicit_steps(beta1, beta2, params[0].dtype),
         beta1,
         beta2,
         eps,
@@ -115,14 +115,14 @@ def lazy_adam_catch_up_(
         table,
         lr_table,
         step,
-        _explicit_steps(beta1, beta2, params[0].dtype),
+        explicit_steps(beta1, beta2, params[0].dtype),
         beta1,
         beta2,
         eps,
     )
 
 
-def _explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
+def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
     """Number of zero-gradient steps after which the drift that is left is below rounding."""
     ratio = beta1 / math.sqrt(beta2)
     negligible = _NEGLIGIBLE.get(dtype, 2.0**-27)

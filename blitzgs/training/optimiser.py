@@ -8,7 +8,9 @@ import math
 from torch import Tensor
 
 from blitzgs.model import GaussianTable
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
+from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, schedule_table
+from blitzgs.ops.project_step import project_bwd_step_
+from blitzgs.pipeline import Frame, RowGradients
 from blitzgs.training.config import OptimiserConfig
 from blitzgs.training.schedule import Schedule
 
@@ -51,14 +53,23 @@ class LazyAdam:
             self._eps,
         )
 
-    def step(self, table: GaussianTable, gradients: tuple[Tensor, ...], ids: Tensor, step: int) -> None:
-        """Take step number `step` (from 1) for the rows `ids` (int32 [U]) with their compact gradients."""
-        lazy_adam_step_(
+    def step(
+        self, table: GaussianTable, frame: Frame, v: RowGradients, scale_reg: Tensor | None, step: int
+    ) -> None:
+        """Take step number `step` (from 1) for the Gaussians that a frame shows.
+
+        Args:
+            table: the table that was rendered, unchanged since.
+            frame: of `pipeline.forward`.
+            v: gradients of the frame's rows, from `pipeline.backward_rows`.
+            scale_reg: as for `pipeline.backward`.
+            step: the visible rows stand at the step before.
+        """
+        views, options = frame.views, frame.options
+        project_bwd_step_(
             table.parameters,
             table.exp_avgs,
             table.exp_avg_sqs,
-            gradients,
-            ids,
             table["last_step"],
             table["moment_step"],
             self.lr_table,
@@ -66,4 +77,17 @@ class LazyAdam:
             *self._betas,
             self._eps,
             self._sparse,
+            frame.rows,
+            views.viewmats,
+            views.Ks,
+            views.width,
+            views.height,
+            sh_degree=options.sh_degree,
+            eps2d=options.eps2d,
+            antialiased=options.antialiased,
+            v_means2d=v.means2d,
+            v_conics=v.conics,
+            v_opacities=v.opacities,
+            v_colors=v.colors,
+            scale_reg=scale_reg,
         )

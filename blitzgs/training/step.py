@@ -9,7 +9,7 @@ from blitzgs import pipeline
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.model import GaussianTable
-from blitzgs.pipeline import Active, Frame, Gradients, Mark, RenderOptions, Views, unmarked
+from blitzgs.pipeline import Active, Frame, Mark, RenderOptions, RowGradients, Views, unmarked
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms
@@ -79,11 +79,11 @@ class Stepper:
         mark("other")
         return frame, terms, sums
 
-    def backward(self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked) -> Gradients:
-        """Carry the gradients of `forward`'s loss back and move the Gaussians by them."""
+    def backward(self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked) -> RowGradients:
+        """Carry the gradients of `forward`'s loss back to the rows, and move the Gaussians by them."""
         table = self._table
-        gradients = pipeline.backward(table, frame, terms.v_renders, terms.scale_reg, mark)
-        self._optimiser.step(table, gradients.parameters, frame.rows.visible_ids, step)
+        gradients = pipeline.backward_rows(frame, terms.v_renders, mark)
+        self._optimiser.step(table, frame, gradients, terms.scale_reg, step)
         mark("optimiser")
         self._blocks.update(table, frame.rows.visible_ids)
         mark("other")

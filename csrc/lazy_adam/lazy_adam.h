@@ -23,7 +23,7 @@
 // which catching up reads and leaves alone (their decay is applied by the next step with a gradient).
 //
 // Rows are independent and each element is computed the same way wherever it lies, so results do not depend
-// on the order of the list or on sharding; CPU and CUDA give the same bits. O(1) per element.
+// on the order of the list or on sharding. O(1) per element.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -66,7 +66,7 @@ struct AdamArgs {
   }
 };
 
-// The Gauss rule of one group: drift = sum of m / (place sqrt(v) + eps) * weight.
+// The Gauss rule of one group: drift = m times the sum of weight / (place sqrt(v) + eps).
 template <class T>
 struct alignas(4 * sizeof(T)) AdamRule {
   T place[2], weight[2];
@@ -140,15 +140,52 @@ BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const AdamDebt<T>& deb
   return drift;
 }
 
+// A root, and the reciprocal of a number that is zero or normal, to an ulp on CUDA: correctly rounded ones
+// would be most of an update's instructions there, and the ulp is lost in the update's own rounding.
+template <class T>
+BLITZGS_HD T adam_root(T x) {
+#ifdef __CUDA_ARCH__
+  if constexpr (sizeof(T) == 4) {
+    asm("sqrt.approx.f32 %0, %0;" : "+f"(x));
+    return x;
+  }
+#endif
+  return std::sqrt(x);
+}
+
+template <class T>
+BLITZGS_HD T adam_reciprocal(T x) {
+#ifdef __CUDA_ARCH__
+  if constexpr (sizeof(T) == 4) {
+    asm("rcp.approx.ftz.f32 %0, %0;" : "+f"(x));
+    return x;
+  }
+#endif
+  return T(1) / x;
+}
+
+// The drift of one element by its group's rule; m and root = sqrt(v) at the step the rule starts from.
+template <class T>
+BLITZGS_HD T adam_ruled_drift(const AdamRule<T>& rule, T m, T root, T eps) {
+  const T drift = m * (adam_reciprocal(rule.place[0] * root + eps) * rule.weight[0] +
+                       adam_reciprocal(rule.place[1] * root + eps) * rule.weight[1]);
+  return m == 0 ? T(0) : drift;
+}
+
 // What a parameter moves down by while its debt is paid; m and v at step debt.from.
 template <class T>
-BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, const AdamRule<T>& rule, int group,
-                        T m, T v) {
+BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T v) {
+  const T root = adam_root(v);
   if (m == 0) return 0;
-  const T root = std::sqrt(v), eps = static_cast<T>(args.eps);
   if (!(root > debt.explicit_up_to)) return adam_explicit_drift(args, debt, group, m, root);
-  return m / (rule.place[0] * root + eps) * rule.weight[0] +
-         m / (rule.place[1] * root + eps) * rule.weight[1];
+  return adam_ruled_drift(debt.rules[group], m, root, static_cast<T>(args.eps));
+}
+
+// Whether a row drifts noticeably on its way to the target: explicit_steps after the moments' step, what is
+// left of the drift is below its rounding.
+template <class T>
+BLITZGS_HD bool adam_moves(const AdamArgs<T>& args, std::int32_t from, std::int32_t stand) {
+  return from < args.target() && from - stand < args.explicit_steps;
 }
 
 // How one row's moments decay: from where they stand to where its parameters stand, and to the target.
@@ -157,7 +194,7 @@ struct AdamRow {
   std::int32_t from;  // where the parameters stand
   T here1, here2;     // beta1^k, beta2^k to there
   T then1, then2;     // to the target
-  bool moves;         // drifts noticeably on its way to the target
+  bool moves;         // see adam_moves
 };
 
 template <class T>
@@ -166,13 +203,12 @@ BLITZGS_HD AdamRow<T> adam_row(const AdamArgs<T>& args, std::int64_t row) {
   if (args.sparse) return {target, T(1), T(1), T(1), T(1), false};
   const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
   const double *here = args.table_row(from - stand), *then = args.table_row(target - stand);
-  // explicit_steps after the moments' step, what is left of the drift is below its rounding.
   return {from,
           static_cast<T>(here[kBeta1Power]),
           static_cast<T>(here[kBeta2Power]),
           static_cast<T>(then[kBeta1Power]),
           static_cast<T>(then[kBeta2Power]),
-          from < target && from - stand < args.explicit_steps};
+          adam_moves(args, from, stand)};
 }
 
 // The scalars of one step with a gradient.
@@ -203,7 +239,7 @@ template <class T>
 BLITZGS_HD void adam_update(const AdamStep<T>& s, int group, T g, T& p, T& m, T& v) {
   m = s.beta1 * m + s.one_minus_beta1 * g;
   v = s.beta2 * v + s.one_minus_beta2 * (g * g);
-  p -= s.rate[group] * m / (std::sqrt(v) * s.inverse_root2 + s.eps);
+  p -= s.rate[group] * m * adam_reciprocal(adam_root(v) * s.inverse_root2 + s.eps);
 }
 
 // The learning-rate group of element j of a column; groups ascend within a column and over the columns.

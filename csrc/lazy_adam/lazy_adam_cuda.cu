@@ -1,153 +1,199 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
 #include <type_traits>
 
 #include "common/cuda_check.h"
-#include "lazy_adam/lazy_adam.h"
+#include "lazy_adam/lazy_adam_device.cuh"
 
 namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kRows = 32;  // rows per block
-constexpr int kThreads = 128;
+// A row of SH degree 3 has 12 packs of SH, one quaternion and seven more numbers: a thread each.
+constexpr int kRows = 16;  // rows per block
+constexpr int kThreads = kRows * (12 + 8);
+constexpr int kCatchUpBlocks = 4;  // per multiprocessor
+constexpr int kPrepareThreads = 64, kListThreads = 256;
 
-// What rows that stand at any step before the target owe: every row of a launch goes to the same step, so
-// the double arithmetic is done once a step, not once a row.
-__global__ void list_debts(const AdamArgs<float> args, AdamDebt<float>* debts) {
-  const std::int32_t from = blockIdx.x * blockDim.x + threadIdx.x;
-  if (from < args.target()) debts[from] = adam_debt(args, from, args.target());
+// What rows that catch up may need: all of a launch go to the same step, so it is worked out once instead of
+// once a row.
+struct Prepared {
+  AdamDebt<float>* debts;  // [target], of parameters that stand at each step before
+  Decay* decays;           // [target + 1], over each number of steps
+  bool* owing;             // whether there are any debtors
+};
+
+__global__ void __launch_bounds__(kPrepareThreads)
+    prepare(const __grid_constant__ AdamArgs<float> args, const Prepared prepared) {
+  const std::int32_t t = blockIdx.x * blockDim.x + threadIdx.x;
+  if (t == 0) *prepared.owing = false;
+  if (t <= args.target()) prepared.decays[t] = make_decay(args, t);
+  if (t < args.target()) prepared.debts[t] = adam_debt(args, t, args.target());
 }
 
-template <int Width>
-struct alignas(4 * Width) Pack {
-  float x[Width];
+// A row that catches up by the rules of the step that it stands at.
+struct alignas(16) Debtor {
+  std::int32_t row;   // -1: nothing to do
+  std::int32_t from;  // its parameters' step
+  Decay here;         // of its moments, to there
 };
 
-// A row as the threads of its block see it.
-struct BlockRow {
-  std::int32_t row, list_row;
-  AdamRow<float> state;
-};
+// Pays a debt that the rules do not do for; a warp for a row.
+template <int Column>
+__device__ void pay_elements(const AdamArgs<float>& args, const AdamDebt<float>& debt, const Decay& here,
+                             std::int64_t row) {
+  const AdamColumn<float>& column = args.columns[Column];
+  for (int j = threadIdx.x % 32; j < column.width; j += 32) {
+    const std::int64_t at = row * column.width + j;
+    column.param[at] -= adam_drift(args, debt, adam_group(Column, j), column.exp_avg[at] * here.first,
+                                   column.exp_avg_sq[at] * here.second);
+  }
+}
 
-// One pack of Width elements of one row: loads first, so that many packs are in flight, then the arithmetic.
-template <int Column, int Width, bool Gradient>
-class Item {
- public:
-  __device__ __forceinline__ void load(const AdamArgs<float>& args, const BlockRow* rows, int local,
-                                       int pack) {
-    const AdamColumn<float>& column = args.columns[Column];
-    local_ = local;
-    pack_ = pack;
-    at_ = rows[local].row * column.width + pack * Width;
-    p_ = *reinterpret_cast<const P*>(column.param + at_);
-    m_ = *reinterpret_cast<const P*>(column.exp_avg + at_);
-    v_ = *reinterpret_cast<const P*>(column.exp_avg_sq + at_);
-    if (Gradient) {
-      g_ = *reinterpret_cast<const P*>(column.grad + rows[local].list_row * column.width + pack * Width);
+// Lists the debtors and notes that they will have paid. Those for whom the rules do not do, which only steps
+// early in a schedule have, pay at once, each by a whole warp.
+__global__ void __launch_bounds__(kListThreads)
+    list_debtors(const __grid_constant__ AdamArgs<float> args, const Prepared prepared, Debtor* debtors) {
+  const std::int64_t i = blockIdx.x * std::int64_t{kListThreads} + threadIdx.x;
+  Debtor mine{-1, 0, {}};
+  bool explicitly = false;
+  if (i < args.n) {
+    const std::int32_t row = args.ids ? args.ids[i] : static_cast<std::int32_t>(i);
+    const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
+    if (adam_moves(args, from, stand)) {
+      mine = {row, from, prepared.decays[from - stand]};
+      explicitly = prepared.debts[from].explicit_up_to >= 0;
+    }
+    if (from < args.step) args.last_step[row] = args.step;
+  }
+  for (unsigned left = __ballot_sync(~0u, explicitly); left; left &= left - 1) {
+    const int lane = __ffs(left) - 1;
+    const std::int64_t row = __shfl_sync(~0u, mine.row, lane);
+    const AdamDebt<float>& debt = prepared.debts[__shfl_sync(~0u, mine.from, lane)];
+    const Decay here{__shfl_sync(~0u, mine.here.first, lane), __shfl_sync(~0u, mine.here.second, lane)};
+    pay_elements<0>(args, debt, here, row);
+    pay_elements<1>(args, debt, here, row);
+    pay_elements<2>(args, debt, here, row);
+    pay_elements<3>(args, debt, here, row);
+    pay_elements<4>(args, debt, here, row);
+  }
+  if (explicitly) mine.row = -1;
+  if (i < args.n) debtors[i] = mine;
+  if (__any_sync(~0u, mine.row >= 0) && threadIdx.x % 32 == 0) *prepared.owing = true;
+}
+
+// Calls update<Column, Width>(local row, pack) for what is a thread's to do in every kRows rows. ShPacks:
+// packs in an SH row; 0: as many as `sh_packs` says.
+template <int ShWidth, int ShPacks, class F>
+__device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
+  const int packs = ShPacks ? ShPacks : sh_packs;
+  constexpr int kRound = ShPacks ? kRows * (ShPacks + 8) : kThreads;  // one round where the row fills it
+  for (int item = threadIdx.x; item < kRows * (packs + 8); item += kRound) {
+    const int rest = item - kRows * packs;
+    if (rest < 0) {
+      update.template operator()<4, ShWidth>(item / packs, item % packs);
+    } else if (rest < 3 * kRows) {
+      update.template operator()<0, 1>(rest / 3, rest % 3);
+    } else if (rest < 6 * kRows) {
+      update.template operator()<2, 1>(rest / 3 - kRows, rest % 3);
+    } else if (rest < 7 * kRows) {
+      update.template operator()<1, 4>(rest - 6 * kRows, 0);
+    } else {
+      update.template operator()<3, 1>(rest - 7 * kRows, 0);
     }
   }
+}
 
-  __device__ __forceinline__ void finish(const AdamArgs<float>& args, const AdamStep<float>& step,
-                                         const AdamDebt<float>* debts, const BlockRow* rows) {
-    const AdamColumn<float>& column = args.columns[Column];
-    const AdamRow<float>& state = rows[local_].state;
-    const int first = adam_group(Column, pack_ * Width), last = adam_group(Column, pack_ * Width + Width - 1);
-    if (state.moves) {
-      const AdamDebt<float>& debt = debts[state.from];
-      const AdamRule<float> rules[2] = {debt.rules[first], debt.rules[last]};
-#pragma unroll
-      for (int j = 0; j < Width; ++j) {
-        const bool low = j < Width - 1;  // of a pack over two groups, the last element alone has the second
-        p_.x[j] -= adam_drift(args, debt, rules[low ? 0 : 1], low ? first : last, m_.x[j] * state.here1,
-                              v_.x[j] * state.here2);
-      }
-    }
-    if (Gradient) {
-#pragma unroll
-      for (int j = 0; j < Width; ++j) {
-        m_.x[j] *= state.then1;
-        v_.x[j] *= state.then2;
-        adam_update(step, j < Width - 1 ? first : last, g_.x[j], p_.x[j], m_.x[j], v_.x[j]);
-      }
-      *reinterpret_cast<P*>(column.exp_avg + at_) = m_;
-      *reinterpret_cast<P*>(column.exp_avg_sq + at_) = v_;
-    }
-    *reinterpret_cast<P*>(column.param + at_) = p_;
-  }
-
- private:
+template <int Column, int Width>
+__device__ __forceinline__ void pay_pack(const AdamArgs<float>& args, const AdamDebt<float>* debts,
+                                         const Debtor& debtor, int pack) {
   using P = Pack<Width>;
-  P p_, m_, v_, g_;
-  std::int64_t at_;
-  int local_, pack_;
-};
-
-// The rows of the block that there is something to do for, in `rows`; returns how many.
-template <bool Gradient>
-__device__ __forceinline__ int collect_rows(const AdamArgs<float>& args, BlockRow* rows) {
-  static_assert(kRows == 32, "the first warp has a row a lane");
-  bool work = false;
-  if (threadIdx.x < kRows) {
-    BlockRow mine;
-    const std::int64_t i = blockIdx.x * std::int64_t{kRows} + threadIdx.x;
-    if (i < args.n) {
-      mine.list_row = static_cast<std::int32_t>(i);
-      mine.row = args.ids ? args.ids[i] : mine.list_row;
-      mine.state = adam_row(args, mine.row);
-      work = Gradient || mine.state.moves;
-      if (Gradient || mine.state.from < args.step) args.last_step[mine.row] = args.step;
-      if (Gradient) args.moment_step[mine.row] = args.step;
-    }
-    const unsigned ballot = __ballot_sync(~0u, work);
-    if (work) rows[__popc(ballot & ((1u << threadIdx.x) - 1))] = mine;
+  const AdamColumn<float>& column = args.columns[Column];
+  const std::int64_t at = debtor.row * column.width + pack * Width;
+  P p = *reinterpret_cast<const P*>(column.param + at);
+  const P m = *reinterpret_cast<const P*>(column.exp_avg + at);
+  const P v = *reinterpret_cast<const P*>(column.exp_avg_sq + at);
+  const AdamDebt<float>& debt = debts[debtor.from];
+  const AdamRule<float> first = debt.rules[pack_group<Column, Width>(pack, 0)],
+                        last = debt.rules[pack_group<Column, Width>(pack, Width - 1)];
+#pragma unroll
+  for (int j = 0; j < Width; ++j) {
+    p.x[j] -= adam_ruled_drift(j < Width - 1 ? first : last, m.x[j] * debtor.here.first,
+                               adam_root(v.x[j] * debtor.here.second), static_cast<float>(args.eps));
   }
-  return __syncthreads_count(work);
+  *reinterpret_cast<P*>(column.param + at) = p;
+}
+
+// A thread has the same part of every kRows-th debtor; who comes next is looked up while one pays.
+template <int ShWidth, int ShPacks>
+__global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
+    catch_up_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
+                    const Debtor* debtors) {
+  if (!*prepared.owing) return;
+  const auto pay = [&]<int Column, int Width>(int local, int pack) {
+    const std::int64_t stride = gridDim.x * std::int64_t{kRows};
+    std::int64_t i = blockIdx.x * std::int64_t{kRows} + local;
+    Debtor next{-1, 0, {}};
+    if (i < args.n) next = debtors[i];
+    while (i < args.n) {
+      const Debtor debtor = next;
+      i += stride;
+      if (i < args.n) next = debtors[i];
+      if (debtor.row >= 0) pay_pack<Column, Width>(args, prepared.debts, debtor, pack);
+    }
+  };
+  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, pay);
+}
+
+template <int Column, int Width>
+__device__ __forceinline__ void step_pack(const AdamArgs<float>& args, const AdamStep<float>& step,
+                                          std::int64_t row, std::int64_t list_row, int pack) {
+  const AdamColumn<float>& column = args.columns[Column];
+  StepPack<Column, Width> own;
+  own.load(column, row, pack);
+  const auto g = *reinterpret_cast<const Pack<Width>*>(column.grad + list_row * column.width + pack * Width);
+  own.finish(column, step, make_decay(args, args.sparse ? 0 : args.target() - args.moment_step[row]), g);
 }
 
 // A block owns kRows rows of the list in all five columns, so their steps are read and written by it alone.
-// The short columns' loads are in flight while the SH column is worked on.
-template <int ShWidth, bool Gradient>
-__global__ void __launch_bounds__(kThreads)
-    lazy_adam_kernel(const AdamArgs<float> args, const AdamDebt<float>* debts) {
-  __shared__ BlockRow rows[kRows];
+template <int ShWidth, int ShPacks>
+__global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ AdamArgs<float> args) {
   __shared__ AdamStep<float> step;
-  if (Gradient && threadIdx.x == kThreads - 1) step = adam_step_scalars(args);
-  const int count = collect_rows<Gradient>(args, rows);
-  const int thread = threadIdx.x;
-  Item<0, 1, Gradient> mean;
-  Item<1, 4, Gradient> quat;
-  Item<2, 1, Gradient> scale;
-  Item<3, 1, Gradient> opacity;
-  if (thread < 3 * count) {
-    mean.load(args, rows, thread / 3, thread % 3);
-    scale.load(args, rows, thread / 3, thread % 3);
-  }
-  if (thread < count) {
-    quat.load(args, rows, thread, 0);
-    opacity.load(args, rows, thread, 0);
-  }
-  constexpr int kUnroll = 3;
-  const int packs = static_cast<int>(args.columns[4].width) / ShWidth, items = count * packs;
-  for (int base = thread; base < items; base += kThreads * kUnroll) {
-    Item<4, ShWidth, Gradient> sh[kUnroll];
-#pragma unroll
-    for (int u = 0; u < kUnroll; ++u) {
-      const int item = base + u * kThreads;
-      if (item < items) sh[u].load(args, rows, item / packs, item % packs);
-    }
-#pragma unroll
-    for (int u = 0; u < kUnroll; ++u) {
-      if (base + u * kThreads < items) sh[u].finish(args, step, debts, rows);
-    }
-  }
-  if (thread < 3 * count) {
-    mean.finish(args, step, debts, rows);
-    scale.finish(args, step, debts, rows);
-  }
-  if (thread < count) {
-    quat.finish(args, step, debts, rows);
-    opacity.finish(args, step, debts, rows);
-  }
+  if (threadIdx.x == 0) step = adam_step_scalars(args);
+  __syncthreads();
+  const std::int64_t first = blockIdx.x * std::int64_t{kRows};
+  const int count = static_cast<int>(args.n - first < kRows ? args.n - first : kRows);
+  const auto take_step = [&]<int Column, int Width>(int local, int pack) {
+    if (local >= count) return;
+    const std::int64_t row = args.ids ? args.ids[first + local] : first + local;
+    step_pack<Column, Width>(args, step, row, first + local, pack);
+  };
+  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, take_step);
+  __syncthreads();
+  if (threadIdx.x >= count) return;
+  const std::int64_t i = first + threadIdx.x, row = args.ids ? args.ids[i] : i;
+  args.last_step[row] = args.step;
+  args.moment_step[row] = args.step;
+}
+
+int multiprocessors() {
+  int device = 0, count = 0;
+  check(cudaGetDevice(&device), "lazy_adam");
+  check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "lazy_adam");
+  return count;
+}
+
+void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
+  if (args.step == 0) return;
+  const Prepared prepared{workspace.allocate<AdamDebt<float>>(args.step),
+                          workspace.allocate<Decay>(args.step + 1), workspace.allocate<bool>(1)};
+  auto* debtors = workspace.allocate<Debtor>(args.n);
+  prepare<<<blocks_for(args.step + 1, kPrepareThreads), kPrepareThreads, 0, stream>>>(args, prepared);
+  list_debtors<<<blocks_for(args.n, kListThreads), kListThreads, 0, stream>>>(args, prepared, debtors);
+  const auto kernel = args.columns[4].width == 48 ? catch_up_kernel<4, 12> : catch_up_kernel<1, 0>;
+  const unsigned blocks = std::min(blocks_for(args.n, kRows), unsigned(kCatchUpBlocks * multiprocessors()));
+  kernel<<<blocks, kThreads, 0, stream>>>(args, prepared, debtors);
+  check_launch("lazy_adam catch-up");
 }
 
 }  // namespace
@@ -156,17 +202,14 @@ template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
   static_assert(std::is_same_v<T, float>);
   if (args.n == 0) return;
-  AdamDebt<float>* debts = nullptr;
-  if (args.target() > 0 && !args.sparse) {
-    debts = workspace.allocate<AdamDebt<float>>(args.target());
-    list_debts<<<blocks_for(args.target(), 64), 64, 0, stream>>>(args, debts);
-    check_launch("list_debts");
-  }
-  const bool wide = args.columns[4].width % 4 == 0;
-  auto kernel = args.with_gradient() ? (wide ? lazy_adam_kernel<4, true> : lazy_adam_kernel<1, true>)
-                                     : (wide ? lazy_adam_kernel<4, false> : lazy_adam_kernel<1, false>);
-  kernel<<<blocks_for(args.n, kRows), kThreads, 0, stream>>>(args, debts);
-  check_launch("lazy_adam");
+  AdamArgs<float> behind = args;
+  behind.step = args.target();
+  for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;
+  if (!args.sparse) catch_up(behind, workspace, stream);
+  if (!args.with_gradient()) return;
+  const auto kernel = args.columns[4].width == 48 ? step_kernel<4, 12> : step_kernel<1, 0>;
+  kernel<<<blocks_for(args.n, kRows), kThreads, 0, stream>>>(args);
+  check_launch("lazy_adam step");
 }
 
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);

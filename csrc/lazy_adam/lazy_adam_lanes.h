@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The update of one row, eight elements at a time, over the lane types of math/lanes.h: operation for
-// operation what adam_drift() and adam_update() do, hence the same bits. Compiled plain and with AVX2.
+// The update of one row, eight elements at a time, over the lane types of math/lanes.h: the arithmetic
+// of adam_drift() and adam_update(). Compiled plain and with AVX2.
 #pragma once
 #include <cstdint>
 
@@ -51,9 +51,9 @@ Lanes drift_of(const AdamRowJob<T>& job, const int* groups, Lanes m, Lanes v) {
   for (int i = 0; i < 2; ++i) {
     const Lanes place = by_group<Lanes>(groups, [&](int g) { return debt.rules[g].place[i]; });
     const Lanes weight = by_group<Lanes>(groups, [&](int g) { return debt.rules[g].weight[i]; });
-    parts[i] = m / (place * root + eps) * weight;
+    parts[i] = Lanes::broadcast(T(1)) / (place * root + eps) * weight;
   }
-  Lanes drift = Lanes::keep(ruled, parts[0] + parts[1]);
+  Lanes drift = Lanes::keep(ruled, m * (parts[0] + parts[1]));
   if (unsigned bits = moving.and_not(ruled).bits()) {
     T ms[kLanes], roots[kLanes], each[kLanes];
     m.store(ms);

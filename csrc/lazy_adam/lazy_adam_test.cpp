@@ -67,7 +67,7 @@ double drift_one_by_one(double m, double v, int from, int to, double eps) {
 template <class T>
 T drift(const blitzgs::AdamArgs<T>& args, int from, int to, int group, T m, T v) {
   const blitzgs::AdamDebt<T> debt = blitzgs::adam_debt(args, from, to);
-  return blitzgs::adam_drift(args, debt, debt.rules[group], group, m, v);
+  return blitzgs::adam_drift(args, debt, group, m, v);
 }
 
 }  // namespace

@@ -1,106 +1,44 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <cub/block/block_reduce.cuh>
 
-#include "project/project_device.cuh"
+#include "project/project_bwd_device.cuh"
 
 namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kThreads = 128;
 constexpr int kPoseThreads = 256;
 
-struct BackwardInputs {
-  Inputs in;
-  ProjectRows rows;
-  ProjectRowGradients<float> v;
-  const float* scale_reg;
+// Stores the gradients, compact.
+struct StoreGradients {
+  struct Shared {};
+  struct Own {};
+  ProjectGradients<float> out;
+  std::int64_t stride;  // floats in a row of SH
+
+  __device__ Own begin(Shared&, const WarpRows&) const { return {}; }
+  __device__ void take(Shared&, Own&, const WarpRows& warp, TripleStage& triple, const Vec3<float>& v_mean,
+                       const float4& v_quat, const Vec3<float>& v_scale, float v_opacity) const {
+    if (warp.id >= 0) {
+      out.opacities[warp.first + warp.lane] = v_opacity;
+      reinterpret_cast<float4*>(out.quats)[warp.first + warp.lane] = v_quat;
+    }
+    triple.store(v_mean, out.means + 3 * warp.first, warp.count, warp.lane);
+    triple.store(v_scale, out.scales + 3 * warp.first, warp.count, warp.lane);
+  }
+  template <int DEGREE>
+  __device__ void take_sh(Shared&, Own&, const WarpRows& warp, const ShStage<DEGREE>& stage) const {
+    if (out.sh) stage.store(out.sh + stride * warp.first, stride, warp.count, warp.lane);
+  }
+  template <int DEGREE>
+  __device__ void take_sh(Shared&, Own&, const WarpRows& warp, const ShRow<DEGREE>& v_sh) const {
+    if (!out.sh || warp.id < 0) return;
+    float* target = out.sh + stride * (warp.first + warp.lane);
+#pragma unroll
+    for (int i = 0; i < ShRow<DEGREE>::kCount; ++i) target[i] = v_sh.values[i];
+    for (int i = ShRow<DEGREE>::kCount; i < stride; ++i) target[i] = 0.f;
+  }
 };
-
-__device__ RowGradient<float> load_row_gradient(const ProjectRowGradients<float>& v, std::int64_t r) {
-  return {{v.means2d[2 * r], v.means2d[2 * r + 1]},
-          {v.conics[3 * r], v.conics[3 * r + 1], v.conics[3 * r + 2]},
-          v.depths ? v.depths[r] : 0.f,
-          v.opacities[r]};
-}
-
-// A thread is a visible Gaussian.
-template <int DEGREE, bool QUADS>
-__global__ void __launch_bounds__(kThreads, 3)
-    backward_kernel(const BackwardInputs args, const ProjectGradients<float> out) {
-  using Coefficients = ShRow<DEGREE>;
-  __shared__ Camera<float> cameras[kMaxViews];
-  __shared__ ShStage<DEGREE> stages[QUADS ? kThreads / 32 : 1];
-  __shared__ TripleStage triples[kThreads / 32];
-  const Inputs& in = args.in;
-  const int lane = threadIdx.x % 32;
-  ShStage<DEGREE>& stage = stages[QUADS ? threadIdx.x / 32 : 0];
-  TripleStage& triple = triples[threadIdx.x / 32];
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x / 32 * 32;
-  const std::int64_t u = first + lane;
-  const std::int32_t id = u < args.rows.n_visible ? args.rows.visible_ids[u] : -1;
-  const std::int64_t stride = 3 * in.options.sh_stride;
-  const bool has_colors = in.sh && args.v.colors;
-  if constexpr (QUADS) {
-    if (has_colors) stage.gather(in.sh, stride, id, lane);
-  }
-  load_cameras(in, cameras);
-  __syncthreads();
-  const Vec3<float> mean = triple.gather(in.means, id, lane), scale = triple.gather(in.scales, id, lane);
-
-  Vec3<float> v_mean{}, v_scale{};
-  const ActiveGaussian<float> gaussian = make_gaussian(in, id < 0 ? 0 : id, mean, scale);
-  GaussianGradient<float> gradient{};
-  float axis_weight = 0.f;
-  const std::int32_t begin = id < 0 ? 0 : args.rows.row_offsets[u],
-                     end = id < 0 ? 0 : args.rows.row_offsets[u + 1];
-  PoseGradient<float>* no_pose = nullptr;
-  for (std::int64_t r = begin; r < end; ++r) {
-    const int view = args.rows.camera_ids[r];
-    project_row_vjp(cameras[view], gaussian, in.options, load_row_gradient(args.v, r), &gradient, no_pose);
-    if (args.scale_reg) axis_weight += args.scale_reg[view];
-  }
-
-  // The colours after the geometry, so that their coefficients are in registers for no longer than needed.
-  Coefficients v_sh;
-#pragma unroll
-  for (float& value : v_sh.values) value = 0.f;
-  if (has_colors) {
-    Coefficients sh;
-    if constexpr (QUADS) {
-      stage.wait();
-      stage.read(lane, &sh);
-      __syncwarp();
-    } else if (id >= 0) {
-#pragma unroll
-      for (int i = 0; i < Coefficients::kCount; ++i) sh.values[i] = in.sh[stride * id + i];
-    }
-    for (std::int64_t r = begin; r < end; ++r) {
-      const float v_color[3] = {args.v.colors[3 * r], args.v.colors[3 * r + 1], args.v.colors[3 * r + 2]};
-      row_color_vjp(cameras[args.rows.camera_ids[r]], mean, sh.values, DEGREE, v_color, v_sh.values,
-                    &gradient.mean, no_pose);
-    }
-  }
-  if (id >= 0) {
-    float v_quat[4];
-    activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
-                          ParameterGradients<float>{&v_mean.x, v_quat, &v_scale.x, out.opacities + u});
-    reinterpret_cast<float4*>(out.quats)[u] = {v_quat[0], v_quat[1], v_quat[2], v_quat[3]};
-  }
-  const std::int64_t rows = args.rows.n_visible - first;
-  triple.store(v_mean, out.means + 3 * first, rows, lane);
-  triple.store(v_scale, out.scales + 3 * first, rows, lane);
-  if (!out.sh) return;
-  if constexpr (QUADS) {
-    stage.write(lane, v_sh);
-    stage.store(out.sh + stride * first, stride, rows, lane);
-  } else if (id >= 0) {
-    float* target = out.sh + stride * u;
-#pragma unroll
-    for (int i = 0; i < Coefficients::kCount; ++i) target[i] = v_sh.values[i];
-    for (int i = Coefficients::kCount; i < stride; ++i) target[i] = 0.f;
-  }
-}
 
 // One block's share of the gradients of view blockIdx.y: [blocks, B, 12] doubles.
 __global__ void __launch_bounds__(kPoseThreads) pose_kernel(const BackwardInputs args, double* partial) {
@@ -166,9 +104,10 @@ void project_bwd<float>(const Inputs& in, const ProjectRows& rows, const Project
   }
   if (blocks == 0) return;
   const BackwardInputs args{in, rows, v, scale_reg};
+  const StoreGradients sink{out, 3 * in.options.sh_stride};
   dispatch_sh(in, [&](auto degree, auto quads) {
     backward_kernel<degree.value, quads.value>
-        <<<blocks_for(rows.n_visible, kThreads), kThreads, 0, stream>>>(args, out);
+        <<<blocks_for(rows.n_visible, kBackwardThreads), kBackwardThreads, 0, stream>>>(args, sink);
   });
   check_launch("project_bwd");
   if (!out.viewmats) return;

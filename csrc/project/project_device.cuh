@@ -55,23 +55,39 @@ __device__ inline ActiveGaussian<float> load_gaussian(const Inputs& in, std::int
 struct TripleStage {
   float values[96];
 
-  // Gathers row `id` of each lane (id < 0: none) and returns the lane's own.
-  __device__ __forceinline__ Vec3<float> gather(const float* source, std::int32_t id, int lane) {
+  // Loads a lane's part of row `id` of each lane (id < 0: none), for share().
+  __device__ static __forceinline__ Vec3<float> fetch(const float* source, std::int32_t id, int lane) {
+    float part[3] = {};
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
       const int at = i * 32 + lane;
       const std::int64_t row = __shfl_sync(0xffffffffu, id, at / 3);
-      if (row >= 0) values[at] = source[3 * row + at % 3];
+      if (row >= 0) part[i] = source[3 * row + at % 3];
     }
+    return {part[0], part[1], part[2]};
+  }
+  // Returns the lane's own row of what the lanes fetched.
+  __device__ __forceinline__ Vec3<float> share(const Vec3<float>& part, int lane) {
+    values[lane] = part.x;
+    values[32 + lane] = part.y;
+    values[64 + lane] = part.z;
     __syncwarp();
     const Vec3<float> mine = load3(values + 3 * lane);
     __syncwarp();
     return mine;
   }
-  // Stores each lane's row, the first `rows` of them, one behind the other at `out`.
-  __device__ __forceinline__ void store(const Vec3<float>& mine, float* out, std::int64_t rows, int lane) {
+  // Gathers row `id` of each lane (id < 0: none) and returns the lane's own.
+  __device__ __forceinline__ Vec3<float> gather(const float* source, std::int32_t id, int lane) {
+    return share(fetch(source, id, lane), lane);
+  }
+  // Sets each lane's row.
+  __device__ __forceinline__ void set(int lane, const Vec3<float>& mine) {
     store3(mine, values + 3 * lane);
     __syncwarp();
+  }
+  // Stores each lane's row, the first `rows` of them, one behind the other at `out`.
+  __device__ __forceinline__ void store(const Vec3<float>& mine, float* out, std::int64_t rows, int lane) {
+    set(lane, mine);
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
       const int at = i * 32 + lane;
@@ -145,10 +161,10 @@ struct ShStage {
   __device__ __forceinline__ void write(int lane, const Row& row) {
 #pragma unroll
     for (int i = 0; i < Row::kQuads; ++i) quads[lane * kPitch + i] = row.quad(i);
+    __syncwarp();
   }
   // Stores the first `rows` rows at out, `stride` floats apart, and zeros where a row has more coefficients.
-  __device__ __forceinline__ void store(float* out, std::int64_t stride, std::int64_t rows, int lane) {
-    __syncwarp();
+  __device__ __forceinline__ void store(float* out, std::int64_t stride, std::int64_t rows, int lane) const {
 #pragma unroll
     for (int i = 0; i < Row::kQuads; ++i) {
       const int at = i * 32 + lane, row = at / Row::kQuads, quad = at % Row::kQuads;

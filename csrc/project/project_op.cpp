@@ -3,86 +3,10 @@
 #include <limits>
 #include <tuple>
 
-#include "common/op.h"
-#include "project/project.h"
+#include "project/project_op.h"
 
 namespace blitzgs {
 namespace {
-
-using OptionalTensor = std::optional<Tensor>;
-
-// The contiguous inputs of both directions, checked. Held here so that the raw pointers stay valid.
-struct Parameters {
-  Tensor means, quats, scales, opacities, viewmats, Ks;
-  OptionalTensor sh;
-  std::int64_t count, n_views, sh_stride;
-
-  Parameters(const char* op, const Tensor& means_in, const Tensor& quats_in, const Tensor& scales_in,
-             const Tensor& opacities_in, const OptionalTensor& sh_in, const Tensor& viewmats_in,
-             const Tensor& Ks_in, std::int64_t sh_degree)
-      : means(as_contiguous(means_in)),
-        quats(as_contiguous(quats_in)),
-        scales(as_contiguous(scales_in)),
-        opacities(as_contiguous(opacities_in)),
-        viewmats(as_contiguous(viewmats_in)),
-        Ks(as_contiguous(Ks_in)),
-        sh(sh_in ? OptionalTensor(as_contiguous(*sh_in)) : std::nullopt) {
-    check_floating(op, "means", means);
-    check_shape(op, "means", means, {-1, 3});
-    check_shape(op, "viewmats", viewmats, {-1, 4, 4});
-    count = means.size(0);
-    n_views = viewmats.size(0);
-    sh_stride = sh && sh->dim() == 3 ? sh->size(1) : 0;
-    check_shape(op, "quats", quats, {count, 4});
-    check_shape(op, "scales", scales, {count, 3});
-    check_shape(op, "opacities", opacities, {count});
-    check_shape(op, "Ks", Ks, {n_views, 3, 3});
-    const ScalarType dtype = means.scalar_type();
-    check_dtype(op, "quats", quats, dtype);
-    check_dtype(op, "scales", scales, dtype);
-    check_dtype(op, "opacities", opacities, dtype);
-    check_dtype(op, "viewmats", viewmats, dtype);
-    check_dtype(op, "Ks", Ks, dtype);
-    STD_TORCH_CHECK(n_views <= kMaxViews, "blitzgs::", op, ": at most ", kMaxViews,
-                    " views in one launch, got ", n_views, "; call it for fewer views at a time");
-    STD_TORCH_CHECK(count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
-                    ": at most 2^31 - 1 Gaussians on one device, got ", count);
-    if (sh) {
-      check_shape(op, "sh", *sh, {count, -1, 3});
-      check_dtype(op, "sh", *sh, dtype);
-      STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kMaxShDegree, "blitzgs::", op,
-                      ": sh_degree must be 0 to 3, got ", sh_degree);
-      STD_TORCH_CHECK(sh_basis_count(static_cast<int>(sh_degree)) <= sh_stride, "blitzgs::", op, ": sh has ",
-                      sh_stride, " coefficients, sh_degree ", sh_degree, " needs ",
-                      sh_basis_count(static_cast<int>(sh_degree)));
-    }
-  }
-
-  template <class T>
-  ProjectInputs<T> inputs(const ProjectOptions<T>& options) const {
-    return {data<T>(means),
-            data<T>(quats),
-            data<T>(scales),
-            data<T>(opacities),
-            data_or_null<T>(sh),
-            data<T>(viewmats),
-            data<T>(Ks),
-            nullptr,
-            nullptr,
-            count,
-            static_cast<int>(n_views),
-            options};
-  }
-};
-
-void check_image(const char* op, std::int64_t width, std::int64_t height) {
-  STD_TORCH_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24), "blitzgs::", op,
-                  ": width and height must be in [1, 2^24), got ", width, " x ", height);
-}
-
-OptionalTensor contiguous_or_none(const OptionalTensor& tensor) {
-  return tensor ? OptionalTensor(as_contiguous(*tensor)) : std::nullopt;
-}
 
 // The arguments that project_count and project_emit share.
 struct Forward {
@@ -244,74 +168,10 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
   return {out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9], out[10], out[11]};
 }
 
-using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-
-BackwardTensors project_bwd(const Tensor& means, const Tensor& quats, const Tensor& scales,
-                            const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
-                            const Tensor& Ks, const Tensor& camera_ids, const Tensor& visible_ids,
-                            const Tensor& row_offsets, std::int64_t width, std::int64_t height,
-                            std::int64_t sh_degree, double eps2d, bool antialiased, bool raw,
-                            const Tensor& v_means2d, const Tensor& v_conics, const OptionalTensor& v_depths,
-                            const Tensor& v_row_opacities, const OptionalTensor& v_colors,
-                            const OptionalTensor& scale_reg, bool need_viewmats) {
-  constexpr const char* kOp = "project_bwd";
-  const Parameters p(kOp, means, quats, scales, opacities, sh, viewmats, Ks, sh_degree);
-  check_image(kOp, width, height);
-  const std::int64_t U = visible_ids.numel(), P = camera_ids.numel();
-  const ScalarType dtype = p.means.scalar_type();
-  check_dtype(kOp, "camera_ids", camera_ids, ScalarType::Int);
-  check_dtype(kOp, "visible_ids", visible_ids, ScalarType::Int);
-  check_dtype(kOp, "row_offsets", row_offsets, ScalarType::Int);
-  check_shape(kOp, "row_offsets", row_offsets, {U + 1});
-  check_shape(kOp, "v_means2d", v_means2d, {P, 2});
-  check_shape(kOp, "v_conics", v_conics, {P, 3});
-  check_shape(kOp, "v_row_opacities", v_row_opacities, {P});
-  if (v_depths) check_shape(kOp, "v_depths", *v_depths, {P});
-  if (v_colors) check_shape(kOp, "v_colors", *v_colors, {P, 3});
-  if (scale_reg) check_shape(kOp, "scale_reg", *scale_reg, {p.n_views});
-  const Tensor cameras = as_contiguous(camera_ids), ids = as_contiguous(visible_ids),
-               offsets = as_contiguous(row_offsets), v_xy = as_contiguous(v_means2d),
-               v_conic = as_contiguous(v_conics), v_opacity = as_contiguous(v_row_opacities);
-  const OptionalTensor v_depth = contiguous_or_none(v_depths), v_color = contiguous_or_none(v_colors),
-                       weights = contiguous_or_none(scale_reg);
-  for (const Tensor* v : {&v_xy, &v_conic, &v_opacity}) check_dtype(kOp, "row gradients", *v, dtype);
-  for (const OptionalTensor* v : {&v_depth, &v_color, &weights}) {
-    if (*v) check_dtype(kOp, "row gradients and scale_reg", **v, dtype);
-  }
-  Tensor v_means = make_empty(p.means, {U, 3}), v_quats = make_empty(p.means, {U, 4}),
-         v_scales = make_empty(p.means, {U, 3}), v_opacities = make_empty(p.means, {U}),
-         v_sh = make_empty(p.means, {U, p.sh_stride, 3}),
-         v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
-  DeviceScope scope(p.means);
-  dispatch_floating(p.means, [&](auto zero) {
-    using T = decltype(zero);
-    ProjectOptions<T> options{};
-    options.width = static_cast<int>(width);
-    options.height = static_cast<int>(height);
-    options.sh_degree = static_cast<int>(sh_degree);
-    options.sh_stride = static_cast<int>(p.sh_stride);
-    options.eps2d = static_cast<T>(eps2d);
-    options.antialiased = antialiased;
-    options.raw = raw;
-    backend::project_bwd(
-        p.inputs<T>(options),
-        ProjectRows{data<std::int32_t>(cameras), data<std::int32_t>(ids), data<std::int32_t>(offsets), U},
-        ProjectRowGradients<T>{data<T>(v_xy), data<T>(v_conic), data_or_null<T>(v_depth), data<T>(v_opacity),
-                               data_or_null<T>(v_color)},
-        data_or_null<T>(weights),
-        ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
-                            mutable_data<T>(v_opacities), sh ? mutable_data<T>(v_sh) : nullptr,
-                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr},
-        scope.workspace, scope.stream);
-  });
-  return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
-}
-
 }  // namespace
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
   m.impl("project_count", TORCH_BOX(&blitzgs::project_count));
   m.impl("project_emit", TORCH_BOX(&blitzgs::project_emit));
-  m.impl("project_bwd", TORCH_BOX(&blitzgs::project_bwd));
 }

@@ -99,7 +99,7 @@ def _render(ranks):
             sums = owners.record(keys, frame.tile_work, ranges, terms.sums).read()[: 2 * n_views]
         gradients = pipeline.backward(table, frame, terms.v_renders, terms.scale_reg)
         dense = [torch.zeros_like(column) for column in table.parameters]
-        for column, gradient in zip(dense, gradients.parameters, strict=True):
+        for column, gradient in zip(dense, gradients, strict=True):
             column[frame.rows.visible_ids.long()] = gradient
         tiles = (0, len(frame.tile_work)) if share is None else share.tiles
         composited = tiles if share is None else share.composited
@@ -188,7 +188,7 @@ def _render_half(ranks):
     for half in (False, True):
         frame = pipeline.forward(table, views, OPTIONS, share=Share(ranks, ranges, half))
         gradients = pipeline.backward(table, frame, torch.ones_like(frame.renders))
-        results.append((frame.renders, gradients.parameters[4]))
+        results.append((frame.renders, gradients[4]))
     return results
 
 

@@ -29,6 +29,6 @@ def test_a_step_marks_its_stages_and_lowers_the_loss():
         assert stages == ["other", "optimiser", "project", "exchange", "sort", "raster", "loss", "other"]
         stages.clear()
         stepper.backward(step, frame, terms, stages.append)
-        assert stages == ["raster back", "exchange back", "project back", "optimiser", "other"]
+        assert stages == ["raster back", "exchange back", "optimiser", "other"]
         losses.append(photometric(sums.read(), batch.samples, config.loss).item())
     assert losses[-1] < losses[0] - 0.01

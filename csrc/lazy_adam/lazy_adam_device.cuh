@@ -1,0 +1,63 @@
+// SPDX-License-Identifier: Apache-2.0
+// The optimiser's step of a few elements of a row, for the kernels that take it.
+#pragma once
+#include <cstdint>
+
+#include "lazy_adam/lazy_adam.h"
+
+namespace blitzgs::cuda {
+
+// How moments decay over a number of steps.
+struct Decay {
+  float first, second;
+};
+
+__device__ inline Decay make_decay(const AdamArgs<float>& args, std::int32_t steps) {
+  const double* row = args.table_row(steps);
+  return {static_cast<float>(row[kBeta1Power]), static_cast<float>(row[kBeta2Power])};
+}
+
+template <int Width>
+struct alignas(4 * Width) Pack {
+  float x[Width];
+};
+
+// The group of an element of a pack: of a pack over two groups, the last element alone has the second.
+template <int Column, int Width>
+__device__ constexpr int pack_group(int pack, int element) {
+  return adam_group(Column, pack * Width + (element < Width - 1 ? 0 : element));
+}
+
+// Width elements of a row of a column: loaded first, so that many packs are in flight, and stepped later.
+template <int Column, int Width>
+class StepPack {
+ public:
+  using P = Pack<Width>;
+
+  __device__ __forceinline__ void load(const AdamColumn<float>& column, std::int64_t row, int pack) {
+    pack_ = pack;
+    at_ = row * column.width + pack * Width;
+    p_ = *reinterpret_cast<const P*>(column.param + at_);
+    m_ = *reinterpret_cast<const P*>(column.exp_avg + at_);
+    v_ = *reinterpret_cast<const P*>(column.exp_avg_sq + at_);
+  }
+  __device__ __forceinline__ void finish(const AdamColumn<float>& column, const AdamStep<float>& step,
+                                         const Decay& decay, const P& g) {
+#pragma unroll
+    for (int j = 0; j < Width; ++j) {
+      m_.x[j] *= decay.first;
+      v_.x[j] *= decay.second;
+      adam_update(step, pack_group<Column, Width>(pack_, j), g.x[j], p_.x[j], m_.x[j], v_.x[j]);
+    }
+    *reinterpret_cast<P*>(column.param + at_) = p_;
+    *reinterpret_cast<P*>(column.exp_avg + at_) = m_;
+    *reinterpret_cast<P*>(column.exp_avg_sq + at_) = v_;
+  }
+
+ private:
+  P p_, m_, v_;
+  std::int64_t at_;
+  int pack_;
+};
+
+}  // namespace blitzgs::cuda

@@ -1,0 +1,93 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the ops that move parameters share: the optimiser's state and schedule, checked.
+#pragma once
+#include <optional>
+#include <vector>
+
+#include "common/op.h"
+#include "lazy_adam/lazy_adam.h"
+
+namespace blitzgs {
+
+inline constexpr const char* kAdamNames[kAdamColumns] = {"means", "quats", "scales", "opacities", "sh"};
+
+inline void check_adam_list(const char* op, const std::vector<Tensor>& tensors, const char* name) {
+  STD_TORCH_CHECK(tensors.size() == kAdamColumns, "blitzgs::", op, ": ", name,
+                  " must hold means, quats, scales, opacities, sh; got ", tensors.size(), " tensors");
+}
+
+struct AdamTensors {
+  const char* op;
+  std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
+  Tensor last_step, moment_step, table, lr_table;
+  std::int64_t step, explicit_steps;
+  double beta1, beta2, eps;
+  bool sparse;
+
+  const Tensor& like() const { return params[0]; }
+  std::int64_t rows() const { return like().size(0); }
+
+  void check() const {
+    check_adam_list(op, params, "params");
+    check_adam_list(op, exp_avgs, "exp_avgs");
+    check_adam_list(op, exp_avg_sqs, "exp_avg_sqs");
+    check_floating(op, "means", like());
+    for (int c = 0; c < kAdamColumns; ++c) {
+      for (const Tensor* tensor : {&params[c], &exp_avgs[c], &exp_avg_sqs[c]}) check_column(*tensor, c);
+      STD_TORCH_CHECK(c != 1 || params[c].numel() == 4 * rows(), "blitzgs::", op,
+                      ": quats must have shape [*, 4], got ", shape_of(params[c]));
+    }
+    check_dtype(op, "last_step", last_step, ScalarType::Int);
+    check_shape(op, "last_step", last_step, {rows()});
+    check_dtype(op, "moment_step", moment_step, ScalarType::Int);
+    check_shape(op, "moment_step", moment_step, {rows()});
+    check_dtype(op, "table", table, ScalarType::Double);
+    check_shape(op, "table", table, {-1, kAdamTable});
+    check_dtype(op, "lr_table", lr_table, ScalarType::Float);
+    check_shape(op, "lr_table", lr_table, {table.size(0), kAdamGroups});
+    STD_TORCH_CHECK(table.is_contiguous() && lr_table.is_contiguous() && last_step.is_contiguous() &&
+                        moment_step.is_contiguous(),
+                    "blitzgs::", op, ": table, lr_table, last_step and moment_step must be contiguous");
+    STD_TORCH_CHECK(step >= 0 && step < table.size(0), "blitzgs::", op, ": step ", step,
+                    " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
+  }
+
+  // Of n rows: those that `ids` lists, or all when it is null; gradients are left null.
+  template <class T>
+  AdamArgs<T> arguments(const std::int32_t* ids, std::int64_t n) {
+    AdamArgs<T> args{};
+    for (int c = 0; c < kAdamColumns; ++c) {
+      args.columns[c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
+                         mutable_data<T>(exp_avg_sqs[c]), nullptr, width(c)};
+    }
+    args.ids = ids;
+    args.n = n;
+    args.last_step = mutable_data<std::int32_t>(last_step);
+    args.moment_step = mutable_data<std::int32_t>(moment_step);
+    args.table = data<double>(table);
+    args.lr_table = data<float>(lr_table);
+    args.step = static_cast<std::int32_t>(step);
+    args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
+    args.beta1 = beta1;
+    args.beta2 = beta2;
+    args.eps = eps;
+    args.sparse = sparse;
+    return args;
+  }
+
+  std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
+
+ private:
+  void check_column(const Tensor& tensor, int column) const {
+    const char* name = kAdamNames[column];
+    check_dtype(op, name, tensor, like().scalar_type());
+    STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", op, ": ", name,
+                    " is updated in place and must be contiguous");
+    STD_TORCH_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), "blitzgs::", op, ": ", name, " must have ",
+                    rows(), " rows, got ", shape_of(tensor));
+    STD_TORCH_CHECK(tensor.numel() == params[column].numel(), "blitzgs::", op, ": the moments of ", name,
+                    " must have its shape ", shape_of(params[column]));
+  }
+};
+
+}  // namespace blitzgs

@@ -1,0 +1,115 @@
+// SPDX-License-Identifier: Apache-2.0
+// The projection's backward pass on CUDA, whatever becomes of the gradients.
+#pragma once
+#include "project/project_device.cuh"
+
+namespace blitzgs::cuda {
+
+constexpr int kBackwardThreads = 128;
+
+struct BackwardInputs {
+  Inputs in;
+  ProjectRows rows;
+  ProjectRowGradients<float> v;
+  const float* scale_reg;
+};
+
+__device__ inline RowGradient<float> load_row_gradient(const ProjectRowGradients<float>& v, std::int64_t r) {
+  return {{v.means2d[2 * r], v.means2d[2 * r + 1]},
+          {v.conics[3 * r], v.conics[3 * r + 1], v.conics[3 * r + 2]},
+          v.depths ? v.depths[r] : 0.f,
+          v.opacities[r]};
+}
+
+// A warp's visible Gaussians, a lane each.
+struct WarpRows {
+  std::int64_t first, count;  // position of the first in the list; how many positions are left from there
+  std::int32_t id;            // the lane's own; -1: none
+  int warp, lane;
+};
+
+// A thread is a visible Gaussian. Its gradients go to the sink: begin() is called by every thread before the
+// block meets, take() and then take_sh() at the end, with the warp's stages to reorder them in.
+template <int DEGREE, bool QUADS, class Sink>
+__global__ void __launch_bounds__(kBackwardThreads, 3)
+    backward_kernel(const __grid_constant__ BackwardInputs args, const __grid_constant__ Sink sink) {
+  using Coefficients = ShRow<DEGREE>;
+  __shared__ Camera<float> cameras[kMaxViews];
+  __shared__ ShStage<DEGREE> stages[QUADS ? kBackwardThreads / 32 : 1];
+  __shared__ TripleStage triples[kBackwardThreads / 32];
+  __shared__ typename Sink::Shared shared;
+  const Inputs& in = args.in;
+  const int lane = threadIdx.x % 32;
+  ShStage<DEGREE>& stage = stages[QUADS ? threadIdx.x / 32 : 0];
+  TripleStage& triple = triples[threadIdx.x / 32];
+  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kBackwardThreads) + threadIdx.x / 32 * 32;
+  const std::int64_t u = first + lane;
+  const std::int32_t id = u < args.rows.n_visible ? args.rows.visible_ids[u] : -1;
+  const std::int64_t stride = 3 * in.options.sh_stride;
+  const bool has_colors = in.sh && args.v.colors;
+  if constexpr (QUADS) {
+    if (has_colors) stage.gather(in.sh, stride, id, lane);
+  }
+  // Everything that is needed first is loaded before anything is waited for.
+  const std::int64_t known = id < 0 ? 0 : id;
+  const Vec3<float> mean_part = TripleStage::fetch(in.means, id, lane),
+                    scale_part = TripleStage::fetch(in.scales, id, lane);
+  float quat[4];
+  load_quat(in, known, quat);
+  const float opacity = in.opacities[known];
+  const std::int32_t begin = id < 0 ? 0 : args.rows.row_offsets[u],
+                     end = id < 0 ? 0 : args.rows.row_offsets[u + 1];
+  load_cameras(in, cameras);
+  const WarpRows warp{first, args.rows.n_visible - first, id, static_cast<int>(threadIdx.x) / 32, lane};
+  auto own = sink.begin(shared, warp);
+  __syncthreads();
+  const Vec3<float> mean = triple.share(mean_part, lane), scale = triple.share(scale_part, lane);
+
+  Vec3<float> v_mean{}, v_scale{};
+  const ActiveGaussian<float> gaussian = activate_gaussian(
+      mean, quat, activate_scale(&scale.x, in.options.raw), activate_opacity(opacity, in.options.raw));
+  GaussianGradient<float> gradient{};
+  float axis_weight = 0.f;
+  PoseGradient<float>* no_pose = nullptr;
+  for (std::int64_t r = begin; r < end; ++r) {
+    const int view = args.rows.camera_ids[r];
+    project_row_vjp(cameras[view], gaussian, in.options, load_row_gradient(args.v, r), &gradient, no_pose);
+    if (args.scale_reg) axis_weight += args.scale_reg[view];
+  }
+
+  // The colours after the geometry, so that their coefficients are in registers for no longer than needed.
+  Coefficients v_sh;
+#pragma unroll
+  for (float& value : v_sh.values) value = 0.f;
+  if (has_colors) {
+    Coefficients sh;
+    if constexpr (QUADS) {
+      stage.wait();
+      stage.read(lane, &sh);
+      __syncwarp();
+    } else if (id >= 0) {
+#pragma unroll
+      for (int i = 0; i < Coefficients::kCount; ++i) sh.values[i] = in.sh[stride * id + i];
+    }
+    for (std::int64_t r = begin; r < end; ++r) {
+      const float v_color[3] = {args.v.colors[3 * r], args.v.colors[3 * r + 1], args.v.colors[3 * r + 2]};
+      row_color_vjp(cameras[args.rows.camera_ids[r]], mean, sh.values, DEGREE, v_color, v_sh.values,
+                    &gradient.mean, no_pose);
+    }
+  }
+  if constexpr (QUADS) stage.write(lane, v_sh);
+  float v_quat[4] = {}, v_opacity = 0.f;
+  if (id >= 0) {
+    activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
+                          ParameterGradients<float>{&v_mean.x, v_quat, &v_scale.x, &v_opacity});
+  }
+  sink.take(shared, own, warp, triple, v_mean, {v_quat[0], v_quat[1], v_quat[2], v_quat[3]}, v_scale,
+            v_opacity);
+  if constexpr (QUADS) {
+    sink.take_sh(shared, own, warp, stage);
+  } else {
+    sink.take_sh(shared, own, warp, v_sh);
+  }
+}
+
+}  // namespace blitzgs::cuda

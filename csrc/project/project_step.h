@@ -1,0 +1,34 @@
+// SPDX-License-Identifier: Apache-2.0
+// The projection's backward pass and the optimiser's step of the visible Gaussians in one: what project_bwd
+// and lazy_adam do one after the other, but for the gradients, which need never be stored. Parameters are
+// raw, with SH; `adam` lists rows.visible_ids and has no gradients; the listed rows' parameters stand at
+// adam.step - 1.
+#pragma once
+#include "lazy_adam/lazy_adam.h"
+#include "project/project.h"
+
+namespace blitzgs {
+
+// Gradients of the visible Gaussians in scratch memory, which `adam` is then given.
+template <class T>
+ProjectGradients<T> scratch_gradients(const ProjectRows& rows, AdamArgs<T>& adam, Workspace& workspace) {
+  T* slots[kAdamColumns];
+  for (int c = 0; c < kAdamColumns; ++c) {
+    slots[c] = workspace.allocate<T>(rows.n_visible * adam.columns[c].width);
+    adam.columns[c].grad = slots[c];
+  }
+  return {slots[0], slots[1], slots[2], slots[3], slots[4], nullptr};
+}
+
+namespace cpu {
+template <class T>
+void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
+                      const T* scale_reg, AdamArgs<T> adam, Workspace&, CudaStream);
+}  // namespace cpu
+namespace cuda {
+template <class T>
+void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
+                      const T* scale_reg, AdamArgs<T> adam, Workspace&, CudaStream);
+}  // namespace cuda
+
+}  // namespace blitzgs

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import pytest
+import torch
+
+from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam_step_, schedule_table
+from blitzgs.ops.project import project
+from blitzgs.ops.project_step import project_bwd_step_
+
+BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
+STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda",
+        marks=[
+            pytest.mark.cuda,
+            pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+        ],
+    ),
+]
+
+
+class Scene:
+    """Gaussians before some cameras, an optimiser's state, and gradients of the rows."""
+
+    def __init__(self, n, k, views, device, dtype):
+        generator = torch.Generator().manual_seed(n + k)
+        normal = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+        params = [normal(n, 3), normal(n, 4), 0.5 * normal(n, 3) - 3, normal(n), 0.3 * normal(n, k, 3)]
+        sizes = [1e-4 * torch.exp(normal(*p.shape)) for p in params]
+        to = lambda tensors: [t.to(device, dtype) for t in tensors]  # noqa: E731
+        self.params = to(params)
+        self.exp_avgs = to([size * normal(*size.shape) for size in sizes])
+        self.exp_avg_sqs = to([size**2 for size in sizes])
+        self.moment_step = torch.arange(n, dtype=torch.int32, device=device) % 40 + 1
+        self.last_step = self.moment_step.clone()
+        self.lr_table = torch.full((200, 6), 1e-3, device=device)
+        viewmats = torch.eye(4).repeat(views, 1, 1)
+        viewmats[:, 2, 3] = 4 + torch.arange(views)
+        self.viewmats = viewmats.to(device, dtype)
+        K = torch.tensor([[80.0, 0, 45], [0, 80, 30], [0, 0, 1]])
+        self.Ks = K.repeat(views, 1, 1).to(device, dtype)
+        self.optimiser = self.lr_table, STEP, BETA1, BETA2, EPS
+        lazy_adam_catch_up_(*self.columns(), None, *self.stands(), self.lr_table, STEP - 1, BETA1, BETA2, EPS)
+        self.degree = min(3, math.isqrt(k) - 1)
+        self.scale_reg = torch.linspace(0.1, 0.2, views).to(device, dtype)
+        self.seed = generator
+
+    def columns(self):
+        return self.params, self.exp_avgs, self.exp_avg_sqs
+
+    def stands(self):
+        return self.last_step, self.moment_step
+
+    def render(self, antialiased):
+        self.rows = project(
+            *self.params, self.viewmats, self.Ks, WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D,
+            antialiased=antialiased,
+        )  # fmt: skip
+        shapes = (self.rows.means2d, self.rows.conics, self.rows.opacities, self.rows.colors)
+        self.v = [torch.randn(s.shape, generator=self.seed, dtype=torch.float64).to(s) for s in shapes]
+
+    def one_after_the_other(self, antialiased, sparse):
+        r = self.rows
+        *gradients, _ = torch.ops.blitzgs.project_bwd(
+            *self.params, self.viewmats, self.Ks, r.camera_ids, r.visible_ids, r.row_offsets, WIDTH, HEIGHT,
+            self.degree, EPS2D, antialiased, True, *self.v[:2], None, *self.v[2:], self.scale_reg, False,
+        )  # fmt: skip
+        lazy_adam_step_(*self.columns(), gradients, r.visible_ids, *self.stands(), *self.optimiser, sparse)
+
+    def at_once(self, antialiased, sparse):
+        project_bwd_step_(
+            *self.columns(), *self.stands(), *self.optimiser, sparse, self.rows, self.viewmats, self.Ks,
+            WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D, antialiased=antialiased, v_means2d=self.v[0],
+            v_conics=self.v[1], v_opacities=self.v[2], v_colors=self.v[3], scale_reg=self.scale_reg,
+        )  # fmt: skip
+
+
+def compare(a, b, exact):
+    assert torch.equal(a.last_step, b.last_step) and torch.equal(a.moment_step, b.moment_step)
+    for x, y in zip(sum(a.columns(), []), sum(b.columns(), []), strict=True):
+        if exact:
+            assert torch.equal(x, y)
+        else:
+            torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(y.abs().max()))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize(
+    "n,k,degree,views",
+    [
+        (1, 16, 3, 1), (1007, 16, 3, 3), (1007, 16, 2, 1), (1007, 16, 1, 2), (333, 16, 0, 1), (333, 4, 1, 2),
+        (333, 25, 3, 1),
+    ],
+)  # fmt: skip
+def test_equals_backward_and_step(device, sparse, n, k, degree, views):
+    antialiased = views == 3
+    scenes = [Scene(n, k, views, device, torch.float32) for _ in range(2)]
+    for scene in scenes:
+        scene.degree = degree
+        scene.render(antialiased)
+    before = [p.clone() for p in scenes[0].params]
+    scenes[0].one_after_the_other(antialiased, sparse)
+    scenes[1].at_once(antialiased, sparse)
+    compare(*scenes, exact=device == "cpu")
+    visible = scenes[0].rows.visible_ids.long()
+    assert len(visible) and bool((scenes[1].moment_step[visible] == STEP).all())
+    if k > (degree + 1) ** 2:  # coefficients not in use yet still decay
+        assert not torch.equal(before[4][visible][:, -1], scenes[1].params[4][visible][:, -1])
+    untouched = torch.ones(n, dtype=torch.bool, device=device)
+    untouched[visible] = False
+    for x, y in zip(before, scenes[1].params, strict=True):
+        assert torch.equal(x[untouched], y[untouched])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_repeats_bit_for_bit(device):
+    scenes = [Scene(5000, 16, 2, device, torch.float32) for _ in range(2)]
+    for scene in scenes:
+        scene.render(False)
+        scene.at_once(False, False)
+    compare(*scenes, exact=True)
+
+
+def test_float64_and_nothing_visible():
+    scenes = [Scene(200, 16, 1, "cpu", torch.float64) for _ in range(2)]
+    for scene in scenes:
+        scene.render(False)
+    scenes[0].one_after_the_other(False, False)
+    scenes[1].at_once(False, False)
+    compare(*scenes, exact=True)
+    scene = scenes[1]
+    scene.viewmats[:, 2, 3] = -100  # all behind the camera
+    scene.render(False)
+    before = [p.clone() for p in scene.params]
+    scene.at_once(False, False)
+    assert len(scene.rows.visible_ids) == 0
+    assert all(torch.equal(x, y) for x, y in zip(before, scene.params, strict=True))
+
+
+def test_errors_name_the_value():
+    scene = Scene(20, 16, 1, "cpu", torch.float32)
+    scene.render(False)
+    scene.v[1] = scene.v[1][:, :2]
+    with pytest.raises(RuntimeError, match=r"project_bwd_step_: v_conics must have shape \[\d+, 3\]"):
+        scene.at_once(False, False)
+    scene.render(False)
+    scene.exp_avgs[4] = scene.exp_avgs[4][:, :4].contiguous()
+    with pytest.raises(RuntimeError, match=r"the moments of sh must have its shape \[20, 16, 3\]"):
+        scene.at_once(False, False)
+
+
+def test_opcheck():
+    scene = Scene(20, 16, 1, "cpu", torch.float32)
+    scene.render(False)
+    torch.library.opcheck(
+        torch.ops.blitzgs.project_bwd_step_,
+        (*scene.columns(), *scene.stands(), schedule_table(scene.lr_table, BETA1, BETA2), scene.lr_table,
+         STEP, explicit_steps(BETA1, BETA2, torch.float32), BETA1, BETA2, EPS, False, scene.viewmats,
+         scene.Ks, scene.rows.camera_ids, scene.rows.visible_ids, scene.rows.row_offsets, WIDTH, HEIGHT, 3,
+         EPS2D, False, *scene.v, scene.scale_reg),
+    )  # fmt: skip
