@@ -68,23 +68,26 @@ BLITZGS_HD float pending_drift(float m, float v, float tail) {
 // Everything a row can be. Rows that are not finite are never seen: they give an empty box.
 BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, std::int64_t row) {
   SweptBox box = empty_box();
+  // All that hangs on the row alone is loaded before anything is computed: on the GPU it is then waited for
+  // together.
+  const bool pending = rows.exp_avg_means != nullptr;
+  const std::int32_t stand = pending ? rows.last_step[row] : 0;
+  const std::int32_t behind = pending ? stand - rows.moment_step[row] : 0;
+  float mean[3], scale[3], moments[2][3], squares[2][3];
+  for (int axis = 0; axis < 3; ++axis) {
+    const std::int64_t at = 3 * row + axis;
+    mean[axis] = rows.means[at], scale[axis] = rows.scales[at];
+    moments[0][axis] = pending ? rows.exp_avg_means[at] : 0.0f;
+    squares[0][axis] = pending ? rows.exp_avg_sq_means[at] : 0.0f;
+    moments[1][axis] = pending ? rows.exp_avg_scales[at] : 0.0f;
+    squares[1][axis] = pending ? rows.exp_avg_sq_scales[at] : 0.0f;
+  }
   float mean_tail = 0.0f, scale_tail = 0.0f;
-  if (rows.exp_avg_means) {
-    const std::int32_t stand = rows.last_step[row], behind = stand - rows.moment_step[row];
+  if (pending) {
     const double* entry = rows.table + static_cast<std::int64_t>(stand) * kAdamTable;
     const double decay = rows.table[static_cast<std::int64_t>(behind) * kAdamTable + kRatioPower];
     mean_tail = static_cast<float>(decay * entry[kTails]);
     scale_tail = static_cast<float>(decay * entry[kTails + 2]);
-  }
-  // All loads before any arithmetic: on the GPU they then wait together.
-  float mean[3], scale[3], moments[2][3] = {}, squares[2][3] = {};
-  for (int axis = 0; axis < 3; ++axis) {
-    const std::int64_t at = 3 * row + axis;
-    mean[axis] = rows.means[at], scale[axis] = rows.scales[at];
-    if (rows.exp_avg_means) {
-      moments[0][axis] = rows.exp_avg_means[at], squares[0][axis] = rows.exp_avg_sq_means[at];
-      moments[1][axis] = rows.exp_avg_scales[at], squares[1][axis] = rows.exp_avg_sq_scales[at];
-    }
   }
   SweptBox swept;
   float largest = -FLT_MAX, check = 0.0f;

@@ -13,6 +13,7 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kWarps = kBlockRows / 32;
+constexpr int kResident = 6;  // CUDA blocks of a row a thread that a multiprocessor holds, of any generation
 
 __global__ void make_keys(const float* points, std::int64_t n, const MortonBounds* bounds,
                           std::int64_t* keys) {
@@ -40,32 +41,42 @@ __global__ void list_blocks(const std::int32_t* ids, std::int64_t n, std::int32_
   append(i < n && (i == 0 || ids[i - 1] / kBlockRows != block), block, list, length);
 }
 
+// The box around those of each kLanes neighbouring lanes.
+template <int kLanes>
+__device__ __forceinline__ SweptBox box_around(SweptBox box) {
+#pragma unroll
+  for (int offset = kLanes / 2; offset > 0; offset /= 2) {
+    SweptBox other;
+    for (int axis = 0; axis < 3; ++axis) {
+      other.low[axis] = __shfl_xor_sync(~0u, box.low[axis], offset);
+      other.high[axis] = __shfl_xor_sync(~0u, box.high[axis], offset);
+    }
+    other.sigma = __shfl_xor_sync(~0u, box.sigma, offset);
+    extend(box, other);
+  }
+  return box;
+}
+
 // The blocks of the list in turn, a thread a row. list null: all blocks.
-__global__ void __launch_bounds__(kBlockRows)
+__global__ void __launch_bounds__(kBlockRows, kResident)
     update_bounds(const BlockRows rows, const std::int32_t* list, const std::int32_t* length, float* bounds) {
-  __shared__ SweptBox warps[kWarps];
+  __shared__ SweptBox warps[2][kWarps];  // they take turns, so that one barrier is enough
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const std::int64_t count = list ? *length : blocks_of(rows.n);
-  for (std::int64_t i = blockIdx.x; i < count; i += gridDim.x) {
-    const std::int64_t block = list ? list[i] : i;
+  const auto block_at = [&](std::int64_t i) { return i >= count ? 0 : list ? list[i] : i; };
+  std::int64_t block = block_at(blockIdx.x), next;
+  int turn = 0;
+  for (std::int64_t i = blockIdx.x; i < count; i += gridDim.x, turn ^= 1, block = next) {
+    next = block_at(i + gridDim.x);  // it arrives while this one is worked on
     const bool present = threadIdx.x < rows_in_block(rows.n, block);
-    SweptBox box = present ? sweep_row(rows, block * kBlockRows + threadIdx.x) : empty_box();
-    const bool finite = !present || !is_empty(box);
-    for (int offset = 16; offset > 0; offset /= 2) {
-      SweptBox other;
-      for (int axis = 0; axis < 3; ++axis) {
-        other.low[axis] = __shfl_xor_sync(~0u, box.low[axis], offset);
-        other.high[axis] = __shfl_xor_sync(~0u, box.high[axis], offset);
-      }
-      other.sigma = __shfl_xor_sync(~0u, box.sigma, offset);
-      extend(box, other);
+    const SweptBox row = present ? sweep_row(rows, block * kBlockRows + threadIdx.x) : empty_box();
+    const SweptBox part = box_around<32>(row);
+    if (lane == 0) warps[turn][warp] = part;
+    const bool all_finite = __syncthreads_and(!present || !is_empty(row));
+    if (warp == 0) {
+      const SweptBox whole = box_around<kWarps>(warps[turn][lane % kWarps]);
+      if (lane == 0) store_bounds(whole, all_finite, bounds + block * kBlockBounds);
     }
-    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = box;
-    const bool all_finite = __syncthreads_and(finite);
-    if (threadIdx.x == 0) {
-      for (int warp = 1; warp < kWarps; ++warp) extend(box, warps[warp]);
-      store_bounds(box, all_finite, bounds + block * kBlockBounds);
-    }
-    __syncthreads();
   }
 }
 
@@ -90,7 +101,7 @@ __global__ void test_blocks(const float* bounds, CullCamera camera, int views, c
 }
 
 // Blocks of the list in turn, a thread a row.
-__global__ void __launch_bounds__(kBlockRows)
+__global__ void __launch_bounds__(kBlockRows, kResident)
     test_rows(const BlockRows rows, const CullView* planes, int views, const CullPlan plan,
               const std::int32_t* list, const std::int32_t* length, std::int32_t* active) {
   __shared__ CullView shared[kMaxViews];
@@ -172,7 +183,7 @@ unsigned persistent_blocks(std::int64_t blocks) {
   int device = 0, count = 0;
   check(cudaGetDevice(&device), "blocks");
   check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "blocks");
-  return static_cast<unsigned>(std::min<std::int64_t>(blocks, 8 * count));
+  return static_cast<unsigned>(std::min<std::int64_t>(blocks, kResident * count));
 }
 
 }  // namespace
