@@ -41,12 +41,13 @@ BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int he
 // Where a mean lands. Computed in double: in float the rounding of the rotation alone moves a splat by
 // hundreds of ulps of its pixel position.
 struct ProjectedMean {
-  double slope_x, slope_y, z;  // x/z, y/z, camera-space depth
+  double slope_x, slope_y, z, inverse_z;  // x/z, y/z, camera-space depth
 };
 
 template <class T>
 BLITZGS_HD double row_times_point(const Vec3<T>& row, const Vec3<T>& point, T offset) {
-  return double(row.x) * double(point.x) + double(row.y) * double(point.y) + double(row.z) * double(point.z) +
+  return mul_add(double(row.z), double(point.z),
+                 mul_add(double(row.y), double(point.y), double(row.x) * double(point.x))) +
          double(offset);
 }
 
@@ -55,13 +56,14 @@ BLITZGS_HD ProjectedMean project_mean(const Camera<T>& camera, const Vec3<T>& me
   const double x = row_times_point(camera.row_x, mean, camera.translation.x);
   const double y = row_times_point(camera.row_y, mean, camera.translation.y);
   const double z = row_times_point(camera.row_z, mean, camera.translation.z);
-  return {x / z, y / z, z};
+  const double inverse_z = 1.0 / z;
+  return {x * inverse_z, y * inverse_z, z, inverse_z};
 }
 
 template <class T>
 BLITZGS_HD void pixel_position(const Camera<T>& camera, const ProjectedMean& p, T* mean2d) {
-  mean2d[0] = T(double(camera.fx) * p.slope_x + double(camera.cx));
-  mean2d[1] = T(double(camera.fy) * p.slope_y + double(camera.cy));
+  mean2d[0] = T(mul_add(double(camera.fx), p.slope_x, double(camera.cx)));
+  mean2d[1] = T(mul_add(double(camera.fy), p.slope_y, double(camera.cy)));
 }
 
 // Rows of J W: how the pixel position answers to a world-space displacement at the clamped slopes.
@@ -80,7 +82,7 @@ BLITZGS_HD PixelGradients<T> pixel_gradients(const Camera<T>& camera, const Proj
   g.v = smaller(larger(v, camera.slope_min_y), camera.slope_max_y);
   g.u_free = g.u == u;
   g.v_free = g.v == v;
-  g.inverse_z = T(1.0 / p.z);
+  g.inverse_z = T(p.inverse_z);
   g.gx = (camera.fx * g.inverse_z) * (camera.row_x - g.u * camera.row_z);
   g.gy = (camera.fy * g.inverse_z) * (camera.row_y - g.v * camera.row_z);
   return g;

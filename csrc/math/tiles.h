@@ -20,6 +20,7 @@
 #include <cstdint>
 
 #include "common/host_device.h"
+#include "math/fused.h"
 
 namespace blitzgs {
 
@@ -49,30 +50,6 @@ BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int til
 
 namespace tiles {
 
-// On a GPU the fused form is written out; on a CPU contraction is off, and fma() would be a library call.
-template <class T>
-BLITZGS_HD T mul_add(T a, T b, T c) {
-#ifdef __CUDA_ARCH__
-  return fma(a, b, c);
-#else
-  return a * b + c;
-#endif
-}
-
-// A product that is added to something afterwards.
-template <class T>
-BLITZGS_HD T mul(T a, T b) {
-#ifdef __CUDA_ARCH__
-  if constexpr (sizeof(T) == 4) {
-    return __fmul_rn(a, b);
-  } else {
-    return __dmul_rn(a, b);
-  }
-#else
-  return a * b;
-#endif
-}
-
 // NaN becomes the lower or the upper bound, as the name says.
 template <class T>
 BLITZGS_HD T clamp_nan_low(T value, T low, T high) {
@@ -87,6 +64,18 @@ template <class T>
 BLITZGS_HD bool finite(T value) {
   return value - value == T(0);
 }
+
+// x / size for x >= 0: a shift for a power of two, as tile sizes are.
+struct Divider {
+  int size, shift;
+
+  BLITZGS_HD explicit Divider(int tile_size) : size(tile_size), shift(-1) {
+    if ((tile_size & (tile_size - 1)) == 0) {
+      for (shift = 0; (1 << shift) < tile_size;) ++shift;
+    }
+  }
+  BLITZGS_HD int operator()(int x) const { return shift >= 0 ? x >> shift : x / size; }
+};
 
 }  // namespace tiles
 
@@ -137,16 +126,17 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
   if (!(opacity >= static_cast<T>(kAlphaCut)) || !tiles::finite(opacity)) return false;
   if (!(a > T(0)) || !(c > T(0)) || !tiles::finite(a) || !tiles::finite(b) || !tiles::finite(c)) return false;
   const T exact = T(2) * std::log(T(255) * opacity);
-  ellipse->cut = tiles::mul_add(exact > T(0) ? exact : T(0), T(1.00002), T(2e-5));
+  ellipse->cut = mul_add(exact > T(0) ? exact : T(0), T(1.00002), T(2e-5));
   const ConicFactor<T> factor = factor_conic(conic);
   if (!(factor.l11 > T(0))) return false;
+  // a / det and c / det by one division, which in double is as dear as the rest of this function.
   const double det = conic_determinant(conic);
-  const T root = std::sqrt(ellipse->cut);
+  const double inverse = 1.0 / det;
   ellipse->inv_l11 = T(1) / factor.l11;
   ellipse->shear = b / a;
   ellipse->l22 = factor.l22;
-  ellipse->half_height = tiles::mul(root, std::sqrt(static_cast<T>(static_cast<double>(a) / det)));
-  ellipse->half_width = tiles::mul(root, std::sqrt(static_cast<T>(static_cast<double>(c) / det)));
+  ellipse->half_height = std::sqrt(mul(ellipse->cut, static_cast<T>(static_cast<double>(a) * inverse)));
+  ellipse->half_width = std::sqrt(mul(ellipse->cut, static_cast<T>(static_cast<double>(c) * inverse)));
   ellipse->turn = b == T(0) ? T(0) : -(b / c) * ellipse->half_width;
   return tiles::finite(ellipse->shear) && tiles::finite(ellipse->inv_l11);
 }
@@ -176,14 +166,14 @@ template <class T>
 BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
   constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
   const T w = e.l22 * dy;
-  const T rest = tiles::mul_add(-w, w, e.cut);
+  const T rest = mul_add(-w, w, e.cut);
   const T root = std::sqrt(rest > T(0) ? rest : T(0));
-  const T middle = tiles::mul(-e.shear, dy);
+  const T middle = mul(-e.shear, dy);
   // What rounding may have cost: of the terms added up, and of dy through the shear.
-  const T tilt = tiles::mul_add(std::fabs(e.shear), std::fabs(y), std::fabs(x));
-  const T terms = tiles::mul_add(root, e.inv_l11, tilt + std::fabs(middle));
-  const T end = x + tiles::mul_add(side * root, e.inv_l11, middle);
-  return tiles::mul_add(side * kRounding, terms, end);
+  const T tilt = mul_add(std::fabs(e.shear), std::fabs(y), std::fabs(x));
+  const T terms = mul_add(root, e.inv_l11, tilt + std::fabs(middle));
+  const T end = x + mul_add(side * root, e.inv_l11, middle);
+  return mul_add(side * kRounding, terms, end);
 }
 
 // Calls f(ty, tx_begin, tx_end) for each tile row with a touched tile, top to bottom.
@@ -194,18 +184,19 @@ BLITZGS_HD void for_each_tile_row(const T* mean2d, const T* conic, T opacity, in
   const T x = mean2d[0], y = mean2d[1];
   SplatEllipse<T> e;
   if (!tiles::finite(x) || !tiles::finite(y) || !make_ellipse(conic, opacity, &e)) return;
-  const T half = tiles::mul_add(kRounding, std::fabs(y), e.half_height);
+  const T half = mul_add(kRounding, std::fabs(y), e.half_height);
   int row_first, row_last;
   pixels_between(y - half, y + half, height, &row_first, &row_last);
-  for (int row = row_first; row <= row_last;) {
-    const int ty = row / tile_size;
+  const tiles::Divider tile_of(tile_size);
+  int ty = tile_of(row_first);
+  for (int row = row_first; row <= row_last; ++ty) {
     const int band_last = (ty + 1) * tile_size - 1 < row_last ? (ty + 1) * tile_size - 1 : row_last;
     const T low = static_cast<T>(row) + T(0.5) - y, high = static_cast<T>(band_last) + T(0.5) - y;
     const T left = chord_end(e, x, y, tiles::clamp_nan_low(-e.turn, low, high), T(-1));
     const T right = chord_end(e, x, y, tiles::clamp_nan_low(e.turn, low, high), T(1));
     int column_first, column_last;
     pixels_between(left, right, width, &column_first, &column_last);
-    if (column_first <= column_last) f(ty, column_first / tile_size, column_last / tile_size + 1);
+    if (column_first <= column_last) f(ty, tile_of(column_first), tile_of(column_last) + 1);
     row = band_last + 1;
   }
 }

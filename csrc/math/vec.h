@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "common/host_device.h"
+#include "math/fused.h"
 
 namespace blitzgs {
 
@@ -26,7 +27,12 @@ BLITZGS_HD Vec3<T> operator*(T s, const Vec3<T>& a) {
 }
 template <class T>
 BLITZGS_HD T dot(const Vec3<T>& a, const Vec3<T>& b) {
-  return a.x * b.x + a.y * b.y + a.z * b.z;
+  return mul_add(a.z, b.z, mul_add(a.y, b.y, a.x * b.x));
+}
+// s a + b.
+template <class T>
+BLITZGS_HD Vec3<T> mul_add(T s, const Vec3<T>& a, const Vec3<T>& b) {
+  return {mul_add(s, a.x, b.x), mul_add(s, a.y, b.y), mul_add(s, a.z, b.z)};
 }
 template <class T>
 BLITZGS_HD Vec3<T> cross(const Vec3<T>& a, const Vec3<T>& b) {

@@ -10,13 +10,13 @@
 // most bytes, and are read once: by project_emit).
 //
 // Rows are ordered by (Gaussian, view). Every value of a row depends on its Gaussian and view alone, so rows
-// are bit-identical however Gaussians are divided among calls. Two passes: project_count finds, in few bytes
-// per candidate, which views see it, and sums up what there will be; project_emit, told the sums, writes
-// those rows and evaluates SH for them alone. Neither waits for the device. O(candidates * B + rows); no
-// output of size N.
+// are bit-identical however Gaussians are divided among calls. Counting comes first: project_count finds, in
+// few bytes per candidate, which views see it, and sums up what there will be. Told those sums, project_list
+// writes which Gaussian and view each row is of, and project_emit the rows; SH is evaluated for them alone.
+// None waits for the device. O(candidates * B + rows); no output of size N.
 //
-// On several ranks, `ranges` says which tiles each wants. The same walk over a row's tiles that counts them
-// then finds the ranks that the row has to reach.
+// On several ranks, rank_tiles says which tiles each composites. The walk over a row's tiles that counts them
+// then also finds the ranks that the row has to reach.
 //
 // project_bwd visits each visible Gaussian once, recomputes its rows and sums their gradients in row order:
 // no atomics, deterministic. The pose gradient is summed in double over fixed blocks of Gaussians.
@@ -60,10 +60,15 @@ struct ProjectSizes {
   std::int64_t visible, rows;
 };
 
-// colors is null without sh, rank_masks (bit m: rank m wants the row) without ranges. row_offsets [U + 1].
+// Which Gaussian and view each row is of, and where the rows of each visible Gaussian begin: [P], [P], [U],
+// [U + 1].
+struct ProjectIds {
+  std::int32_t *gaussian_ids, *camera_ids, *visible_ids, *row_offsets;
+};
+
+// colors is null without sh, rank_masks (bit m: rank m composites tiles of the row) without ranks.
 template <class T>
 struct ProjectOutputs {
-  std::int32_t *gaussian_ids, *camera_ids, *visible_ids, *row_offsets;
   T *means2d, *conics, *depths, *opacities, *colors;
   std::int32_t *radii, *tiles_touched;
   std::int64_t* rank_masks;
@@ -93,11 +98,14 @@ namespace cpu {
 // back.
 std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
-void project_count(const ProjectInputs<T>&, const RankTiles& ranges, void* plan, Workspace& carry,
+void project_count(const ProjectInputs<T>&, const RankTiles& rank_tiles, void* plan, Workspace& carry,
                    std::int64_t* totals, Workspace&, CudaStream);
 template <class T>
-void project_emit(const ProjectInputs<T>&, const RankTiles& ranges, const void* plan, const void* carry,
-                  const ProjectSizes&, const ProjectOutputs<T>&, Workspace&, CudaStream);
+void project_list(const ProjectInputs<T>&, const void* plan, const ProjectSizes&, const ProjectIds&,
+                  Workspace&, CudaStream);
+template <class T>
+void project_emit(const ProjectInputs<T>&, const RankTiles&, const void* carry, const ProjectIds&,
+                  std::int64_t n_rows, const ProjectOutputs<T>&, Workspace&, CudaStream);
 // scale_reg [B] or null: adds scale_reg[b] * d(min_j s_j) for each row in view b (the paper's L_scale).
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
@@ -106,11 +114,14 @@ void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGr
 namespace cuda {
 std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
-void project_count(const ProjectInputs<T>&, const RankTiles& ranges, void* plan, Workspace& carry,
+void project_count(const ProjectInputs<T>&, const RankTiles& rank_tiles, void* plan, Workspace& carry,
                    std::int64_t* totals, Workspace&, CudaStream);
 template <class T>
-void project_emit(const ProjectInputs<T>&, const RankTiles& ranges, const void* plan, const void* carry,
-                  const ProjectSizes&, const ProjectOutputs<T>&, Workspace&, CudaStream);
+void project_list(const ProjectInputs<T>&, const void* plan, const ProjectSizes&, const ProjectIds&,
+                  Workspace&, CudaStream);
+template <class T>
+void project_emit(const ProjectInputs<T>&, const RankTiles&, const void* carry, const ProjectIds&,
+                  std::int64_t n_rows, const ProjectOutputs<T>&, Workspace&, CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
                  const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);

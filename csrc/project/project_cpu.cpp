@@ -60,7 +60,7 @@ using MadePlan = Plan<const std::int64_t, const std::uint32_t>;
 // Projects a candidate into the views that may see it, adds its rows to `rows` and what they are to `totals`,
 // and returns their views.
 template <class T>
-std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ranges,
+std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
                                 const std::vector<Camera<T>>& cameras, std::int64_t candidate,
                                 std::vector<KeptRow<T>>* rows, std::int64_t* totals) {
   const std::int64_t id = candidate_id(in, candidate);
@@ -90,9 +90,9 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
     }
     KeptRow<T> kept{};
     if (!project_row(cameras[view], gaussian, in.options, &kept.row)) continue;
-    kept.tiles = row_tiles(kept.row, view, in.options, ranges, &kept.ranks,
+    kept.tiles = row_tiles(kept.row, view, in.options, rank_tiles, &kept.ranks,
                            [&](int rank, std::int64_t tiles) { by_rank[2 * rank + 1] += tiles; });
-    for (int rank = 0; rank < ranges.n_ranks; ++rank) by_rank[2 * rank] += kept.ranks >> rank & 1;
+    for (int rank = 0; rank < rank_tiles.n_ranks; ++rank) by_rank[2 * rank] += kept.ranks >> rank & 1;
     ++totals[kTotalRows];
     ++totals[kTotalViews + view];
     totals[kTotalTiles] += kept.tiles;
@@ -183,11 +183,11 @@ std::size_t project_plan_bytes(std::int64_t candidates) {
 }
 
 template <class T>
-void project_count(const ProjectInputs<T>& in, const RankTiles& ranges, void* plan_memory, Workspace& carry,
-                   std::int64_t* totals, Workspace&, CudaStream) {
+void project_count(const ProjectInputs<T>& in, const RankTiles& rank_tiles, void* plan_memory,
+                   Workspace& carry, std::int64_t* totals, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const std::int64_t blocks = project_blocks(in.n_candidates);
-  const std::int64_t n_totals = project_totals(in.n_views, ranges.n_ranks);
+  const std::int64_t n_totals = project_totals(in.n_views, rank_tiles.n_ranks);
   const NewPlan plan(plan_memory, in.n_candidates);
   std::vector<std::vector<KeptRow<T>>> kept(blocks);
   std::fill_n(totals, n_totals, 0);
@@ -198,7 +198,7 @@ void project_count(const ProjectInputs<T>& in, const RankTiles& ranges, void* pl
       const std::int64_t before = sums[kTotalVisible];
       const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
       for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
-        plan.view_masks[c] = project_candidate(in, ranges, cameras, c, &kept[block], sums.data());
+        plan.view_masks[c] = project_candidate(in, rank_tiles, cameras, c, &kept[block], sums.data());
       }
       plan.visible_before[block] = sums[kTotalVisible] - before;
     }
@@ -223,33 +223,40 @@ void project_count(const ProjectInputs<T>& in, const RankTiles& ranges, void* pl
 }
 
 template <class T>
-void project_emit(const ProjectInputs<T>& in, const RankTiles&, const void* plan_memory, const void* carry,
-                  const ProjectSizes& sizes, const ProjectOutputs<T>& out, Workspace&, CudaStream) {
-  const std::vector<Camera<T>> cameras = make_cameras(in);
+void project_list(const ProjectInputs<T>& in, const void* plan_memory, const ProjectSizes& sizes,
+                  const ProjectIds& ids, Workspace&, CudaStream) {
   const std::int64_t blocks = project_blocks(in.n_candidates);
   const MadePlan plan(plan_memory, in.n_candidates);
   if (plan.visible_before[blocks] != sizes.visible || plan.rows_before[blocks] != sizes.rows) {
     throw std::invalid_argument("blitzgs::project_emit: counts must be the totals of project_count");
   }
-  out.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
+  ids.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
   parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
       std::int64_t u = plan.visible_before[block], index = plan.rows_before[block];
-      const auto* row = static_cast<const KeptRow<T>*>(carry) + index;
       const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
       for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
-        const std::uint32_t mask = plan.view_masks[c];
-        if (mask == 0) continue;
-        const std::int64_t id = candidate_id(in, c);
-        out.visible_ids[u] = static_cast<std::int32_t>(id);
-        out.row_offsets[u++] = static_cast<std::int32_t>(index);
-        for (std::uint32_t rest = mask; rest != 0; rest &= rest - 1) {
-          const int view = __builtin_ctz(rest);
-          out.gaussian_ids[index] = static_cast<std::int32_t>(id);
-          out.camera_ids[index] = view;
-          emit_row(in, cameras[view], id, index++, *row++, out);
+        if (plan.view_masks[c] == 0) continue;
+        const auto id = static_cast<std::int32_t>(candidate_id(in, c));
+        ids.visible_ids[u] = id;
+        ids.row_offsets[u++] = static_cast<std::int32_t>(index);
+        for (std::uint32_t rest = plan.view_masks[c]; rest != 0; rest &= rest - 1) {
+          ids.gaussian_ids[index] = id;
+          ids.camera_ids[index++] = __builtin_ctz(rest);
         }
       }
+    }
+  });
+}
+
+template <class T>
+void project_emit(const ProjectInputs<T>& in, const RankTiles&, const void* carry, const ProjectIds& ids,
+                  std::int64_t n_rows, const ProjectOutputs<T>& out, Workspace&, CudaStream) {
+  const std::vector<Camera<T>> cameras = make_cameras(in);
+  const auto* rows = static_cast<const KeptRow<T>*>(carry);
+  parallel_for(0, n_rows, kProjectBlock, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t row = begin; row < end; ++row) {
+      emit_row(in, cameras[ids.camera_ids[row]], ids.gaussian_ids[row], row, rows[row], out);
     }
   });
 }
@@ -276,8 +283,10 @@ void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const Proj
 #define BLITZGS_INSTANTIATE(T)                                                                             \
   template void project_count<T>(const ProjectInputs<T>&, const RankTiles&, void*, Workspace&,             \
                                  std::int64_t*, Workspace&, CudaStream);                                   \
-  template void project_emit<T>(const ProjectInputs<T>&, const RankTiles&, const void*, const void*,       \
-                                const ProjectSizes&, const ProjectOutputs<T>&, Workspace&, CudaStream);    \
+  template void project_list<T>(const ProjectInputs<T>&, const void*, const ProjectSizes&,                 \
+                                const ProjectIds&, Workspace&, CudaStream);                                \
+  template void project_emit<T>(const ProjectInputs<T>&, const RankTiles&, const void*, const ProjectIds&, \
+                                std::int64_t, const ProjectOutputs<T>&, Workspace&, CudaStream);           \
   template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&, \
                                const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
 BLITZGS_INSTANTIATE(float)

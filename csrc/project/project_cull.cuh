@@ -9,73 +9,77 @@ __device__ inline std::int64_t candidate_id(const Inputs& in, std::int64_t candi
   return in.active_ids ? in.active_ids[candidate] : candidate;
 }
 
-// What the quick test needs of a camera: bounds in float, rounded up.
-struct Frustum {
-  Vec3<float> row_x, row_y, row_z, translation;
-  float fx, fy, cx, cy;
-  float largest, offset;   // of the rotation's entries and of the translation's: bounds the rounding of p
-  float reach_x, reach_y;  // |d pixel / d world| * z cannot exceed this
+// n . p + d + k s + e |p|_1 >= 0 for whatever a view may see, p a mean and s its largest standard deviation.
+struct Plane {
+  float4 normal;  // n, d
+  float k, e;
+
+  __device__ float value(const Vec3<float>& p, float norm1) const {
+    return fmaf(e, norm1, fmaf(normal.z, p.z, fmaf(normal.y, p.y, fmaf(normal.x, p.x, normal.w))));
+  }
 };
+
+constexpr int kSides = 4;
+
+// The region that a view may see, in float, rounded up: depths first, which need no scale, then the borders
+// of the image, all times z. Within kMostSigmas of its mean a splat of opacity <= 1 has alpha >= 1/255.
+struct Frustum {
+  Plane near, far, sides[kSides];
+};
+
+constexpr float kMostSigmas = 3.331f;
 
 __device__ inline float norm1(const Vec3<float>& v) { return fabsf(v.x) + fabsf(v.y) + fabsf(v.z); }
 __device__ inline float top(const Vec3<float>& v) { return fmaxf(fabsf(v.x), fmaxf(fabsf(v.y), fabsf(v.z))); }
 
-__device__ inline Frustum make_frustum(const Camera<float>& c) {
-  Frustum f{c.row_x, c.row_y, c.row_z, c.translation, c.fx, c.fy, c.cx, c.cy, 0.f, 0.f, 0.f, 0.f};
-  f.largest = fmaxf(top(c.row_x), fmaxf(top(c.row_y), top(c.row_z)));
-  f.offset = top(c.translation);
-  const float along = sqrtf(dot(c.row_z, c.row_z));
-  const float u = fmaxf(fabsf(c.slope_min_x), fabsf(c.slope_max_x));
-  const float v = fmaxf(fabsf(c.slope_min_y), fabsf(c.slope_max_y));
-  f.reach_x = 1.01f * fabsf(c.fx) * (sqrtf(dot(c.row_x, c.row_x)) + u * along);
-  f.reach_y = 1.01f * fabsf(c.fy) * (sqrtf(dot(c.row_y, c.row_y)) + v * along);
+// size: an upper bound of |n| in units of the rows of the rotation, whose entries and those of the
+// translation do not exceed `largest` and `offset`. 2e-6 of every term is more than rounding takes.
+__device__ inline Plane make_plane(const Vec3<float>& n, float d, float k, float size, float largest,
+                                   float offset) {
+  return {{n.x, n.y, n.z, d + 2e-6f * (size * offset + fabsf(d))}, k, 2e-6f * size * largest};
+}
+
+__device__ inline Frustum make_frustum(const Camera<float>& c, const ProjectOptions<float>& o) {
+  const Vec3<float>& t = c.translation;
+  const float largest = fmaxf(top(c.row_x), fmaxf(top(c.row_y), top(c.row_z))), offset = top(t);
+  Frustum f;
+  f.near = make_plane(c.row_z, t.z - o.near_plane, 0.f, 1.f, largest, offset);
+  f.far = make_plane(-1.f * c.row_z, o.far_plane - t.z, 0.f, 1.f, largest, offset);
+  const float along = sqrtf(dot(c.row_z, c.row_z)), blur = 1.01f * kMostSigmas * sqrtf(o.eps2d);
+  const auto add_sides = [&](Plane* sides, const Vec3<float>& row, float shift, float focal, float centre,
+                             float slope_min, float slope_max, float length) {
+    // |d pixel / d world| z cannot exceed this.
+    const float reach =
+        fabsf(focal) * (sqrtf(dot(row, row)) + fmaxf(fabsf(slope_min), fabsf(slope_max)) * along);
+    const float k = 1.01f * kMostSigmas * reach, size = fabsf(focal) + fabsf(centre) + length + blur;
+    const float low = centre + blur, high = length - centre + blur;
+    sides[0] = make_plane(focal * row + low * c.row_z, focal * shift + low * t.z, k, size, largest, offset);
+    sides[1] = make_plane(high * c.row_z - focal * row, high * t.z - focal * shift, k, size, largest, offset);
+  };
+  add_sides(f.sides, c.row_x, t.x, c.fx, c.cx, c.slope_min_x, c.slope_max_x, static_cast<float>(o.width));
+  add_sides(f.sides + 2, c.row_y, t.y, c.fy, c.cy, c.slope_min_y, c.slope_max_y,
+            static_cast<float>(o.height));
   return f;
 }
 
-// A bound on the rounding of any coordinate of p = W mean + t in float.
-__device__ inline float rounding(const Frustum& f, const Vec3<float>& mean) {
-  return 1e-6f * (f.largest * norm1(mean) + f.offset);
+__device__ inline bool may_be_in_depth(const Frustum& f, const Vec3<float>& mean, float norm) {
+  return f.near.value(mean, norm) >= 0.f && f.far.value(mean, norm) >= 0.f;
 }
 
-__device__ inline bool may_be_in_depth(const Frustum& f, const Vec3<float>& mean,
-                                       const ProjectOptions<float>& o) {
-  const float z = dot(f.row_z, mean) + f.translation.z, error = rounding(f, mean);
-  return z + error > o.near_plane && z - error <= o.far_plane;
+// False only when project_row would be false: no division, no quaternion, floats alone. Of what is in depth.
+__device__ inline bool may_overlap(const Frustum& f, const Vec3<float>& mean, float norm, float sigma) {
+  bool overlaps = true;
+#pragma unroll
+  for (const Plane& side : f.sides) overlaps &= fmaf(side.k, sigma, side.value(mean, norm)) >= 0.f;
+  return overlaps;
 }
 
-// Is the splat's box, no larger than `spread` standard deviations of its largest axis, within [0, size)? All
-// times z.
-__device__ inline bool may_overlap(float focal, float centre, float x, float z, float error, float reach,
-                                   float spread, float sigmas, float root_eps, float size) {
-  const float position = focal * x + centre * z;
-  const float slack = error * (fabsf(focal) + fabsf(centre) + size) +
-                      1e-5f * (fabsf(focal * x) + (fabsf(centre) + size) * fabsf(z));
-  const float half = reach * spread + 1.01f * sigmas * root_eps * (z + error) + slack;
-  return position + half > 0.f && position - half < size * z;
-}
-
-// False only when project_row would be false: no division, no quaternion, floats alone.
-__device__ inline bool may_be_seen(const Frustum& f, const Vec3<float>& mean, float largest_scale,
-                                   float sigmas, const ProjectOptions<float>& o) {
-  if (!may_be_in_depth(f, mean, o)) return false;
-  const float z = dot(f.row_z, mean) + f.translation.z, error = rounding(f, mean);
-  const float x = dot(f.row_x, mean) + f.translation.x, y = dot(f.row_y, mean) + f.translation.y;
-  const float spread = sigmas * largest_scale, root_eps = sqrtf(o.eps2d);
-  return may_overlap(f.fx, f.cx, x, z, error, f.reach_x, spread, sigmas, root_eps,
-                     static_cast<float>(o.width)) &&
-         may_overlap(f.fy, f.cy, y, z, error, f.reach_y, spread, sigmas, root_eps,
-                     static_cast<float>(o.height));
-}
-
-// How many standard deviations any splat of this candidate can reach; raw opacities never exceed 1.
-__device__ inline float most_sigmas(const Inputs& in, std::int64_t id) {
-  return in.options.raw ? 3.331f : 1.0001f * reach(in.opacities[id]);
-}
-
+// An upper bound. Stored opacities may exceed 1, and such a splat kMostSigmas; logits cannot.
 __device__ inline float largest_scale(const Inputs& in, std::int64_t id) {
   const float* s = in.scales + 3 * id;
   const float widest = fmaxf(s[0], fmaxf(s[1], s[2]));
-  return in.options.raw ? 1.0001f * expf(widest) : widest;
+  if (in.options.raw) return 1.001f * __expf(widest);
+  return in.opacities[id] <= 1.f ? widest : 1e30f;
 }
 
 }  // namespace blitzgs::cuda

@@ -13,7 +13,7 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kSegment = 256;  // candidates that a warp takes together
+constexpr int kSegment = 512;  // candidates that a warp takes together
 constexpr int kBatch = 4;      // of them, those of a lane at a time
 constexpr int kCountThreads = 128, kCountBlocks = 4096;
 constexpr int kListThreads = 256;
@@ -28,6 +28,7 @@ __device__ void quick_views(const Inputs& in, const Frustum* frusta, std::int64_
                             std::uint32_t* maybe) {
   std::int64_t ids[kBatch];
   Vec3<float> means[kBatch];
+  float norms[kBatch];
 #pragma unroll
   for (int k = 0; k < kBatch; ++k) {
     const std::int64_t c = first + 32 * k;
@@ -36,23 +37,23 @@ __device__ void quick_views(const Inputs& in, const Frustum* frusta, std::int64_
     maybe[k] = !present ? 0u : in.active_views ? static_cast<std::uint32_t>(in.active_views[c]) : ~0u;
     if (in.n_views < 32) maybe[k] &= (1u << in.n_views) - 1u;
     means[k] = maybe[k] ? load3(in.means + 3 * ids[k]) : Vec3<float>{0.f, 0.f, 0.f};
+    norms[k] = norm1(means[k]);
   }
+  for (int view = 0; view < in.n_views; ++view) {
+    const Frustum& frustum = frusta[view];
 #pragma unroll
-  for (int k = 0; k < kBatch; ++k) {
-    for (int view = 0; view < in.n_views; ++view) {
-      if (!may_be_in_depth(frusta[view], means[k], in.options)) maybe[k] &= ~(1u << view);
+    for (int k = 0; k < kBatch; ++k) {
+      if (!may_be_in_depth(frustum, means[k], norms[k])) maybe[k] &= ~(1u << view);
     }
   }
-  float scales[kBatch], sigmas[kBatch];
+  float scales[kBatch];
 #pragma unroll
-  for (int k = 0; k < kBatch; ++k) {
-    scales[k] = maybe[k] ? largest_scale(in, ids[k]) : 0.f;
-    sigmas[k] = maybe[k] ? most_sigmas(in, ids[k]) : 0.f;
-  }
+  for (int k = 0; k < kBatch; ++k) scales[k] = maybe[k] ? largest_scale(in, ids[k]) : 0.f;
+  for (int view = 0; view < in.n_views; ++view) {
+    const Frustum& frustum = frusta[view];
 #pragma unroll
-  for (int k = 0; k < kBatch; ++k) {
-    for (int view = 0; view < in.n_views && maybe[k]; ++view) {
-      if (!may_be_seen(frusta[view], means[k], scales[k], sigmas[k], in.options)) maybe[k] &= ~(1u << view);
+    for (int k = 0; k < kBatch; ++k) {
+      if (!may_overlap(frustum, means[k], norms[k], scales[k])) maybe[k] &= ~(1u << view);
     }
   }
 }
@@ -74,8 +75,8 @@ struct Plan {
         views(reinterpret_cast<Views*>(before + segments_of(candidates) + 1)),
         slots(reinterpret_cast<Slot*>(views + candidates)) {}
 };
-using NewPlan = Plan<std::int64_t, std::uint32_t, std::uint8_t>;
-using MadePlan = Plan<const std::int64_t, const std::uint32_t, const std::uint8_t>;
+using NewPlan = Plan<std::int64_t, std::uint32_t, std::uint16_t>;
+using MadePlan = Plan<const std::int64_t, const std::uint32_t, const std::uint16_t>;
 
 // A block's sums for project_totals. Adding 64-bit numbers in shared memory is slow, so tiles carry by hand.
 struct Sums {
@@ -89,9 +90,9 @@ struct Sums {
 };
 
 // The views that do see a candidate, of those that may.
-__device__ std::uint32_t exact_views(const Inputs& in, const RankTiles& ranges, const Camera<float>* cameras,
-                                     std::int64_t candidate, std::uint32_t maybe, Sums* sums,
-                                     std::int64_t* tiles) {
+__device__ std::uint32_t exact_views(const Inputs& in, const RankTiles& rank_tiles,
+                                     const Camera<float>* cameras, std::int64_t candidate,
+                                     std::uint32_t maybe, Sums* sums, std::int64_t* tiles) {
   const ActiveGaussian<float> gaussian = load_gaussian(in, candidate_id(in, candidate));
   std::uint32_t seen = 0;
   for (; maybe; maybe &= maybe - 1) {
@@ -100,7 +101,7 @@ __device__ std::uint32_t exact_views(const Inputs& in, const RankTiles& ranges, 
     if (!project_row(cameras[view], gaussian, in.options, &row)) continue;
     seen |= 1u << view;
     std::int64_t ranks;
-    *tiles += row_tiles(row, view, in.options, ranges, &ranks, [&](int rank, std::int64_t count) {
+    *tiles += row_tiles(row, view, in.options, rank_tiles, &ranks, [&](int rank, std::int64_t count) {
       sums->add_tiles(rank, static_cast<unsigned>(count));
     });
     for (; ranks; ranks &= ranks - 1) atomicAdd(&sums->rank_rows[__ffsll(ranks) - 1], 1u);
@@ -130,24 +131,25 @@ __device__ void store_sums(const Sums& sums, const Inputs& in, int n_ranks, unsi
 // A warp takes a segment of candidates: the quick test of all, then the exact test of those it leaves. Warps
 // never wait for one another, so some stream means while others work.
 __global__ void __launch_bounds__(kCountThreads, 6)
-    count_kernel(const Inputs in, const RankTiles ranges, const NewPlan plan, unsigned long long* totals) {
+    count_kernel(const Inputs in, const RankTiles rank_tiles, const NewPlan plan,
+                 unsigned long long* totals) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ Frustum frusta[kMaxViews];
   __shared__ Sums sums;
   __shared__ std::uint32_t left_views[kCountThreads / 32][kSegment];
-  __shared__ std::uint8_t left_slots[kCountThreads / 32][kSegment];
+  __shared__ std::uint16_t left_slots[kCountThreads / 32][kSegment];
   for (int i = threadIdx.x; i < static_cast<int>(sizeof(Sums) / 4); i += kCountThreads) {
     reinterpret_cast<unsigned*>(&sums)[i] = 0;
   }
   load_cameras(in, cameras);
   __syncthreads();
   for (int view = threadIdx.x; view < in.n_views; view += kCountThreads)
-    frusta[view] = make_frustum(cameras[view]);
+    frusta[view] = make_frustum(cameras[view], in.options);
   __syncthreads();
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const unsigned below = (1u << lane) - 1u;
   std::uint32_t* const left = left_views[warp];
-  std::uint8_t* const slots = left_slots[warp];
+  std::uint16_t* const slots = left_slots[warp];
   const std::int64_t n_segments = segments_of(in.n_candidates);
   std::int64_t tiles = 0, visible = 0, rows = 0;
   unsigned of_view = 0;  // rows of view `lane`
@@ -163,7 +165,7 @@ __global__ void __launch_bounds__(kCountThreads, 6)
         if (maybe[k]) {
           const int at = n_left + __popc(some & below);
           left[at] = maybe[k];
-          slots[at] = static_cast<std::uint8_t>(batch + 32 * k + lane);
+          slots[at] = static_cast<std::uint16_t>(batch + 32 * k + lane);
         }
         n_left += __popc(some);
       }
@@ -173,10 +175,10 @@ __global__ void __launch_bounds__(kCountThreads, 6)
     unsigned n_rows = 0;
     for (int first = 0; first < n_left; first += 32) {
       const bool present = first + lane < n_left;
-      const std::uint8_t slot = present ? slots[first + lane] : 0;
-      const std::uint32_t seen =
-          present ? exact_views(in, ranges, cameras, s * kSegment + slot, left[first + lane], &sums, &tiles)
-                  : 0;
+      const std::uint16_t slot = present ? slots[first + lane] : 0;
+      const std::uint32_t seen = present ? exact_views(in, rank_tiles, cameras, s * kSegment + slot,
+                                                       left[first + lane], &sums, &tiles)
+                                         : 0;
       const unsigned some = __ballot_sync(0xffffffffu, seen != 0);
       if (seen) {
         const std::int64_t at = s * kSegment + n_visible + __popc(some & below);
@@ -207,13 +209,12 @@ __global__ void __launch_bounds__(kCountThreads, 6)
   }
   if (blockIdx.x == 0 && threadIdx.x == 0) plan.before[n_segments] = 0;
   __syncthreads();
-  if (sums.rows > 0) store_sums(sums, in, ranges.n_ranks, totals);
+  if (sums.rows > 0) store_sums(sums, in, rank_tiles.n_ranks, totals);
 }
 
 // Which Gaussian and view each row is of. A warp takes a segment.
 __global__ void __launch_bounds__(kListThreads)
-    list_rows_kernel(const Inputs in, const MadePlan plan, const ProjectSizes sizes,
-                     const ProjectOutputs<float> out) {
+    list_rows_kernel(const Inputs in, const MadePlan plan, const ProjectSizes sizes, const ProjectIds out) {
   const int lane = threadIdx.x % 32;
   const std::int64_t s = (blockIdx.x * static_cast<std::int64_t>(kListThreads) + threadIdx.x) / 32;
   if (s == 0 && lane == 0) out.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
@@ -229,25 +230,39 @@ __global__ void __launch_bounds__(kListThreads)
       const int other = __shfl_up_sync(0xffffffffu, end, step);
       if (lane >= step) end += other;
     }
+    const int begin = end - __popc(views), n_rows = __shfl_sync(0xffffffffu, end, 31);
     const std::int64_t u = (before >> 32) + first + lane;
-    std::int64_t row = at + end - __popc(views);
-    at += __shfl_sync(0xffffffffu, end, 31);
-    if (!present || u >= sizes.visible) continue;
-    const auto id =
-        static_cast<std::int32_t>(candidate_id(in, s * kSegment + plan.slots[s * kSegment + first + lane]));
-    out.visible_ids[u] = id;
-    out.row_offsets[u] = static_cast<std::int32_t>(row);
-    for (std::uint32_t rest = views; rest && row < sizes.rows; rest &= rest - 1, ++row) {
-      out.gaussian_ids[row] = id;
-      out.camera_ids[row] = __ffs(rest) - 1;
+    std::int32_t id = 0;
+    if (present && u < sizes.visible) {
+      id =
+          static_cast<std::int32_t>(candidate_id(in, s * kSegment + plan.slots[s * kSegment + first + lane]));
+      out.visible_ids[u] = id;
+      out.row_offsets[u] = static_cast<std::int32_t>(at + begin);
     }
+    // Lanes write consecutive rows: each finds the candidate whose `end` is the first beyond its row.
+    for (int base = 0; base < n_rows; base += 32) {
+      const int row = base + lane;
+      int owner = 0;
+#pragma unroll
+      for (int step = 16; step > 0; step /= 2) {
+        if (__shfl_sync(0xffffffffu, end, owner + step - 1) <= row) owner += step;
+      }
+      std::uint32_t rest = __shfl_sync(0xffffffffu, views, owner);
+      const int owner_begin = __shfl_sync(0xffffffffu, begin, owner);
+      const std::int32_t owner_id = __shfl_sync(0xffffffffu, id, owner);
+      if (row >= n_rows || at + row >= sizes.rows) continue;
+      for (int skip = row - owner_begin; skip > 0; --skip) rest &= rest - 1;
+      out.gaussian_ids[at + row] = owner_id;
+      out.camera_ids[at + row] = __ffs(rest) - 1;
+    }
+    at += n_rows;
   }
 }
 
 template <int DEGREE, bool QUADS>
 __global__ void __launch_bounds__(kEmitThreads)
-    emit_kernel(const Inputs in, const RankTiles ranges, const ProjectOutputs<float> out,
-                std::int64_t n_rows) {
+    emit_kernel(const Inputs in, const RankTiles rank_tiles, const ProjectIds ids, std::int64_t n_rows,
+                const ProjectOutputs<float> out) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ ShStage<DEGREE> stages[QUADS ? kEmitThreads / 32 : 1];
   __shared__ TripleStage triples[kEmitThreads / 32];
@@ -255,12 +270,12 @@ __global__ void __launch_bounds__(kEmitThreads)
   TripleStage& triple = triples[threadIdx.x / 32];
   ShStage<DEGREE>& stage = stages[QUADS ? threadIdx.x / 32 : 0];
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kEmitThreads) + threadIdx.x;
-  const std::int32_t id = i < n_rows ? out.gaussian_ids[i] : -1;
+  const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
   int slot = 0;
   if constexpr (QUADS) slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
   load_cameras(in, cameras);
   __syncthreads();
-  const int view = id < 0 ? 0 : out.camera_ids[i];
+  const int view = id < 0 ? 0 : ids.camera_ids[i];
   const Camera<float>& camera = cameras[view];
   const Vec3<float> mean = triple.gather(in.means, id, lane), scale = triple.gather(in.scales, id, lane);
   if (id >= 0) {
@@ -273,7 +288,7 @@ __global__ void __launch_bounds__(kEmitThreads)
     out.opacities[i] = row.opacity;
     reinterpret_cast<int2*>(out.radii)[i] = {pixel_radius(row.extent[0]), pixel_radius(row.extent[1])};
     std::int64_t ranks;
-    out.tiles_touched[i] = row_tiles(row, view, in.options, ranges, &ranks, [](int, std::int64_t) {});
+    out.tiles_touched[i] = row_tiles(row, view, in.options, rank_tiles, &ranks, [](int, std::int64_t) {});
     if (out.rank_masks) out.rank_masks[i] = ranks;
   }
   if (!in.sh) return;
@@ -298,20 +313,20 @@ __global__ void __launch_bounds__(kEmitThreads)
 
 std::size_t project_plan_bytes(std::int64_t candidates) {
   return static_cast<std::size_t>(segments_of(candidates) + 1) * sizeof(std::int64_t) +
-         static_cast<std::size_t>(candidates) * (sizeof(std::uint32_t) + sizeof(std::uint8_t));
+         static_cast<std::size_t>(candidates) * (sizeof(std::uint32_t) + sizeof(std::uint16_t));
 }
 
 template <>
-void project_count<float>(const Inputs& in, const RankTiles& ranges, void* plan_memory, Workspace&,
+void project_count<float>(const Inputs& in, const RankTiles& rank_tiles, void* plan_memory, Workspace&,
                           std::int64_t* totals, Workspace& workspace, CudaStream stream) {
-  const std::size_t bytes = project_totals(in.n_views, ranges.n_ranks) * sizeof(std::int64_t);
+  const std::size_t bytes = project_totals(in.n_views, rank_tiles.n_ranks) * sizeof(std::int64_t);
   check(cudaMemsetAsync(totals, 0, bytes, stream), "project_count");
   const std::int64_t segments = segments_of(in.n_candidates);
   const NewPlan plan(plan_memory, in.n_candidates);
   if (segments == 0 || in.n_views == 0) return;
   const auto grid = std::min<std::int64_t>(kCountBlocks, blocks_for(segments, kCountThreads / 32));
   count_kernel<<<static_cast<unsigned>(grid), kCountThreads, 0, stream>>>(
-      in, ranges, plan, reinterpret_cast<unsigned long long*>(totals));
+      in, rank_tiles, plan, reinterpret_cast<unsigned long long*>(totals));
   check_launch("project_count");
   std::size_t scratch_bytes = 0;
   const auto scan = [&](void* scratch) {
@@ -324,20 +339,26 @@ void project_count<float>(const Inputs& in, const RankTiles& ranges, void* plan_
 }
 
 template <>
-void project_emit<float>(const Inputs& in, const RankTiles& ranges, const void* plan_memory, const void*,
-                         const ProjectSizes& sizes, const ProjectOutputs<float>& out, Workspace&,
-                         CudaStream stream) {
+void project_list<float>(const Inputs& in, const void* plan_memory, const ProjectSizes& sizes,
+                         const ProjectIds& ids, Workspace&, CudaStream stream) {
   if (sizes.rows == 0) {
-    check(cudaMemsetAsync(out.row_offsets, 0, sizeof(std::int32_t), stream), "project_emit");
+    check(cudaMemsetAsync(ids.row_offsets, 0, sizeof(std::int32_t), stream), "project_emit");
     return;
   }
   const MadePlan plan(plan_memory, in.n_candidates);
   list_rows_kernel<<<blocks_for(segments_of(in.n_candidates), kListThreads / 32), kListThreads, 0, stream>>>(
-      in, plan, sizes, out);
+      in, plan, sizes, ids);
   check_launch("project_emit");
+}
+
+template <>
+void project_emit<float>(const Inputs& in, const RankTiles& ranks, const void*, const ProjectIds& ids,
+                         std::int64_t n_rows, const ProjectOutputs<float>& out, Workspace&,
+                         CudaStream stream) {
+  if (n_rows == 0) return;
   dispatch_sh(in, [&](auto degree, auto quads) {
     emit_kernel<degree.value, quads.value>
-        <<<blocks_for(sizes.rows, kEmitThreads), kEmitThreads, 0, stream>>>(in, ranges, out, sizes.rows);
+        <<<blocks_for(n_rows, kEmitThreads), kEmitThreads, 0, stream>>>(in, ranks, ids, n_rows, out);
   });
   check_launch("project_emit");
 }

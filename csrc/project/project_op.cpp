@@ -14,7 +14,7 @@ struct Forward {
   OptionalTensor ids, views;
   std::int64_t candidates;
   ProjectOptions<double> options;
-  RankTiles ranges;
+  RankTiles ranks;
 
   Forward(const char* op, const Tensor& means, const Tensor& quats, const Tensor& scales,
           const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats, const Tensor& Ks,
@@ -37,7 +37,7 @@ struct Forward {
                 radius_clip,
                 antialiased,
                 raw},
-        ranges{} {
+        ranks{} {
     check_image(op, width, height);
     STD_TORCH_CHECK(tile_size > 0, "blitzgs::", op, ": tile_size must be positive, got ", tile_size);
     if (ids) {
@@ -51,9 +51,9 @@ struct Forward {
     STD_TORCH_CHECK(tile_begins.size() == tile_ends.size() && tile_begins.size() <= kMaxRanks,
                     "blitzgs::", op, ": tile_begins and tile_ends must have one entry for each of at most ",
                     kMaxRanks, " ranks, got ", tile_begins.size(), " and ", tile_ends.size());
-    ranges.n_ranks = static_cast<int>(tile_begins.size());
-    std::copy(tile_begins.begin(), tile_begins.end(), ranges.begin);
-    std::copy(tile_ends.begin(), tile_ends.end(), ranges.end);
+    ranks.n_ranks = static_cast<int>(tile_begins.size());
+    std::copy(tile_begins.begin(), tile_begins.end(), ranks.begin);
+    std::copy(tile_ends.begin(), tile_ends.end(), ranks.end);
   }
 
   template <class T>
@@ -96,11 +96,11 @@ std::tuple<Tensor, Tensor, Tensor> project_count(
                   radius_clip, antialiased, raw, tile_begins, tile_ends);
   const std::size_t bytes = backend::project_plan_bytes(f.candidates);
   Tensor plan = make_empty(f.p.means, {static_cast<std::int64_t>((bytes + 7) / 8)}, ScalarType::Long);
-  Tensor totals = make_empty(f.p.means, {project_totals(f.p.n_views, f.ranges.n_ranks)}, ScalarType::Long);
+  Tensor totals = make_empty(f.p.means, {project_totals(f.p.n_views, f.ranks.n_ranks)}, ScalarType::Long);
   Carry carry(f.p.means);
   DeviceScope scope(f.p.means);
   dispatch_floating(f.p.means, [&](auto zero) {
-    backend::project_count(f.inputs<decltype(zero)>(), f.ranges, plan.mutable_data_ptr(), carry,
+    backend::project_count(f.inputs<decltype(zero)>(), f.ranks, plan.mutable_data_ptr(), carry,
                            mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
   });
   return {plan, carry.tensor(), totals};
@@ -135,37 +135,38 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
                   " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
   const std::int64_t U = sizes.visible, P = sizes.rows;
   const auto ints = ScalarType::Int;
-  std::vector<Tensor> out{make_empty(f.p.means, {P}, ints),
-                          make_empty(f.p.means, {P}, ints),
-                          make_empty(f.p.means, {U}, ints),
-                          make_empty(f.p.means, {U + 1}, ints),
-                          make_empty(f.p.means, {P, 2}),
-                          make_empty(f.p.means, {P, 3}),
-                          make_empty(f.p.means, {P}),
-                          make_empty(f.p.means, {P}),
-                          make_empty(f.p.means, {sh ? P : 0, 3}),
-                          make_empty(f.p.means, {P, 2}, ints),
-                          make_empty(f.p.means, {P}, ints),
-                          make_empty(f.p.means, {f.ranges.n_ranks > 0 ? P : 0}, ScalarType::Long)};
+  Tensor gaussian_ids = make_empty(f.p.means, {P}, ints), camera_ids = make_empty(f.p.means, {P}, ints),
+         visible_ids = make_empty(f.p.means, {U}, ints), row_offsets = make_empty(f.p.means, {U + 1}, ints);
+  const ProjectIds listed{mutable_data<std::int32_t>(gaussian_ids), mutable_data<std::int32_t>(camera_ids),
+                          mutable_data<std::int32_t>(visible_ids), mutable_data<std::int32_t>(row_offsets)};
+  std::vector<Tensor> out;
   DeviceScope scope(f.p.means);
   dispatch_floating(f.p.means, [&](auto zero) {
     using T = decltype(zero);
-    const ProjectOutputs<T> rows{mutable_data<std::int32_t>(out[0]),
-                                 mutable_data<std::int32_t>(out[1]),
-                                 mutable_data<std::int32_t>(out[2]),
-                                 mutable_data<std::int32_t>(out[3]),
+    const ProjectInputs<T> in = f.inputs<T>();
+    backend::project_list(in, plan.const_data_ptr(), sizes, listed, scope.workspace, scope.stream);
+    // Only now the other outputs: the device has waited for the sizes long enough.
+    out = {make_empty(f.p.means, {P, 2}),
+           make_empty(f.p.means, {P, 3}),
+           make_empty(f.p.means, {P}),
+           make_empty(f.p.means, {P}),
+           make_empty(f.p.means, {sh ? P : 0, 3}),
+           make_empty(f.p.means, {P, 2}, ints),
+           make_empty(f.p.means, {P}, ints),
+           make_empty(f.p.means, {f.ranks.n_ranks > 0 ? P : 0}, ScalarType::Long)};
+    const ProjectOutputs<T> rows{mutable_data<T>(out[0]),
+                                 mutable_data<T>(out[1]),
+                                 mutable_data<T>(out[2]),
+                                 mutable_data<T>(out[3]),
                                  mutable_data<T>(out[4]),
-                                 mutable_data<T>(out[5]),
-                                 mutable_data<T>(out[6]),
-                                 mutable_data<T>(out[7]),
-                                 mutable_data<T>(out[8]),
-                                 mutable_data<std::int32_t>(out[9]),
-                                 mutable_data<std::int32_t>(out[10]),
-                                 f.ranges.n_ranks > 0 ? mutable_data<std::int64_t>(out[11]) : nullptr};
-    backend::project_emit(f.inputs<T>(), f.ranges, plan.const_data_ptr(), carry.const_data_ptr(), sizes, rows,
-                          scope.workspace, scope.stream);
+                                 mutable_data<std::int32_t>(out[5]),
+                                 mutable_data<std::int32_t>(out[6]),
+                                 f.ranks.n_ranks > 0 ? mutable_data<std::int64_t>(out[7]) : nullptr};
+    backend::project_emit(in, f.ranks, carry.const_data_ptr(), listed, P, rows, scope.workspace,
+                          scope.stream);
   });
-  return {out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9], out[10], out[11]};
+  return {gaussian_ids, camera_ids, visible_ids, row_offsets, out[0], out[1],
+          out[2],       out[3],     out[4],      out[5],      out[6], out[7]};
 }
 
 }  // namespace

@@ -134,7 +134,7 @@ BLITZGS_HD bool project_row(const Camera<T>& camera, const ActiveGaussian<T>& ga
 // row that a rank wants.
 template <class T, class F>
 BLITZGS_HD std::int32_t row_tiles(const Row<T>& row, int view, const ProjectOptions<T>& options,
-                                  const RankTiles& ranges, std::int64_t* ranks, const F& f) {
+                                  const RankTiles& rank_tiles, std::int64_t* ranks, const F& f) {
   const int tiles_x = (options.width + options.tile_size - 1) / options.tile_size;
   const int tiles_y = (options.height + options.tile_size - 1) / options.tile_size;
   const std::int64_t image = static_cast<std::int64_t>(view) * tiles_x * tiles_y;
@@ -144,10 +144,11 @@ BLITZGS_HD std::int32_t row_tiles(const Row<T>& row, int view, const ProjectOpti
                     [&](int ty, int begin, int end) {
                       count += end - begin;
                       const std::int64_t first = image + static_cast<std::int64_t>(ty) * tiles_x;
-                      for_each_rank(ranges, first + begin, first + end, [&](int rank, std::int64_t tiles) {
-                        wanted |= std::int64_t{1} << rank;
-                        f(rank, tiles);
-                      });
+                      for_each_rank(rank_tiles, first + begin, first + end,
+                                    [&](int rank, std::int64_t tiles) {
+                                      wanted |= std::int64_t{1} << rank;
+                                      f(rank, tiles);
+                                    });
                     });
   *ranks = wanted;
   return count;
@@ -172,7 +173,7 @@ BLITZGS_HD T view_direction(const Camera<T>& camera, const Vec3<T>& mean, Vec3<T
 template <class T>
 BLITZGS_HD Vec3<T> unclipped_color(const T* basis, const T* sh, int degree) {
   Vec3<T> sum{T(0.5), T(0.5), T(0.5)};
-  for (int k = 0; k < sh_basis_count(degree); ++k) sum = sum + basis[k] * load3(sh + 3 * k);
+  for (int k = 0; k < sh_basis_count(degree); ++k) sum = mul_add(basis[k], load3(sh + 3 * k), sum);
   return sum;
 }
 

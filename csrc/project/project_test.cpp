@@ -71,11 +71,12 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
   p.opacities.resize(P);
   p.colors.resize(3 * P);
   p.rank_masks.resize(P);
-  const ProjectOutputs<double> out{p.gaussian_ids.data(), p.camera_ids.data(), p.visible_ids.data(),
-                                   p.row_offsets.data(),  p.means2d.data(),    p.conics.data(),
-                                   p.depths.data(),       p.opacities.data(),  p.colors.data(),
-                                   p.radii.data(),        p.tiles.data(),      p.rank_masks.data()};
-  cpu::project_emit(in, ranks, plan, carry.last(), p.sizes, out, workspace, nullptr);
+  const ProjectIds ids{p.gaussian_ids.data(), p.camera_ids.data(), p.visible_ids.data(),
+                       p.row_offsets.data()};
+  const ProjectOutputs<double> out{p.means2d.data(), p.conics.data(), p.depths.data(), p.opacities.data(),
+                                   p.colors.data(),  p.radii.data(),  p.tiles.data(),  p.rank_masks.data()};
+  cpu::project_list(in, plan, p.sizes, ids, workspace, nullptr);
+  cpu::project_emit(in, ranks, carry.last(), ids, p.sizes.rows, out, workspace, nullptr);
   return p;
 }
 
