@@ -17,7 +17,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.exchange import Route, Splats, plan_route, read_traffic, send, send_back
+from blitzgs.distributed.exchange import (
+    PeerSpace,
+    Route,
+    Splats,
+    plan_route,
+    read_traffic,
+    send,
+    send_back,
+)
 from blitzgs.distributed.ownership import Share
 from blitzgs.model import GaussianTable
 from blitzgs.ops.host import to_host
@@ -256,8 +264,9 @@ def _project(
 ) -> tuple[Rows, Splats, Route | None, int, Tensor]:
     """Project a table and, on several ranks, agree on which row goes where: the step's one wait.
 
-    Returns this rank's rows; the same as splats; where they go (None: they stay); at least the number of
-    intersections to composite here; rows of each view over all ranks, int64 [B].
+    Returns this rank's rows; the same as splats, or what the other ranks' projections write here; where rows
+    go (None: they stay); at least the number of intersections to composite here; rows of each view over all
+    ranks, int64 [B].
     """
     active = active or Active()
     # Halves are routed by what arrives: rounding may move a splat's border over that of a tile.
@@ -270,14 +279,22 @@ def _project(
     )  # fmt: skip
     plan, carry, totals = torch.ops.blitzgs.project_count(*arguments)
     traffic = None if asking is None else read_traffic(totals, len(views), asking.ranks)
+    if asking is not None and traffic is not None and asking.ranks.peers is not None:
+        space = PeerSpace.reserve(traffic, asking.ranks.peers)
+        *written, bases = torch.ops.blitzgs.project_emit_to_peers_(
+            *arguments, plan, traffic.counts, table["id"], *space.arguments
+        )
+        rows = Rows._make((*written, traffic.counts))
+        route = Route(traffic, rows.rank_masks, bases=bases, space=space)
+        return rows, space.arrived(), route, traffic.n_isects, traffic.visible
     counts = to_host(totals)[:3] if traffic is None else traffic.counts
     rows = Rows._make((*torch.ops.blitzgs.project_emit(*arguments, plan, carry, counts), counts))
     splats = Splats(
         rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
         table["id"].index_select(0, rows.gaussian_ids),
     )  # fmt: skip
-    if asking is not None and traffic is not None:
-        route = Route(traffic, rows.rank_masks, peers=asking.ranks.peers)
+    if traffic is not None:
+        route = Route(traffic, rows.rank_masks)
     elif share is not None:
         route = plan_route(splats, share.ranges, share.ranks, share.half)
     else:

@@ -44,7 +44,8 @@ target_compile_options(
 # Counting and emitting compute the same rows and tiles in different kernels: no contraction, so that they
 # get the same bits. These kernels wait for memory, not for arithmetic.
 set_source_files_properties(
-  ${CMAKE_SOURCE_DIR}/csrc/project/project_fwd_cuda.cu
+  ${CMAKE_SOURCE_DIR}/csrc/project/project_count_cuda.cu
+  ${CMAKE_SOURCE_DIR}/csrc/project/project_emit_cuda.cu
   ${CMAKE_SOURCE_DIR}/csrc/intersect/intersect_cuda.cu
   PROPERTIES COMPILE_OPTIONS "-fmad=false"
 )

@@ -33,6 +33,17 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor means2d, Tensor conics, Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, "
       "Tensor tiles_touched, Tensor rank_masks)");
   m.def(
+      "project_emit_to_peers_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh, "
+      "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
+      "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
+      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor plan, Tensor counts, Tensor "
+      "ids, "
+      "Tensor(a!)[] buffers, int capacity, int[] starts, int[] group_sizes) -> (Tensor gaussian_ids, "
+      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, Tensor "
+      "depths, "
+      "Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, Tensor rank_masks, "
+      "Tensor bases)");
+  m.def(
       "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
       "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "
       "int sh_degree, float eps2d, bool antialiased, bool raw, Tensor v_means2d, Tensor v_conics, "
@@ -65,9 +76,6 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "sum_rows(Tensor values, Tensor masks, Tensor bases, int[] group_sizes, int[] widths) -> Tensor[] "
       "columns");
-  m.def(
-      "scatter_to_peers_(Tensor[] columns, Tensor masks, Tensor(a!)[] buffers, int capacity, int[] starts, "
-      "int[] group_sizes) -> Tensor bases");
   m.def(
       "return_to_peers_(Tensor[] columns, int[] group_sizes, Tensor(a!)[] buffers, int offset, int[] starts) "
       "-> ()");

@@ -7,15 +7,15 @@ there; `send_back` returns their gradients along the same routes and adds them u
 that the sum does not depend on who was faster (paper §3.1). `exchange` is the differentiable form for use
 with autograd, `plan_route` for rows that are there already.
 
-Rows travel in one of two ways. Ranks with peer access write them straight into the columns that the others
-composite from (`blitzgs.distributed.peers`). Otherwise they are packed, carried by one all-to-all and taken
-apart. Either way the place of a row among those of its rank follows from the masks and one number per block
-of rows, and serves the way back too.
+Rows travel in one of two ways. Where the ranks share memory (`blitzgs.distributed.peers`), the projection
+itself writes each row into the columns that other ranks composite from, so that the links work while it
+computes; `PeerSpace` tells it where. Otherwise rows are packed, carried by one all-to-all and taken apart.
+Either way the place of a row among those of its rank follows from the masks and one number per block of
+rows, and serves the way back too.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,6 +37,18 @@ from blitzgs.ops.scatter import (
     words_per_row,
 )
 
+# Columns of a row as peers write them: those of `Splats`, with dtype, words and shape of an element.
+_COLUMNS = (
+    (torch.float32, 2, (2,)),
+    (torch.float32, 3, (3,)),
+    (torch.float32, 1, ()),
+    (torch.float32, 3, (3,)),
+    (torch.float32, 1, ()),
+    (torch.int32, 1, ()),
+    (torch.int64, 2, ()),
+)
+_ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
+_GRADIENT_WORDS = 9  # of means2d, conics, opacities and colors
 # A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
 _ALIGNMENT = 32
 
@@ -97,6 +109,72 @@ class Traffic:
         return max(*map(sum, self.rows), *map(sum, zip(*self.rows, strict=True)))
 
 
+@dataclass(frozen=True)
+class PeerSpace:
+    """Where the rows of one exchange lie in the peers' memory, see `blitzgs.distributed.peers`.
+
+    Attributes:
+        peers: the memory.
+        traffic: what goes where.
+        capacity: length of the columns of arriving rows.
+        exchange: number of this exchange; only the last one's rows are there.
+    """
+
+    peers: Peers
+    traffic: Traffic
+    capacity: int
+    exchange: int
+
+    @classmethod
+    def reserve(cls, traffic: Traffic, peers: Peers) -> PeerSpace:
+        """Begin an exchange whose traffic all ranks know. Collective."""
+        needed = -(-traffic.most // _ALIGNMENT) * _ALIGNMENT
+        peers.reserve((_ROW_WORDS + _GRADIENT_WORDS) * needed)
+        peers.exchanges += 1
+        capacity = len(peers.buffers[0]) // (_ROW_WORDS + _GRADIENT_WORDS) // _ALIGNMENT * _ALIGNMENT
+        return cls(peers, traffic, capacity, peers.exchanges)
+
+    @property
+    def arguments(self) -> tuple[list[Tensor], int, list[int], list[int]]:
+        """Last arguments of `project_emit_to_peers_`."""
+        sources = self.traffic.rows[: self.peers.rank]
+        before = [sum(row[d] for row in sources) for d in range(self.peers.world_size)]
+        return self.peers.buffers, self.capacity, before, self.traffic.sent
+
+    def arrived(self) -> Splats:
+        """Return the rows that arrive here; they may be read after the next meeting."""
+        mine, count = self.peers.buffers[self.peers.rank], sum(self.traffic.received)
+        columns, begin = [], 0
+        for dtype, words, shape in _COLUMNS:
+            column = mine[begin : begin + count * words].view(dtype)
+            columns.append(column.view(count, *shape))
+            begin += self.capacity * words
+        return Splats(*columns)
+
+    def write_back(self, gradients: Sequence[Tensor]) -> Tensor:
+        """Write gradients [R, w] of the rows that arrived to their owners.
+
+        Returns:
+            [S, 9], those of the rows this rank sent; they may be read after the next meeting.
+
+        Raises:
+            RuntimeError: a later exchange has begun.
+        """
+        if self.exchange != self.peers.exchanges:
+            raise RuntimeError(
+                "send_back: a later exchange has overwritten this one's rows: run the backward pass of a "
+                "frame before the next forward pass"
+            )
+        offset, me = self.capacity * _ROW_WORDS, self.peers.rank
+        before = [sum(row[:me]) for row in self.traffic.rows]
+        torch.ops.blitzgs.return_to_peers_(
+            list(gradients), self.traffic.received, self.peers.buffers, offset, before
+        )
+        count = sum(self.traffic.sent)
+        mine = self.peers.buffers[me][offset : offset + count * _GRADIENT_WORDS]
+        return mine.view(torch.float32).view(count, _GRADIENT_WORDS)
+
+
 @dataclass
 class Route:
     """Where the rows of one rank go.
@@ -106,17 +184,15 @@ class Route:
         masks: int64 [P], bit m set for rows that go to rank m.
         halves: float16 [P, 4 + D], what to send for conic, opacity and colour in half precision; None: send
             them as they are.
-        peers: how rows travel; None: by collectives.
-        bases: int32, places of the rows sent, see `blitzgs.ops.scatter`; set by `send`.
-        exchange: which exchange over peers this is; set by `send`.
+        bases: int32, places of the rows sent, see `blitzgs.ops.scatter`; None: not sent yet.
+        space: where peers write; None: rows travel by collectives.
     """
 
     traffic: Traffic
     masks: Tensor
     halves: Tensor | None = None
-    peers: Peers | None = None
     bases: Tensor | None = None
-    exchange: int = 0
+    space: PeerSpace | None = None
 
 
 def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
@@ -128,14 +204,15 @@ def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
         ranks: the job.
     """
     everyone = ranks.share(totals)
-    known = ranks.read(everyone)
     first = 3 + n_views
+    visible = everyone[:, 3:first].sum(0)
+    known = ranks.read(everyone)
     return Traffic(
         counts=torch.tensor(known[ranks.rank][:3]),
         rows=[numbers[first::2] for numbers in known],
         rank=ranks.rank,
         n_isects=sum(numbers[first + 2 * ranks.rank + 1] for numbers in known),
-        visible=everyone[:, 3:first].sum(0),
+        visible=visible,
     )
 
 
@@ -171,14 +248,14 @@ def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = Fa
     # As `project_count` would have it; nobody asks for the first three.
     totals = torch.cat((counts.new_zeros(3), seen, counts.flatten()))
     traffic = read_traffic(totals, ranges.n_views, ranks)
-    return Route(traffic, masks, halves, None if half else ranks.peers)
+    return Route(traffic, masks, halves)
 
 
 def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
     """Carry rows to the ranks whose tiles they touch.
 
     Args:
-        splats: this rank's rows.
+        splats: this rank's rows; where peers write: what they write here.
         route: of these rows; remembers their places.
         ranks: the job.
 
@@ -186,8 +263,9 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
         The rows that touch the tiles this rank composites, grouped by source rank. Where peers write them,
         they are valid until the next exchange.
     """
-    if route.peers is not None:
-        return _write_rows(splats, route, route.peers)
+    if route.space is not None:
+        route.space.peers.meet()
+        return splats
     columns = [splats.means2d, splats.depths, splats.camera_ids, splats.ids]
     if route.halves is None:
         columns += [splats.conics, splats.opacities, splats.colors]
@@ -221,8 +299,9 @@ def send_back(gradients: Sequence[Tensor], route: Route, ranks: Ranks) -> list[T
     flat = [g.reshape(len(g), math.prod(g.shape[1:])) for g in gradients]
     widths, dtype = [g.shape[1] for g in flat], gradients[0].dtype
     sent, received = route.traffic.sent, route.traffic.received
-    if route.peers is not None:
-        returned = _write_gradients(flat, route, route.peers)
+    if route.space is not None:
+        returned = route.space.write_back(flat)
+        route.space.peers.meet()
     elif route.halves is None:
         returned = ranks.all_to_all(torch.cat(flat, 1), received, sent).view(-1, sum(widths))
     else:
@@ -233,50 +312,10 @@ def send_back(gradients: Sequence[Tensor], route: Route, ranks: Ranks) -> list[T
     return [part.reshape(-1, *g.shape[1:]) for part, g in zip(sums, gradients, strict=True)]
 
 
-def _write_rows(splats: Splats, route: Route, peers: Peers) -> Splats:
-    """`send`, into the memory of the others."""
-    traffic, columns = route.traffic, [words_of(column) for column in splats]
-    ends = list(itertools.accumulate(column.shape[1] for column in columns))
-    needed = -(-traffic.most // _ALIGNMENT) * _ALIGNMENT
-    peers.reserve(2 * needed * ends[-1])  # a gradient is never wider than its row
-    # The first half of a buffer is for rows, the second for gradients.
-    capacity = len(peers.buffers[0]) // 2 // ends[-1] // _ALIGNMENT * _ALIGNMENT
-    before = [sum(row[d] for row in traffic.rows[: peers.rank]) for d in range(peers.world_size)]
-    peers.exchanges += 1
-    route.exchange = peers.exchanges
-    route.bases = torch.ops.blitzgs.scatter_to_peers_(
-        columns, route.masks, peers.buffers, capacity, before, traffic.sent
-    )
-    peers.meet()
-    mine, count, arrived = peers.buffers[peers.rank], sum(traffic.received), []
-    for like, words, end in zip(splats, columns, ends, strict=True):
-        width = words.shape[1]
-        begin = capacity * (end - width)
-        arrived.append(as_column(mine[begin : begin + count * width].view(count, width), like))
-    return Splats(*arrived)
-
-
-def _write_gradients(flat: list[Tensor], route: Route, peers: Peers) -> Tensor:
-    """Write gradients [R, w] to the owners of their rows; return what came back here, [S, sum w]."""
-    if route.exchange != peers.exchanges:
-        raise RuntimeError(
-            "send_back: a later exchange has overwritten this one's rows: run the backward pass of a frame "
-            "before the next forward pass"
-        )
-    traffic, width = route.traffic, sum(column.shape[1] for column in flat)
-    offset = len(peers.buffers[0]) // 2
-    before = [sum(row[: peers.rank]) for row in traffic.rows]
-    torch.ops.blitzgs.return_to_peers_(flat, traffic.received, peers.buffers, offset, before)
-    peers.meet()
-    count = sum(traffic.sent)
-    mine = peers.buffers[peers.rank][offset : offset + count * width]
-    return mine.view(torch.float32).view(count, width)
-
-
 def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> tuple[Splats, Route]:
     """Differentiable exchange: `plan_route` and `send`, with `send_back` as the backward pass.
 
-    Several may be open at once, so their rows travel by collectives.
+    Several may be open at once, so rows travel by collectives.
 
     Args:
         splats: this rank's rows; gradients flow to means2d, conics, opacities, colors and depths.
@@ -288,7 +327,6 @@ def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = Fals
         The rows that touch this rank's tiles, and the route.
     """
     route = plan_route(splats, ranges, ranks, half)
-    route.peers = None
     return Splats(*_Exchange.apply(*splats, route, ranks)), route  # type: ignore[no-untyped-call]
 
 

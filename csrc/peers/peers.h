@@ -2,17 +2,16 @@
 // Ranks that reach each other's memory: rows written where they are needed, and a meeting of all ranks on the
 // device. CUDA only. Every rank holds the same kind of buffers; `buffers[m]` is rank m's, mapped here.
 //
-//   scatter_to_peers_: as scatter (scatter/scatter.h), but each group goes into its rank's buffer, behind the
-//       groups of the ranks before this one: column c begins at word capacity * begin[c], this rank's rows at
-//       row starts[m].
-//   return_to_peers_: the way back. Values [R, w] of received rows, group m of them from rank m, go to rank
-//   m's
-//       buffer as rows of all columns, from row starts[m] of the values there; those begin at word `offset`.
-//   meet_peers_: a barrier in stream order: what any rank queued before it is done, and visible, when what
-//   any
-//       rank queues behind it runs. Each rank also leaves its `values` with every other. mail[m], int64:
-//       [M] the last meeting each rank came to, then [M, n] their values. A rank that waits for longer than
-//       timeout_seconds aborts its kernels, so that its process sees an error.
+// Rows for other ranks are written by the projection (project_emit_to_peers_): each group goes into its
+// rank's buffer behind the groups of the ranks before this one, column c from word capacity * begin[c] on.
+//
+// return_to_peers_, the way back: values [R, w] of received rows, group m of them from rank m, go to rank m's
+// buffer as rows of all columns, from row starts[m] of the values there; those begin at word `offset`.
+//
+// meet_peers_, a barrier in stream order: what any rank queued before it is done, and visible, when what any
+// rank queues behind it runs. Each rank also leaves its `values` with every other. mail[m], int64: [M] the
+// last meeting each rank came to, then [M, n] their values. A rank that waits for longer than timeout_seconds
+// aborts its kernels, so that its process sees an error.
 #pragma once
 #include "scatter/scatter.h"
 

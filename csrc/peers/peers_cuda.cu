@@ -47,11 +47,13 @@ __global__ void __launch_bounds__(kMeetThreads)
   }
 }
 
-// Block (x, m): kScatterBlock rows of group m, put together in shared memory, leave in one run.
+// Block x: kScatterBlock rows of group x % M, put together in shared memory, leave in one run. Neighbouring
+// blocks write to different ranks, so that no link waits for another.
 __global__ void __launch_bounds__(kScatterBlock) return_kernel(const __grid_constant__ PeerReturn job) {
   extern __shared__ float block_rows[];
-  const int m = blockIdx.y, width = job.columns.begin[job.columns.count];
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
+  const int m = static_cast<int>(blockIdx.x) % job.groups.count;
+  const int width = job.columns.begin[job.columns.count];
+  const std::int64_t first = static_cast<int>(blockIdx.x) / job.groups.count * std::int64_t{kScatterBlock};
   const std::int64_t left = job.groups.size[m] - first;
   if (left <= 0) return;
   const int n_rows = left < kScatterBlock ? static_cast<int>(left) : kScatterBlock;
@@ -88,8 +90,8 @@ void return_rows(const PeerReturn& job, Workspace&, CudaStream stream) {
                                static_cast<int>(bytes)),
           "return_to_peers");
   }
-  const dim3 grid(static_cast<unsigned>(scatter_blocks(most)), job.groups.count);
-  return_kernel<<<grid, kScatterBlock, bytes, stream>>>(job);
+  const std::int64_t blocks = scatter_blocks(most) * job.groups.count;
+  return_kernel<<<static_cast<unsigned>(blocks), kScatterBlock, bytes, stream>>>(job);
   check_launch("return_to_peers");
 }
 

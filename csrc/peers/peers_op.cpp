@@ -1,61 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "peers/peers.h"
-
-#include "scatter/scatter_op.h"
+#include "peers/peers_op.h"
 
 #ifdef BLITZGS_BACKEND_CUDA
 namespace blitzgs {
 namespace {
-
-void check_peers(const char* op, const std::vector<Tensor>& buffers, ScalarType dtype) {
-  const auto count = static_cast<std::int64_t>(buffers.size());
-  STD_TORCH_CHECK(count >= 1 && count <= kMaxPeers, "blitzgs::", op, ": 1 to ", kMaxPeers,
-                  " peers are supported, got ", count);
-  for (const Tensor& buffer : buffers) {
-    check_shape(op, "a buffer", buffer, {buffers[0].size(0)});
-    check_dtype(op, "a buffer", buffer, dtype);
-    STD_TORCH_CHECK(buffer.is_contiguous(), "blitzgs::", op, ": buffers must be contiguous");
-  }
-}
-
-// Rows starts[m] .. + sizes[m] of every peer lie within its first `rows`.
-void check_starts(const char* op, const std::vector<std::int64_t>& starts, const RowGroups& groups,
-                  std::int64_t rows) {
-  STD_TORCH_CHECK(static_cast<int>(starts.size()) == groups.count, "blitzgs::", op, ": ", groups.count,
-                  " starts are needed, got ", starts.size());
-  for (int m = 0; m < groups.count; ++m) {
-    STD_TORCH_CHECK(starts[m] >= 0 && starts[m] + groups.size[m] <= rows, "blitzgs::", op, ": rows [",
-                    starts[m], ", ", starts[m] + groups.size[m], ") do not fit into the ", rows, " of rank ",
-                    m);
-  }
-}
-
-Tensor scatter_to_peers(const std::vector<Tensor>& columns, const Tensor& masks, std::vector<Tensor> buffers,
-                        std::int64_t capacity, const std::vector<std::int64_t>& starts,
-                        const std::vector<std::int64_t>& group_sizes) {
-  constexpr const char* kOp = "scatter_to_peers_";
-  HeldRows held(kOp, columns, masks);
-  const RowGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
-  check_peers(kOp, buffers, ScalarType::Int);
-  STD_TORCH_CHECK(static_cast<int>(buffers.size()) == groups.count, "blitzgs::", kOp,
-                  ": there must be a buffer for each group");
-  check_starts(kOp, starts, groups, capacity);
-  const auto& columns_in = held.rows.columns;
-  STD_TORCH_CHECK(capacity * columns_in.begin[columns_in.count] <= buffers[0].size(0), "blitzgs::", kOp, ": ",
-                  capacity, " rows do not fit into a buffer of ", buffers[0].size(0), " words");
-  Tensor bases = make_empty(held.masks, {scatter_blocks(held.rows.count), groups.count}, ScalarType::Int);
-  ScatterTargets targets{};
-  for (int m = 0; m < groups.count; ++m) {
-    for (int c = 0; c < columns_in.count; ++c) {
-      const std::int64_t width = columns_in.begin[c + 1] - columns_in.begin[c];
-      targets.words[m][c] =
-          mutable_data<std::int32_t>(buffers[m]) + capacity * columns_in.begin[c] + starts[m] * width;
-    }
-  }
-  DeviceScope scope(held.masks);
-  cuda::scatter(held.rows, groups, targets, mutable_data<std::int32_t>(bases), scope.workspace, scope.stream);
-  return bases;
-}
 
 void return_to_peers(const std::vector<Tensor>& columns, const std::vector<std::int64_t>& group_sizes,
                      std::vector<Tensor> buffers, std::int64_t offset,
@@ -71,15 +19,12 @@ void return_to_peers(const std::vector<Tensor>& columns, const std::vector<std::
     held.push_back(as_contiguous(column));
     add_column(kOp, job.columns, data<float>(held.back()), column.size(1));
   }
-  check_peers(kOp, buffers, ScalarType::Int);
-  STD_TORCH_CHECK(static_cast<int>(buffers.size()) == job.groups.count, "blitzgs::", kOp,
-                  ": there must be a buffer for each group");
   const std::int64_t width = job.columns.begin[job.columns.count];
   STD_TORCH_CHECK(width > 0 && width <= 400, "blitzgs::", kOp, ": a row must have 1 to 400 values, got ",
                   width);
-  STD_TORCH_CHECK(offset >= 0 && offset <= buffers[0].size(0), "blitzgs::", kOp,
+  STD_TORCH_CHECK(!buffers.empty() && offset >= 0 && offset <= buffers[0].size(0), "blitzgs::", kOp,
                   ": offset must lie in the buffers, got ", offset);
-  check_starts(kOp, starts, job.groups, (buffers[0].size(0) - offset) / width);
+  check_starts(kOp, buffers, starts, job.groups, (buffers[0].size(0) - offset) / width);
   for (int m = 0; m < job.groups.count; ++m) {
     job.targets[m] =
         reinterpret_cast<float*>(mutable_data<std::int32_t>(buffers[m]) + offset) + starts[m] * width;
@@ -117,7 +62,6 @@ void meet_peers(std::vector<Tensor> mail, std::int64_t rank, std::int64_t meetin
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("scatter_to_peers_", TORCH_BOX(&blitzgs::scatter_to_peers));
   m.impl("return_to_peers_", TORCH_BOX(&blitzgs::return_to_peers));
   m.impl("meet_peers_", TORCH_BOX(&blitzgs::meet_peers));
 }

@@ -27,6 +27,7 @@
 #include "common/stream.h"
 #include "math/rank_tiles.h"
 #include "project/project_row.h"
+#include "scatter/scatter.h"
 
 namespace blitzgs {
 
@@ -72,6 +73,20 @@ struct ProjectOutputs {
   T *means2d, *conics, *depths, *opacities, *colors;
   std::int32_t *radii, *tiles_touched;
   std::int64_t* rank_masks;
+};
+
+// What other ranks need of a row: means2d, conics, opacities, colors, depths, camera_ids and the Gaussian's
+// persistent id, in words.
+inline constexpr RowColumns<const std::int32_t> kEmittedColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
+
+// Where emitted rows go besides (CUDA): each to the ranks of its rank mask, as `scatter` does
+// (scatter/scatter.h). ids [N]; row_ids [P] and bases are written too.
+struct ProjectScatter {
+  const std::int64_t* ids;
+  std::int64_t* row_ids;
+  std::int32_t* bases;
+  RowGroups groups;
+  ScatterTargets targets;
 };
 
 // Gradients of the rows; v_depths and v_colors may be null (zero).
@@ -122,6 +137,9 @@ void project_list(const ProjectInputs<T>&, const void* plan, const ProjectSizes&
 template <class T>
 void project_emit(const ProjectInputs<T>&, const RankTiles&, const void* carry, const ProjectIds&,
                   std::int64_t n_rows, const ProjectOutputs<T>&, Workspace&, CudaStream);
+void project_emit_to_ranks(const ProjectInputs<float>&, const RankTiles&, const ProjectIds&,
+                           std::int64_t n_rows, const ProjectOutputs<float>&, const ProjectScatter&,
+                           Workspace&, CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
                  const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);

@@ -5,10 +5,6 @@
 
 namespace blitzgs::cuda {
 
-__device__ inline std::int64_t candidate_id(const Inputs& in, std::int64_t candidate) {
-  return in.active_ids ? in.active_ids[candidate] : candidate;
-}
-
 // n . p + d + k s + e |p|_1 >= 0 for whatever a view may see, p a mean and s its largest standard deviation.
 struct Plane {
   float4 normal;  // n, d

@@ -5,6 +5,10 @@
 
 #include "project/project_op.h"
 
+#ifdef BLITZGS_BACKEND_CUDA
+#include "peers/peers_op.h"
+#endif
+
 namespace blitzgs {
 namespace {
 
@@ -109,29 +113,20 @@ std::tuple<Tensor, Tensor, Tensor> project_count(
 using RowTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                               Tensor, Tensor>;
 
-RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& scales,
-                        const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
-                        const Tensor& Ks, const OptionalTensor& active_ids,
-                        const OptionalTensor& active_views, std::int64_t width, std::int64_t height,
-                        std::int64_t tile_size, std::int64_t sh_degree, double near_plane, double far_plane,
-                        double eps2d, double radius_clip, bool antialiased, bool raw,
-                        const std::vector<std::int64_t>& tile_begins,
-                        const std::vector<std::int64_t>& tile_ends, const Tensor& plan, const Tensor& carry,
-                        const Tensor& counts) {
-  constexpr const char* kOp = "project_emit";
-  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
-                  height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
-                  tile_begins, tile_ends);
+// Lists the rows that `counts` announces and calls launch(inputs, ids, rows, outputs, scope) to have them
+// written.
+template <class F>
+RowTensors emit_rows(const char* op, const Forward& f, const Tensor& plan, const Tensor& counts,
+                     const F& launch) {
   const auto bytes = static_cast<std::int64_t>(backend::project_plan_bytes(f.candidates));
-  check_dtype(kOp, "plan", plan, ScalarType::Long);
-  check_shape(kOp, "plan", plan, {(bytes + 7) / 8});
-  check_dtype(kOp, "counts", counts, ScalarType::Long);
-  STD_TORCH_CHECK(counts.is_cpu() && counts.numel() >= 2,
-                  "blitzgs::project_emit: counts must be the totals of project_count, on the CPU");
+  check_dtype(op, "plan", plan, ScalarType::Long);
+  check_shape(op, "plan", plan, {(bytes + 7) / 8});
+  check_dtype(op, "counts", counts, ScalarType::Long);
+  STD_TORCH_CHECK(counts.is_cpu() && counts.numel() >= 2, "blitzgs::", op,
+                  ": counts must be the totals of project_count, on the CPU");
   const auto* totals = data<std::int64_t>(counts);
   const ProjectSizes sizes{totals[kTotalVisible], totals[kTotalRows]};
-  STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(),
-                  "blitzgs::project_emit: ", sizes.rows,
+  STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ", sizes.rows,
                   " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
   const std::int64_t U = sizes.visible, P = sizes.rows;
   const auto ints = ScalarType::Int;
@@ -150,7 +145,7 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
            make_empty(f.p.means, {P, 3}),
            make_empty(f.p.means, {P}),
            make_empty(f.p.means, {P}),
-           make_empty(f.p.means, {sh ? P : 0, 3}),
+           make_empty(f.p.means, {f.p.sh ? P : 0, 3}),
            make_empty(f.p.means, {P, 2}, ints),
            make_empty(f.p.means, {P}, ints),
            make_empty(f.p.means, {f.ranks.n_ranks > 0 ? P : 0}, ScalarType::Long)};
@@ -162,12 +157,72 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
                                  mutable_data<std::int32_t>(out[5]),
                                  mutable_data<std::int32_t>(out[6]),
                                  f.ranks.n_ranks > 0 ? mutable_data<std::int64_t>(out[7]) : nullptr};
-    backend::project_emit(in, f.ranks, carry.const_data_ptr(), listed, P, rows, scope.workspace,
-                          scope.stream);
+    launch(in, listed, P, rows, scope);
   });
   return {gaussian_ids, camera_ids, visible_ids, row_offsets, out[0], out[1],
           out[2],       out[3],     out[4],      out[5],      out[6], out[7]};
 }
+
+RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& scales,
+                        const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
+                        const Tensor& Ks, const OptionalTensor& active_ids,
+                        const OptionalTensor& active_views, std::int64_t width, std::int64_t height,
+                        std::int64_t tile_size, std::int64_t sh_degree, double near_plane, double far_plane,
+                        double eps2d, double radius_clip, bool antialiased, bool raw,
+                        const std::vector<std::int64_t>& tile_begins,
+                        const std::vector<std::int64_t>& tile_ends, const Tensor& plan, const Tensor& carry,
+                        const Tensor& counts) {
+  constexpr const char* kOp = "project_emit";
+  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
+                  height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
+                  tile_begins, tile_ends);
+  return emit_rows(
+      kOp, f, plan, counts,
+      [&](const auto& in, const ProjectIds& ids, std::int64_t n_rows, const auto& rows, DeviceScope& scope) {
+        backend::project_emit(in, f.ranks, carry.const_data_ptr(), ids, n_rows, rows, scope.workspace,
+                              scope.stream);
+      });
+}
+
+#ifdef BLITZGS_BACKEND_CUDA
+using SentRowTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
+                                  Tensor, Tensor, Tensor, Tensor>;
+
+SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, const Tensor& scales,
+                                     const Tensor& opacities, const Tensor& sh, const Tensor& viewmats,
+                                     const Tensor& Ks, const OptionalTensor& active_ids,
+                                     const OptionalTensor& active_views, std::int64_t width,
+                                     std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree,
+                                     double near_plane, double far_plane, double eps2d, double radius_clip,
+                                     bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
+                                     const std::vector<std::int64_t>& tile_ends, const Tensor& plan,
+                                     const Tensor& counts, const Tensor& ids, std::vector<Tensor> buffers,
+                                     std::int64_t capacity, const std::vector<std::int64_t>& starts,
+                                     const std::vector<std::int64_t>& group_sizes) {
+  constexpr const char* kOp = "project_emit_to_peers_";
+  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
+                  height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
+                  tile_begins, tile_ends);
+  const RowGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
+  STD_TORCH_CHECK(f.ranks.n_ranks == groups.count, "blitzgs::", kOp, ": ", groups.count,
+                  " groups need as many ranges of tiles, got ", f.ranks.n_ranks);
+  check_dtype(kOp, "ids", ids, ScalarType::Long);
+  check_shape(kOp, "ids", ids, {f.p.count});
+  const Tensor every_id = as_contiguous(ids);
+  Tensor row_ids, bases;
+  const auto send = [&](const auto& in, const ProjectIds& listed, std::int64_t n_rows, const auto& out,
+                        DeviceScope& scope) {
+    row_ids = make_empty(f.p.means, {n_rows}, ScalarType::Long);
+    bases = make_empty(f.p.means, {scatter_blocks(n_rows), groups.count}, ScalarType::Int);
+    const ProjectScatter scatter{data<std::int64_t>(every_id), mutable_data<std::int64_t>(row_ids),
+                                 mutable_data<std::int32_t>(bases), groups,
+                                 peer_targets(kOp, buffers, kEmittedColumns, capacity, starts, groups)};
+    cuda::project_emit_to_ranks(in, f.ranks, listed, n_rows, out, scatter, scope.workspace, scope.stream);
+  };
+  auto rows = emit_rows(kOp, f, plan, counts, send);
+  return std::tuple_cat(std::move(rows), std::tuple{bases});
+}
+#endif
 
 }  // namespace
 }  // namespace blitzgs
@@ -175,4 +230,7 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
 BLITZGS_REGISTER(m) {
   m.impl("project_count", TORCH_BOX(&blitzgs::project_count));
   m.impl("project_emit", TORCH_BOX(&blitzgs::project_emit));
+#ifdef BLITZGS_BACKEND_CUDA
+  m.impl("project_emit_to_peers_", TORCH_BOX(&blitzgs::project_emit_to_peers));
+#endif
 }

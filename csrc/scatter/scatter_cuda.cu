@@ -15,9 +15,7 @@ __global__ void __launch_bounds__(kScatterBlock)
     scatter_kernel(const __grid_constant__ ScatterRows rows, const __grid_constant__ RowGroups groups,
                    const __grid_constant__ ScatterTargets targets, const ScatterState state) {
   __shared__ ScatterShared<RANKS> shared;
-  const std::int64_t row = blockIdx.x * static_cast<std::int64_t>(kScatterBlock) + threadIdx.x;
-  const std::int64_t mask = row < rows.count ? rows.masks[row] : 0;
-  scatter_block(shared, rows.columns, mask, groups, targets, state);
+  scatter_block<kScatterBlock>(shared, rows, groups, targets, state);
 }
 
 // Block (x, y) copies a part of column y % count of group y / count.
@@ -37,10 +35,22 @@ __global__ void gather_kernel(const std::int32_t* packed, const __grid_constant_
 template <int RANKS>
 struct SumShared {
   std::uint8_t place[RANKS][kScatterBlock];  // of each thread's row among the block's rows for a rank
-  int in_warp[RANKS][kScatterWarps];
+  int before[RANKS][kScatterWarps];
   std::int32_t base[RANKS];
   float sums[kScatterBlock][kSumWidth + 1];
 };
+
+// Stores `part` values of each row, kSumWidth + 1 apart in shared memory, into rows of `width`. WIDTH: both,
+// or 0.
+template <int WIDTH>
+__device__ __forceinline__ void store_values(const float* from, int n_rows, int any_part, int any_width,
+                                             float* to) {
+  const int part = WIDTH > 0 ? WIDTH : any_part, width = WIDTH > 0 ? WIDTH : any_width;
+  for (int i = threadIdx.x; i < n_rows * part; i += kScatterBlock) {
+    const int row = i / part, k = i - row * part;
+    to[row * width + k] = from[row * (kSumWidth + 1) + k];
+  }
+}
 
 // Values [kSumWidth * blockIdx.y, ...) of a block of rows.
 template <int RANKS>
@@ -55,17 +65,20 @@ __global__ void __launch_bounds__(kScatterBlock)
   if (static_cast<int>(threadIdx.x) < n_ranks) {
     shared.base[threadIdx.x] = in.bases[blockIdx.x * static_cast<std::int64_t>(n_ranks) + threadIdx.x];
   }
-  count_by_warp(shared.in_warp, mask, n_ranks);
+  const int slot = threadIdx.x;
+  count_by_warp(shared.before, slot, mask, n_ranks);
+  __syncthreads();
+  if (slot < n_ranks) scan_warps(shared.before[slot]);
   __syncthreads();
   for (int m = 0; m < n_ranks; ++m) {
     const unsigned going = __ballot_sync(0xffffffffu, (mask >> m) & 1);
-    shared.place[m][threadIdx.x] = static_cast<std::uint8_t>(place_in_block(shared.in_warp[m], going));
+    shared.place[m][slot] = static_cast<std::uint8_t>(place_in_block(shared.before[m], slot, going));
   }
   // Most rows went to a single rank: this way all threads load their first at once.
   float sum[kSumWidth] = {};
   for (std::int64_t left = mask; left; left &= left - 1) {
     const int m = __ffsll(left) - 1;
-    const std::int64_t at = std::int64_t{shared.base[m]} + shared.place[m][threadIdx.x];
+    const std::int64_t at = std::int64_t{shared.base[m]} + shared.place[m][slot];
     if (at >= in.groups.size[m]) continue;
     const float* from = in.values + (in.groups.start[m] + at) * in.width + value;
 #pragma unroll
@@ -83,9 +96,13 @@ __global__ void __launch_bounds__(kScatterBlock)
     const int part = high - low, width = out.begin[c + 1] - out.begin[c];
     if (part <= 0) continue;
     float* to = out.data[c] + first * width + (low - out.begin[c]);
-    for (int i = threadIdx.x; i < n_rows * part; i += kScatterBlock) {
-      const int r = i / part, k = i - r * part;
-      to[r * width + k] = shared.sums[r][low - value + k];
+    const float* from = &shared.sums[0][low - value];
+    if (part == 3 && width == 3) {
+      store_values<3>(from, n_rows, part, width, to);
+    } else if (part == 1 && width == 1) {
+      store_values<1>(from, n_rows, part, width, to);
+    } else {
+      store_values<0>(from, n_rows, part, width, to);
     }
   }
 }

@@ -24,8 +24,8 @@ void dispatch_ranks(int n_ranks, const F& f) {
 
 template <int RANKS>
 struct ScatterShared {
-  std::uint8_t list[RANKS][kScatterBlock];  // threads whose rows go to each rank, ascending
-  int in_warp[RANKS][kScatterWarps];
+  std::uint8_t list[RANKS][kScatterBlock];  // the block's rows that go to each rank, ascending
+  int before[RANKS][kScatterWarps];
   int count[RANKS], base[RANKS];
 };
 
@@ -34,19 +34,30 @@ struct ScatterState {
   std::int32_t *filled, *bases;
 };
 
-// Rows for rank m in the warps before this one, and in this one before this thread.
-__device__ __forceinline__ int place_in_block(const int* in_warp, unsigned going) {
-  int before = __popc(going & ((1u << threadIdx.x % 32) - 1u));
-  for (int warp = 0; warp < static_cast<int>(threadIdx.x) / 32; ++warp) before += in_warp[warp];
-  return before;
-}
-
-// Counts the rows of each warp for each rank; the block has to synchronise before they are read.
-__device__ __forceinline__ void count_by_warp(int (*in_warp)[kScatterWarps], std::int64_t mask, int n_ranks) {
+// Counts a warp's rows for each rank, whose masks the lanes bring.
+__device__ __forceinline__ void count_by_warp(int (*counts)[kScatterWarps], int slot, std::int64_t mask,
+                                              int n_ranks) {
   for (int m = 0; m < n_ranks; ++m) {
     const unsigned going = __ballot_sync(0xffffffffu, (mask >> m) & 1);
-    if (threadIdx.x % 32 == 0) in_warp[m][threadIdx.x / 32] = __popc(going);
+    if (slot % 32 == 0) counts[m][slot / 32] = __popc(going);
   }
+}
+
+// Turns one rank's counts into the counts before each warp; returns their sum.
+__device__ __forceinline__ int scan_warps(int* counts) {
+  int sum = 0;
+#pragma unroll
+  for (int warp = 0; warp < kScatterWarps; ++warp) {
+    const int count = counts[warp];
+    counts[warp] = sum;
+    sum += count;
+  }
+  return sum;
+}
+
+// Rows for one rank before row `slot` of the block; `going` tells those of its warp.
+__device__ __forceinline__ int place_in_block(const int* before, int slot, unsigned going) {
+  return before[slot / 32] + __popc(going & ((1u << slot % 32) - 1u));
 }
 
 // Words by which a warp has to start early for its stores to be whole 128-byte transactions.
@@ -65,35 +76,45 @@ __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::ui
   }
 }
 
-// All kScatterBlock threads of the block call this, each with the mask of its row (0 beyond the last row).
-// The columns of the block's rows must be visible to the whole block.
-template <int RANKS>
-__device__ void scatter_block(ScatterShared<RANKS>& shared, const RowColumns<const std::int32_t>& columns,
-                              std::int64_t mask, const RowGroups& groups, const ScatterTargets& targets,
-                              const ScatterState& state) {
+// Scatters rows [kScatterBlock * blockIdx.x, ...). All THREADS threads of the block call this; the rows must
+// be visible to all of them.
+template <int THREADS, int RANKS>
+__device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& rows, const RowGroups& groups,
+                              const ScatterTargets& targets, const ScatterState& state) {
+  constexpr int kRounds = kScatterBlock / THREADS;
   const int n_ranks = groups.count;
-  count_by_warp(shared.in_warp, mask, n_ranks);
+  const RowColumns<const std::int32_t>& columns = rows.columns;
+  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
+  std::int64_t masks[kRounds];
+#pragma unroll
+  for (int round = 0; round < kRounds; ++round) {
+    const int slot = round * THREADS + static_cast<int>(threadIdx.x);
+    masks[round] = first + slot < rows.count ? rows.masks[first + slot] : 0;
+    count_by_warp(shared.before, slot, masks[round], n_ranks);
+  }
   __syncthreads();
   if (static_cast<int>(threadIdx.x) < n_ranks) {
     const int m = threadIdx.x;
-    int count = 0;
-    for (int warp = 0; warp < kScatterWarps; ++warp) count += shared.in_warp[m][warp];
+    const int count = scan_warps(shared.before[m]);
     const int base = count ? atomicAdd(state.filled + m, count) : 0;
     state.bases[blockIdx.x * static_cast<std::int64_t>(n_ranks) + m] = base;
     const std::int64_t room = groups.size[m] - base;
     shared.base[m] = base;
     shared.count[m] = room >= count ? count : room > 0 ? static_cast<int>(room) : 0;
   }
-  for (int m = 0; m < n_ranks; ++m) {
-    const bool goes = (mask >> m) & 1;
-    const unsigned going = __ballot_sync(0xffffffffu, goes);
-    if (goes) {
-      shared.list[m][place_in_block(shared.in_warp[m], going)] = static_cast<std::uint8_t>(threadIdx.x);
+  __syncthreads();
+#pragma unroll
+  for (int round = 0; round < kRounds; ++round) {
+    const int slot = round * THREADS + static_cast<int>(threadIdx.x);
+    for (int m = 0; m < n_ranks; ++m) {
+      const bool goes = (masks[round] >> m) & 1;
+      const unsigned going = __ballot_sync(0xffffffffu, goes);
+      if (goes)
+        shared.list[m][place_in_block(shared.before[m], slot, going)] = static_cast<std::uint8_t>(slot);
     }
   }
   __syncthreads();
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
-  for (int run = threadIdx.x / 32; run < n_ranks * columns.count; run += kScatterWarps) {
+  for (int run = threadIdx.x / 32; run < n_ranks * columns.count; run += THREADS / 32) {
     const int m = run / columns.count, c = run - m * columns.count;
     const int width = columns.begin[c + 1] - columns.begin[c];
     const std::int32_t* from = columns.data[c] + first * width;

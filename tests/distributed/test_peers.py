@@ -7,10 +7,14 @@ import time
 import pytest
 import torch
 
-from blitzgs.distributed.exchange import Splats, plan_route, send, send_back
+from blitzgs import pipeline
+from blitzgs.distributed.exchange import send_back
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.model import GaussianTable
 from tests.distributed.rank_harness import RankError, run_ranks
-from tests.distributed.test_exchange import owned_by, ranges_for, scene
+from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.training.tiny import random_gaussians
 
 TWO_GPUS = [
     pytest.mark.cuda,
@@ -18,33 +22,38 @@ TWO_GPUS = [
 ]
 
 
-def _to(device, splats):
-    return Splats(*(column.to(device) for column in splats))
+def _table(count, ranks):
+    """This rank's part of a scene; at four ranks one has none."""
+    table = random_gaussians(count) if count else random_gaussians(1)
+    owner = torch.arange(len(table)) % ranks.world_size
+    table.keep((owner == ranks.rank) & (owner != 2) & (count > 0))
+    return GaussianTable({name: table[name].to(ranks.device) for name in table})
 
 
-def _sorted(splats):
-    order = splats.ids.argsort()
-    return [column[order] for column in splats]
+def _exchange(table, ranks):
+    """Rows that arrive here in a fixed order, and the sums of a function of them that return."""
+    views = cameras(3, device=ranks.device)
+    ranges = TileOwners(ranks).divide(range(3), views.width, views.height)
+    frame = pipeline.forward(table, views, OPTIONS, share=Share(ranks, ranges))
+    got = frame.splats
+    order = (got.ids * 4 + got.camera_ids).argsort()
+    arrived = [column[order].clone() for column in got]
+    sums = send_back([got.means2d * 2, got.conics + 1, got.opacities, got.colors**2], frame.route, ranks)
+    return [*arrived, *sums, frame.renders, frame.visible]
 
 
 def _both_ways(ranks):
     """Exchanges of growing, shrinking and empty shards; each by peers and by collectives."""
-    assert ranks.peers is not None, ranks.transport
-    ranges, sizes = ranges_for(ranks.world_size), []
-    for count in (3, 240, 400_000, 0, 1000):
-        mine = _to(ranks.device, owned_by(scene(count), ranks.rank, ranks.world_size))
-        answers = []
-        for peers in (ranks.peers, None):
-            route = plan_route(mine, ranges, ranks)
-            route.peers = peers
-            got = send(mine, route, ranks)
-            gradients = [got.means2d * 2, got.conics + 1, got.opacities, got.colors**2]
-            arrived = [column.clone() for column in _sorted(got)]
-            answers.append((arrived, send_back(gradients, route, ranks)))
-        for a, b in zip(*answers, strict=True):
-            for x, y in zip(a, b, strict=True):
-                assert x.dtype == y.dtype and torch.equal(x, y)
-        sizes.append(len(ranks.peers.buffers[0]))
+    peers, sizes = ranks.peers, []
+    assert peers is not None, ranks.transport
+    for count in (3, 700, 400_000, 0, 1000):
+        table = _table(count, ranks)
+        ranks.peers = peers
+        written = _exchange(table, ranks)
+        ranks.peers = None
+        for x, y in zip(written, _exchange(table, ranks), strict=True):
+            assert x.dtype == y.dtype and torch.equal(x, y)
+        sizes.append(len(peers.buffers[0]))
     assert sizes[0] == sizes[1] < sizes[2] == sizes[3] == sizes[4]
     return sizes[2]
 
@@ -68,13 +77,12 @@ def test_peers_bring_what_collectives_bring(world_size):
 
 
 def _overtaken(ranks):
-    mine, ranges = _to(ranks.device, owned_by(scene(), ranks.rank, 2)), ranges_for(2)
-    first = plan_route(mine, ranges, ranks)
-    got = send(mine, first, ranks)
-    send(mine, plan_route(mine, ranges, ranks), ranks)
+    table, views = _table(300, ranks), cameras(2, device=ranks.device)
+    share = Share(ranks, TileOwners(ranks).divide(range(2), views.width, views.height))
+    frame = pipeline.forward(table, views, OPTIONS, share=share)
+    pipeline.forward(table, views, OPTIONS, share=share)
     with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
-        send_back([got.means2d], first, ranks)
-    # Several differentiable exchanges may be open at once: they leave the peers' buffers alone.
+        pipeline.backward(table, frame, torch.ones_like(frame.renders))
     return True
 
 
@@ -84,13 +92,13 @@ def test_an_overtaken_exchange_is_refused(_):
 
 
 def _abandoned(ranks, how):
-    mine, ranges = _to(ranks.device, owned_by(scene(), ranks.rank, 2)), ranges_for(2)
-    send(mine, plan_route(mine, ranges, ranks), ranks)
+    table = _table(300, ranks)
+    _exchange(table, ranks)
     if ranks.rank == 1:
         if how == "kill":
             os.kill(os.getpid(), 9)
         time.sleep(30)
-    plan_route(mine, ranges, ranks)
+    _exchange(table, ranks)
 
 
 @pytest.mark.parametrize("how", [pytest.param(how, marks=TWO_GPUS) for how in ("kill", "hang")])

@@ -7,21 +7,14 @@
 #include <algorithm>
 
 #include "project/project_cull.cuh"
-#include "project/project_device.cuh"
+#include "project/project_plan.cuh"
 
 namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kSegment = 512;  // candidates that a warp takes together
-constexpr int kBatch = 4;      // of them, those of a lane at a time
+constexpr int kBatch = 4;  // candidates of a lane at a time
 constexpr int kCountThreads = 128, kCountBlocks = 4096;
-constexpr int kListThreads = 256;
-constexpr int kEmitThreads = 128;
-
-__host__ __device__ std::int64_t segments_of(std::int64_t candidates) {
-  return (candidates + kSegment - 1) / kSegment;
-}
 
 // The views that may see each of kBatch candidates first, first + 32, ..., from the mean, then the scale.
 __device__ void quick_views(const Inputs& in, const Frustum* frusta, std::int64_t first,
@@ -57,26 +50,6 @@ __device__ void quick_views(const Inputs& in, const Frustum* frusta, std::int64_
     }
   }
 }
-
-// Visible candidates and rows in one number, so that one scan serves both.
-__device__ std::int64_t pack_counts(std::int64_t visible, std::int64_t rows) { return visible << 32 | rows; }
-
-// before [segments + 1]: pack_counts() of the segments before each. The visible candidates of segment s are
-// the first entries from kSegment * s on, ascending: the views that see each, and where in the segment it is.
-template <class Count, class Views, class Slot>
-struct Plan {
-  Count* before;
-  Views* views;
-  Slot* slots;
-
-  template <class Memory>
-  Plan(Memory* memory, std::int64_t candidates)
-      : before(static_cast<Count*>(memory)),
-        views(reinterpret_cast<Views*>(before + segments_of(candidates) + 1)),
-        slots(reinterpret_cast<Slot*>(views + candidates)) {}
-};
-using NewPlan = Plan<std::int64_t, std::uint32_t, std::uint16_t>;
-using MadePlan = Plan<const std::int64_t, const std::uint32_t, const std::uint16_t>;
 
 // A block's sums for project_totals. Adding 64-bit numbers in shared memory is slow, so tiles carry by hand.
 struct Sums {
@@ -212,103 +185,6 @@ __global__ void __launch_bounds__(kCountThreads, 6)
   if (sums.rows > 0) store_sums(sums, in, rank_tiles.n_ranks, totals);
 }
 
-// Which Gaussian and view each row is of. A warp takes a segment.
-__global__ void __launch_bounds__(kListThreads)
-    list_rows_kernel(const Inputs in, const MadePlan plan, const ProjectSizes sizes, const ProjectIds out) {
-  const int lane = threadIdx.x % 32;
-  const std::int64_t s = (blockIdx.x * static_cast<std::int64_t>(kListThreads) + threadIdx.x) / 32;
-  if (s == 0 && lane == 0) out.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
-  if (s >= segments_of(in.n_candidates)) return;
-  const std::int64_t before = plan.before[s];
-  const auto count = static_cast<int>((plan.before[s + 1] >> 32) - (before >> 32));
-  std::int64_t at = before & 0xffffffff;
-  for (int first = 0; first < count; first += 32) {
-    const bool present = first + lane < count;
-    const std::uint32_t views = present ? plan.views[s * kSegment + first + lane] : 0;
-    int end = __popc(views);
-    for (int step = 1; step < 32; step *= 2) {
-      const int other = __shfl_up_sync(0xffffffffu, end, step);
-      if (lane >= step) end += other;
-    }
-    const int begin = end - __popc(views), n_rows = __shfl_sync(0xffffffffu, end, 31);
-    const std::int64_t u = (before >> 32) + first + lane;
-    std::int32_t id = 0;
-    if (present && u < sizes.visible) {
-      id =
-          static_cast<std::int32_t>(candidate_id(in, s * kSegment + plan.slots[s * kSegment + first + lane]));
-      out.visible_ids[u] = id;
-      out.row_offsets[u] = static_cast<std::int32_t>(at + begin);
-    }
-    // Lanes write consecutive rows: each finds the candidate whose `end` is the first beyond its row.
-    for (int base = 0; base < n_rows; base += 32) {
-      const int row = base + lane;
-      int owner = 0;
-#pragma unroll
-      for (int step = 16; step > 0; step /= 2) {
-        if (__shfl_sync(0xffffffffu, end, owner + step - 1) <= row) owner += step;
-      }
-      std::uint32_t rest = __shfl_sync(0xffffffffu, views, owner);
-      const int owner_begin = __shfl_sync(0xffffffffu, begin, owner);
-      const std::int32_t owner_id = __shfl_sync(0xffffffffu, id, owner);
-      if (row >= n_rows || at + row >= sizes.rows) continue;
-      for (int skip = row - owner_begin; skip > 0; --skip) rest &= rest - 1;
-      out.gaussian_ids[at + row] = owner_id;
-      out.camera_ids[at + row] = __ffs(rest) - 1;
-    }
-    at += n_rows;
-  }
-}
-
-template <int DEGREE, bool QUADS>
-__global__ void __launch_bounds__(kEmitThreads)
-    emit_kernel(const Inputs in, const RankTiles rank_tiles, const ProjectIds ids, std::int64_t n_rows,
-                const ProjectOutputs<float> out) {
-  __shared__ Camera<float> cameras[kMaxViews];
-  __shared__ ShStage<DEGREE> stages[QUADS ? kEmitThreads / 32 : 1];
-  __shared__ TripleStage triples[kEmitThreads / 32];
-  const int lane = threadIdx.x % 32;
-  TripleStage& triple = triples[threadIdx.x / 32];
-  ShStage<DEGREE>& stage = stages[QUADS ? threadIdx.x / 32 : 0];
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kEmitThreads) + threadIdx.x;
-  const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
-  int slot = 0;
-  if constexpr (QUADS) slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
-  load_cameras(in, cameras);
-  __syncthreads();
-  const int view = id < 0 ? 0 : ids.camera_ids[i];
-  const Camera<float>& camera = cameras[view];
-  const Vec3<float> mean = triple.gather(in.means, id, lane), scale = triple.gather(in.scales, id, lane);
-  if (id >= 0) {
-    const ActiveGaussian<float> gaussian = make_gaussian(in, id, mean, scale);
-    Row<float> row{};
-    project_row(camera, gaussian, in.options, &row);
-    reinterpret_cast<float2*>(out.means2d)[i] = {row.mean2d[0], row.mean2d[1]};
-    for (int k = 0; k < 3; ++k) out.conics[3 * i + k] = row.conic[k];
-    out.depths[i] = row.depth;
-    out.opacities[i] = row.opacity;
-    reinterpret_cast<int2*>(out.radii)[i] = {pixel_radius(row.extent[0]), pixel_radius(row.extent[1])};
-    std::int64_t ranks;
-    out.tiles_touched[i] = row_tiles(row, view, in.options, rank_tiles, &ranks, [](int, std::int64_t) {});
-    if (out.rank_masks) out.rank_masks[i] = ranks;
-  }
-  if (!in.sh) return;
-  bool shown = true;
-  if constexpr (QUADS) {
-    stage.wait();
-    if (id < 0) return;
-    ShRow<DEGREE> sh;
-    stage.read(slot, &sh);
-    shown = row_color(camera, mean, sh.values, DEGREE, out.colors + 3 * i);
-  } else if (id >= 0) {
-    shown = row_color(camera, mean, in.sh + 3 * in.options.sh_stride * std::int64_t{id}, DEGREE,
-                      out.colors + 3 * i);
-  }
-  if (shown) return;
-  out.opacities[i] = 0.f;
-  reinterpret_cast<int2*>(out.radii)[i] = {0, 0};
-  out.tiles_touched[i] = 0;
-}
-
 }  // namespace
 
 std::size_t project_plan_bytes(std::int64_t candidates) {
@@ -336,31 +212,6 @@ void project_count<float>(const Inputs& in, const RankTiles& rank_tiles, void* p
   };
   scan(nullptr);
   scan(workspace.allocate_bytes(scratch_bytes));
-}
-
-template <>
-void project_list<float>(const Inputs& in, const void* plan_memory, const ProjectSizes& sizes,
-                         const ProjectIds& ids, Workspace&, CudaStream stream) {
-  if (sizes.rows == 0) {
-    check(cudaMemsetAsync(ids.row_offsets, 0, sizeof(std::int32_t), stream), "project_emit");
-    return;
-  }
-  const MadePlan plan(plan_memory, in.n_candidates);
-  list_rows_kernel<<<blocks_for(segments_of(in.n_candidates), kListThreads / 32), kListThreads, 0, stream>>>(
-      in, plan, sizes, ids);
-  check_launch("project_emit");
-}
-
-template <>
-void project_emit<float>(const Inputs& in, const RankTiles& ranks, const void*, const ProjectIds& ids,
-                         std::int64_t n_rows, const ProjectOutputs<float>& out, Workspace&,
-                         CudaStream stream) {
-  if (n_rows == 0) return;
-  dispatch_sh(in, [&](auto degree, auto quads) {
-    emit_kernel<degree.value, quads.value>
-        <<<blocks_for(n_rows, kEmitThreads), kEmitThreads, 0, stream>>>(in, ranks, ids, n_rows, out);
-  });
-  check_launch("project_emit");
 }
 
 }  // namespace blitzgs::cuda

@@ -1,0 +1,55 @@
+// SPDX-License-Identifier: Apache-2.0
+// The buffers of all ranks, checked the same way in every op that writes to them.
+#pragma once
+#include "peers/peers.h"
+#include "scatter/scatter_op.h"
+
+namespace blitzgs {
+
+// One buffer for each rank, all alike.
+inline void check_peers(const char* op, const std::vector<Tensor>& buffers, ScalarType dtype) {
+  const auto count = static_cast<std::int64_t>(buffers.size());
+  STD_TORCH_CHECK(count >= 1 && count <= kMaxPeers, "blitzgs::", op, ": 1 to ", kMaxPeers,
+                  " peers are supported, got ", count);
+  for (const Tensor& buffer : buffers) {
+    check_shape(op, "a buffer", buffer, {buffers[0].size(0)});
+    check_dtype(op, "a buffer", buffer, dtype);
+    STD_TORCH_CHECK(buffer.is_contiguous(), "blitzgs::", op, ": buffers must be contiguous");
+  }
+}
+
+// Rows [starts[m], starts[m] + size[m]) lie within the `capacity` that rank m's buffer has.
+inline void check_starts(const char* op, const std::vector<Tensor>& buffers,
+                         const std::vector<std::int64_t>& starts, const RowGroups& groups,
+                         std::int64_t capacity) {
+  check_peers(op, buffers, ScalarType::Int);
+  const auto count = static_cast<std::size_t>(groups.count);
+  STD_TORCH_CHECK(buffers.size() == count && starts.size() == count, "blitzgs::", op, ": ", count,
+                  " groups need as many buffers and starts, got ", buffers.size(), " and ", starts.size());
+  for (int m = 0; m < groups.count; ++m) {
+    STD_TORCH_CHECK(starts[m] >= 0 && starts[m] + groups.size[m] <= capacity, "blitzgs::", op, ": rows [",
+                    starts[m], ", ", starts[m] + groups.size[m], ") do not fit into the ", capacity,
+                    " of rank ", m);
+  }
+}
+
+// Where each group's columns begin when the columns of a buffer are `capacity` rows long.
+template <class Word>
+ScatterTargets peer_targets(const char* op, std::vector<Tensor>& buffers, const RowColumns<Word>& columns,
+                            std::int64_t capacity, const std::vector<std::int64_t>& starts,
+                            const RowGroups& groups) {
+  check_starts(op, buffers, starts, groups, capacity);
+  STD_TORCH_CHECK(capacity * columns.begin[columns.count] <= buffers[0].size(0), "blitzgs::", op, ": ",
+                  capacity, " rows do not fit into a buffer of ", buffers[0].size(0), " words");
+  ScatterTargets targets{};
+  for (int m = 0; m < groups.count; ++m) {
+    for (int c = 0; c < columns.count; ++c) {
+      const std::int64_t width = columns.begin[c + 1] - columns.begin[c];
+      targets.words[m][c] =
+          mutable_data<std::int32_t>(buffers[m]) + capacity * columns.begin[c] + starts[m] * width;
+    }
+  }
+  return targets;
+}
+
+}  // namespace blitzgs
