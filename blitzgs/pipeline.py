@@ -25,6 +25,7 @@ from blitzgs.distributed.exchange import (
     read_traffic,
     send,
     send_back,
+    send_back_packed,
 )
 from blitzgs.distributed.ownership import Share
 from blitzgs.model import GaussianTable
@@ -211,14 +212,22 @@ def backward_rows(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> Row
     """
     views, options, splats, share = frame.views, frame.options, frame.splats, frame.share
     tiles = (0, -1) if share is None else share.tiles
-    *row_gradients, _ = torch.ops.blitzgs.rasterize_bwd(
+    arguments = (
         splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
-        frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders, None,
-        len(views), views.width, views.height, options.tile_size, *tiles, False, options.deterministic,
+        frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders,
     )  # fmt: skip
-    mark("raster back")
-    if share is not None and frame.route is not None:
-        row_gradients = send_back(row_gradients, frame.route, share.ranks)
+    grid = (len(views), views.width, views.height, options.tile_size, *tiles)
+    if frame.route is not None and frame.route.space is not None:
+        packed = torch.ops.blitzgs.rasterize_bwd_packed(*arguments, *grid, options.deterministic)
+        mark("raster back")
+        row_gradients = send_back_packed(packed, frame.route)
+    else:
+        *row_gradients, _ = torch.ops.blitzgs.rasterize_bwd(
+            *arguments, None, *grid, False, options.deterministic
+        )
+        mark("raster back")
+        if share is not None and frame.route is not None:
+            row_gradients = send_back(row_gradients, frame.route, share.ranks)
     mark("exchange back")
     return RowGradients(*row_gradients)
 

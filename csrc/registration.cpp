@@ -77,8 +77,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "sum_rows(Tensor values, Tensor masks, Tensor bases, int[] group_sizes, int[] widths) -> Tensor[] "
       "columns");
   m.def(
-      "return_to_peers_(Tensor[] columns, int[] group_sizes, Tensor(a!)[] buffers, int offset, int[] starts) "
-      "-> ()");
+      "return_to_peers_(Tensor values, int width, int[] group_sizes, Tensor(a!)[] buffers, int offset, "
+      "int[] starts) -> ()");
   m.def("meet_peers_(Tensor(a!)[] mail, int rank, int meeting, Tensor? values, float timeout_seconds) -> ()");
 
   // Alpha compositing.
@@ -97,6 +97,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int tile_begin, int tile_end, bool absgrad, bool deterministic) -> (Tensor v_means2d, Tensor "
       "v_conics, "
       "Tensor v_row_opacities, Tensor v_colors, Tensor v_means2d_abs)");
+  m.def(
+      "rasterize_bwd_packed(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
+      "backgrounds, Tensor isect_rows, Tensor tile_offsets, Tensor renders, Tensor transmittances, Tensor "
+      "last_ids, Tensor aux, Tensor v_renders, int n_cameras, int width, int height, int tile_size, "
+      "int tile_begin, int tile_end, bool deterministic) -> Tensor");
 
   // L1 and SSIM of the owned tiles; fwd_bwd does both at once when the weights of the sums are known.
   m.def(

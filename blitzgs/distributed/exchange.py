@@ -3,9 +3,9 @@
 
 Each rank projects its own Gaussians. The counting pass of the projection finds where each row will have to
 go, and `read_traffic` shows everyone's counts to all, which is all the host waits for; `send` brings the rows
-there; `send_back` returns their gradients along the same routes and adds them up at the owner, by rank, so
-that the sum does not depend on who was faster (paper §3.1). `exchange` is the differentiable form for use
-with autograd, `plan_route` for rows that are there already.
+there; `send_back` or `send_back_packed` returns their gradients along the same routes and adds them up at the
+owner, by rank, so that the sum does not depend on who was faster (paper §3.1). `exchange` is the
+differentiable form for use with autograd, `plan_route` for rows that are there already.
 
 Rows travel in one of two ways. Where the ranks share memory (`blitzgs.distributed.peers`), the projection
 itself writes each row into the columns that other ranks composite from, so that the links work while it
@@ -48,7 +48,9 @@ _COLUMNS = (
     (torch.int64, 2, ()),
 )
 _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
-_GRADIENT_WORDS = 9  # of means2d, conics, opacities and colors
+# Gradients of means2d, conics, opacities and colors as they return, `rasterize_bwd_packed` has them in front.
+_GRADIENT_SHAPES = ((2,), (3,), (), (3,))
+_GRADIENT_WORDS = 9
 # A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
 _ALIGNMENT = 32
 
@@ -151,8 +153,11 @@ class PeerSpace:
             begin += self.capacity * words
         return Splats(*columns)
 
-    def write_back(self, gradients: Sequence[Tensor]) -> Tensor:
-        """Write gradients [R, w] of the rows that arrived to their owners.
+    def write_back(self, packed: Tensor) -> Tensor:
+        """Write the gradients of the rows that arrived to their owners.
+
+        Args:
+            packed: [R, 9 or more], of `rasterize_bwd_packed`.
 
         Returns:
             [S, 9], those of the rows this rank sent; they may be read after the next meeting.
@@ -168,7 +173,7 @@ class PeerSpace:
         offset, me = self.capacity * _ROW_WORDS, self.peers.rank
         before = [sum(row[:me]) for row in self.traffic.rows]
         torch.ops.blitzgs.return_to_peers_(
-            list(gradients), self.traffic.received, self.peers.buffers, offset, before
+            packed, _GRADIENT_WORDS, self.traffic.received, self.peers.buffers, offset, before
         )
         count = sum(self.traffic.sent)
         mine = self.peers.buffers[me][offset : offset + count * _GRADIENT_WORDS]
@@ -285,31 +290,50 @@ def send_back(gradients: Sequence[Tensor], route: Route, ranks: Ranks) -> list[T
 
     Args:
         gradients: [R, ...] each, of the rows that `send` returned.
-        route: the same as for `send`.
+        route: the same as for `send`, without peers.
         ranks: the job.
 
     Returns:
         Gradients [P, ...] of this rank's own rows; zero for rows that touch no tile.
-
-    Raises:
-        RuntimeError: another exchange has taken the place of this one.
     """
-    if route.bases is None:
-        raise RuntimeError("send_back: the route's rows have not been sent")
     flat = [g.reshape(len(g), math.prod(g.shape[1:])) for g in gradients]
     widths, dtype = [g.shape[1] for g in flat], gradients[0].dtype
     sent, received = route.traffic.sent, route.traffic.received
-    if route.space is not None:
-        returned = route.space.write_back(flat)
-        route.space.peers.meet()
-    elif route.halves is None:
+    if route.halves is None:
         returned = ranks.all_to_all(torch.cat(flat, 1), received, sent).view(-1, sum(widths))
     else:
         # Gradients span too many magnitudes for float16.
         halves = torch.cat(flat, 1).bfloat16()
         returned = as_column(ranks.all_to_all(words_of(halves), received, sent), halves).to(dtype)
-    sums = sum_rows(returned, route.masks, route.bases, sent, widths)
-    return [part.reshape(-1, *g.shape[1:]) for part, g in zip(sums, gradients, strict=True)]
+    return _add_up(returned, route, [g.shape[1:] for g in gradients])
+
+
+def send_back_packed(packed: Tensor, route: Route) -> list[Tensor]:
+    """`send_back`, for a route whose rows the peers write.
+
+    Args:
+        packed: [R, 9 or more], of `rasterize_bwd_packed`.
+        route: of these rows.
+
+    Returns:
+        Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
+
+    Raises:
+        RuntimeError: another exchange has taken the place of this one.
+    """
+    assert route.space is not None
+    returned = route.space.write_back(packed)
+    route.space.peers.meet()
+    return _add_up(returned, route, _GRADIENT_SHAPES)
+
+
+def _add_up(returned: Tensor, route: Route, shapes: Sequence[Sequence[int]]) -> list[Tensor]:
+    """Add up the gradients of each row that returned from one rank or more."""
+    if route.bases is None:
+        raise RuntimeError("send_back: the route's rows have not been sent")
+    widths = [math.prod(shape) for shape in shapes]
+    sums = sum_rows(returned, route.masks, route.bases, route.traffic.sent, widths)
+    return [part.reshape(-1, *shape) for part, shape in zip(sums, shapes, strict=True)]
 
 
 def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> tuple[Splats, Route]:

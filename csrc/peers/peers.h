@@ -5,8 +5,8 @@
 // Rows for other ranks are written by the projection (project_emit_to_peers_): each group goes into its
 // rank's buffer behind the groups of the ranks before this one, column c from word capacity * begin[c] on.
 //
-// return_to_peers_, the way back: values [R, w] of received rows, group m of them from rank m, go to rank m's
-// buffer as rows of all columns, from row starts[m] of the values there; those begin at word `offset`.
+// return_to_peers_, the way back: the first `width` values of each received row of values [R, W], group m of
+// them from rank m, go to rank m's buffer, from row starts[m] of those there, which begin at word `offset`.
 //
 // meet_peers_, a barrier in stream order: what any rank queued before it is done, and visible, when what any
 // rank queues behind it runs. Each rank also leaves its `values` with every other. mail[m], int64: [M] the
@@ -24,9 +24,10 @@ struct PeerMail {
   int count, rank;
 };
 
-// Target m: where the rows of group m go, [size[m], width].
+// values [R, stride]. Target m: where the first `width` of each row of group m go, [size[m], width].
 struct PeerReturn {
-  RowColumns<const float> columns;
+  const float* values;
+  int stride, width;
   RowGroups groups;
   float* targets[kMaxPeers];
 };

@@ -10,7 +10,7 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kMeetThreads = 128;
+constexpr int kMeetThreads = 128, kReturnThreads = 256, kReturnWords = 2048;
 
 __device__ std::uint64_t nanoseconds() {
   std::uint64_t now;
@@ -47,28 +47,22 @@ __global__ void __launch_bounds__(kMeetThreads)
   }
 }
 
-// Block x: kScatterBlock rows of group x % M, put together in shared memory, leave in one run. Neighbouring
-// blocks write to different ranks, so that no link waits for another.
-__global__ void __launch_bounds__(kScatterBlock) return_kernel(const __grid_constant__ PeerReturn job) {
-  extern __shared__ float block_rows[];
-  const int m = static_cast<int>(blockIdx.x) % job.groups.count;
-  const int width = job.columns.begin[job.columns.count];
-  const std::int64_t first = static_cast<int>(blockIdx.x) / job.groups.count * std::int64_t{kScatterBlock};
-  const std::int64_t left = job.groups.size[m] - first;
-  if (left <= 0) return;
-  const int n_rows = left < kScatterBlock ? static_cast<int>(left) : kScatterBlock;
-  for (int c = 0; c < job.columns.count; ++c) {
-    const int begin = job.columns.begin[c], part = job.columns.begin[c + 1] - begin;
-    const float* from = job.columns.data[c] + (job.groups.start[m] + first) * part;
-    for (int i = threadIdx.x; i < n_rows * part; i += kScatterBlock) {
-      const int row = i / part;
-      block_rows[row * width + begin + (i - row * part)] = from[i];
-    }
-  }
-  __syncthreads();
-  float* to = job.targets[m] + first * width;
-  for (int i = static_cast<int>(threadIdx.x) - words_past_line(to); i < n_rows * width; i += kScatterBlock) {
-    if (i >= 0) to[i] = block_rows[i];
+// Block x: kReturnWords words of group x % M. Neighbouring blocks write to different ranks, so that no link
+// waits for another.
+template <int WIDTH>
+__global__ void __launch_bounds__(kReturnThreads) return_kernel(const __grid_constant__ PeerReturn job) {
+  const int m = static_cast<int>(blockIdx.x) % job.groups.count, width = WIDTH > 0 ? WIDTH : job.width;
+  const float* from = job.values + job.groups.start[m] * job.stride;
+  float* to = job.targets[m];
+  const std::int64_t words = job.groups.size[m] * width;
+  const std::int64_t first = static_cast<int>(blockIdx.x) / job.groups.count * std::int64_t{kReturnWords} -
+                             words_past_line(to) + threadIdx.x;
+#pragma unroll
+  for (int k = 0; k < kReturnWords; k += kReturnThreads) {
+    const std::int64_t i = first + k;
+    if (i < 0 || i >= words) continue;
+    const auto row = static_cast<std::int64_t>(static_cast<std::uint64_t>(i) / width);
+    to[i] = from[row * job.stride + (i - row * width)];
   }
 }
 
@@ -83,15 +77,10 @@ void meet(const PeerMail& mail, std::int64_t meeting, const std::int64_t* values
 
 void return_rows(const PeerReturn& job, Workspace&, CudaStream stream) {
   const std::int64_t most = *std::max_element(job.groups.size, job.groups.size + job.groups.count);
-  const std::size_t bytes = kScatterBlock * job.columns.begin[job.columns.count] * sizeof(float);
-  if (most == 0 || bytes == 0) return;
-  if (bytes > 48 * 1024) {
-    check(cudaFuncSetAttribute(return_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize,
-                               static_cast<int>(bytes)),
-          "return_to_peers");
-  }
-  const std::int64_t blocks = scatter_blocks(most) * job.groups.count;
-  return_kernel<<<static_cast<unsigned>(blocks), kScatterBlock, bytes, stream>>>(job);
+  if (most == 0) return;
+  const unsigned blocks = job.groups.count * (blocks_for(most * job.width, kReturnWords) + 1);
+  const auto kernel = job.width == 9 ? return_kernel<9> : return_kernel<0>;
+  kernel<<<blocks, kReturnThreads, 0, stream>>>(job);
   check_launch("return_to_peers");
 }
 

@@ -5,23 +5,20 @@
 namespace blitzgs {
 namespace {
 
-void return_to_peers(const std::vector<Tensor>& columns, const std::vector<std::int64_t>& group_sizes,
+void return_to_peers(const Tensor& values, std::int64_t width, const std::vector<std::int64_t>& group_sizes,
                      std::vector<Tensor> buffers, std::int64_t offset,
                      const std::vector<std::int64_t>& starts) {
   constexpr const char* kOp = "return_to_peers_";
-  STD_TORCH_CHECK(!columns.empty(), "blitzgs::return_to_peers_: there must be a column");
   PeerReturn job{};
   job.groups = checked_groups(kOp, "group_sizes", group_sizes);
-  std::vector<Tensor> held;
-  for (const Tensor& column : columns) {
-    check_dtype(kOp, "a column", column, ScalarType::Float);
-    check_shape(kOp, "a column", column, {total_rows(job.groups), -1});
-    held.push_back(as_contiguous(column));
-    add_column(kOp, job.columns, data<float>(held.back()), column.size(1));
-  }
-  const std::int64_t width = job.columns.begin[job.columns.count];
-  STD_TORCH_CHECK(width > 0 && width <= 400, "blitzgs::", kOp, ": a row must have 1 to 400 values, got ",
-                  width);
+  check_dtype(kOp, "values", values, ScalarType::Float);
+  check_shape(kOp, "values", values, {total_rows(job.groups), -1});
+  STD_TORCH_CHECK(width > 0 && width <= values.size(1), "blitzgs::", kOp, ": width must be 1 to ",
+                  values.size(1), ", got ", width);
+  const Tensor held = as_contiguous(values);
+  job.values = data<float>(held);
+  job.stride = static_cast<int>(values.size(1));
+  job.width = static_cast<int>(width);
   STD_TORCH_CHECK(!buffers.empty() && offset >= 0 && offset <= buffers[0].size(0), "blitzgs::", kOp,
                   ": offset must lie in the buffers, got ", offset);
   check_starts(kOp, buffers, starts, job.groups, (buffers[0].size(0) - offset) / width);
@@ -29,7 +26,7 @@ void return_to_peers(const std::vector<Tensor>& columns, const std::vector<std::
     job.targets[m] =
         reinterpret_cast<float*>(mutable_data<std::int32_t>(buffers[m]) + offset) + starts[m] * width;
   }
-  DeviceScope scope(held[0]);
+  DeviceScope scope(held);
   cuda::return_rows(job, scope.workspace, scope.stream);
 }
 

@@ -109,8 +109,8 @@ __global__ void __launch_bounds__(kCountThreads, 6)
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ Frustum frusta[kMaxViews];
   __shared__ Sums sums;
-  __shared__ std::uint32_t left_views[kCountThreads / 32][kSegment];
-  __shared__ std::uint16_t left_slots[kCountThreads / 32][kSegment];
+  __shared__ std::uint32_t left_views[kCountThreads / 32][kMostSegment];
+  __shared__ std::uint16_t left_slots[kCountThreads / 32][kMostSegment];
   for (int i = threadIdx.x; i < static_cast<int>(sizeof(Sums) / 4); i += kCountThreads) {
     reinterpret_cast<unsigned*>(&sums)[i] = 0;
   }
@@ -123,15 +123,16 @@ __global__ void __launch_bounds__(kCountThreads, 6)
   const unsigned below = (1u << lane) - 1u;
   std::uint32_t* const left = left_views[warp];
   std::uint16_t* const slots = left_slots[warp];
+  const int segment = segment_of(in.n_candidates);
   const std::int64_t n_segments = segments_of(in.n_candidates);
   std::int64_t tiles = 0, visible = 0, rows = 0;
   unsigned of_view = 0;  // rows of view `lane`
   for (std::int64_t s = blockIdx.x * (kCountThreads / 32) + warp; s < n_segments;
        s += static_cast<std::int64_t>(gridDim.x) * (kCountThreads / 32)) {
     int n_left = 0;
-    for (int batch = 0; batch < kSegment; batch += 32 * kBatch) {
+    for (int batch = 0; batch < segment; batch += 32 * kBatch) {
       std::uint32_t maybe[kBatch];
-      quick_views(in, frusta, s * kSegment + batch + lane, maybe);
+      quick_views(in, frusta, s * segment + batch + lane, maybe);
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) {
         const unsigned some = __ballot_sync(0xffffffffu, maybe[k] != 0);
@@ -149,12 +150,12 @@ __global__ void __launch_bounds__(kCountThreads, 6)
     for (int first = 0; first < n_left; first += 32) {
       const bool present = first + lane < n_left;
       const std::uint16_t slot = present ? slots[first + lane] : 0;
-      const std::uint32_t seen = present ? exact_views(in, rank_tiles, cameras, s * kSegment + slot,
+      const std::uint32_t seen = present ? exact_views(in, rank_tiles, cameras, s * segment + slot,
                                                        left[first + lane], &sums, &tiles)
                                          : 0;
       const unsigned some = __ballot_sync(0xffffffffu, seen != 0);
       if (seen) {
-        const std::int64_t at = s * kSegment + n_visible + __popc(some & below);
+        const std::int64_t at = s * segment + n_visible + __popc(some & below);
         plan.views[at] = seen;
         plan.slots[at] = slot;
       }

@@ -14,7 +14,7 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kListThreads = 256;
-constexpr int kEmitThreads = 128;
+constexpr int kEmitThreads = 128, kEmitBlocks = 5;
 
 // Which Gaussian and view each row is of. A warp takes a segment.
 __global__ void __launch_bounds__(kListThreads)
@@ -23,12 +23,12 @@ __global__ void __launch_bounds__(kListThreads)
   const std::int64_t s = (blockIdx.x * static_cast<std::int64_t>(kListThreads) + threadIdx.x) / 32;
   if (s == 0 && lane == 0) out.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
   if (s >= segments_of(in.n_candidates)) return;
-  const std::int64_t before = plan.before[s];
+  const std::int64_t before = plan.before[s], first_candidate = s * segment_of(in.n_candidates);
   const auto count = static_cast<int>((plan.before[s + 1] >> 32) - (before >> 32));
   std::int64_t at = before & 0xffffffff;
   for (int first = 0; first < count; first += 32) {
     const bool present = first + lane < count;
-    const std::uint32_t views = present ? plan.views[s * kSegment + first + lane] : 0;
+    const std::uint32_t views = present ? plan.views[first_candidate + first + lane] : 0;
     int end = __popc(views);
     for (int step = 1; step < 32; step *= 2) {
       const int other = __shfl_up_sync(0xffffffffu, end, step);
@@ -38,8 +38,8 @@ __global__ void __launch_bounds__(kListThreads)
     const std::int64_t u = (before >> 32) + first + lane;
     std::int32_t id = 0;
     if (present && u < sizes.visible) {
-      id =
-          static_cast<std::int32_t>(candidate_id(in, s * kSegment + plan.slots[s * kSegment + first + lane]));
+      id = static_cast<std::int32_t>(
+          candidate_id(in, first_candidate + plan.slots[first_candidate + first + lane]));
       out.visible_ids[u] = id;
       out.row_offsets[u] = static_cast<std::int32_t>(at + begin);
     }
@@ -119,8 +119,13 @@ struct GoToRanks {
   ScatterState state;
 };
 
+// Apart, so that its registers are not added to those of the projection.
+__device__ __noinline__ void send_block(ScatterShared<kMaxPeers>& shared, const GoToRanks& to) {
+  scatter_block<kEmitThreads>(shared, to.rows, to.groups, to.targets, to.state);
+}
+
 template <int DEGREE, bool QUADS, class DESTINATION>
-__global__ void __launch_bounds__(kEmitThreads)
+__global__ void __launch_bounds__(kEmitThreads, kEmitBlocks)
     emit_kernel(const Inputs in, const RankTiles rank_tiles, const ProjectIds ids, std::int64_t n_rows,
                 const ProjectOutputs<float> out, const __grid_constant__ DESTINATION destination) {
   union Shared {
@@ -132,6 +137,7 @@ __global__ void __launch_bounds__(kEmitThreads)
   __shared__ TripleStage triples[kEmitThreads / 32];
   const int warp = threadIdx.x / 32;
   ShStage<DEGREE>& stage = shared.stages[QUADS ? warp : 0];
+#pragma unroll 1
   for (int first = 0; first < DESTINATION::kRows; first += kEmitThreads) {
     const std::int64_t i = blockIdx.x * std::int64_t{DESTINATION::kRows} + first + threadIdx.x;
     const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
@@ -149,8 +155,7 @@ __global__ void __launch_bounds__(kEmitThreads)
   }
   if constexpr (std::is_same_v<DESTINATION, GoToRanks>) {
     __syncthreads();
-    scatter_block<kEmitThreads>(shared.scatter, destination.rows, destination.groups, destination.targets,
-                                destination.state);
+    send_block(shared.scatter, destination);
   }
 }
 

@@ -5,10 +5,18 @@
 
 namespace blitzgs::cuda {
 
-inline constexpr int kSegment = 512;  // candidates that a warp takes together
+// Candidates that a warp takes together: as many as leave enough of them to fill the device.
+inline constexpr int kMostSegment = 512, kLeastSegment = 128;
+inline constexpr std::int64_t kSegmentsWanted = 1 << 14;
+
+__host__ __device__ inline int segment_of(std::int64_t candidates) {
+  int segment = kMostSegment;
+  while (segment > kLeastSegment && candidates < kSegmentsWanted * segment) segment /= 2;
+  return segment;
+}
 
 __host__ __device__ inline std::int64_t segments_of(std::int64_t candidates) {
-  return (candidates + kSegment - 1) / kSegment;
+  return (candidates + segment_of(candidates) - 1) / segment_of(candidates);
 }
 
 __device__ inline std::int64_t candidate_id(const Inputs& in, std::int64_t candidate) {
@@ -21,7 +29,8 @@ __device__ inline std::int64_t pack_counts(std::int64_t visible, std::int64_t ro
 }
 
 // before [segments + 1]: pack_counts() of the segments before each. The visible candidates of segment s are
-// the first entries from kSegment * s on, ascending: the views that see each, and where in the segment it is.
+// the first entries from segment_of() * s on, ascending: the views that see each, and where in the segment it
+// is.
 template <class Count, class Views, class Slot>
 struct Plan {
   Count* before;

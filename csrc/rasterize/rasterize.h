@@ -76,6 +76,10 @@ struct RasterizeGradients {
   T* v_means2d_abs;  // null: not wanted
 };
 
+// Up to four channels on CUDA: the gradients of a row in kPackedGradient floats, mean2d 2, conic 3, opacity
+// 1, color, and the rest of no use.
+inline constexpr std::int64_t kPackedGradient = 12;
+
 // aux is the backend's own memory between forward and backward, 64-byte aligned and of
 // rasterize_aux_bytes(), which may depend on the shapes and the number of entries, not on values on the
 // device. All outputs are written in full.
@@ -101,6 +105,9 @@ template <class T>
 void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
                    const void* aux, bool deterministic, const RasterizeGradients<T>& gradients, Workspace&,
                    CudaStream);
+void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
+                          std::int64_t n_isects, const void* aux, bool deterministic, float* packed,
+                          Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -6,10 +6,11 @@
 // them through shared memory, and each lane then sums for one entry: the weights against the pixels'
 // gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic follow.
 #include <algorithm>
-#include <cub/device/device_radix_sort.cuh>
+#include <stdexcept>
 #include <string>
 
 #include "rasterize/backward_pixel.cuh"
+#include "rasterize/row_entries.cuh"
 #include "rasterize/unpack_gradients.cuh"
 
 namespace blitzgs::cuda {
@@ -216,29 +217,6 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) :
   }
 }
 
-__global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
-  if (i < n) values[i] = static_cast<std::int32_t>(i);
-}
-
-// Adds each row's entries in the order of the list of all tiles.
-__global__ void sum_entries_kernel(const std::int32_t* sorted_rows, const std::int32_t* entries,
-                                   std::int64_t n, const PackedGradient* entry_gradients,
-                                   PackedGradient* row_gradients) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
-  if (i >= 3 * n) return;
-  const int quad = static_cast<int>(i % 3);
-  std::int64_t at = i / 3;
-  const std::int32_t row = sorted_rows[at];
-  if (at > 0 && sorted_rows[at - 1] == row) return;
-  float4 sum{0.f, 0.f, 0.f, 0.f};
-  for (; at < n && sorted_rows[at] == row; ++at) {
-    const float4 part = entry_gradients[entries[at]].quads[quad];
-    sum = {sum.x + part.x, sum.y + part.y, sum.z + part.z, sum.w + part.w};
-  }
-  row_gradients[row].quads[quad] = sum;
-}
-
 template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
 void launch_backward(const BackwardArguments& args, CudaStream stream) {
   const auto kernel = backward_kernel<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>;
@@ -266,36 +244,6 @@ void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream 
   }
 }
 
-// Which entries belong to each row, in order.
-struct EntriesByRow {
-  std::int32_t* rows;
-  std::int32_t* entries;
-};
-
-EntriesByRow sort_entries(const std::int32_t* isect_rows, std::int64_t n, std::int64_t n_rows,
-                          Workspace& workspace, CudaStream stream) {
-  if (n > INT32_MAX) {
-    throw std::runtime_error(
-        "blitzgs::rasterize_bwd: deterministic gradients hold at most 2^31 - 1 intersections, got " +
-        std::to_string(n) + "; render fewer views at once or set deterministic=False");
-  }
-  int bits = 1;
-  while (bits < 31 && (std::int64_t{1} << bits) < n_rows) ++bits;
-  EntriesByRow sorted{workspace.allocate<std::int32_t>(n), workspace.allocate<std::int32_t>(n)};
-  auto* order = workspace.allocate<std::int32_t>(n);
-  iota_kernel<<<blocks_for(n, 256), 256, 0, stream>>>(order, n);
-  check_launch("rasterize_bwd");
-  std::size_t bytes = 0;
-  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, isect_rows, sorted.rows, order, sorted.entries, n, 0,
-                                        bits, stream),
-        "rasterize_bwd");
-  void* scratch = workspace.allocate_bytes(bytes);
-  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_rows, sorted.rows, order, sorted.entries, n, 0,
-                                        bits, stream),
-        "rasterize_bwd");
-  return sorted;
-}
-
 void check_supported(const RasterizeInput<float>& in) {
   const int size = in.grid.tile_size;
   if (size != 8 && size != 16 && size != 32) {
@@ -303,6 +251,56 @@ void check_supported(const RasterizeInput<float>& in) {
                              std::to_string(size));
   }
 }
+
+// The gradients of each row, a chunk of channels at a time.
+class PackedRows {
+ public:
+  PackedRows(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved, std::int64_t n_isects,
+             const void* aux, bool deterministic, Workspace& workspace, CudaStream stream)
+      : in_(in), saved_(saved), aux_(aux), n_isects_(n_isects), stream_(stream) {
+    check_supported(in);
+    empty_ = n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin;
+    if (!deterministic || empty_) return;
+    entries_ = static_cast<PackedGradient*>(workspace.allocate_bytes(n_isects * sizeof(PackedGradient)));
+    sorted_ = sort_entries(in.isect_rows, n_isects, in.n_rows, workspace, stream);
+  }
+
+  ChannelChunk chunk(int first) const {
+    return {in_.n_channels <= 4 ? aux_colors(aux_, in_.n_rows) : nullptr, in_.colors, in_.n_channels, first,
+            std::min(4, in_.n_channels - first)};
+  }
+
+  void write(const ChannelChunk& chunk, bool absolute, PackedGradient* packed) const {
+    check(cudaMemsetAsync(packed, 0, in_.n_rows * sizeof(PackedGradient), stream_), "rasterize_bwd");
+    if (empty_) return;
+    if (entries_) {
+      check(cudaMemsetAsync(entries_, 0, n_isects_ * sizeof(PackedGradient), stream_), "rasterize_bwd");
+    }
+    const BackwardArguments args{aux_rows(aux_), chunk,  in_.backgrounds, in_.isect_rows, in_.tile_offsets,
+                                 in_.grid,       saved_, packed,          entries_};
+    if (in_.grid.tile_size == 8) {
+      dispatch_backward<8>(args, absolute, stream_);
+    } else if (in_.grid.tile_size == 16) {
+      dispatch_backward<16>(args, absolute, stream_);
+    } else {
+      dispatch_backward<32>(args, absolute, stream_);
+    }
+    if (!entries_) return;
+    sum_entries_kernel<<<blocks_for(3 * n_isects_, 256), 256, 0, stream_>>>(sorted_.rows, sorted_.entries,
+                                                                            n_isects_, entries_, packed);
+    check_launch("rasterize_bwd");
+  }
+
+ private:
+  const RasterizeInput<float>& in_;
+  const RasterizeSaved<float>& saved_;
+  const void* aux_;
+  std::int64_t n_isects_;
+  CudaStream stream_;
+  bool empty_;
+  EntriesByRow sorted_{};
+  PackedGradient* entries_ = nullptr;
+};
 
 }  // namespace
 
@@ -313,42 +311,24 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
                           CudaStream stream) {
   if (in.n_rows == 0) return;
   const bool absolute = gradients.v_means2d_abs != nullptr;
-  check_supported(in);
-  const bool empty = n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin;
-  const std::size_t row_bytes = static_cast<std::size_t>(in.n_rows) * sizeof(PackedGradient);
-  auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(row_bytes));
-  EntriesByRow sorted{};
-  PackedGradient* entries = nullptr;
-  const std::size_t entry_bytes = static_cast<std::size_t>(n_isects) * sizeof(PackedGradient);
-  if (deterministic && !empty) {
-    entries = static_cast<PackedGradient*>(workspace.allocate_bytes(entry_bytes));
-    sorted = sort_entries(in.isect_rows, n_isects, in.n_rows, workspace, stream);
-  }
+  const PackedRows rows(in, saved, n_isects, aux, deterministic, workspace, stream);
+  auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(in.n_rows * sizeof(PackedGradient)));
   for (int first = 0; first < in.n_channels; first += 4) {
-    const ChannelChunk chunk{in.n_channels <= 4 ? aux_colors(aux, in.n_rows) : nullptr, in.colors,
-                             in.n_channels, first, std::min(4, in.n_channels - first)};
-    check(cudaMemsetAsync(packed, 0, row_bytes, stream), "rasterize_bwd");
-    if (!empty) {
-      if (entries) check(cudaMemsetAsync(entries, 0, entry_bytes, stream), "rasterize_bwd");
-      const BackwardArguments args{aux_rows(aux), chunk, in.backgrounds, in.isect_rows, in.tile_offsets,
-                                   in.grid,       saved, packed,         entries};
-      if (in.grid.tile_size == 8) {
-        dispatch_backward<8>(args, absolute, stream);
-      } else if (in.grid.tile_size == 16) {
-        dispatch_backward<16>(args, absolute, stream);
-      } else {
-        dispatch_backward<32>(args, absolute, stream);
-      }
-      if (entries) {
-        sum_entries_kernel<<<blocks_for(3 * n_isects, 256), 256, 0, stream>>>(sorted.rows, sorted.entries,
-                                                                              n_isects, entries, packed);
-        check_launch("rasterize_bwd");
-      }
-    }
+    const ChannelChunk chunk = rows.chunk(first);
+    rows.write(chunk, absolute, packed);
     unpack_kernel<<<blocks_for(in.n_rows, kUnpackThreads), kUnpackThreads, 0, stream>>>(
         packed, in.n_rows, chunk, absolute && first > 0, gradients);
     check_launch("rasterize_bwd");
   }
+}
+
+void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
+                          std::int64_t n_isects, const void* aux, bool deterministic, float* packed,
+                          Workspace& workspace, CudaStream stream) {
+  static_assert(sizeof(PackedGradient) == kPackedGradient * sizeof(float));
+  if (in.n_rows == 0) return;
+  const PackedRows rows(in, saved, n_isects, aux, deterministic, workspace, stream);
+  rows.write(rows.chunk(0), false, reinterpret_cast<PackedGradient*>(packed));
 }
 
 }  // namespace blitzgs::cuda

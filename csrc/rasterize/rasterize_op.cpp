@@ -96,6 +96,48 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
   return {renders, transmittances, last_ids, tile_work, aux};
 }
 
+// The arguments that the backward ops share, checked and contiguous.
+struct Composited {
+  Composited(const char* op, const Splats& splats, const Tensor& renders_in, const Tensor& transmittances_in,
+             const Tensor& last_ids_in, const Tensor& aux_in, const Tensor& v_renders_in,
+             const std::optional<Tensor>& v_alphas_in, std::int64_t width, std::int64_t height)
+      : renders(as_contiguous(renders_in)),
+        transmittances(as_contiguous(transmittances_in)),
+        last_ids(as_contiguous(last_ids_in)),
+        v_renders(as_contiguous(v_renders_in)),
+        aux(aux_in) {
+    const std::int64_t B = splats.grid.n_cameras;
+    const ScalarType dtype = splats.means2d.scalar_type();
+    for (const auto& [name, tensor] : {std::pair{"renders", &renders}, std::pair{"v_renders", &v_renders}}) {
+      check_shape(op, name, *tensor, {B, height, width, splats.n_channels});
+      check_dtype(op, name, *tensor, dtype);
+    }
+    check_shape(op, "transmittances", transmittances, {B, height, width});
+    check_dtype(op, "transmittances", transmittances, dtype);
+    check_shape(op, "last_ids", last_ids, {B, height, width});
+    check_dtype(op, "last_ids", last_ids, ScalarType::Int);
+    if (v_alphas_in) {
+      check_shape(op, "v_alphas", *v_alphas_in, {B, height, width});
+      check_dtype(op, "v_alphas", *v_alphas_in, dtype);
+      v_alphas = as_contiguous(*v_alphas_in);
+    }
+    check_shape(op, "aux", aux,
+                {backend::rasterize_aux_bytes(splats.grid, splats.n_rows, splats.isect_rows.size(0),
+                                              static_cast<int>(splats.n_channels))});
+    STD_TORCH_CHECK(reinterpret_cast<std::uintptr_t>(aux.const_data_ptr()) % 64 == 0, "blitzgs::", op,
+                    ": aux must be 64-byte aligned, as rasterize_fwd returned it");
+  }
+
+  template <class T>
+  RasterizeSaved<T> saved() const {
+    return {data<T>(renders), data<T>(transmittances), data<std::int32_t>(last_ids), data<T>(v_renders),
+            data_or_null<T>(v_alphas)};
+  }
+
+  Tensor renders, transmittances, last_ids, v_renders, aux;
+  std::optional<Tensor> v_alphas;
+};
+
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
@@ -107,29 +149,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid);
-  const ScalarType dtype = splats.means2d.scalar_type();
-  for (const auto& [name, tensor] : {std::pair{"renders", &renders}, std::pair{"v_renders", &v_renders}}) {
-    check_shape(kOp, name, *tensor, {n_cameras, height, width, splats.n_channels});
-    check_dtype(kOp, name, *tensor, dtype);
-  }
-  check_shape(kOp, "transmittances", transmittances, {n_cameras, height, width});
-  check_dtype(kOp, "transmittances", transmittances, dtype);
-  check_shape(kOp, "last_ids", last_ids, {n_cameras, height, width});
-  check_dtype(kOp, "last_ids", last_ids, ScalarType::Int);
-  std::optional<Tensor> v_alpha_pixels;
-  if (v_alphas) {
-    check_shape(kOp, "v_alphas", *v_alphas, {n_cameras, height, width});
-    check_dtype(kOp, "v_alphas", *v_alphas, dtype);
-    v_alpha_pixels = as_contiguous(*v_alphas);
-  }
-  const Tensor colors_out = as_contiguous(renders), rest = as_contiguous(transmittances),
-               last = as_contiguous(last_ids), v_pixels = as_contiguous(v_renders);
+  const Composited composited(kOp, splats, renders, transmittances, last_ids, aux, v_renders, v_alphas, width,
+                              height);
   const std::int64_t n_rows = splats.n_rows;
-  check_shape(kOp, "aux", aux,
-              {backend::rasterize_aux_bytes(grid, n_rows, splats.isect_rows.size(0),
-                                            static_cast<int>(splats.n_channels))});
-  STD_TORCH_CHECK(reinterpret_cast<std::uintptr_t>(aux.const_data_ptr()) % 64 == 0,
-                  "blitzgs::rasterize_bwd: aux must be 64-byte aligned, as rasterize_fwd returned it");
   Tensor v_means2d = make_empty(splats.means2d, {n_rows, 2});
   Tensor v_conics = make_empty(splats.means2d, {n_rows, 3});
   Tensor v_opacities = make_empty(splats.means2d, {n_rows});
@@ -138,16 +160,40 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
   DeviceScope scope(splats.means2d);
   dispatch_floating(splats.means2d, [&](auto zero) {
     using T = decltype(zero);
-    const RasterizeSaved<T> saved{data<T>(colors_out), data<T>(rest), data<std::int32_t>(last),
-                                  data<T>(v_pixels), data_or_null<T>(v_alpha_pixels)};
     const RasterizeGradients<T> gradients{mutable_data<T>(v_means2d), mutable_data<T>(v_conics),
                                           mutable_data<T>(v_opacities), mutable_data<T>(v_colors),
                                           absgrad ? mutable_data<T>(v_means2d_abs) : nullptr};
-    backend::rasterize_bwd(splats.input<T>(), saved, splats.isect_rows.size(0), data<void>(aux),
-                           deterministic, gradients, scope.workspace, scope.stream);
+    backend::rasterize_bwd(splats.input<T>(), composited.saved<T>(), splats.isect_rows.size(0),
+                           data<void>(composited.aux), deterministic, gradients, scope.workspace,
+                           scope.stream);
   });
   return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
 }
+
+#ifdef BLITZGS_BACKEND_CUDA
+Tensor rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
+                            const Tensor& colors, const std::optional<Tensor>& backgrounds,
+                            const Tensor& isect_rows, const Tensor& tile_offsets, const Tensor& renders,
+                            const Tensor& transmittances, const Tensor& last_ids, const Tensor& aux,
+                            const Tensor& v_renders, std::int64_t n_cameras, std::int64_t width,
+                            std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
+                            std::int64_t tile_end, bool deterministic) {
+  constexpr const char* kOp = "rasterize_bwd_packed";
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
+                      grid);
+  STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", kOp, ": colors must have 1 to 4 channels, got ",
+                  splats.n_channels);
+  const Composited composited(kOp, splats, renders, transmittances, last_ids, aux, v_renders, std::nullopt,
+                              width, height);
+  Tensor packed = make_empty(splats.means2d, {splats.n_rows, kPackedGradient});
+  DeviceScope scope(splats.means2d);
+  cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_rows.size(0),
+                             data<void>(composited.aux), deterministic, mutable_data<float>(packed),
+                             scope.workspace, scope.stream);
+  return packed;
+}
+#endif
 
 }  // namespace
 }  // namespace blitzgs
@@ -155,4 +201,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
 BLITZGS_REGISTER(m) {
   m.impl("rasterize_fwd", TORCH_BOX(&blitzgs::rasterize_fwd));
   m.impl("rasterize_bwd", TORCH_BOX(&blitzgs::rasterize_bwd));
+#ifdef BLITZGS_BACKEND_CUDA
+  m.impl("rasterize_bwd_packed", TORCH_BOX(&blitzgs::rasterize_bwd_packed));
+#endif
 }

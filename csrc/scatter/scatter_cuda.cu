@@ -8,7 +8,8 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kSumWidth = 16;  // values of a row that a thread adds up at once
+// Values of a row that a thread adds up at once: those of three colours, or a part of more.
+constexpr int kRowValues = 9, kPartValues = 16;
 
 template <int RANKS>
 __global__ void __launch_bounds__(kScatterBlock)
@@ -32,33 +33,35 @@ __global__ void gather_kernel(const std::int32_t* packed, const __grid_constant_
   }
 }
 
-template <int RANKS>
+template <int RANKS, int VALUES>
 struct SumShared {
+  static constexpr int kPitch = VALUES | 1;  // odd, so that a column of rows spreads over the banks
   std::uint8_t place[RANKS][kScatterBlock];  // of each thread's row among the block's rows for a rank
   int before[RANKS][kScatterWarps];
   std::int32_t base[RANKS];
-  float sums[kScatterBlock][kSumWidth + 1];
+  float sums[kScatterBlock * kPitch];
 };
 
-// Stores `part` values of each row, kSumWidth + 1 apart in shared memory, into rows of `width`. WIDTH: both,
-// or 0.
-template <int WIDTH>
+// Stores `part` values of each row, PITCH apart in shared memory, into rows of `width`. WIDTH: both, or 0.
+template <int PITCH, int WIDTH>
 __device__ __forceinline__ void store_values(const float* from, int n_rows, int any_part, int any_width,
                                              float* to) {
   const int part = WIDTH > 0 ? WIDTH : any_part, width = WIDTH > 0 ? WIDTH : any_width;
   for (int i = threadIdx.x; i < n_rows * part; i += kScatterBlock) {
     const int row = i / part, k = i - row * part;
-    to[row * width + k] = from[row * (kSumWidth + 1) + k];
+    to[row * width + k] = from[row * PITCH + k];
   }
 }
 
-// Values [kSumWidth * blockIdx.y, ...) of a block of rows.
-template <int RANKS>
-__global__ void __launch_bounds__(kScatterBlock)
-    sum_kernel(const __grid_constant__ ReturnedRows<float> in, const RowColumns<float> out) {
-  __shared__ SumShared<RANKS> shared;
-  const int n_ranks = in.groups.count, value = kSumWidth * static_cast<int>(blockIdx.y);
-  const int n_values = min(kSumWidth, in.width - value);
+// Values [VALUES * blockIdx.y, ...) of a block of rows. ALL: the rows have VALUES.
+template <int RANKS, int VALUES, bool ALL>
+__global__ void __launch_bounds__(kScatterBlock) sum_kernel(const __grid_constant__ ReturnedRows<float> in,
+                                                            const __grid_constant__ RowColumns<float> out) {
+  using Shared = SumShared<RANKS, VALUES>;
+  __shared__ Shared shared;
+  const int n_ranks = in.groups.count, width_in = ALL ? VALUES : in.width;
+  const int value = ALL ? 0 : VALUES * static_cast<int>(blockIdx.y);
+  const int n_values = ALL ? VALUES : min(VALUES, width_in - value);
   const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
   const std::int64_t row = first + threadIdx.x;
   const std::int64_t mask = row < in.count ? in.masks[row] : 0;
@@ -75,19 +78,19 @@ __global__ void __launch_bounds__(kScatterBlock)
     shared.place[m][slot] = static_cast<std::uint8_t>(place_in_block(shared.before[m], slot, going));
   }
   // Most rows went to a single rank: this way all threads load their first at once.
-  float sum[kSumWidth] = {};
+  float sum[VALUES] = {};
   for (std::int64_t left = mask; left; left &= left - 1) {
     const int m = __ffsll(left) - 1;
     const std::int64_t at = std::int64_t{shared.base[m]} + shared.place[m][slot];
     if (at >= in.groups.size[m]) continue;
-    const float* from = in.values + (in.groups.start[m] + at) * in.width + value;
+    const float* from = in.values + (in.groups.start[m] + at) * width_in + value;
 #pragma unroll
-    for (int k = 0; k < kSumWidth; ++k) {
+    for (int k = 0; k < VALUES; ++k) {
       if (k < n_values) sum[k] += from[k];
     }
   }
 #pragma unroll
-  for (int k = 0; k < kSumWidth; ++k) shared.sums[threadIdx.x][k] = sum[k];
+  for (int k = 0; k < VALUES; ++k) shared.sums[slot * Shared::kPitch + k] = sum[k];
   __syncthreads();
   const std::int64_t left = in.count - first;
   const int n_rows = left < kScatterBlock ? static_cast<int>(left) : kScatterBlock;
@@ -96,13 +99,15 @@ __global__ void __launch_bounds__(kScatterBlock)
     const int part = high - low, width = out.begin[c + 1] - out.begin[c];
     if (part <= 0) continue;
     float* to = out.data[c] + first * width + (low - out.begin[c]);
-    const float* from = &shared.sums[0][low - value];
-    if (part == 3 && width == 3) {
-      store_values<3>(from, n_rows, part, width, to);
-    } else if (part == 1 && width == 1) {
-      store_values<1>(from, n_rows, part, width, to);
+    const float* from = shared.sums + (low - value);
+    if (part == width && width == 3) {
+      store_values<Shared::kPitch, 3>(from, n_rows, part, width, to);
+    } else if (part == width && width == 2) {
+      store_values<Shared::kPitch, 2>(from, n_rows, part, width, to);
+    } else if (part == width && width == 1) {
+      store_values<Shared::kPitch, 1>(from, n_rows, part, width, to);
     } else {
-      store_values<0>(from, n_rows, part, width, to);
+      store_values<Shared::kPitch, 0>(from, n_rows, part, width, to);
     }
   }
 }
@@ -134,9 +139,15 @@ void gather(const std::int32_t* packed, const RowGroups& groups, const RowColumn
 template <>
 void sum<float>(const ReturnedRows<float>& in, const RowColumns<float>& out, Workspace&, CudaStream stream) {
   if (in.count == 0 || in.width == 0) return;
-  const dim3 grid(static_cast<unsigned>(scatter_blocks(in.count)), blocks_for(in.width, kSumWidth));
-  dispatch_ranks(in.groups.count,
-                 [&](auto ranks) { sum_kernel<ranks.value><<<grid, kScatterBlock, 0, stream>>>(in, out); });
+  const auto blocks = static_cast<unsigned>(scatter_blocks(in.count));
+  dispatch_ranks(in.groups.count, [&](auto ranks) {
+    if (in.width == kRowValues) {
+      sum_kernel<ranks.value, kRowValues, true><<<blocks, kScatterBlock, 0, stream>>>(in, out);
+    } else {
+      const dim3 grid(blocks, blocks_for(in.width, kPartValues));
+      sum_kernel<ranks.value, kPartValues, false><<<grid, kScatterBlock, 0, stream>>>(in, out);
+    }
+  });
   check_launch("sum_rows");
 }
 

@@ -65,14 +65,25 @@ __device__ __forceinline__ int words_past_line(const void* address) {
   return static_cast<int>(reinterpret_cast<std::uintptr_t>(address) / 4 % 32);
 }
 
+// Loads are kAhead deep, as they come from the second-level cache at best.
 template <int WIDTH>
 __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::uint8_t* list, int n,
                                          int any_width, std::int32_t* to) {
-  const int width = WIDTH > 0 ? WIDTH : any_width;
-  for (int i = static_cast<int>(threadIdx.x % 32) - words_past_line(to); i < n * width; i += 32) {
-    if (i < 0) continue;
-    const int row = i / width;
-    to[i] = from[list[row] * width + (i - row * width)];
+  constexpr int kAhead = 4;
+  const int width = WIDTH > 0 ? WIDTH : any_width, words = n * width;
+  for (int first = static_cast<int>(threadIdx.x % 32) - words_past_line(to); first < words;
+       first += 32 * kAhead) {
+    std::int32_t values[kAhead];
+#pragma unroll
+    for (int k = 0; k < kAhead; ++k) {
+      const int i = first + 32 * k, row = i / width;
+      if (i >= 0 && i < words) values[k] = from[list[row] * width + (i - row * width)];
+    }
+#pragma unroll
+    for (int k = 0; k < kAhead; ++k) {
+      const int i = first + 32 * k;
+      if (i >= 0 && i < words) to[i] = values[k];
+    }
   }
 }
 

@@ -75,6 +75,26 @@ def test_gradients_match_float64(scene, channels, tile_size, deterministic, absg
         assert relative_error(value, target) < 1e-4, name
 
 
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_packed_gradients_are_the_same(scene, channels):
+    job = Job(scene, channels)
+    renders, rest, last, _, aux = saved = job.forward("cuda")
+    v_renders = torch.randn(renders.shape, generator=torch.Generator().manual_seed(7)).cuda()
+    none = torch.zeros_like(rest)
+    *columns, _ = job.backward("cuda", torch.float32, saved, v_renders, none, False, True)
+    arguments = *job.inputs("cuda", torch.float32), renders, rest, last, aux, v_renders, *job.grid
+    packed = ops.rasterize_bwd_packed(*arguments, True)
+    assert torch.equal(packed[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
+
+
+def test_packed_gradients_have_four_channels_at_most(scene):
+    job = Job(scene, 9)
+    renders, rest, last, _, aux = job.forward("cuda")
+    arguments = *job.inputs("cuda", torch.float32), renders, rest, last, aux, renders, *job.grid
+    with pytest.raises(RuntimeError, match="1 to 4 channels, got 9"):
+        ops.rasterize_bwd_packed(*arguments, True)
+
+
 @pytest.mark.parametrize("tile_size", [8, 16, 32])
 def test_deterministic_gradients_repeat(scene, tile_size):
     job = Job(scene, 3, tile_size)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from blitzgs import pipeline
-from blitzgs.distributed.exchange import send_back
+from blitzgs.distributed.exchange import send_back, send_back_packed
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.model import GaussianTable
@@ -38,7 +38,12 @@ def _exchange(table, ranks):
     got = frame.splats
     order = (got.ids * 4 + got.camera_ids).argsort()
     arrived = [column[order].clone() for column in got]
-    sums = send_back([got.means2d * 2, got.conics + 1, got.opacities, got.colors**2], frame.route, ranks)
+    gradients = [got.means2d * 2, got.conics + 1, got.opacities, got.colors**2]
+    if frame.route.space is None:
+        sums = send_back(gradients, frame.route, ranks)
+    else:
+        columns = [g[:, None] if g.dim() == 1 else g for g in gradients]
+        sums = send_back_packed(torch.cat((*columns, torch.ones_like(got.conics)), 1), frame.route)
     return [*arrived, *sums, frame.renders, frame.visible]
 
 
