@@ -105,7 +105,10 @@ class Peers:
             return
         self.buffers = []
         size = max(_LEAST_WORDS, -(-int(HEADROOM * words) // 4096) * 4096)
-        self.buffers = self._map("rows", symmetric.empty(size, dtype=torch.int32, device=self.device))
+        mine = symmetric.empty(size, dtype=torch.int32, device=self.device)
+        # It is zeroed in stream order: that must be over before any peer can write.
+        torch.cuda.current_stream(self.device).synchronize()
+        self.buffers = self._map("rows", mine)
 
 
 def connect(ranks: Ranks, timeout_seconds: float) -> Peers | str:
