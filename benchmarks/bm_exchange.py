@@ -32,10 +32,10 @@ import torch
 from scenes import aerial
 
 from blitzgs import pipeline
-from blitzgs.distributed.exchange import Traffic
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import LOSS_REACH, TILE_COST, Share, TileOwners, TileRanges, cost_balance
 from blitzgs.distributed.pixels import collect_images
+from blitzgs.distributed.rows import Traffic
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views, unmarked
 from blitzgs.population.initialisation import octree_gaussians

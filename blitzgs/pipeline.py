@@ -18,9 +18,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.exchange import (
-    PeerSpace,
     Route,
-    Splats,
     plan_route,
     read_traffic,
     send,
@@ -28,8 +26,9 @@ from blitzgs.distributed.exchange import (
     send_back_packed,
 )
 from blitzgs.distributed.ownership import Share
+from blitzgs.distributed.rows import PeerSpace, Splats
 from blitzgs.model import GaussianTable
-from blitzgs.ops.host import to_host
+from blitzgs.ops.host import start_copy
 from blitzgs.ops.project import Rows
 
 Mark = Callable[[str], None]
@@ -287,16 +286,20 @@ def _project(
         options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted],
     )  # fmt: skip
     plan, carry, totals = torch.ops.blitzgs.project_count(*arguments)
+    if asking is not None and asking.ranks.peers is not None:
+        rank, ids = asking.ranks.rank, table["id"]
+
+        def project(everyone: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
+            return torch.ops.blitzgs.project_emit_to_peers_(
+                *arguments, plan, everyone, rank, ids, buffers, capacity
+            )
+
+        (*written, bases), space = PeerSpace.fill(totals, len(views), asking.ranks, project)
+        rows = Rows._make((*written, space.traffic.counts))
+        route = Route(space.traffic, rows.rank_masks, bases=bases, space=space)
+        return rows, space.arrived(), route, space.traffic.n_isects, space.traffic.visible
     traffic = None if asking is None else read_traffic(totals, len(views), asking.ranks)
-    if asking is not None and traffic is not None and asking.ranks.peers is not None:
-        space = PeerSpace.reserve(traffic, asking.ranks.peers)
-        *written, bases = torch.ops.blitzgs.project_emit_to_peers_(
-            *arguments, plan, traffic.counts, table["id"], *space.arguments
-        )
-        rows = Rows._make((*written, traffic.counts))
-        route = Route(traffic, rows.rank_masks, bases=bases, space=space)
-        return rows, space.arrived(), route, traffic.n_isects, traffic.visible
-    counts = to_host(totals)[:3] if traffic is None else traffic.counts
+    counts = start_copy(totals)[:3] if traffic is None else traffic.counts
     rows = Rows._make((*torch.ops.blitzgs.project_emit(*arguments, plan, carry, counts), counts))
     splats = Splats(
         rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,

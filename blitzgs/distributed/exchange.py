@@ -19,14 +19,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileRanges
-from blitzgs.distributed.peers import Peers
+from blitzgs.distributed.rows import GRADIENT_SHAPES, PeerSpace, Splats, Traffic
 from blitzgs.ops.route import route_count
 from blitzgs.ops.scatter import (
     as_column,
@@ -36,148 +36,6 @@ from blitzgs.ops.scatter import (
     words_of,
     words_per_row,
 )
-
-# Columns of a row as peers write them: those of `Splats`, with dtype, words and shape of an element.
-_COLUMNS = (
-    (torch.float32, 2, (2,)),
-    (torch.float32, 3, (3,)),
-    (torch.float32, 1, ()),
-    (torch.float32, 3, (3,)),
-    (torch.float32, 1, ()),
-    (torch.int32, 1, ()),
-    (torch.int64, 2, ()),
-)
-_ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
-# Gradients of means2d, conics, opacities and colors as they return, `rasterize_bwd_packed` has them in front.
-_GRADIENT_SHAPES = ((2,), (3,), (), (3,))
-_GRADIENT_WORDS = 9
-# A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
-_ALIGNMENT = 32
-
-
-class Splats(NamedTuple):
-    """Projected Gaussians as compositing sees them; P rows.
-
-    Attributes:
-        means2d: [P, 2] pixels.
-        conics: [P, 3], inverse 2D covariance (a, b, c).
-        opacities: [P].
-        colors: [P, D].
-        depths: [P].
-        camera_ids: int32 [P].
-        ids: int64 [P], persistent: what breaks ties of depth.
-    """
-
-    means2d: Tensor
-    conics: Tensor
-    opacities: Tensor
-    colors: Tensor
-    depths: Tensor
-    camera_ids: Tensor
-    ids: Tensor
-
-
-@dataclass(frozen=True)
-class Traffic:
-    """How many rows go where: what the host has to know before rows are written and exchanged.
-
-    Attributes:
-        counts: int64 [3] on the CPU: this rank's visible Gaussians, rows and tiles they touch.
-        rows: rows[s][d] that rank s sends to rank d.
-        rank: this rank.
-        n_isects: row-tile intersections among the rows received, or a few more.
-        visible: int64 [B], rows of each view before the exchange, over all ranks.
-    """
-
-    counts: Tensor
-    rows: list[list[int]]
-    rank: int
-    n_isects: int
-    visible: Tensor
-
-    @property
-    def sent(self) -> list[int]:
-        """Rows for each rank."""
-        return self.rows[self.rank]
-
-    @property
-    def received(self) -> list[int]:
-        """Rows from each rank."""
-        return [row[self.rank] for row in self.rows]
-
-    @property
-    def most(self) -> int:
-        """Most rows that any rank sends or gets."""
-        return max(*map(sum, self.rows), *map(sum, zip(*self.rows, strict=True)))
-
-
-@dataclass(frozen=True)
-class PeerSpace:
-    """Where the rows of one exchange lie in the peers' memory, see `blitzgs.distributed.peers`.
-
-    Attributes:
-        peers: the memory.
-        traffic: what goes where.
-        capacity: length of the columns of arriving rows.
-        exchange: number of this exchange; only the last one's rows are there.
-    """
-
-    peers: Peers
-    traffic: Traffic
-    capacity: int
-    exchange: int
-
-    @classmethod
-    def reserve(cls, traffic: Traffic, peers: Peers) -> PeerSpace:
-        """Begin an exchange whose traffic all ranks know. Collective."""
-        needed = -(-traffic.most // _ALIGNMENT) * _ALIGNMENT
-        peers.reserve((_ROW_WORDS + _GRADIENT_WORDS) * needed)
-        peers.exchanges += 1
-        capacity = len(peers.buffers[0]) // (_ROW_WORDS + _GRADIENT_WORDS) // _ALIGNMENT * _ALIGNMENT
-        return cls(peers, traffic, capacity, peers.exchanges)
-
-    @property
-    def arguments(self) -> tuple[list[Tensor], int, list[int], list[int]]:
-        """Last arguments of `project_emit_to_peers_`."""
-        sources = self.traffic.rows[: self.peers.rank]
-        before = [sum(row[d] for row in sources) for d in range(self.peers.world_size)]
-        return self.peers.buffers, self.capacity, before, self.traffic.sent
-
-    def arrived(self) -> Splats:
-        """Return the rows that arrive here; they may be read after the next meeting."""
-        mine, count = self.peers.buffers[self.peers.rank], sum(self.traffic.received)
-        columns, begin = [], 0
-        for dtype, words, shape in _COLUMNS:
-            column = mine[begin : begin + count * words].view(dtype)
-            columns.append(column.view(count, *shape))
-            begin += self.capacity * words
-        return Splats(*columns)
-
-    def write_back(self, packed: Tensor) -> Tensor:
-        """Write the gradients of the rows that arrived to their owners.
-
-        Args:
-            packed: [R, 9 or more], of `rasterize_bwd_packed`.
-
-        Returns:
-            [S, 9], those of the rows this rank sent; they may be read after the next meeting.
-
-        Raises:
-            RuntimeError: a later exchange has begun.
-        """
-        if self.exchange != self.peers.exchanges:
-            raise RuntimeError(
-                "send_back: a later exchange has overwritten this one's rows: run the backward pass of a "
-                "frame before the next forward pass"
-            )
-        offset, me = self.capacity * _ROW_WORDS, self.peers.rank
-        before = [sum(row[:me]) for row in self.traffic.rows]
-        torch.ops.blitzgs.return_to_peers_(
-            packed, _GRADIENT_WORDS, self.traffic.received, self.peers.buffers, offset, before
-        )
-        count = sum(self.traffic.sent)
-        mine = self.peers.buffers[me][offset : offset + count * _GRADIENT_WORDS]
-        return mine.view(torch.float32).view(count, _GRADIENT_WORDS)
 
 
 @dataclass
@@ -204,21 +62,13 @@ def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
     """Agree on how many rows go where; the step's only wait for the device.
 
     Args:
-        totals: of `project_count`, with the tiles of each rank; int64 [3 + B + 2 M].
+        totals: as for `PeerSpace.fill`.
         n_views: B.
         ranks: the job.
     """
     everyone = ranks.share(totals)
-    first = 3 + n_views
-    visible = everyone[:, 3:first].sum(0)
-    known = ranks.read(everyone)
-    return Traffic(
-        counts=torch.tensor(known[ranks.rank][:3]),
-        rows=[numbers[first::2] for numbers in known],
-        rank=ranks.rank,
-        n_isects=sum(numbers[first + 2 * ranks.rank + 1] for numbers in known),
-        visible=visible,
-    )
+    visible = everyone[:, 3 : 3 + n_views].sum(0)
+    return Traffic.of(ranks.read(everyone), visible, ranks.rank)
 
 
 def plan_route(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> Route:
@@ -324,7 +174,7 @@ def send_back_packed(packed: Tensor, route: Route) -> list[Tensor]:
     assert route.space is not None
     returned = route.space.write_back(packed)
     route.space.peers.meet()
-    return _add_up(returned, route, _GRADIENT_SHAPES)
+    return _add_up(returned, route, GRADIENT_SHAPES)
 
 
 def _add_up(returned: Tensor, route: Route, shapes: Sequence[Sequence[int]]) -> list[Tensor]:

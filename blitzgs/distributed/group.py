@@ -217,7 +217,11 @@ class Ranks:
 
     def read(self, tensor: Tensor) -> Any:
         """Return a small tensor as nested lists; waits for the device, and so for the ranks it waits for."""
-        return self._collective("read", lambda: to_host(tensor).tolist())
+        return self.reading(lambda: to_host(tensor).tolist())
+
+    def reading(self, call: Callable[[], T]) -> T:
+        """Return what a function does that waits for the device, and so for the ranks it waits for."""
+        return self._collective("read", call)
 
     def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
         """Send consecutive groups of rows, one to each rank, and return those received, by source rank.

@@ -104,7 +104,7 @@ class Peers:
         if self.buffers and len(self.buffers[0]) >= words:
             return
         self.buffers = []
-        size = max(_LEAST_WORDS, -(-int(HEADROOM * words) // 4096) * 4096)
+        size = -(-int(HEADROOM * words) // 4096) * 4096
         mine = symmetric.empty(size, dtype=torch.int32, device=self.device)
         # It is zeroed in stream order: that must be over before any peer can write.
         torch.cuda.current_stream(self.device).synchronize()
@@ -133,6 +133,7 @@ def connect(ranks: Ranks, timeout_seconds: float) -> Peers | str:
     if obstacles or mail is None:
         return obstacles[0]
     peers = Peers(ranks, mail, timeout_seconds)
+    peers.reserve(_LEAST_WORDS)
     ranks.barrier()
     return peers
 

@@ -13,7 +13,7 @@
 // are bit-identical however Gaussians are divided among calls. Counting comes first: project_count finds, in
 // few bytes per candidate, which views see it, and sums up what there will be. Told those sums, project_list
 // writes which Gaussian and view each row is of, and project_emit the rows; SH is evaluated for them alone.
-// None waits for the device. O(candidates * B + rows); no output of size N.
+// None waits for the device; project_wait does. O(candidates * B + rows); no output of size N.
 //
 // On several ranks, rank_tiles says which tiles each composites. The walk over a row's tiles that counts them
 // then also finds the ranks that the row has to reach.
@@ -115,6 +115,8 @@ std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
 void project_count(const ProjectInputs<T>&, const RankTiles& rank_tiles, void* plan, Workspace& carry,
                    std::int64_t* totals, Workspace&, CudaStream);
+// Returns when the host can read what was queued to be copied to it.
+void project_wait(CudaStream);
 template <class T>
 void project_list(const ProjectInputs<T>&, const void* plan, const ProjectSizes&, const ProjectIds&,
                   Workspace&, CudaStream);
@@ -131,6 +133,7 @@ std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
 void project_count(const ProjectInputs<T>&, const RankTiles& rank_tiles, void* plan, Workspace& carry,
                    std::int64_t* totals, Workspace&, CudaStream);
+void project_wait(CudaStream);
 template <class T>
 void project_list(const ProjectInputs<T>&, const void* plan, const ProjectSizes&, const ProjectIds&,
                   Workspace&, CudaStream);

@@ -215,4 +215,6 @@ void project_count<float>(const Inputs& in, const RankTiles& rank_tiles, void* p
   scan(workspace.allocate_bytes(scratch_bytes));
 }
 
+void project_wait(CudaStream stream) { check(cudaStreamSynchronize(stream), "project_emit"); }
+
 }  // namespace blitzgs::cuda

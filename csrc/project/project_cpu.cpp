@@ -177,6 +177,8 @@ void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_v
 
 }  // namespace
 
+void project_wait(CudaStream) {}
+
 std::size_t project_plan_bytes(std::int64_t candidates) {
   return static_cast<std::size_t>(2 * (project_blocks(candidates) + 1)) * sizeof(std::int64_t) +
          static_cast<std::size_t>(candidates) * sizeof(std::uint32_t);

@@ -113,19 +113,16 @@ std::tuple<Tensor, Tensor, Tensor> project_count(
 using RowTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                               Tensor, Tensor>;
 
-// Lists the rows that `counts` announces and calls launch(inputs, ids, rows, outputs, scope) to have them
-// written.
-template <class F>
-RowTensors emit_rows(const char* op, const Forward& f, const Tensor& plan, const Tensor& counts,
-                     const F& launch) {
+void check_plan(const char* op, const Forward& f, const Tensor& plan) {
   const auto bytes = static_cast<std::int64_t>(backend::project_plan_bytes(f.candidates));
   check_dtype(op, "plan", plan, ScalarType::Long);
   check_shape(op, "plan", plan, {(bytes + 7) / 8});
-  check_dtype(op, "counts", counts, ScalarType::Long);
-  STD_TORCH_CHECK(counts.is_cpu() && counts.numel() >= 2, "blitzgs::", op,
-                  ": counts must be the totals of project_count, on the CPU");
-  const auto* totals = data<std::int64_t>(counts);
-  const ProjectSizes sizes{totals[kTotalVisible], totals[kTotalRows]};
+}
+
+// Lists the rows of a plan and calls launch(inputs, ids, rows, outputs) to have them written.
+template <class F>
+RowTensors emit_rows(const char* op, const Forward& f, const Tensor& plan, const ProjectSizes& sizes,
+                     DeviceScope& scope, const F& launch) {
   STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ", sizes.rows,
                   " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
   const std::int64_t U = sizes.visible, P = sizes.rows;
@@ -135,7 +132,6 @@ RowTensors emit_rows(const char* op, const Forward& f, const Tensor& plan, const
   const ProjectIds listed{mutable_data<std::int32_t>(gaussian_ids), mutable_data<std::int32_t>(camera_ids),
                           mutable_data<std::int32_t>(visible_ids), mutable_data<std::int32_t>(row_offsets)};
   std::vector<Tensor> out;
-  DeviceScope scope(f.p.means);
   dispatch_floating(f.p.means, [&](auto zero) {
     using T = decltype(zero);
     const ProjectInputs<T> in = f.inputs<T>();
@@ -157,7 +153,7 @@ RowTensors emit_rows(const char* op, const Forward& f, const Tensor& plan, const
                                  mutable_data<std::int32_t>(out[5]),
                                  mutable_data<std::int32_t>(out[6]),
                                  f.ranks.n_ranks > 0 ? mutable_data<std::int64_t>(out[7]) : nullptr};
-    launch(in, listed, P, rows, scope);
+    launch(in, listed, P, rows);
   });
   return {gaussian_ids, camera_ids, visible_ids, row_offsets, out[0], out[1],
           out[2],       out[3],     out[4],      out[5],      out[6], out[7]};
@@ -176,17 +172,48 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
   const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
                   height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
                   tile_begins, tile_ends);
-  return emit_rows(
-      kOp, f, plan, counts,
-      [&](const auto& in, const ProjectIds& ids, std::int64_t n_rows, const auto& rows, DeviceScope& scope) {
-        backend::project_emit(in, f.ranks, carry.const_data_ptr(), ids, n_rows, rows, scope.workspace,
-                              scope.stream);
-      });
+  check_plan(kOp, f, plan);
+  check_dtype(kOp, "counts", counts, ScalarType::Long);
+  STD_TORCH_CHECK(counts.is_cpu() && counts.numel() >= 2, "blitzgs::", kOp,
+                  ": counts must be the totals of project_count, on the CPU");
+  DeviceScope scope(f.p.means);
+  backend::project_wait(scope.stream);
+  const auto* totals = data<std::int64_t>(counts);
+  const auto write = [&](const auto& in, const ProjectIds& ids, std::int64_t n_rows, const auto& rows) {
+    backend::project_emit(in, f.ranks, carry.const_data_ptr(), ids, n_rows, rows, scope.workspace,
+                          scope.stream);
+  };
+  return emit_rows(kOp, f, plan, {totals[kTotalVisible], totals[kTotalRows]}, scope, write);
 }
 
 #ifdef BLITZGS_BACKEND_CUDA
 using SentRowTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                                   Tensor, Tensor, Tensor, Tensor>;
+
+// What every rank's project_count summed up, [M, project_totals(B, M)] on the host.
+struct Announced {
+  const std::int64_t* totals;
+  std::int64_t stride, first;
+  int n_ranks;
+
+  std::int64_t rows(int source, int target) const { return totals[source * stride + first + 2 * target]; }
+  // Rows that go to `target` from the ranks before `end`.
+  std::int64_t before(int target, int end) const {
+    std::int64_t sum = 0;
+    for (int source = 0; source < end; ++source) sum += rows(source, target);
+    return sum;
+  }
+  // Most rows that any rank sends or gets.
+  std::int64_t most() const {
+    std::int64_t result = 0;
+    for (int m = 0; m < n_ranks; ++m) {
+      std::int64_t sent = 0;
+      for (int target = 0; target < n_ranks; ++target) sent += rows(m, target);
+      result = std::max({result, sent, before(m, n_ranks)});
+    }
+    return result;
+  }
+};
 
 SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, const Tensor& scales,
                                      const Tensor& opacities, const Tensor& sh, const Tensor& viewmats,
@@ -196,22 +223,40 @@ SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, c
                                      double near_plane, double far_plane, double eps2d, double radius_clip,
                                      bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
                                      const std::vector<std::int64_t>& tile_ends, const Tensor& plan,
-                                     const Tensor& counts, const Tensor& ids, std::vector<Tensor> buffers,
-                                     std::int64_t capacity, const std::vector<std::int64_t>& starts,
-                                     const std::vector<std::int64_t>& group_sizes) {
+                                     const Tensor& everyone, std::int64_t rank, const Tensor& ids,
+                                     std::vector<Tensor> buffers, std::int64_t capacity) {
   constexpr const char* kOp = "project_emit_to_peers_";
   const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
                   height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
                   tile_begins, tile_ends);
-  const RowGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
-  STD_TORCH_CHECK(f.ranks.n_ranks == groups.count, "blitzgs::", kOp, ": ", groups.count,
-                  " groups need as many ranges of tiles, got ", f.ranks.n_ranks);
+  check_plan(kOp, f, plan);
+  const int n_ranks = f.ranks.n_ranks, me = static_cast<int>(rank);
+  const std::int64_t n_totals = project_totals(f.p.n_views, n_ranks);
+  check_dtype(kOp, "everyone", everyone, ScalarType::Long);
+  check_shape(kOp, "everyone", everyone, {n_ranks, n_totals});
+  STD_TORCH_CHECK(everyone.is_cpu() && everyone.is_contiguous() && rank >= 0 && rank < n_ranks,
+                  "blitzgs::", kOp,
+                  ": everyone must be the totals of each rank, contiguous on the CPU, and rank one of ",
+                  n_ranks, ", got ", rank);
   check_dtype(kOp, "ids", ids, ScalarType::Long);
   check_shape(kOp, "ids", ids, {f.p.count});
   const Tensor every_id = as_contiguous(ids);
+  DeviceScope scope(f.p.means);
+  backend::project_wait(scope.stream);
+  const Announced announced{data<std::int64_t>(everyone), n_totals, kTotalViews + f.p.n_views, n_ranks};
+  std::vector<std::int64_t> group_sizes(n_ranks), starts(n_ranks);
+  ProjectSizes sizes{};
+  if (announced.most() <= capacity) {
+    const std::int64_t* mine = announced.totals + rank * n_totals;
+    sizes = {mine[kTotalVisible], mine[kTotalRows]};
+    for (int m = 0; m < n_ranks; ++m) {
+      group_sizes[m] = announced.rows(me, m);
+      starts[m] = announced.before(m, me);
+    }
+  }
+  const RowGroups groups = checked_groups(kOp, "everyone", group_sizes);
   Tensor row_ids, bases;
-  const auto send = [&](const auto& in, const ProjectIds& listed, std::int64_t n_rows, const auto& out,
-                        DeviceScope& scope) {
+  const auto send = [&](const auto& in, const ProjectIds& listed, std::int64_t n_rows, const auto& out) {
     row_ids = make_empty(f.p.means, {n_rows}, ScalarType::Long);
     bases = make_empty(f.p.means, {scatter_blocks(n_rows), groups.count}, ScalarType::Int);
     const ProjectScatter scatter{data<std::int64_t>(every_id), mutable_data<std::int64_t>(row_ids),
@@ -219,7 +264,7 @@ SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, c
                                  peer_targets(kOp, buffers, kEmittedColumns, capacity, starts, groups)};
     cuda::project_emit_to_ranks(in, f.ranks, listed, n_rows, out, scatter, scope.workspace, scope.stream);
   };
-  auto rows = emit_rows(kOp, f, plan, counts, send);
+  auto rows = emit_rows(kOp, f, plan, sizes, scope, send);
   return std::tuple_cat(std::move(rows), std::tuple{bases});
 }
 #endif

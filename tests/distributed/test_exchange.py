@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
 
-from blitzgs.distributed.exchange import Splats, exchange, plan_route, send, send_back
+from blitzgs.distributed.exchange import exchange, plan_route, send, send_back
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import LOSS_REACH, TileRanges
+from blitzgs.distributed.rows import Splats
 from tests.distributed.rank_harness import run_ranks
 
 WIDTH, HEIGHT, CAMERAS = 100, 60, 2

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What travels between ranks: projected rows, how many go where, and where peers write them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.peers import Peers
+from blitzgs.ops.host import start_copy
+
+# Columns of a row as peers write them: those of `Splats`, with dtype, words and shape of an element.
+_COLUMNS = (
+    (torch.float32, 2, (2,)),
+    (torch.float32, 3, (3,)),
+    (torch.float32, 1, ()),
+    (torch.float32, 3, (3,)),
+    (torch.float32, 1, ()),
+    (torch.int32, 1, ()),
+    (torch.int64, 2, ()),
+)
+_ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
+# Gradients of means2d, conics, opacities and colors as they return, `rasterize_bwd_packed` has them in front.
+GRADIENT_SHAPES = ((2,), (3,), (), (3,))
+_GRADIENT_WORDS = 9
+# Writes rows to the peers: see `PeerSpace.fill`.
+Projection = Callable[[Tensor, list[Tensor], int], Any]
+# A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
+_ALIGNMENT = 32
+
+
+class Splats(NamedTuple):
+    """Projected Gaussians as compositing sees them; P rows.
+
+    Attributes:
+        means2d: [P, 2] pixels.
+        conics: [P, 3], inverse 2D covariance (a, b, c).
+        opacities: [P].
+        colors: [P, D].
+        depths: [P].
+        camera_ids: int32 [P].
+        ids: int64 [P], persistent: what breaks ties of depth.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    opacities: Tensor
+    colors: Tensor
+    depths: Tensor
+    camera_ids: Tensor
+    ids: Tensor
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """How many rows go where: what the host has to know before rows are written and exchanged.
+
+    Attributes:
+        counts: int64 [3] on the CPU: this rank's visible Gaussians, rows and tiles they touch.
+        rows: rows[s][d] that rank s sends to rank d.
+        rank: this rank.
+        n_isects: row-tile intersections among the rows received, or a few more.
+        visible: int64 [B], rows of each view before the exchange, over all ranks.
+    """
+
+    counts: Tensor
+    rows: list[list[int]]
+    rank: int
+    n_isects: int
+    visible: Tensor
+
+    @classmethod
+    def of(cls, known: Sequence[Sequence[int]], visible: Tensor, rank: int) -> Traffic:
+        """Read it from every rank's totals."""
+        first = 3 + len(visible)
+        return cls(
+            counts=torch.tensor(known[rank][:3]),
+            rows=[list(numbers[first::2]) for numbers in known],
+            rank=rank,
+            n_isects=sum(numbers[first + 2 * rank + 1] for numbers in known),
+            visible=visible,
+        )
+
+    @property
+    def sent(self) -> list[int]:
+        """Rows for each rank."""
+        return self.rows[self.rank]
+
+    @property
+    def received(self) -> list[int]:
+        """Rows from each rank."""
+        return [row[self.rank] for row in self.rows]
+
+    @property
+    def most(self) -> int:
+        """Most rows that any rank sends or gets."""
+        return max(*map(sum, self.rows), *map(sum, zip(*self.rows, strict=True)))
+
+
+@dataclass(frozen=True)
+class PeerSpace:
+    """Where the rows of one exchange lie in the peers' memory, see `blitzgs.distributed.peers`.
+
+    Attributes:
+        peers: the memory.
+        traffic: what goes where.
+        capacity: length of the columns of arriving rows.
+        exchange: number of this exchange; only the last one's rows are there.
+    """
+
+    peers: Peers
+    traffic: Traffic
+    capacity: int
+    exchange: int
+
+    @classmethod
+    def fill(cls, totals: Tensor, n_views: int, ranks: Ranks, project: Projection) -> tuple[Any, PeerSpace]:
+        """Begin an exchange: have the rows of all ranks written, and agree on how many. Collective.
+
+        Args:
+            totals: of `project_count`, with the tiles of each rank; int64 [3 + B + 2 M].
+            n_views: B.
+            ranks: the job, with peers.
+            project: given all ranks' totals, which are on their way to the CPU, the buffers and how many rows
+                each has room for: waits, and writes this rank's rows if there is room for everyone's.
+
+        Returns:
+            What `project` returned, and where the rows are.
+        """
+        peers = ranks.peers
+        assert peers is not None
+        everyone = ranks.share(totals)
+        known = start_copy(everyone)
+        visible = everyone[:, 3 : 3 + n_views].sum(0)
+        needed = 0
+        while True:
+            peers.reserve((_ROW_WORDS + _GRADIENT_WORDS) * needed)
+            room = len(peers.buffers[0]) // (_ROW_WORDS + _GRADIENT_WORDS) // _ALIGNMENT * _ALIGNMENT
+            result = ranks.reading(partial(project, known, peers.buffers, room))
+            traffic = Traffic.of(known.tolist(), visible, ranks.rank)
+            if traffic.most <= room:
+                peers.exchanges += 1
+                return result, cls(peers, traffic, room, peers.exchanges)
+            needed = -(-traffic.most // _ALIGNMENT) * _ALIGNMENT
+
+    def arrived(self) -> Splats:
+        """Return the rows that arrive here; they may be read after the next meeting."""
+        mine, count = self.peers.buffers[self.peers.rank], sum(self.traffic.received)
+        columns, begin = [], 0
+        for dtype, words, shape in _COLUMNS:
+            column = mine[begin : begin + count * words].view(dtype)
+            columns.append(column.view(count, *shape))
+            begin += self.capacity * words
+        return Splats(*columns)
+
+    def write_back(self, packed: Tensor) -> Tensor:
+        """Write the gradients of the rows that arrived to their owners.
+
+        Args:
+            packed: [R, 9 or more], of `rasterize_bwd_packed`.
+
+        Returns:
+            [S, 9], those of the rows this rank sent; they may be read after the next meeting.
+
+        Raises:
+            RuntimeError: a later exchange has begun.
+        """
+        if self.exchange != self.peers.exchanges:
+            raise RuntimeError(
+                "send_back: a later exchange has overwritten this one's rows: run the backward pass of a "
+                "frame before the next forward pass"
+            )
+        offset, me = self.capacity * _ROW_WORDS, self.peers.rank
+        before = [sum(row[:me]) for row in self.traffic.rows]
+        torch.ops.blitzgs.return_to_peers_(
+            packed, _GRADIENT_WORDS, self.traffic.received, self.peers.buffers, offset, before
+        )
+        count = sum(self.traffic.sent)
+        mine = self.peers.buffers[me][offset : offset + count * _GRADIENT_WORDS]
+        return mine.view(torch.float32).view(count, _GRADIENT_WORDS)
