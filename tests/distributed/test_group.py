@@ -66,7 +66,7 @@ def _fail(ranks, how):
             raise ValueError("shard 1 has a hole")
         if how == "kill":
             os.kill(os.getpid(), 9)
-        time.sleep(30)
+        time.sleep(60)
         return
     ranks.all_reduce(torch.zeros(4))
 
@@ -82,9 +82,9 @@ def _fail(ranks, how):
 def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
     start = time.monotonic()
     with pytest.raises(RankError) as failure:
-        run_ranks(_fail, 3, how, timeout_seconds=2.0, limit=20)
-    assert time.monotonic() - start < 20
+        run_ranks(_fail, 3, how, timeout_seconds=5.0, limit=45)
+    assert time.monotonic() - start < 45
     if how == "hang":
-        assert "waited 2 s in all_reduce: rank 1 has not arrived" in failure.value.blame
+        assert "waited 5 s in all_reduce: rank 1 has not arrived" in failure.value.blame
     assert expected in failure.value.messages[0]
     assert expected in failure.value.messages[2]
