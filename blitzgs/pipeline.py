@@ -270,7 +270,7 @@ def _project(
     active: Active | None,
     share: Share | None,
 ) -> tuple[Rows, Splats, Route | None, int, Tensor]:
-    """Project a table and, on several ranks, agree on which row goes where: the step's one wait.
+    """Project a table and, on several ranks, agree on which row goes where: `forward`'s one wait.
 
     Returns this rank's rows; the same as splats, or what the other ranks' projections write here; where rows
     go (None: they stay); at least the number of intersections to composite here; rows of each view over all

@@ -38,10 +38,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
       "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor plan, Tensor everyone, "
       "int rank, Tensor ids, Tensor(a!)[] buffers, int capacity) -> (Tensor gaussian_ids, "
-      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, Tensor "
-      "depths, "
-      "Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, Tensor rank_masks, "
-      "Tensor bases)");
+      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, "
+      "Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
+      "Tensor rank_masks, Tensor bases)");
   m.def(
       "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
       "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "

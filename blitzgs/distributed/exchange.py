@@ -59,7 +59,7 @@ class Route:
 
 
 def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
-    """Agree on how many rows go where; the step's only wait for the device.
+    """Agree on how many rows go where; waits for the device.
 
     Args:
         totals: as for `PeerSpace.fill`.

@@ -14,10 +14,11 @@ barrier between streams: work queued behind it, on any rank, finds done what any
 - arriving rows of a step overwrite those of the step before after A; whoever read those had queued that
   before its own A;
 - returning gradients are written after A and B, and those of the step before were summed up before A;
-- the counts of a step are copied to the host before B, and the next ones are written at the next A.
+- the counts of a step are copied to the host before B, and the next ones are written at the next A. Where
+  nothing but counts travels this way and no B follows, `share` holds a meeting of its own first.
 
 Between A and the writing every rank waits for the counts on the host, so when buffers have to grow, no kernel
-of any rank uses them. A rank that dies leaves the others in a meeting: their hosts wait in `Ranks.read`,
+of any rank uses them. A rank that dies leaves the others in a meeting: their hosts wait in `Ranks.reading`,
 where the watchdog finds them, and a meeting that lasts longer than that aborts the process's kernels.
 """
 
@@ -63,6 +64,7 @@ class Peers:
         self.buffers: list[Tensor] = []
         self.exchanges = 0
         self._meetings = 0
+        self._shown = False  # whether numbers of the last meeting may still be read somewhere
         self._handles: dict[str, Any] = {}  # the mappings live as long as these
         self._mail = self._map("mail", mail)
 
@@ -81,6 +83,7 @@ class Peers:
             values: int64 [n] that every rank gets to see, n <= MAX_VALUES, the same on all; None: nothing.
         """
         self._meetings += 1
+        self._shown = values is not None
         torch.ops.blitzgs.meet_peers_(self._mail, self.rank, self._meetings, values, self.timeout_seconds)
 
     def share(self, values: Tensor) -> Tensor:
@@ -92,6 +95,9 @@ class Peers:
         Returns:
             int64 [M, n], valid until `share` is called again.
         """
+        if self._shown:
+            # A rank may have come out of the last meeting and not have copied its numbers yet.
+            self.meet()
         self.meet(values)
         count = self.world_size * len(values)
         return self._mail[self.rank][self.world_size : self.world_size + count].view(self.world_size, -1)

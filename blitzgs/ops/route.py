@@ -10,8 +10,6 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-MAX_RANKS = 63
-
 
 def route_count(
     means2d: Tensor,

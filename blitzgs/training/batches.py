@@ -131,6 +131,7 @@ class BatchLoader:
             if stream is not None:
                 self._used.read.record(stream)
             self._free.append(self._used)
+            self._used = None  # in case the next batch cannot be loaded
         for ahead in range(step, max(step + 1, min(step + self._ahead + 1, last))):
             if ahead not in self._pending:
                 indices = [self._train[view] for view in self._sampler.batch(ahead)]
@@ -141,9 +142,10 @@ class BatchLoader:
                     [index for index, (y0, y1) in zip(indices, rows, strict=True) if y0 < y1]
                 )
                 self._pending[ahead] = self._worker.submit(self._load, indices, ranges, rows)
-        batch, self._used = self._pending.pop(step).result()
+        batch, slot = self._pending.pop(step).result()
         if stream is not None:
-            stream.wait_event(self._used.uploaded)
+            stream.wait_event(slot.uploaded)
+        self._used = slot
         return batch
 
     def close(self) -> None:
@@ -164,13 +166,14 @@ class BatchLoader:
     def _load(
         self, indices: list[int], ranges: TileRanges | None, rows: list[tuple[int, int]]
     ) -> tuple[Batch, _Slot]:
-        slot, count, (width, height) = self._free.popleft(), len(indices), self._views.size(indices)
+        count, (width, height) = len(indices), self._views.size(indices)
         masks = [self._images.mask(index) for index in indices]
         samples = [self._samples(index, mask) for index, mask in zip(indices, masks, strict=True)]
         strips = [
             self._images.get(index)[y0:y1] if y0 < y1 else None
             for index, (y0, y1) in zip(indices, rows, strict=True)
         ]
+        slot = self._free.popleft()  # not before: images that cannot be read must not keep it
         if self._stream is not None:
             slot.uploaded.synchronize()  # the pinned memory is free, long since
             self._stream.wait_event(slot.read)

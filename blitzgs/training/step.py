@@ -92,8 +92,11 @@ class Stepper:
     def _active(self, views: Views, options: RenderOptions) -> Active:
         """Find the Gaussians that the views may see."""
         near, far = options.near_plane, options.far_plane
-        return Active(
-            *self._blocks.active(
-                self._table, views.viewmats, views.Ks, views.width, views.height, near, far, options.eps2d
+        # Their number is waited for, and so, in stream order, the other ranks' part in the step before.
+        return self._owners.ranks.reading(
+            lambda: Active(
+                *self._blocks.active(
+                    self._table, views.viewmats, views.Ks, views.width, views.height, near, far, options.eps2d
+                )
             )
         )

@@ -6,6 +6,7 @@
 
 #include "blocks/blocks.h"
 #include "common/cuda_check.h"
+#include "common/multiprocessors.h"
 #include "math/morton_cuda.cuh"
 
 namespace blitzgs::cuda {
@@ -180,10 +181,7 @@ class ToldNumber {
 };
 
 unsigned persistent_blocks(std::int64_t blocks) {
-  int device = 0, count = 0;
-  check(cudaGetDevice(&device), "blocks");
-  check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "blocks");
-  return static_cast<unsigned>(std::min<std::int64_t>(blocks, kResident * count));
+  return static_cast<unsigned>(std::min<std::int64_t>(blocks, kResident * multiprocessors()));
 }
 
 }  // namespace

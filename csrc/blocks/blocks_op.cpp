@@ -36,7 +36,8 @@ HeldRows hold_rows(const char* op, const Tensor& means, const Tensor& scales,
                    const std::optional<Tensor>& moment_step, const std::optional<Tensor>& table) {
   HeldRows held;
   const std::int64_t n = means.size(0);
-  STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "blitzgs::", op, ": at most 2^31 rows, got ", n);
+  STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "blitzgs::", op, ": fewer than 2^31 - ",
+                  kBlockRows, " rows are supported, got ", n);
   held.rows.n = n;
   held.rows.means = hold_column(op, "means", means, n, held);
   held.rows.scales = hold_column(op, "scales", scales, n, held);
@@ -88,6 +89,7 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, co
     check_dtype(op, "ids", *ids_in, ScalarType::Int);
     check_shape(op, "ids", *ids_in, {-1});
     ids = as_contiguous(*ids_in);
+    if (ids->size(0) == 0) return;  // it may have no address, which would mean all rows
   }
   DeviceScope scope(bounds);
   backend::update_block_bounds(held.rows, data_or_null<std::int32_t>(ids), ids ? ids->size(0) : 0,

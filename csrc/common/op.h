@@ -110,11 +110,6 @@ inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& sh
   return Tensor(handle);
 }
 
-inline Tensor make_zeros(const Tensor& like, std::vector<std::int64_t> shape,
-                         std::optional<ScalarType> dtype = std::nullopt) {
-  return torch::stable::new_zeros(like, shape, dtype);
-}
-
 template <class T>
 const T* data(const Tensor& tensor) {
   return static_cast<const T*>(tensor.const_data_ptr());

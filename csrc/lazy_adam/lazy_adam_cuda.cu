@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
+#include <stdexcept>
 #include <type_traits>
 
 #include "common/cuda_check.h"
+#include "common/multiprocessors.h"
 #include "lazy_adam/lazy_adam_device.cuh"
 
 namespace blitzgs::cuda {
@@ -176,13 +178,6 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
   args.moment_step[row] = args.step;
 }
 
-int multiprocessors() {
-  int device = 0, count = 0;
-  check(cudaGetDevice(&device), "lazy_adam");
-  check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "lazy_adam");
-  return count;
-}
-
 void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
   if (args.step == 0) return;
   const Prepared prepared{workspace.allocate<AdamDebt<float>>(args.step),
@@ -196,12 +191,28 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
   check_launch("lazy_adam catch-up");
 }
 
+// Quaternions, and SH of degree 3, are moved 16 bytes at a time.
+void check_alignment(const AdamArgs<float>& args) {
+  for (const int c : {1, 4}) {
+    const AdamColumn<float>& column = args.columns[c];
+    if (c == 4 && column.width != 48) continue;
+    const float* const arrays[] = {column.param, column.exp_avg, column.exp_avg_sq, column.grad};
+    for (const float* values : arrays) {
+      if (reinterpret_cast<std::uintptr_t>(values) % alignof(Pack<4>) == 0) continue;
+      throw std::runtime_error(
+          "blitzgs::lazy_adam: quats and sh, their moments and gradients must be 16-byte aligned on CUDA; "
+          "clone() a tensor that begins within another");
+    }
+  }
+}
+
 }  // namespace
 
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
   static_assert(std::is_same_v<T, float>);
   if (args.n == 0) return;
+  check_alignment(args);
   AdamArgs<float> behind = args;
   behind.step = args.target();
   for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;

@@ -9,9 +9,8 @@
 //
 // Conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q and the interval by some float
 // roundings, which covers the rounding of this test and of the rasterisers that evaluate q as
-// factor_conic() writes it. What is not listed
-// therefore contributes nothing to the image. Not finite, not convex (a <= 0 or c <= 0) or too faint (opacity
-// < 1/255): no tiles.
+// factor_conic() writes it. What is not listed therefore contributes nothing to the image. Not finite, not
+// convex (a <= 0 or c <= 0) or too faint (opacity < 1/255): no tiles.
 //
 // All contexts must count alike (a count from one kernel sizes the buffer of another), so no expression here
 // leaves the compiler a choice of contraction.
@@ -141,17 +140,6 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
   return tiles::finite(ellipse->shear) && tiles::finite(ellipse->inv_l11);
 }
 
-// Half-widths in pixels of the box around {alpha >= 1/255} (slack included, infinite for a stripe); false,
-// and zeros, when the splat is drawn nowhere.
-template <class T>
-BLITZGS_HD bool splat_extent(const T* conic, T opacity, T* rx, T* ry) {
-  SplatEllipse<T> ellipse;
-  const bool drawn = make_ellipse(conic, opacity, &ellipse);
-  *rx = drawn ? ellipse.half_width : T(0);
-  *ry = drawn ? ellipse.half_height : T(0);
-  return drawn;
-}
-
 // First and last index of the pixel centres i + 0.5 in [low, high], within [0, size); empty: first > last.
 // A NaN bound does not bound.
 template <class T>
@@ -208,15 +196,6 @@ BLITZGS_HD void for_each_tile(const T* mean2d, const T* conic, T opacity, int wi
   for_each_tile_row(mean2d, conic, opacity, width, height, tile_size, [&](int ty, int begin, int end) {
     for (int tx = begin; tx < end; ++tx) f(tx, ty);
   });
-}
-
-template <class T>
-BLITZGS_HD std::int32_t count_tiles(const T* mean2d, const T* conic, T opacity, int width, int height,
-                                    int tile_size) {
-  std::int32_t count = 0;
-  for_each_tile_row(mean2d, conic, opacity, width, height, tile_size,
-                    [&](int, int begin, int end) { count += end - begin; });
-  return count;
 }
 
 }  // namespace blitzgs

@@ -15,6 +15,7 @@
 #include <climits>
 
 #include "common/cuda_check.h"
+#include "common/multiprocessors.h"
 #include "photometric/photometric.h"
 #include "photometric/photometric_device.cuh"
 
@@ -322,13 +323,6 @@ int cut_strips(const PhotometricArgs<float>& args, int columns, int slots, Launc
     launch->view_strips = cut(args.height, rows);
   }
   return best_strips;
-}
-
-int multiprocessors() {
-  int device = 0, count = 0;
-  check(cudaGetDevice(&device), "photometric");
-  check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "photometric");
-  return count;
 }
 
 template <bool kBytes, bool kGradient, bool kSums>

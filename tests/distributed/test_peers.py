@@ -11,6 +11,7 @@ from blitzgs import pipeline
 from blitzgs.distributed.exchange import send_back, send_back_packed
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.peers import MAX_VALUES, Peers
 from blitzgs.model import GaussianTable
 from tests.distributed.rank_harness import RankError, run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
@@ -113,6 +114,24 @@ def test_a_rank_that_leaves_a_meeting_is_named(how):
         run_ranks(_abandoned, 2, how, device="cuda", timeout_seconds=3.0, limit=50)
     assert time.monotonic() - start < 50
     assert "waited 3 s in read: rank 1 has not" in failure.value.blame
+
+
+def test_counts_are_not_overwritten_before_all_have_read_them(monkeypatch):
+    """Between two calls of `share` every rank meets the others once more, if only for that."""
+    met = []
+    monkeypatch.setattr(Peers, "_map", lambda self, name, mine: [mine])
+    monkeypatch.setattr(
+        torch.ops.blitzgs,
+        "meet_peers_",
+        lambda mail, rank, number, values, timeout: met.append((number, values is not None)),
+    )
+    peers = Peers(Ranks(), torch.zeros(1 + MAX_VALUES, dtype=torch.int64), 1.0)
+    numbers = torch.arange(3)
+    assert peers.share(numbers).shape == (1, 3)
+    peers.meet()  # as after rows were written
+    peers.share(numbers)
+    peers.share(numbers)
+    assert met == [(1, True), (2, False), (3, True), (4, False), (5, True)]
 
 
 def _refused(rank):

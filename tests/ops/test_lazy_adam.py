@@ -360,3 +360,14 @@ def test_cuda_equals_cpu(k):
         for a, b in zip(getattr(states["cpu"], name), getattr(states["cuda"], name), strict=True):
             torch.testing.assert_close(a, b.cpu(), rtol=1e-5, atol=1e-6 * float(a.abs().max()))
     assert torch.equal(states["cpu"].moment_step, states["cuda"].moment_step.cpu())
+
+
+@pytest.mark.cuda
+@needs_cuda
+@pytest.mark.parametrize("column", [1, 4])
+def test_cuda_refuses_what_begins_within_16_bytes(column):
+    state = State(8, torch.float32, "cuda", k=16)
+    moment = state.exp_avgs[column]
+    state.exp_avgs[column] = moment.new_zeros(moment.numel() + 1)[1:].view(moment.shape)
+    with pytest.raises(RuntimeError, match="must be 16-byte aligned on CUDA"):
+        state.catch_up(None, learning_rates(10).cuda(), 5)

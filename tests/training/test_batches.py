@@ -71,3 +71,38 @@ def test_each_step_gets_its_own_views(capture, device, ahead):
             assert torch.equal(masks.cpu(), torch.stack(counted).byte())
         else:
             assert masks is None
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("ahead", [0, 2])
+def test_memory_is_used_once_though_an_image_could_not_be_read(capture, device, ahead, monkeypatch):
+    cameras, images = capture
+    device = torch.device(device)
+    views = ViewSet(cameras, Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
+    sampler = BatchSampler(SIZES, 2, seed=3)
+    loader = BatchLoader(images, views, list(range(len(SIZES))), sampler, device, ahead)
+    fails, get = True, images.get
+
+    def sometimes(index):
+        if fails and index in sampler.batch(5):
+            raise OSError("cannot be read")
+        return get(index)
+
+    monkeypatch.setattr(images, "get", sometimes)
+    try:
+        step = 0
+        for _ in range(STEPS + 20):
+            try:
+                batch = loader.get(step, STEPS)
+            except OSError:
+                fails = False
+                continue
+            expected = torch.stack([get(index) for index in sampler.batch(step)])
+            assert torch.equal(batch.targets.cpu(), expected)
+            assert len(set(map(id, loader._free))) == len(loader._free)
+            step += 1
+            if step == STEPS:
+                break
+    finally:
+        loader.close()
+    assert step == STEPS and not fails

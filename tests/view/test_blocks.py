@@ -226,6 +226,16 @@ def test_bounds_follow_the_rows_that_were_stepped(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_no_rows_stepped_leave_all_bounds_alone(device):
+    table = make_table(device=device)
+    index = BlockIndex(table)
+    before = index._bounds.clone()
+    table["means"].add_(1000.0)
+    index.update(table, torch.empty(0, dtype=torch.int32, device=device))
+    assert torch.equal(index._bounds, before)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_morton_order_keeps_neighbours_together(device):
     points = torch.rand(4096, 3, generator=torch.Generator().manual_seed(0)).to(device)
     points[3] = math.nan
