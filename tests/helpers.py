@@ -14,10 +14,8 @@ from blitzgs.reference import ReferenceImage, render
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 
-_CUDA_MARKS = [
-    pytest.mark.cuda,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+_CUDA_MARKS = [pytest.mark.cuda, needs_cuda]
 DEVICES = ["cpu", pytest.param("cuda", marks=_CUDA_MARKS)]
 # Where the kernels run, and in which dtype.
 BACKENDS = [

@@ -13,6 +13,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 import bm_accuracy  # noqa: E402
 from scenes import aerial  # noqa: E402
 
+from tests.helpers import needs_cuda
+
 
 @pytest.fixture(scope="module")
 def scene():
@@ -32,7 +34,7 @@ def test_the_default_is_exact_to_float_rounding_and_half_precision_is_not(scene)
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@needs_cuda
 @pytest.mark.parametrize("option", bm_accuracy.options_for("cuda"), ids=lambda option: option.name)
 def test_every_option_but_half_precision_keeps_the_bounds_on_cuda(option):
     scene = aerial(300_000, "cuda", views=option.views, width=1200, height=800)

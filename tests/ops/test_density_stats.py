@@ -3,9 +3,8 @@ import pytest
 import torch
 
 from blitzgs.ops.density_stats import density_stats_
+from tests.helpers import DEVICES
 
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
 WIDTH, HEIGHT, B = 640, 480, 3
 
 

@@ -7,9 +7,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from blitzgs.ops.knn_distances import knn_distances
-
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
+from tests.helpers import DEVICES
 
 
 def cloud(kind, n=3000):

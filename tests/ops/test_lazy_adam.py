@@ -5,11 +5,10 @@ import pytest
 import torch
 
 from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_
+from tests.helpers import DEVICES, needs_cuda
 
 COEFFICIENTS = 4
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
 
 
 def shapes(n, k=COEFFICIENTS):

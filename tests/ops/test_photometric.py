@@ -15,10 +15,9 @@ from blitzgs.ops.photometric import (
     pixel_counts,
     ssim,
 )
+from tests.helpers import DEVICES
 
 ROOT = Path(__file__).parents[2]
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
 
 
 def reference_ssim_map(x, y):

@@ -7,19 +7,10 @@ import torch
 from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.project import project
 from blitzgs.ops.project_step import project_bwd_step_
+from tests.helpers import DEVICES
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
 STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
-DEVICES = [
-    "cpu",
-    pytest.param(
-        "cuda",
-        marks=[
-            pytest.mark.cuda,
-            pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-        ],
-    ),
-]
 
 
 class Scene:

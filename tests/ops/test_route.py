@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from blitzgs.ops.route import route_count
+from tests.helpers import needs_cuda
 
 WIDTH, HEIGHT, CAMERAS = 100, 60, 2
 TILES = 7 * 4
@@ -60,7 +61,7 @@ def test_one_rank_gets_every_intersection():
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@needs_cuda
 @pytest.mark.parametrize("count", [0, 1, 3000])
 def test_cuda_equals_cpu(count):
     ranges = [(0, 18), (2, 2), (2, 39), (23, CAMERAS * TILES)]

@@ -3,9 +3,8 @@ import pytest
 import torch
 
 from blitzgs.ops.scatter import BLOCK, gather_rows, scatter_rows, sum_rows
+from tests.helpers import DEVICES
 
-NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, NEEDS_GPU])]
 RANKS = 3
 
 

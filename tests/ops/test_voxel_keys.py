@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from blitzgs.ops.voxel_keys import voxel_keys
+from tests.helpers import needs_cuda
 
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 CUDA = pytest.param("cuda", torch.float32, marks=[pytest.mark.cuda, needs_cuda])
 
 

@@ -8,18 +8,9 @@ import torch
 from blitzgs.training.batches import BatchLoader
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.views import Space, ViewSet
+from tests.helpers import DEVICES
 from tests.training.tiny import Camera, Images, look_at_origin
 
-DEVICES = [
-    "cpu",
-    pytest.param(
-        "cuda",
-        marks=[
-            pytest.mark.cuda,
-            pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-        ],
-    ),
-]
 SIZES = [(48, 32)] * 5 + [(30, 20)] * 3
 STEPS = 25
 

@@ -12,10 +12,8 @@ from blitzgs.training import run
 from blitzgs.training.config_io import ConfigError
 from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer
+from tests.helpers import DEVICES, needs_cuda
 from tests.training.tiny import tiny_config, tiny_scene
-
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
 
 
 @pytest.fixture(autouse=True)

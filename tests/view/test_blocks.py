@@ -9,9 +9,8 @@ from blitzgs.ops.blocks import cull_blocks, morton_keys
 from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.project import project
 from blitzgs.view.blocks import BlockIndex, morton_order
+from tests.helpers import DEVICES
 
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, needs_cuda])]
 WIDTH, HEIGHT, NEAR, FAR = 160, 120, 0.2, 60.0
 
 
