@@ -142,8 +142,7 @@ class ImageStore:
             planned += 3 * camera.width * camera.height
             if planned > self._decoded.budget:
                 return
-            if self._decoded.get(("image", index)) is None:
-                self._submit("image", index)
+            self._submit("image", index)
 
     @property
     def compressed_bytes(self) -> int:
@@ -160,15 +159,22 @@ class ImageStore:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _result(self, kind: str, index: int) -> UInt8:
-        found = self._decoded.get((kind, index))
-        return found if found is not None else self._submit(kind, index).result()
+        return self._submit(kind, index).result()
 
     def _submit(self, kind: str, index: int) -> Future[UInt8]:
         key = (kind, index)
+        # What is no longer pending is decoded: both are looked up under one lock, or a thread held up between
+        # the two would have it decoded again.
         with self._pending_lock:
-            if key not in self._pending:
-                self._pending[key] = self._pool.submit(self._produce, kind, index)
-            return self._pending[key]
+            if key in self._pending:
+                return self._pending[key]
+            found = self._decoded.get(key)
+            if found is None:
+                future = self._pending[key] = self._pool.submit(self._produce, kind, index)
+            else:
+                future = Future()
+                future.set_result(found)
+            return future
 
     def _produce(self, kind: str, index: int) -> UInt8:
         try:

@@ -111,6 +111,28 @@ def test_an_image_wanted_by_many_threads_is_decoded_once(capture, monkeypatch):
     assert calls == [3]
 
 
+def test_a_thread_held_up_after_its_look_does_not_decode_again(capture, monkeypatch):
+    store, calls, looked, others_done = ImageStore(capture), [], threading.Event(), threading.Event()
+    make, look = ImageStore._make_image, store._decoded.get
+
+    def held_up(key):
+        found = look(key)
+        if not looked.is_set():
+            looked.set()
+            others_done.wait(0.5)
+        return found
+
+    monkeypatch.setattr(ImageStore, "_make_image", lambda s, i: calls.append(i) or make(s, i))
+    monkeypatch.setattr(store._decoded, "get", held_up)
+    with ThreadPoolExecutor(1) as pool:
+        slow = pool.submit(store.get, 3)
+        assert looked.wait(5)
+        fast = store.get(3)
+        others_done.set()
+        assert torch.equal(slow.result(), fast)
+    assert calls == [3]
+
+
 @pytest.mark.parametrize("kept", [0, 1, 30, 0.5, 0.99])
 def test_truncated_jpegs_are_named_and_never_shown_in_part(capture, kept):
     path = capture.cameras[2].image_path
