@@ -10,7 +10,7 @@ intersection, and its reverse between their gradients.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,6 +30,8 @@ from blitzgs.distributed.rows import PeerSpace, Splats
 from blitzgs.model import GaussianTable
 from blitzgs.ops.host import start_copy
 from blitzgs.ops.project import Rows
+from blitzgs.ops.rasterize import gradient_columns
+from blitzgs.ops.scatter import OWN_VALUES, Returns
 
 Mark = Callable[[str], None]
 
@@ -129,19 +131,22 @@ class Frame(NamedTuple):
 
 
 class RowGradients(NamedTuple):
-    """Gradients of this rank's P rows.
+    """Gradients of this rank's P rows, maybe views of one table.
 
     Attributes:
         means2d: [P, 2], per pixel.
         conics: [P, 3].
         opacities: [P].
         colors: [P, 3].
+        returns: says where they are in parts, [S, ...], from the ranks that composited the rows, and how to
+            add them up (`blitzgs.ops.scatter.sum_rows`); such are valid until the next exchange.
     """
 
     means2d: Tensor
     conics: Tensor
     opacities: Tensor
     colors: Tensor
+    returns: Returns = OWN_VALUES
 
 
 def forward(
@@ -216,19 +221,21 @@ def backward_rows(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> Row
         frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders,
     )  # fmt: skip
     grid = (len(views), views.width, views.height, options.tile_size, *tiles)
-    if frame.route is not None and frame.route.space is not None:
+    returns = OWN_VALUES
+    if v_renders.is_cuda:
         packed = torch.ops.blitzgs.rasterize_bwd_packed(*arguments, *grid, options.deterministic)
         mark("raster back")
-        row_gradients = send_back_packed(packed, frame.route)
+        if frame.route is not None and frame.route.space is not None:
+            packed, returns = send_back_packed(packed, frame.route)
+        columns: Sequence[Tensor] = gradient_columns(packed)
     else:
-        *row_gradients, _ = torch.ops.blitzgs.rasterize_bwd(
-            *arguments, None, *grid, False, options.deterministic
-        )
+        *columns, _ = torch.ops.blitzgs.rasterize_bwd(*arguments, None, *grid, False, options.deterministic)
         mark("raster back")
-        if share is not None and frame.route is not None:
-            row_gradients = send_back(row_gradients, frame.route, share.ranks)
+    if share is not None and frame.route is not None and frame.route.space is None:
+        columns = send_back(columns, frame.route, share.ranks)
     mark("exchange back")
-    return RowGradients(*row_gradients)
+    means2d, conics, opacities, colors = columns
+    return RowGradients(means2d, conics, opacities, colors, returns)
 
 
 def backward(
@@ -257,7 +264,7 @@ def backward(
     *parameters, _ = torch.ops.blitzgs.project_bwd(
         *table.parameters, views.viewmats, views.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
         views.width, views.height, options.sh_degree, options.eps2d, options.antialiased, True, v.means2d,
-        v.conics, None, v.opacities, v.colors, scale_reg, False,
+        v.conics, None, v.opacities, v.colors, scale_reg, False, *v.returns,
     )  # fmt: skip
     mark("project back")
     return tuple(parameters)
@@ -294,9 +301,9 @@ def _project(
                 *arguments, plan, everyone, rank, ids, buffers, capacity
             )
 
-        (*written, bases), space = PeerSpace.fill(totals, len(views), asking.ranks, project)
+        (*written, places), space = PeerSpace.fill(totals, len(views), asking.ranks, project)
         rows = Rows._make((*written, space.traffic.counts))
-        route = Route(space.traffic, rows.rank_masks, bases=bases, space=space)
+        route = Route(space.traffic, rows.rank_masks, places=places, space=space)
         return rows, space.arrived(), route, space.traffic.n_isects, space.traffic.visible
     traffic = None if asking is None else read_traffic(totals, len(views), asking.ranks)
     counts = start_copy(totals)[:3] if traffic is None else traffic.counts

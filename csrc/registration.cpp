@@ -40,14 +40,14 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int rank, Tensor ids, Tensor(a!)[] buffers, int capacity) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
-      "Tensor rank_masks, Tensor bases)");
+      "Tensor rank_masks, Tensor places)");
   m.def(
       "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
       "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "
       "int sh_degree, float eps2d, bool antialiased, bool raw, Tensor v_means2d, Tensor v_conics, "
-      "Tensor? v_depths, Tensor v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats) -> "
-      "(Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, Tensor "
-      "v_viewmats)");
+      "Tensor? v_depths, Tensor v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats, "
+      "Tensor? places=None, int[] group_sizes=[]) -> (Tensor v_means, Tensor v_quats, "
+      "Tensor v_scales, Tensor v_opacities, Tensor v_sh, Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible rows.
   m.def(
       "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
@@ -55,7 +55,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int explicit_steps, float beta1, float beta2, float eps, bool sparse, Tensor viewmats, Tensor Ks, "
       "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, int sh_degree, "
       "float eps2d, bool antialiased, Tensor v_means2d, Tensor v_conics, Tensor v_row_opacities, "
-      "Tensor v_colors, Tensor? scale_reg) -> ()");
+      "Tensor v_colors, Tensor? scale_reg, Tensor? places=None, int[] group_sizes=[]) "
+      "-> ()");
 
   // Which rows each tile composites, front to back by (depth, id).
   m.def(
@@ -69,10 +70,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "tile_begins, int[] tile_ends, int width, int height, int tile_size) -> (Tensor masks, Tensor counts)");
 
   // Rows on their way between ranks, packed for a collective or written straight into peers' memory (CUDA).
-  m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor bases)");
+  m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
   m.def("gather_rows(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
   m.def(
-      "sum_rows(Tensor values, Tensor masks, Tensor bases, int[] group_sizes, int[] widths) -> Tensor[] "
+      "sum_rows(Tensor values, Tensor places, int[] group_sizes, int rows, int[] widths) -> Tensor[] "
       "columns");
   m.def(
       "return_to_peers_(Tensor values, int width, int[] group_sizes, Tensor(a!)[] buffers, int offset, "
@@ -129,8 +130,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
-      "weight) "
-      "-> ()");
+      "weight, Tensor? places=None, int[] group_sizes=[]) -> ()");
 
   // Scene initialisation.
   m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");

@@ -3,15 +3,15 @@
 
 Each rank projects its own Gaussians. The counting pass of the projection finds where each row will have to
 go, and `read_traffic` shows everyone's counts to all, which is all the host waits for; `send` brings the rows
-there; `send_back` or `send_back_packed` returns their gradients along the same routes and adds them up at the
+there; `send_back` or `send_back_packed` returns their gradients along the same routes, to be added up at the
 owner, by rank, so that the sum does not depend on who was faster (paper §3.1). `exchange` is the
 differentiable form for use with autograd, `plan_route` for rows that are there already.
 
 Rows travel in one of two ways. Where the ranks share memory (`blitzgs.distributed.peers`), the projection
 itself writes each row into the columns that other ranks composite from, so that the links work while it
 computes; `PeerSpace` tells it where. Otherwise rows are packed, carried by one all-to-all and taken apart.
-Either way the place of a row among those of its rank follows from the masks and one number per block of
-rows, and serves the way back too.
+Either way the places of rows among those of a rank are kept in 8 bytes per 32 rows, and serve the way back
+too.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileRanges
-from blitzgs.distributed.rows import GRADIENT_SHAPES, PeerSpace, Splats, Traffic
+from blitzgs.distributed.rows import PeerSpace, Splats, Traffic
 from blitzgs.ops.route import route_count
 from blitzgs.ops.scatter import (
+    Returns,
     as_column,
     gather_rows,
     scatter_rows,
@@ -47,14 +48,14 @@ class Route:
         masks: int64 [P], bit m set for rows that go to rank m.
         halves: float16 [P, 4 + D], what to send for conic, opacity and colour in half precision; None: send
             them as they are.
-        bases: int32, places of the rows sent, see `blitzgs.ops.scatter`; None: not sent yet.
+        places: int64, of the rows sent, see `blitzgs.ops.scatter`; None: not sent yet.
         space: where peers write; None: rows travel by collectives.
     """
 
     traffic: Traffic
     masks: Tensor
     halves: Tensor | None = None
-    bases: Tensor | None = None
+    places: Tensor | None = None
     space: PeerSpace | None = None
 
 
@@ -127,7 +128,7 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
     else:
         columns += [route.halves]
     sent, received = route.traffic.sent, route.traffic.received
-    packed, route.bases = scatter_rows(columns, route.masks, sent)
+    packed, route.places = scatter_rows(columns, route.masks, sent)
     words = sum(map(words_per_row, columns))
     arrived = ranks.all_to_all(packed, [words * n for n in sent], [words * n for n in received])
     means2d, depths, camera_ids, ids, *rest = gather_rows(arrived, columns, received)
@@ -155,18 +156,21 @@ def send_back(gradients: Sequence[Tensor], route: Route, ranks: Ranks) -> list[T
         # Gradients span too many magnitudes for float16.
         halves = torch.cat(flat, 1).bfloat16()
         returned = as_column(ranks.all_to_all(words_of(halves), received, sent), halves).to(dtype)
-    return _add_up(returned, route, [g.shape[1:] for g in gradients])
+    sums = sum_rows(returned, _returns(route), len(route.masks), widths)
+    return [part.reshape(-1, *g.shape[1:]) for part, g in zip(sums, gradients, strict=True)]
 
 
-def send_back_packed(packed: Tensor, route: Route) -> list[Tensor]:
-    """`send_back`, for a route whose rows the peers write.
+def send_back_packed(packed: Tensor, route: Route) -> tuple[Tensor, Returns]:
+    """Return the gradients of received rows to their owners, for a route whose rows the peers write.
+
+    Nobody adds them up: that is left to who reads them, once.
 
     Args:
         packed: [R, 9 or more], of `rasterize_bwd_packed`.
         route: of these rows.
 
     Returns:
-        Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
+        What came back for the rows this rank sent, [S, 9], valid until the next exchange; how it adds up.
 
     Raises:
         RuntimeError: another exchange has taken the place of this one.
@@ -174,16 +178,14 @@ def send_back_packed(packed: Tensor, route: Route) -> list[Tensor]:
     assert route.space is not None
     returned = route.space.write_back(packed)
     route.space.peers.meet()
-    return _add_up(returned, route, GRADIENT_SHAPES)
+    return returned, _returns(route)
 
 
-def _add_up(returned: Tensor, route: Route, shapes: Sequence[Sequence[int]]) -> list[Tensor]:
-    """Add up the gradients of each row that returned from one rank or more."""
-    if route.bases is None:
+def _returns(route: Route) -> Returns:
+    """Tell how what returned along a route adds up."""
+    if route.places is None:
         raise RuntimeError("send_back: the route's rows have not been sent")
-    widths = [math.prod(shape) for shape in shapes]
-    sums = sum_rows(returned, route.masks, route.bases, route.traffic.sent, widths)
-    return [part.reshape(-1, *shape) for part, shape in zip(sums, shapes, strict=True)]
+    return Returns(route.places, route.traffic.sent)
 
 
 def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> tuple[Splats, Route]:

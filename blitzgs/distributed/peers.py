@@ -7,13 +7,14 @@ rows that arrive for this rank's tiles, column by column, so that intersection a
 they lie; behind them the gradients that come back for the rows this rank sent.
 
 A step is, in stream order on every rank: meeting A with the counts (`share`), rows written to the others,
-meeting B, compositing and its gradient, gradients written to the others, meeting C, their sum. A meeting is a
-barrier between streams: work queued behind it, on any rank, finds done what any rank queued before it. Hence
+meeting B, compositing and its gradient, gradients written to the others, meeting C, reading those. A meeting
+is a barrier between streams: work queued behind it, on any rank, finds done what any rank queued before it.
+Hence
 
 - rows and gradients are read after the meeting that follows their writing: B and C;
 - arriving rows of a step overwrite those of the step before after A; whoever read those had queued that
   before its own A;
-- returning gradients are written after A and B, and those of the step before were summed up before A;
+- returning gradients are written after A and B, and those of the step before were read before A;
 - the counts of a step are copied to the host before B, and the next ones are written at the next A. Where
   nothing but counts travels this way and no B follows, `share` holds a meeting of its own first.
 

@@ -27,7 +27,6 @@ _COLUMNS = (
 )
 _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
 # Gradients of means2d, conics, opacities and colors as they return, `rasterize_bwd_packed` has them in front.
-GRADIENT_SHAPES = ((2,), (3,), (), (3,))
 _GRADIENT_WORDS = 9
 # Writes rows to the peers: see `PeerSpace.fill`.
 Projection = Callable[[Tensor, list[Tensor], int], Any]

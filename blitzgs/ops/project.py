@@ -164,7 +164,7 @@ def _(
         means.new_empty(U, 3),
         means.new_empty(U),
         means.new_empty(U, 0 if sh is None else sh.shape[1], 3),
-        means.new_empty(viewmats.shape[0] if rest[-1] else 0, 4, 4),
+        means.new_empty(viewmats.shape[0] if rest[13] else 0, 4, 4),
     )
 
 

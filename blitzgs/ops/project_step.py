@@ -11,6 +11,7 @@ from torch import Tensor
 
 from blitzgs.ops.lazy_adam import explicit_steps, schedule_table
 from blitzgs.ops.project import Rows
+from blitzgs.ops.scatter import OWN_VALUES, Returns
 
 
 @torch.no_grad()
@@ -40,6 +41,7 @@ def project_bwd_step_(
     v_opacities: Tensor,
     v_colors: Tensor,
     scale_reg: Tensor | None = None,
+    returns: Returns = OWN_VALUES,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their rows.
 
@@ -74,6 +76,11 @@ def project_bwd_step_(
         v_colors: gradient of `rows.colors`, [P, 3].
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
+        returns: how to add up the gradients of the rows, which are then those that came back from the ranks,
+            [S, ...]. They are the sums that `blitzgs.ops.scatter.sum_rows` makes.
+
+    The four gradients may be views of one table, [.., 9 or more] in this order: on CUDA, one of 12 floats a
+    row, or any that came back, is read where it lies.
 
     Raises:
         ValueError: decay rates outside their range.
@@ -84,6 +91,7 @@ def project_bwd_step_(
         schedule_table(lr_table, beta1, beta2), lr_table, step, explicit_steps(beta1, beta2, params[0].dtype),
         beta1, beta2, eps, sparse, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets, width,
         height, sh_degree, eps2d, antialiased, v_means2d, v_conics, v_opacities, v_colors, scale_reg,
+        *returns,
     )  # fmt: skip
 
 

@@ -13,6 +13,18 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.ops.intersect import tile_counts
 
 
+def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """View a table of the gradients of rows as columns.
+
+    Args:
+        packed: [P, 9 or more], of the op `rasterize_bwd_packed` or the part of it that ranks send back.
+
+    Returns:
+        Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
+    """
+    return packed[:, :2], packed[:, 2:5], packed[:, 5], packed[:, 6:9]
+
+
 def rasterize(
     means2d: Tensor,
     conics: Tensor,

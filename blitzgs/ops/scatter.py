@@ -5,14 +5,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Rows whose places are reserved together, see csrc/scatter/scatter.h.
-BLOCK = 256
+# Rows that share an entry of `places`, see csrc/scatter/scatter.h.
+RUN = 32
+
+
+class Returns(NamedTuple):
+    """How values that came back from M ranks belong to rows; as it is by default, each row has its own.
+
+    Attributes:
+        places: from `scatter_rows`.
+        group_sizes: as for `scatter_rows`.
+    """
+
+    places: Tensor | None = None
+    group_sizes: Sequence[int] = ()
+
+
+OWN_VALUES = Returns()
 
 
 def scatter_rows(
@@ -27,15 +43,15 @@ def scatter_rows(
         group_sizes: rows for each of the M ranks, as the masks have them.
 
     Returns:
-        packed int32 [words]: one group after the other, in each the columns one after the other; and bases
-        int32 [ceil(P / BLOCK), M], where in each group the rows of a block begin: what `sum_rows` needs. The
-        order of a block's rows is kept; on CUDA that of blocks is not.
+        packed int32 [words]: one group after the other, in each the columns one after the other; and places
+        int64 [ceil(P / RUN), M], where in each group the rows are: what `sum_rows` needs. The order of the
+        rows of a run is kept; on CUDA that of runs is not.
 
     Raises:
         RuntimeError: columns of different lengths, or too many.
     """
-    packed, bases = torch.ops.blitzgs.scatter_rows([words_of(c) for c in columns], masks, list(group_sizes))
-    return packed, bases
+    packed, places = torch.ops.blitzgs.scatter_rows([words_of(c) for c in columns], masks, list(group_sizes))
+    return packed, places
 
 
 def gather_rows(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[int]) -> list[Tensor]:
@@ -57,16 +73,13 @@ def gather_rows(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[in
     return [as_column(part, column) for part, column in zip(parts, like, strict=True)]
 
 
-def sum_rows(
-    values: Tensor, masks: Tensor, bases: Tensor, group_sizes: Sequence[int], widths: Sequence[int]
-) -> list[Tensor]:
+def sum_rows(values: Tensor, returns: Returns, rows: int, widths: Sequence[int]) -> list[Tensor]:
     """Add up what came back for each row, in the order of ranks.
 
     Args:
         values: [sum(group_sizes), F], float32 (CPU also float64): rows where `scatter_rows` put them.
-        masks: as for `scatter_rows`.
-        bases: from `scatter_rows`.
-        group_sizes: as for `scatter_rows`.
+        returns: how the rows were scattered.
+        rows: P.
         widths: of the columns that the F values are; they add up to F.
 
     Returns:
@@ -75,7 +88,7 @@ def sum_rows(
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
-    return torch.ops.blitzgs.sum_rows(values, masks, bases, list(group_sizes), list(widths))
+    return torch.ops.blitzgs.sum_rows(values, *returns, rows, list(widths))
 
 
 def words_per_row(column: Tensor) -> int:
@@ -103,9 +116,9 @@ def as_column(words: Tensor, like: Tensor) -> Tensor:
 @torch.library.register_fake("blitzgs::scatter_rows")
 def _(columns: Sequence[Tensor], masks: Tensor, group_sizes: Sequence[int]) -> tuple[Tensor, Tensor]:
     words = sum(column.shape[1] for column in columns) * sum(group_sizes)
-    blocks = -(-masks.shape[0] // BLOCK)
+    runs = -(-masks.shape[0] // RUN)
     packed = masks.new_empty(words, dtype=torch.int32)
-    return packed, masks.new_empty((blocks, len(group_sizes)), dtype=torch.int32)
+    return packed, masks.new_empty((runs, len(group_sizes)))
 
 
 @torch.library.register_fake("blitzgs::gather_rows")
@@ -115,6 +128,6 @@ def _(packed: Tensor, widths: Sequence[int], group_sizes: Sequence[int]) -> list
 
 @torch.library.register_fake("blitzgs::sum_rows")
 def _(
-    values: Tensor, masks: Tensor, bases: Tensor, group_sizes: Sequence[int], widths: Sequence[int]
+    values: Tensor, places: Tensor, group_sizes: Sequence[int], rows: int, widths: Sequence[int]
 ) -> list[Tensor]:
-    return [values.new_empty((masks.shape[0], width)) for width in widths]
+    return [values.new_empty((rows, width)) for width in widths]

@@ -90,4 +90,5 @@ class LazyAdam:
             v_opacities=v.opacities,
             v_colors=v.colors,
             scale_reg=scale_reg,
+            returns=v.returns,
         )

@@ -80,7 +80,11 @@ class Stepper:
         return frame, terms, sums
 
     def backward(self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked) -> RowGradients:
-        """Carry the gradients of `forward`'s loss back to the rows, and move the Gaussians by them."""
+        """Carry the gradients of `forward`'s loss back to the rows, and move the Gaussians by them.
+
+        Returns:
+            The gradients of the rows, valid until the next `forward`.
+        """
         table = self._table
         gradients = pipeline.backward_rows(frame, terms.v_renders, mark)
         self._optimiser.step(table, frame, gradients, terms.scale_reg, step)

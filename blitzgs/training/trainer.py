@@ -16,7 +16,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.ops.density_stats import density_stats_
-from blitzgs.pipeline import Frame
+from blitzgs.pipeline import Frame, RowGradients
 from blitzgs.population.density import DensityRules, densify
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.redistribution import redistribute
@@ -203,7 +203,7 @@ class Trainer:
             report = self._measure(frame, batch)
         gradients = self._stepper.backward(step, frame, terms)
         if begin < config.schedule.densify_until * config.schedule.scale:
-            self._gather(frame, gradients.means2d)
+            self._gather(frame, gradients)
         self.progress = dataclasses.replace(
             self.progress, step=step, sh_degree=degree, seconds=time.monotonic() - self._clock
         )
@@ -220,7 +220,7 @@ class Trainer:
         """Whether the step at `begin` completes a multiple of `every` images."""
         return (begin + self.schedule.batch_size) // every > begin // every
 
-    def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
+    def _gather(self, frame: Frame, v: RowGradients) -> None:
         rows, views = frame.rows, frame.views
         density_stats_(
             self.table["grad_sum"],
@@ -228,11 +228,12 @@ class Trainer:
             self.table["max_radii"],
             rows.visible_ids,
             rows.row_offsets,
-            v_means2d,
+            v.means2d,
             rows.conics,
             views.width,
             views.height,
             float(len(views)),
+            returns=v.returns,
         )
 
     def _measure(self, frame: Frame, batch: Batch) -> Tensor:

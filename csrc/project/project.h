@@ -27,6 +27,7 @@
 #include "common/stream.h"
 #include "math/rank_tiles.h"
 #include "project/project_row.h"
+#include "project/row_gradients.h"
 #include "scatter/scatter.h"
 
 namespace blitzgs {
@@ -80,19 +81,13 @@ struct ProjectOutputs {
 inline constexpr RowColumns<const std::int32_t> kEmittedColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
 
 // Where emitted rows go besides (CUDA): each to the ranks of its rank mask, as `scatter` does
-// (scatter/scatter.h). ids [N]; row_ids [P] and bases are written too.
+// (scatter/scatter.h). ids [N]; row_ids [P] and places are written too.
 struct ProjectScatter {
   const std::int64_t* ids;
   std::int64_t* row_ids;
-  std::int32_t* bases;
+  RowPlace* places;
   RowGroups groups;
   ScatterTargets targets;
-};
-
-// Gradients of the rows; v_depths and v_colors may be null (zero).
-template <class T>
-struct ProjectRowGradients {
-  const T *means2d, *conics, *depths, *opacities, *colors;
 };
 
 // Gradients by visible Gaussian, [U, ...] (sh [U, K, 3], null without sh); viewmats [B, 4, 4] or null.
@@ -144,8 +139,8 @@ void project_emit_to_ranks(const ProjectInputs<float>&, const RankTiles&, const 
                            std::int64_t n_rows, const ProjectOutputs<float>&, const ProjectScatter&,
                            Workspace&, CudaStream);
 template <class T>
-void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
-                 const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);
+void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const RowGradientSource&, const T* scale_reg,
+                 const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -41,7 +41,9 @@ struct StoreGradients {
 };
 
 // One block's share of the gradients of view blockIdx.y: [blocks, B, 12] doubles.
-__global__ void __launch_bounds__(kPoseThreads) pose_kernel(const BackwardInputs args, double* partial) {
+template <class Source>
+__global__ void __launch_bounds__(kPoseThreads)
+    pose_kernel(const __grid_constant__ BackwardInputs<Source> args, double* partial) {
   __shared__ Camera<float> cameras[kMaxViews];
   using Reduce = cub::BlockReduce<double, kPoseThreads>;
   __shared__ typename Reduce::TempStorage storage;
@@ -58,11 +60,12 @@ __global__ void __launch_bounds__(kPoseThreads) pose_kernel(const BackwardInputs
       const std::int64_t id = args.rows.visible_ids[u];
       const ActiveGaussian<float> gaussian = load_gaussian(in, id);
       GaussianGradient<float> unused{};
-      project_row_vjp(cameras[view], gaussian, in.options, load_row_gradient(args.v, r), &unused, &pose);
-      if (!in.sh || !args.v.colors) continue;
+      project_row_vjp(cameras[view], gaussian, in.options, args.v.geometry(r), &unused, &pose);
+      if (!in.sh || !args.v.colored()) continue;
+      const Vec3<float> v_color = args.v.color(r);
       float v_sh[3 * kMaxShBasis] = {};
       row_color_vjp(cameras[view], gaussian.mean, in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree,
-                    args.v.colors + 3 * r, v_sh, &unused.mean, &pose);
+                    &v_color.x, v_sh, &unused.mean, &pose);
     }
   }
   const Vec3<float> columns[4] = {pose.row_x, pose.row_y, pose.row_z, pose.translation};
@@ -94,7 +97,7 @@ __global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks
 }  // namespace
 
 template <>
-void project_bwd<float>(const Inputs& in, const ProjectRows& rows, const ProjectRowGradients<float>& v,
+void project_bwd<float>(const Inputs& in, const ProjectRows& rows, const RowGradientSource& v,
                         const float* scale_reg, const ProjectGradients<float>& out, Workspace& workspace,
                         CudaStream stream) {
   const std::int64_t blocks = project_blocks(rows.n_visible);
@@ -103,16 +106,21 @@ void project_bwd<float>(const Inputs& in, const ProjectRows& rows, const Project
     check(cudaMemsetAsync(out.viewmats, 0, bytes, stream), "project_bwd");
   }
   if (blocks == 0) return;
-  const BackwardInputs args{in, rows, v, scale_reg};
   const StoreGradients sink{out, 3 * in.options.sh_stride};
-  dispatch_sh(in, [&](auto degree, auto quads) {
+  dispatch_backward(in, rows, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
     backward_kernel<degree.value, quads.value>
         <<<blocks_for(rows.n_visible, kBackwardThreads), kBackwardThreads, 0, stream>>>(args, sink);
   });
   check_launch("project_bwd");
   if (!out.viewmats) return;
   auto* partial = workspace.allocate<double>(blocks * in.n_views * 12);
-  pose_kernel<<<dim3(static_cast<unsigned>(blocks), in.n_views), kPoseThreads, 0, stream>>>(args, partial);
+  std::visit(
+      [&](const auto& source) {
+        const BackwardInputs<std::decay_t<decltype(source)>> args{in, rows, source, scale_reg};
+        const dim3 grid(static_cast<unsigned>(blocks), in.n_views);
+        pose_kernel<<<grid, kPoseThreads, 0, stream>>>(args, partial);
+      },
+      v);
   check_launch("project_bwd");
   reduce_poses_kernel<<<in.n_views, 16, 0, stream>>>(partial, blocks, in.n_views, out.viewmats);
   check_launch("project_bwd");

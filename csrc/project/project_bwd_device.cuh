@@ -7,18 +7,25 @@ namespace blitzgs::cuda {
 
 constexpr int kBackwardThreads = 128;
 
+// v: one of RowGradientSource.
+template <class Source>
 struct BackwardInputs {
   Inputs in;
   ProjectRows rows;
-  ProjectRowGradients<float> v;
+  Source v;
   const float* scale_reg;
 };
 
-__device__ inline RowGradient<float> load_row_gradient(const ProjectRowGradients<float>& v, std::int64_t r) {
-  return {{v.means2d[2 * r], v.means2d[2 * r + 1]},
-          {v.conics[3 * r], v.conics[3 * r + 1], v.conics[3 * r + 2]},
-          v.depths ? v.depths[r] : 0.f,
-          v.opacities[r]};
+// Calls f(degree, quads, BackwardInputs) with degree and quads as dispatch_sh has them.
+template <class F>
+void dispatch_backward(const Inputs& in, const ProjectRows& rows, const RowGradientSource& v,
+                       const float* scale_reg, const F& f) {
+  std::visit(
+      [&](const auto& source) {
+        const BackwardInputs<std::decay_t<decltype(source)>> args{in, rows, source, scale_reg};
+        dispatch_sh(in, [&](auto degree, auto quads) { f(degree, quads, args); });
+      },
+      v);
 }
 
 // A warp's visible Gaussians, a lane each.
@@ -30,9 +37,9 @@ struct WarpRows {
 
 // A thread is a visible Gaussian. Its gradients go to the sink: begin() is called by every thread before the
 // block meets, take() and then take_sh() at the end, with the warp's stages to reorder them in.
-template <int DEGREE, bool QUADS, class Sink>
+template <int DEGREE, bool QUADS, class Source, class Sink>
 __global__ void __launch_bounds__(kBackwardThreads, 3)
-    backward_kernel(const __grid_constant__ BackwardInputs args, const __grid_constant__ Sink sink) {
+    backward_kernel(const __grid_constant__ BackwardInputs<Source> args, const __grid_constant__ Sink sink) {
   using Coefficients = ShRow<DEGREE>;
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ ShStage<DEGREE> stages[QUADS ? kBackwardThreads / 32 : 1];
@@ -46,7 +53,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   const std::int64_t u = first + lane;
   const std::int32_t id = u < args.rows.n_visible ? args.rows.visible_ids[u] : -1;
   const std::int64_t stride = 3 * in.options.sh_stride;
-  const bool has_colors = in.sh && args.v.colors;
+  const bool has_colors = in.sh && args.v.colored();
   if constexpr (QUADS) {
     if (has_colors) stage.gather(in.sh, stride, id, lane);
   }
@@ -73,7 +80,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   PoseGradient<float>* no_pose = nullptr;
   for (std::int64_t r = begin; r < end; ++r) {
     const int view = args.rows.camera_ids[r];
-    project_row_vjp(cameras[view], gaussian, in.options, load_row_gradient(args.v, r), &gradient, no_pose);
+    project_row_vjp(cameras[view], gaussian, in.options, args.v.geometry(r), &gradient, no_pose);
     if (args.scale_reg) axis_weight += args.scale_reg[view];
   }
 
@@ -92,8 +99,8 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
       for (int i = 0; i < Coefficients::kCount; ++i) sh.values[i] = in.sh[stride * id + i];
     }
     for (std::int64_t r = begin; r < end; ++r) {
-      const float v_color[3] = {args.v.colors[3 * r], args.v.colors[3 * r + 1], args.v.colors[3 * r + 2]};
-      row_color_vjp(cameras[args.rows.camera_ids[r]], mean, sh.values, DEGREE, v_color, v_sh.values,
+      const Vec3<float> v_color = args.v.color(r);
+      row_color_vjp(cameras[args.rows.camera_ids[r]], mean, sh.values, DEGREE, &v_color.x, v_sh.values,
                     &gradient.mean, no_pose);
     }
   }

@@ -134,12 +134,8 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
   for (std::int64_t r = rows.row_offsets[u]; r < rows.row_offsets[u + 1]; ++r) {
     const int view = rows.camera_ids[r];
     PoseGradient<T>* pose = poses ? poses + view : nullptr;
-    const RowGradient<T> v_row{{v.means2d[2 * r], v.means2d[2 * r + 1]},
-                               {v.conics[3 * r], v.conics[3 * r + 1], v.conics[3 * r + 2]},
-                               v.depths ? v.depths[r] : T(0),
-                               v.opacities[r]};
-    project_row_vjp(cameras[view], gaussian, in.options, v_row, &gradient, pose);
-    if (in.sh && v.colors) {
+    project_row_vjp(cameras[view], gaussian, in.options, v.geometry(r), &gradient, pose);
+    if (in.sh && v.colored()) {
       row_color_vjp(cameras[view], gaussian.mean, in.sh + stride * id, in.options.sh_degree, v.colors + 3 * r,
                     out.sh + stride * u, &gradient.mean, pose);
     }

@@ -205,7 +205,7 @@ void project_emit_to_ranks(const Inputs& in, const RankTiles& rank_tiles, const 
                                 words(scatter.row_ids)};
   std::copy(std::begin(data), std::end(data), columns.data);
   const GoToRanks destination{scatter.ids,    scatter.row_ids, {columns, out.rank_masks, n_rows},
-                              scatter.groups, scatter.targets, {filled, scatter.bases}};
+                              scatter.groups, scatter.targets, {filled, scatter.places}};
   emit_rows(in, rank_tiles, ids, n_rows, out, destination, stream);
 }
 

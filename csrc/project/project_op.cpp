@@ -255,17 +255,17 @@ SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, c
     }
   }
   const RowGroups groups = checked_groups(kOp, "everyone", group_sizes);
-  Tensor row_ids, bases;
+  Tensor row_ids, places;
   const auto send = [&](const auto& in, const ProjectIds& listed, std::int64_t n_rows, const auto& out) {
     row_ids = make_empty(f.p.means, {n_rows}, ScalarType::Long);
-    bases = make_empty(f.p.means, {scatter_blocks(n_rows), groups.count}, ScalarType::Int);
+    places = make_places(f.p.means, n_rows, groups);
     const ProjectScatter scatter{data<std::int64_t>(every_id), mutable_data<std::int64_t>(row_ids),
-                                 mutable_data<std::int32_t>(bases), groups,
+                                 places_of(places), groups,
                                  peer_targets(kOp, buffers, kEmittedColumns, capacity, starts, groups)};
     cuda::project_emit_to_ranks(in, f.ranks, listed, n_rows, out, scatter, scope.workspace, scope.stream);
   };
   auto rows = emit_rows(kOp, f, plan, sizes, scope, send);
-  return std::tuple_cat(std::move(rows), std::tuple{bases});
+  return std::tuple_cat(std::move(rows), std::tuple{places});
 }
 #endif
 

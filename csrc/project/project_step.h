@@ -27,7 +27,7 @@ void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const Project
 }  // namespace cpu
 namespace cuda {
 template <class T>
-void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
+void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const RowGradientSource&,
                       const T* scale_reg, AdamArgs<T> adam, Workspace&, CudaStream);
 }  // namespace cuda
 

@@ -118,14 +118,13 @@ bool moves_by_packs(const AdamArgs<float>& adam) {
 }  // namespace
 
 template <>
-void project_bwd_step<float>(const Inputs& in, const ProjectRows& rows, const ProjectRowGradients<float>& v,
+void project_bwd_step<float>(const Inputs& in, const ProjectRows& rows, const RowGradientSource& v,
                              const float* scale_reg, AdamArgs<float> adam, Workspace& workspace,
                              CudaStream stream) {
   if (rows.n_visible == 0) return;
   bool done = false;
   if (moves_by_packs(adam)) {
-    const BackwardInputs args{in, rows, v, scale_reg};
-    dispatch_sh(in, [&](auto degree, auto quads) {
+    dispatch_backward(in, rows, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
       if constexpr (quads.value) {
         backward_kernel<degree.value, true>
             <<<blocks_for(rows.n_visible, kBackwardThreads), kBackwardThreads, 0, stream>>>(args,

@@ -8,54 +8,39 @@
 
 namespace blitzgs::cpu {
 
-namespace {
-
-// Calls f(row, rank, position in the block's part of the rank's group) for the rows of a block, in order.
-template <class F>
-void for_each_destination(const std::int64_t* masks, std::int64_t block, std::int64_t n_rows, int n_ranks,
-                          const F& f) {
-  std::int64_t taken[kMaxRanks] = {};
-  const std::int64_t end = std::min(n_rows, (block + 1) * kScatterBlock);
-  for (std::int64_t row = block * kScatterBlock; row < end; ++row) {
-    for (int m = 0; m < n_ranks; ++m) {
-      if ((masks[row] >> m) & 1) f(row, m, taken[m]++);
-    }
-  }
-}
-
-}  // namespace
-
 void scatter(const ScatterRows& rows, const RowGroups& groups, const ScatterTargets& targets,
-             std::int32_t* bases, Workspace&, CudaStream) {
+             RowPlace* places, Workspace&, CudaStream) {
   const int n_ranks = groups.count;
-  const std::int64_t blocks = scatter_blocks(rows.count);
-  parallel_for(0, blocks, 32, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      std::int32_t* counts = bases + block * n_ranks;
-      std::fill(counts, counts + n_ranks, 0);
-      for_each_destination(rows.masks, block, rows.count, n_ranks,
-                           [&](std::int64_t, int m, std::int64_t) { ++counts[m]; });
+  const std::int64_t runs = place_runs(rows.count);
+  parallel_for(0, runs, 256, [&](std::int64_t begin, std::int64_t end) {
+    std::fill(places + begin * n_ranks, places + end * n_ranks, RowPlace{});
+    for (std::int64_t row = begin * kPlaceRows; row < std::min(rows.count, end * kPlaceRows); ++row) {
+      RowPlace* run = places + row / kPlaceRows * n_ranks;
+      for (int m = 0; m < n_ranks; ++m) {
+        run[m].bits |= static_cast<std::uint32_t>((rows.masks[row] >> m) & 1) << row % kPlaceRows;
+      }
     }
   });
   for (int m = 0; m < n_ranks; ++m) {
     std::int32_t before = 0;
-    for (std::int64_t block = 0; block < blocks; ++block) {
-      const std::int32_t count = bases[block * n_ranks + m];
-      bases[block * n_ranks + m] = before;
-      before += count;
+    for (std::int64_t run = 0; run < runs; ++run) {
+      RowPlace& place = places[run * n_ranks + m];
+      place.first = before;
+      before += count_bits(place.bits);
     }
   }
-  parallel_for(0, blocks, 32, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      for_each_destination(
-          rows.masks, block, rows.count, n_ranks, [&](std::int64_t row, int m, std::int64_t position) {
-            const std::int64_t at = bases[block * n_ranks + m] + position;
-            if (at >= groups.size[m]) return;
-            for (int c = 0; c < rows.columns.count; ++c) {
-              const std::int64_t width = rows.columns.begin[c + 1] - rows.columns.begin[c];
-              std::memcpy(targets.words[m][c] + at * width, rows.columns.data[c] + row * width, 4 * width);
-            }
-          });
+  parallel_for(0, runs, 256, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t row = begin * kPlaceRows; row < std::min(rows.count, end * kPlaceRows); ++row) {
+      const RowPlace* run = places + row / kPlaceRows * n_ranks;
+      for (int m = 0; m < n_ranks; ++m) {
+        const auto in_run = static_cast<std::uint32_t>(row % kPlaceRows);
+        const std::int64_t at = run[m].of(in_run);
+        if (!run[m].has(in_run) || at >= groups.size[m]) continue;
+        for (int c = 0; c < rows.columns.count; ++c) {
+          const std::int64_t width = rows.columns.begin[c + 1] - rows.columns.begin[c];
+          std::memcpy(targets.words[m][c] + at * width, rows.columns.data[c] + row * width, 4 * width);
+        }
+      }
     }
   });
 }
@@ -73,29 +58,23 @@ void gather(const std::int32_t* packed, const RowGroups& groups, const RowColumn
 }
 
 template <class T>
-void sum(const ReturnedRows<T>& in, const RowColumns<T>& out, Workspace&, CudaStream) {
-  const int n_ranks = in.groups.count;
+void sum(const RowValues<T>& in, const RowColumns<T>& out, Workspace&, CudaStream) {
   for (int c = 0; c < out.count; ++c) {
     std::fill_n(out.data[c], in.count * (out.begin[c + 1] - out.begin[c]), T(0));
   }
-  parallel_for(0, scatter_blocks(in.count), 32, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      for_each_destination(in.masks, block, in.count, n_ranks,
-                           [&](std::int64_t row, int m, std::int64_t position) {
-                             const std::int64_t at = in.bases[block * n_ranks + m] + position;
-                             if (at >= in.groups.size[m]) return;
-                             const T* values = in.values + (in.groups.start[m] + at) * in.width;
-                             for (int c = 0; c < out.count; ++c) {
-                               const int width = out.begin[c + 1] - out.begin[c];
-                               for (int k = 0; k < width; ++k)
-                                 out.data[c][row * width + k] += values[out.begin[c] + k];
-                             }
-                           });
+  parallel_for(0, in.count, 8192, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t row = begin; row < end; ++row) {
+      in.for_each(row, [&](const T* values) {
+        for (int c = 0; c < out.count; ++c) {
+          const int width = out.begin[c + 1] - out.begin[c];
+          for (int k = 0; k < width; ++k) out.data[c][row * width + k] += values[out.begin[c] + k];
+        }
+      });
     }
   });
 }
 
-template void sum<float>(const ReturnedRows<float>&, const RowColumns<float>&, Workspace&, CudaStream);
-template void sum<double>(const ReturnedRows<double>&, const RowColumns<double>&, Workspace&, CudaStream);
+template void sum<float>(const RowValues<float>&, const RowColumns<float>&, Workspace&, CudaStream);
+template void sum<double>(const RowValues<double>&, const RowColumns<double>&, Workspace&, CudaStream);
 
 }  // namespace blitzgs::cpu

@@ -10,6 +10,7 @@ namespace {
 
 // Values of a row that a thread adds up at once: those of three colours, or a part of more.
 constexpr int kRowValues = 9, kPartValues = 16;
+constexpr int kSumThreads = 256;
 
 template <int RANKS>
 __global__ void __launch_bounds__(kScatterBlock)
@@ -33,81 +34,55 @@ __global__ void gather_kernel(const std::int32_t* packed, const __grid_constant_
   }
 }
 
-template <int RANKS, int VALUES>
-struct SumShared {
-  static constexpr int kPitch = VALUES | 1;  // odd, so that a column of rows spreads over the banks
-  std::uint8_t place[RANKS][kScatterBlock];  // of each thread's row among the block's rows for a rank
-  int before[RANKS][kScatterWarps];
-  std::int32_t base[RANKS];
-  float sums[kScatterBlock * kPitch];
-};
-
 // Stores `part` values of each row, PITCH apart in shared memory, into rows of `width`. WIDTH: both, or 0.
 template <int PITCH, int WIDTH>
 __device__ __forceinline__ void store_values(const float* from, int n_rows, int any_part, int any_width,
                                              float* to) {
   const int part = WIDTH > 0 ? WIDTH : any_part, width = WIDTH > 0 ? WIDTH : any_width;
-  for (int i = threadIdx.x; i < n_rows * part; i += kScatterBlock) {
+  for (int i = threadIdx.x; i < n_rows * part; i += kSumThreads) {
     const int row = i / part, k = i - row * part;
     to[row * width + k] = from[row * PITCH + k];
   }
 }
 
 // Values [VALUES * blockIdx.y, ...) of a block of rows. ALL: the rows have VALUES.
-template <int RANKS, int VALUES, bool ALL>
-__global__ void __launch_bounds__(kScatterBlock) sum_kernel(const __grid_constant__ ReturnedRows<float> in,
-                                                            const __grid_constant__ RowColumns<float> out) {
-  using Shared = SumShared<RANKS, VALUES>;
-  __shared__ Shared shared;
-  const int n_ranks = in.groups.count, width_in = ALL ? VALUES : in.width;
+template <int VALUES, bool ALL>
+__global__ void __launch_bounds__(kSumThreads)
+    sum_kernel(const __grid_constant__ RowValues<float> in, const __grid_constant__ RowColumns<float> out) {
+  constexpr int kPitch = VALUES | 1;  // odd, so that a column of rows spreads over the banks
+  __shared__ float sums[kSumThreads * kPitch];
   const int value = ALL ? 0 : VALUES * static_cast<int>(blockIdx.y);
-  const int n_values = ALL ? VALUES : min(VALUES, width_in - value);
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
+  const int n_values = ALL ? VALUES : min(VALUES, in.width - value);
+  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kSumThreads);
   const std::int64_t row = first + threadIdx.x;
-  const std::int64_t mask = row < in.count ? in.masks[row] : 0;
-  if (static_cast<int>(threadIdx.x) < n_ranks) {
-    shared.base[threadIdx.x] = in.bases[blockIdx.x * static_cast<std::int64_t>(n_ranks) + threadIdx.x];
-  }
-  const int slot = threadIdx.x;
-  count_by_warp(shared.before, slot, mask, n_ranks);
-  __syncthreads();
-  if (slot < n_ranks) scan_warps(shared.before[slot]);
-  __syncthreads();
-  for (int m = 0; m < n_ranks; ++m) {
-    const unsigned going = __ballot_sync(0xffffffffu, (mask >> m) & 1);
-    shared.place[m][slot] = static_cast<std::uint8_t>(place_in_block(shared.before[m], slot, going));
-  }
-  // Most rows went to a single rank: this way all threads load their first at once.
   float sum[VALUES] = {};
-  for (std::int64_t left = mask; left; left &= left - 1) {
-    const int m = __ffsll(left) - 1;
-    const std::int64_t at = std::int64_t{shared.base[m]} + shared.place[m][slot];
-    if (at >= in.groups.size[m]) continue;
-    const float* from = in.values + (in.groups.start[m] + at) * width_in + value;
+  if (row < in.count) {
+    in.for_each(row, [&](const float* from) {
 #pragma unroll
-    for (int k = 0; k < VALUES; ++k) {
-      if (k < n_values) sum[k] += from[k];
-    }
+      for (int k = 0; k < VALUES; ++k) {
+        if (k < n_values) sum[k] += from[value + k];
+      }
+    });
   }
 #pragma unroll
-  for (int k = 0; k < VALUES; ++k) shared.sums[slot * Shared::kPitch + k] = sum[k];
+  for (int k = 0; k < VALUES; ++k) sums[threadIdx.x * kPitch + k] = sum[k];
   __syncthreads();
   const std::int64_t left = in.count - first;
-  const int n_rows = left < kScatterBlock ? static_cast<int>(left) : kScatterBlock;
+  const int n_rows = left < kSumThreads ? static_cast<int>(left) : kSumThreads;
   for (int c = 0; c < out.count; ++c) {
     const int low = max(out.begin[c], value), high = min(out.begin[c + 1], value + n_values);
     const int part = high - low, width = out.begin[c + 1] - out.begin[c];
     if (part <= 0) continue;
     float* to = out.data[c] + first * width + (low - out.begin[c]);
-    const float* from = shared.sums + (low - value);
+    const float* from = sums + (low - value);
     if (part == width && width == 3) {
-      store_values<Shared::kPitch, 3>(from, n_rows, part, width, to);
+      store_values<kPitch, 3>(from, n_rows, part, width, to);
     } else if (part == width && width == 2) {
-      store_values<Shared::kPitch, 2>(from, n_rows, part, width, to);
+      store_values<kPitch, 2>(from, n_rows, part, width, to);
     } else if (part == width && width == 1) {
-      store_values<Shared::kPitch, 1>(from, n_rows, part, width, to);
+      store_values<kPitch, 1>(from, n_rows, part, width, to);
     } else {
-      store_values<Shared::kPitch, 0>(from, n_rows, part, width, to);
+      store_values<kPitch, 0>(from, n_rows, part, width, to);
     }
   }
 }
@@ -115,14 +90,14 @@ __global__ void __launch_bounds__(kScatterBlock) sum_kernel(const __grid_constan
 }  // namespace
 
 void scatter(const ScatterRows& rows, const RowGroups& groups, const ScatterTargets& targets,
-             std::int32_t* bases, Workspace& workspace, CudaStream stream) {
+             RowPlace* places, Workspace& workspace, CudaStream stream) {
   if (rows.count == 0) return;
   auto* filled = workspace.allocate<std::int32_t>(groups.count);
   check(cudaMemsetAsync(filled, 0, groups.count * sizeof(*filled), stream), "scatter_rows");
   dispatch_ranks(groups.count, [&](auto ranks) {
     scatter_kernel<ranks.value>
         <<<static_cast<unsigned>(scatter_blocks(rows.count)), kScatterBlock, 0, stream>>>(
-            rows, groups, targets, ScatterState{filled, bases});
+            rows, groups, targets, ScatterState{filled, places});
   });
   check_launch("scatter_rows");
 }
@@ -137,17 +112,15 @@ void gather(const std::int32_t* packed, const RowGroups& groups, const RowColumn
 }
 
 template <>
-void sum<float>(const ReturnedRows<float>& in, const RowColumns<float>& out, Workspace&, CudaStream stream) {
+void sum<float>(const RowValues<float>& in, const RowColumns<float>& out, Workspace&, CudaStream stream) {
   if (in.count == 0 || in.width == 0) return;
-  const auto blocks = static_cast<unsigned>(scatter_blocks(in.count));
-  dispatch_ranks(in.groups.count, [&](auto ranks) {
-    if (in.width == kRowValues) {
-      sum_kernel<ranks.value, kRowValues, true><<<blocks, kScatterBlock, 0, stream>>>(in, out);
-    } else {
-      const dim3 grid(blocks, blocks_for(in.width, kPartValues));
-      sum_kernel<ranks.value, kPartValues, false><<<grid, kScatterBlock, 0, stream>>>(in, out);
-    }
-  });
+  const unsigned blocks = blocks_for(in.count, kSumThreads);
+  if (in.width == kRowValues) {
+    sum_kernel<kRowValues, true><<<blocks, kSumThreads, 0, stream>>>(in, out);
+  } else {
+    const dim3 grid(blocks, blocks_for(in.width, kPartValues));
+    sum_kernel<kPartValues, false><<<grid, kSumThreads, 0, stream>>>(in, out);
+  }
   check_launch("sum_rows");
 }
 

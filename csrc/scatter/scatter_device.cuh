@@ -10,6 +10,7 @@
 namespace blitzgs::cuda {
 
 inline constexpr int kScatterWarps = kScatterBlock / 32;
+static_assert(kPlaceRows == 32, "a warp's rows are a run");
 inline constexpr int kFewRanks = 8;  // what most hosts have: needs less shared memory than kMaxRanks
 
 // Calls f(integral constant: an upper bound of the ranks).
@@ -31,7 +32,8 @@ struct ScatterShared {
 
 // What all blocks share: how far each group is filled (zeroed before), and what `scatter` returns.
 struct ScatterState {
-  std::int32_t *filled, *bases;
+  std::int32_t* filled;
+  RowPlace* places;
 };
 
 // Counts a warp's rows for each rank, whose masks the lanes bring.
@@ -108,7 +110,6 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
     const int m = threadIdx.x;
     const int count = scan_warps(shared.before[m]);
     const int base = count ? atomicAdd(state.filled + m, count) : 0;
-    state.bases[blockIdx.x * static_cast<std::int64_t>(n_ranks) + m] = base;
     const std::int64_t room = groups.size[m] - base;
     shared.base[m] = base;
     shared.count[m] = room >= count ? count : room > 0 ? static_cast<int>(room) : 0;
@@ -122,6 +123,10 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
       const unsigned going = __ballot_sync(0xffffffffu, goes);
       if (goes)
         shared.list[m][place_in_block(shared.before[m], slot, going)] = static_cast<std::uint8_t>(slot);
+      if (slot % 32 == 0 && first + slot < rows.count) {
+        state.places[(first + slot) / kPlaceRows * n_ranks + m] = {
+            shared.base[m] + shared.before[m][slot / 32], going};
+      }
     }
   }
   __syncthreads();

@@ -14,7 +14,7 @@ std::tuple<Tensor, Tensor> scatter_rows(const std::vector<Tensor>& columns, cons
   const auto& columns_in = held.rows.columns;
   const std::int64_t words = columns_in.begin[columns_in.count];
   Tensor packed = make_empty(held.masks, {total_rows(groups) * words}, ScalarType::Int);
-  Tensor bases = make_empty(held.masks, {scatter_blocks(held.rows.count), groups.count}, ScalarType::Int);
+  Tensor places = make_places(held.masks, held.rows.count, groups);
   ScatterTargets targets{};
   for (int m = 0; m < groups.count; ++m) {
     for (int c = 0; c < columns_in.count; ++c) {
@@ -23,9 +23,8 @@ std::tuple<Tensor, Tensor> scatter_rows(const std::vector<Tensor>& columns, cons
     }
   }
   DeviceScope scope(held.masks);
-  backend::scatter(held.rows, groups, targets, mutable_data<std::int32_t>(bases), scope.workspace,
-                   scope.stream);
-  return {packed, bases};
+  backend::scatter(held.rows, groups, targets, places_of(places), scope.workspace, scope.stream);
+  return {packed, places};
 }
 
 std::vector<Tensor> gather_rows(const Tensor& packed, const std::vector<std::int64_t>& widths,
@@ -50,23 +49,18 @@ std::vector<Tensor> gather_rows(const Tensor& packed, const std::vector<std::int
   return held;
 }
 
-std::vector<Tensor> sum_rows(const Tensor& values, const Tensor& masks, const Tensor& bases,
-                             const std::vector<std::int64_t>& group_sizes,
+std::vector<Tensor> sum_rows(const Tensor& values, const Tensor& places,
+                             const std::vector<std::int64_t>& group_sizes, std::int64_t rows,
                              const std::vector<std::int64_t>& widths) {
   constexpr const char* kOp = "sum_rows";
-  const RowGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
-  const Tensor values_c = as_contiguous(values), masks_c = as_contiguous(masks),
-               bases_c = as_contiguous(bases);
+  STD_TORCH_CHECK(rows >= 0, "blitzgs::sum_rows: rows must not be negative, got ", rows);
+  const HeldReturns held(kOp, rows, places, group_sizes);
+  const Tensor values_c = as_contiguous(values);
   check_floating(kOp, "values", values);
-  check_shape(kOp, "masks", masks, {-1});
-  check_dtype(kOp, "masks", masks, ScalarType::Long);
-  const std::int64_t n_rows = masks.size(0);
-  check_shape(kOp, "bases", bases, {scatter_blocks(n_rows), groups.count});
-  check_dtype(kOp, "bases", bases, ScalarType::Int);
   std::vector<Tensor> sums;
   for (const std::int64_t width : widths) {
     STD_TORCH_CHECK(width >= 0, "blitzgs::sum_rows: widths must not be negative, got ", width);
-    sums.push_back(make_empty(values_c, {n_rows, width}));
+    sums.push_back(make_empty(values_c, {rows, width}));
   }
   DeviceScope scope(values_c);
   dispatch_floating(values_c, [&](auto zero) {
@@ -74,10 +68,8 @@ std::vector<Tensor> sum_rows(const Tensor& values, const Tensor& masks, const Te
     RowColumns<T> columns{};
     for (Tensor& sum : sums) add_column(kOp, columns, mutable_data<T>(sum), sum.size(1));
     const int width = columns.begin[columns.count];
-    check_shape(kOp, "values", values, {total_rows(groups), width});
-    const ReturnedRows<T> returned{data<T>(values_c),           width,  data<std::int64_t>(masks_c),
-                                   data<std::int32_t>(bases_c), n_rows, groups};
-    backend::sum(returned, columns, scope.workspace, scope.stream);
+    check_shape(kOp, "values", values, {total_rows(held.groups), width});
+    backend::sum(held.values(data<T>(values_c), width), columns, scope.workspace, scope.stream);
   });
   return sums;
 }

@@ -62,4 +62,42 @@ struct HeldRows {
   ScatterRows rows{};
 };
 
+// What tells where values belong that came back from ranks: places and the sizes of the groups, as of
+// scatter_rows; keeps the contiguous form alive.
+struct HeldReturns {
+  HeldReturns(const char* op, std::int64_t rows_in, const Tensor& places_in,
+              const std::vector<std::int64_t>& group_sizes)
+      : rows(rows_in),
+        places(as_contiguous(places_in)),
+        groups(checked_groups(op, "group_sizes", group_sizes)) {
+    check_shape(op, "places", places, {place_runs(rows), groups.count});
+    check_dtype(op, "places", places, ScalarType::Long);
+  }
+
+  template <class T>
+  RowValues<T> values(const T* returned, std::int64_t width) const {
+    return {returned, static_cast<int>(width), rows,
+            reinterpret_cast<const RowPlace*>(data<std::int64_t>(places)), groups};
+  }
+
+  std::int64_t rows;
+  Tensor places;
+  RowGroups groups;
+};
+
+// Each row's own values.
+template <class T>
+RowValues<T> own_values(const T* values, std::int64_t width, std::int64_t rows) {
+  return {values, static_cast<int>(width), rows, nullptr, {}};
+}
+
+inline Tensor make_places(const Tensor& like, std::int64_t rows, const RowGroups& groups) {
+  return make_empty(like, {place_runs(rows), groups.count}, ScalarType::Long);
+}
+
+inline RowPlace* places_of(Tensor& places) {
+  static_assert(sizeof(RowPlace) == sizeof(std::int64_t));
+  return reinterpret_cast<RowPlace*>(mutable_data<std::int64_t>(places));
+}
+
 }  // namespace blitzgs

@@ -37,14 +37,15 @@ TEST_CASE("scattered rows arrive in order, and their sums return", "[scatter]") 
   }
   const RowGroups groups = make_groups(sizes);
   const std::int64_t total = groups.start[2] + groups.size[2];
-  std::vector<std::int32_t> packed(3 * total), bases(scatter_blocks(n) * n_ranks);
+  std::vector<std::int32_t> packed(3 * total);
+  std::vector<RowPlace> places(place_runs(n) * n_ranks);
   ScatterTargets targets{};
   for (int m = 0; m < n_ranks; ++m) {
     targets.words[m][0] = packed.data() + 3 * groups.start[m];
     targets.words[m][1] = targets.words[m][0] + 2 * groups.size[m];
   }
   NoWorkspace workspace;
-  cpu::scatter({{{a.data(), b.data()}, {0, 2, 3}, 2}, masks.data(), n}, groups, targets, bases.data(),
+  cpu::scatter({{{a.data(), b.data()}, {0, 2, 3}, 2}, masks.data(), n}, groups, targets, places.data(),
                workspace, nullptr);
 
   std::vector<std::int32_t> a2(2 * total), b2(total);
@@ -66,8 +67,8 @@ TEST_CASE("scattered rows arrive in order, and their sums return", "[scatter]") 
     values[3 * i + 1] = weight;
     values[3 * i + 2] = 2 * weight;
   }
-  cpu::sum<double>({values.data(), 3, masks.data(), bases.data(), n, groups},
-                   {{x.data(), y.data()}, {0, 1, 3}, 2}, workspace, nullptr);
+  cpu::sum<double>({values.data(), 3, n, places.data(), groups}, {{x.data(), y.data()}, {0, 1, 3}, 2},
+                   workspace, nullptr);
   for (int i = 0; i < n; ++i) {
     const double weight = (masks[i] & 1 ? 1.0 : 0.0) + (masks[i] & 4 ? 10.0 : 0.0);
     REQUIRE(x[i] == weight * b[i]);
@@ -78,10 +79,12 @@ TEST_CASE("scattered rows arrive in order, and their sums return", "[scatter]") 
 TEST_CASE("rows beyond a group's size are dropped", "[scatter]") {
   const std::int32_t column[4] = {1, 2, 3, 4};
   const std::int64_t masks[4] = {1, 1, 1, 1};
-  std::int32_t packed[4] = {-1, -1, -1, -1}, bases[1];
+  std::int32_t packed[4] = {-1, -1, -1, -1};
+  RowPlace place;
   ScatterTargets targets{};
   targets.words[0][0] = packed;
   NoWorkspace workspace;
-  cpu::scatter({{{column}, {0, 1}, 1}, masks, 4}, make_groups({2}), targets, bases, workspace, nullptr);
+  cpu::scatter({{{column}, {0, 1}, 1}, masks, 4}, make_groups({2}), targets, &place, workspace, nullptr);
   REQUIRE((packed[0] == 1 && packed[1] == 2 && packed[2] == -1));
+  REQUIRE((place.first == 0 && place.bits == 15));
 }

@@ -13,6 +13,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.distributed.peers import MAX_VALUES, Peers
 from blitzgs.model import GaussianTable
+from blitzgs.ops.scatter import sum_rows
 from tests.distributed.rank_harness import RankError, run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
 from tests.training.tiny import random_gaussians
@@ -44,7 +45,9 @@ def _exchange(table, ranks):
         sums = send_back(gradients, frame.route, ranks)
     else:
         columns = [g[:, None] if g.dim() == 1 else g for g in gradients]
-        sums = send_back_packed(torch.cat((*columns, torch.ones_like(got.conics)), 1), frame.route)
+        returned = send_back_packed(torch.cat((*columns, torch.ones_like(got.conics)), 1), frame.route)
+        sums = sum_rows(*returned, len(frame.rows.means2d), [2, 3, 1, 3])
+        sums[2] = sums[2].squeeze(1)
     return [*arrived, *sums, frame.renders, frame.visible]
 
 

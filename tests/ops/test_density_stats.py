@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from blitzgs.ops.density_stats import density_stats_
+from blitzgs.ops.scatter import OWN_VALUES, Returns, scatter_rows, sum_rows
 from tests.helpers import DEVICES
 
 WIDTH, HEIGHT, B = 640, 480, 3
@@ -74,6 +75,29 @@ def test_radii_keep_their_maximum_and_empty_steps_change_nothing(device):
         sums, counts, radii, visible[:0], offsets[:1], gradients[:0], conics[:0], WIDTH, HEIGHT, 1.0
     )
     assert torch.equal(sums, before)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_gradients_are_read_where_they_are(device):
+    """Those in the first columns of a table, and those that came back from two ranks."""
+    visible, offsets, gradients, conics, _, _ = rows(device=device)
+
+    def sums(v_means2d, returns=OWN_VALUES):
+        columns = state(device=device)
+        density_stats_(*columns, visible, offsets, v_means2d, conics, WIDTH, HEIGHT, 1.0, returns=returns)
+        return columns[0]
+
+    expected = sums(gradients)
+    assert torch.equal(sums(torch.cat((gradients, gradients.exp()), 1)[:, :2]), expected)
+    masks = torch.arange(len(gradients), device=device) % 4
+    sizes = [int((masks >> m & 1).sum()) for m in range(2)]
+    sent, places = scatter_rows([gradients], masks, sizes)
+    parts = sent.view(torch.float32).view(-1, 2).repeat(1, 2)
+    returns = Returns(places, sizes)
+    total, _ = sum_rows(parts, returns, len(masks), [2, 2])
+    torch.testing.assert_close(sums(parts[:, :2], returns), sums(total))
+    with pytest.raises(RuntimeError, match=r"v_means2d must have shape \[\d+, 2\]"):
+        sums(gradients[1:].contiguous(), returns)
 
 
 def test_errors_name_the_value():

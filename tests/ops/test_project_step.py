@@ -7,6 +7,8 @@ import torch
 from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.project import project
 from blitzgs.ops.project_step import project_bwd_step_
+from blitzgs.ops.rasterize import gradient_columns
+from blitzgs.ops.scatter import Returns, scatter_rows
 from tests.helpers import DEVICES
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
@@ -52,13 +54,19 @@ class Scene:
         )  # fmt: skip
         shapes = (self.rows.means2d, self.rows.conics, self.rows.opacities, self.rows.colors)
         self.v = [torch.randn(s.shape, generator=self.seed, dtype=torch.float64).to(s) for s in shapes]
+        self.returns = Returns()
+
+    def backward(self, antialiased, need_viewmats=False):
+        r = self.rows
+        return torch.ops.blitzgs.project_bwd(
+            *self.params, self.viewmats, self.Ks, r.camera_ids, r.visible_ids, r.row_offsets, WIDTH, HEIGHT,
+            self.degree, EPS2D, antialiased, True, *self.v[:2], None, *self.v[2:], self.scale_reg,
+            need_viewmats, *self.returns,
+        )  # fmt: skip
 
     def one_after_the_other(self, antialiased, sparse):
         r = self.rows
-        *gradients, _ = torch.ops.blitzgs.project_bwd(
-            *self.params, self.viewmats, self.Ks, r.camera_ids, r.visible_ids, r.row_offsets, WIDTH, HEIGHT,
-            self.degree, EPS2D, antialiased, True, *self.v[:2], None, *self.v[2:], self.scale_reg, False,
-        )  # fmt: skip
+        *gradients, _ = self.backward(antialiased)
         lazy_adam_step_(*self.columns(), gradients, r.visible_ids, *self.stands(), *self.optimiser, sparse)
 
     def at_once(self, antialiased, sparse):
@@ -66,7 +74,29 @@ class Scene:
             *self.columns(), *self.stands(), *self.optimiser, sparse, self.rows, self.viewmats, self.Ks,
             WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D, antialiased=antialiased, v_means2d=self.v[0],
             v_conics=self.v[1], v_opacities=self.v[2], v_colors=self.v[3], scale_reg=self.scale_reg,
+            returns=self.returns,
         )  # fmt: skip
+
+    def pack(self, width):
+        """Put the gradients into one table, with something that is none of them behind."""
+        columns = [v[:, None] if v.dim() == 1 else v for v in self.v]
+        table = torch.full((len(self.v[0]), width), 1e9).to(self.v[0])
+        table[:, :9] = torch.cat(columns, 1)
+        self.v = gradient_columns(table)
+
+    def tear(self, width, ranks=3):
+        """Replace the gradients by parts from ranks, `width` floats a row; return what they add up to."""
+        rows = len(self.v[0])
+        masks = torch.randint(0, 2**ranks, (rows,), generator=self.seed) & ~2  # rank 1 had nothing
+        sizes = [int((masks >> m & 1).sum()) for m in range(ranks)]
+        masks, numbers = masks.to(self.v[0].device), torch.arange(rows, dtype=torch.int32)
+        sent, places = scatter_rows([numbers.to(masks.device)], masks, sizes)
+        table = torch.randn(len(sent), width, generator=self.seed, dtype=torch.float64).to(self.v[0])
+        total = table.new_zeros(rows, 9)
+        for part, group in zip(table.split(sizes), sent.long().split(sizes), strict=True):
+            total[group] += part[:, :9]
+        self.v, self.returns = gradient_columns(table), Returns(places, sizes)
+        return [column.contiguous() for column in gradient_columns(total)]
 
 
 def compare(a, b, exact):
@@ -108,6 +138,32 @@ def test_equals_backward_and_step(device, sparse, n, k, degree, views):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("source", ["packed", "odd table", "returned", "returned packed", "returned columns"])
+@pytest.mark.parametrize(
+    "n,k,degree,views", [(1, 16, 3, 1), (3000, 16, 3, 3), (700, 16, 2, 1), (700, 4, 1, 2), (700, 16, 0, 1)]
+)
+def test_gradients_are_read_where_they_are(device, source, n, k, degree, views):
+    """However the gradients of the rows are laid out: as from columns of their sums."""
+    plain, other = (Scene(n, k, views, device, torch.float32) for _ in range(2))
+    for scene in (plain, other):
+        scene.degree = degree
+        scene.render(antialiased=False)
+    if source.startswith("returned"):
+        plain.v = other.tear(12 if source == "returned packed" else 9)
+        if source == "returned columns":
+            other.v = [column.contiguous() for column in other.v]
+    else:
+        other.pack(12 if source == "packed" else 10)
+    exact = device == "cpu"
+    for x, y in zip(plain.backward(False, True), other.backward(False, True), strict=True):
+        assert len(x) and (torch.equal(x, y) or not exact)
+        torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(x.abs().max()))
+    plain.at_once(False, False)
+    other.at_once(False, False)
+    compare(plain, other, exact)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_repeats_bit_for_bit(device):
     scenes = [Scene(5000, 16, 2, device, torch.float32) for _ in range(2)]
     for scene in scenes:
@@ -144,6 +200,19 @@ def test_errors_name_the_value():
         scene.at_once(False, False)
 
 
+def test_errors_name_what_is_missing_of_returns():
+    scene = Scene(20, 16, 1, "cpu", torch.float32)
+    scene.render(False)
+    scene.tear(9)
+    whole = scene.returns
+    scene.returns = whole._replace(places=whole.places[:, :-1])
+    with pytest.raises(RuntimeError, match=r"places must have shape \[\d+, 3\], got \[\d+, 2\]"):
+        scene.backward(False)
+    scene.returns = whole._replace(group_sizes=[0, 0, 0])
+    with pytest.raises(RuntimeError, match=r"v_means2d must have shape \[0, 2\]"):
+        scene.at_once(False, False)
+
+
 def test_opcheck():
     scene = Scene(20, 16, 1, "cpu", torch.float32)
     scene.render(False)
@@ -153,4 +222,11 @@ def test_opcheck():
          STEP, explicit_steps(BETA1, BETA2, torch.float32), BETA1, BETA2, EPS, False, scene.viewmats,
          scene.Ks, scene.rows.camera_ids, scene.rows.visible_ids, scene.rows.row_offsets, WIDTH, HEIGHT, 3,
          EPS2D, False, *scene.v, scene.scale_reg),
+    )  # fmt: skip
+    scene.tear(9)
+    torch.library.opcheck(
+        torch.ops.blitzgs.project_bwd,
+        (*scene.params, scene.viewmats, scene.Ks, scene.rows.camera_ids, scene.rows.visible_ids,
+         scene.rows.row_offsets, WIDTH, HEIGHT, 3, EPS2D, False, True, *scene.v[:2], None, *scene.v[2:],
+         scene.scale_reg, True, *scene.returns),
     )  # fmt: skip

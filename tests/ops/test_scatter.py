@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.scatter import BLOCK, gather_rows, scatter_rows, sum_rows
+from blitzgs.ops.scatter import RUN, Returns, gather_rows, scatter_rows, sum_rows
 from tests.helpers import DEVICES
 
 RANKS = 3
@@ -34,8 +34,8 @@ def on(device, tensors):
 @pytest.mark.parametrize("n", [0, 1, 5, 6000])
 def test_rows_reach_their_groups(n, device):
     data, (masks, sizes) = columns(n), destinations(n)
-    packed, bases = scatter_rows(on(device, data), masks.to(device), sizes)
-    assert packed.shape == (13 * sum(sizes),) and bases.shape == (-(-n // BLOCK), RANKS)
+    packed, places = scatter_rows(on(device, data), masks.to(device), sizes)
+    assert packed.shape == (13 * sum(sizes),) and places.shape == (-(-n // RUN), RANKS)
     received = gather_rows(packed, data, sizes)
     rows = received[2].cpu().long()  # the column of row numbers
     begin = 0
@@ -54,13 +54,13 @@ def test_rows_reach_their_groups(n, device):
 def test_sums_follow_the_rows_back(n, device):
     masks, sizes = destinations(n)
     numbers = torch.arange(n, dtype=torch.int32)
-    packed, bases = scatter_rows([numbers.to(device)], masks.to(device), sizes)
+    packed, places = scatter_rows([numbers.to(device)], masks.to(device), sizes)
     rows = packed.cpu().long()
     values = torch.randn(len(rows), 20, generator=torch.Generator().manual_seed(2))
     expected = torch.zeros(n, 20)
     for part, group in zip(values.split(sizes), rows.split(sizes), strict=True):
         expected[group] += part
-    got = sum_rows(values.to(device), masks.to(device), bases, sizes, [2, 0, 17, 1])
+    got = sum_rows(values.to(device), Returns(places, sizes), n, [2, 0, 17, 1])
     assert [part.shape[1] for part in got] == [2, 0, 17, 1]
     assert torch.equal(torch.cat(got, 1).cpu(), expected)
 
@@ -69,11 +69,11 @@ def test_doubles_and_strided_columns():
     wide = torch.randn(4, 9, dtype=torch.float64)
     data = [wide[:, 2:5], wide[:, 0], wide[:1].expand(4, 9)]
     masks = torch.tensor([1, 0, 3, 2])
-    packed, bases = scatter_rows(data, masks, [2, 2])
+    packed, places = scatter_rows(data, masks, [2, 2])
     for got, column in zip(gather_rows(packed, data, [2, 2]), data, strict=True):
         assert torch.equal(got, column[[0, 2, 2, 3]])
     values = torch.arange(4, dtype=torch.float64)[:, None]
-    assert sum_rows(values, masks, bases, [2, 2], [1])[0].squeeze(1).tolist() == [0, 0, 3, 3]
+    assert sum_rows(values, Returns(places, [2, 2]), 4, [1])[0].squeeze(1).tolist() == [0, 0, 3, 3]
 
 
 def test_errors():
@@ -87,13 +87,13 @@ def test_errors():
     with pytest.raises(RuntimeError, match=r"packed must have shape \[4\], got \[3\]"):
         gather_rows(torch.zeros(3, dtype=torch.int32), [torch.zeros(1, 2)], [1, 1])
     with pytest.raises(RuntimeError, match=r"values must have shape \[3, 1\], got \[2, 1\]"):
-        sum_rows(torch.zeros(2, 1), masks, torch.zeros(1, 2, dtype=torch.int32), [1, 2], [1])
+        sum_rows(torch.zeros(2, 1), Returns(torch.zeros(1, 2, dtype=torch.int64), [1, 2]), 4, [1])
 
 
 def test_opcheck():
     ops, masks = torch.ops.blitzgs, torch.tensor([2, 0, 3])
     words = [torch.arange(6, dtype=torch.int32).view(3, 2), torch.arange(3, dtype=torch.int32).view(3, 1)]
     torch.library.opcheck(ops.scatter_rows, (words, masks, [1, 2]))
-    packed, bases = ops.scatter_rows(words, masks, [1, 2])
+    packed, places = ops.scatter_rows(words, masks, [1, 2])
     torch.library.opcheck(ops.gather_rows, (packed, [2, 1], [1, 2]))
-    torch.library.opcheck(ops.sum_rows, (torch.randn(3, 3), masks, bases, [1, 2], [2, 1]))
+    torch.library.opcheck(ops.sum_rows, (torch.randn(3, 3), places, [1, 2], 3, [2, 1]))

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training path's backward pass, where the gradients of the rows stay in the rasteriser's table."""
+
+import dataclasses
+
+import pytest
+import torch
+from cuda_scenes import ops, relative_error
+
+from blitzgs import pipeline
+from blitzgs.model import GaussianTable
+from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.training.tiny import random_gaussians
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gradients_are_those_from_columns(degree):
+    small = random_gaussians(3000)
+    columns = {name: small[name] for name in small if "exp_avg" not in name}
+    columns["sh"] = torch.cat((columns["sh"], 0.1 * torch.randn(3000, 15, 3)), 1)
+    table = GaussianTable.create({name: column.cuda() for name, column in columns.items()})
+    options = dataclasses.replace(OPTIONS, sh_degree=degree, deterministic=True)
+    views = cameras(3, device="cuda")
+    frame = pipeline.forward(table, views, options)
+    v_renders = torch.randn_like(frame.renders)
+    v = pipeline.backward_rows(frame, v_renders)
+    assert v.means2d.stride(0) == v.colors.stride(0) == 12  # nobody has unpacked them
+    rows, splats = frame.rows, frame.splats
+    *unpacked, _ = ops.rasterize_bwd(
+        splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
+        frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders, None,
+        len(views), views.width, views.height, options.tile_size, 0, -1, False, True,
+    )  # fmt: skip
+    for x, y in zip(v[:4], unpacked, strict=True):
+        assert y.any() and torch.equal(x, y)
+    scale_reg = torch.linspace(0.1, 0.3, 3, device="cuda")
+    *expected, _ = ops.project_bwd(
+        *table.parameters, views.viewmats, views.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
+        views.width, views.height, degree, options.eps2d, options.antialiased, True, *unpacked[:2], None,
+        *unpacked[2:], scale_reg, False,
+    )  # fmt: skip
+    gradients = pipeline.backward(table, frame, v_renders, scale_reg)
+    for x, y in zip(gradients, expected, strict=True):
+        assert relative_error(x, y) < 1e-6
