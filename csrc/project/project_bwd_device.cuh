@@ -51,7 +51,10 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   TripleStage& triple = triples[threadIdx.x / 32];
   const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kBackwardThreads) + threadIdx.x / 32 * 32;
   const std::int64_t u = first + lane;
-  const std::int32_t id = u < args.rows.n_visible ? args.rows.visible_ids[u] : -1;
+  const bool exists = u < args.rows.n_visible;
+  const std::int32_t id = exists ? args.rows.visible_ids[u] : -1,
+                     begin = exists ? args.rows.row_offsets[u] : 0,
+                     end = exists ? args.rows.row_offsets[u + 1] : 0;
   const std::int64_t stride = 3 * in.options.sh_stride;
   const bool has_colors = in.sh && args.v.colored();
   if constexpr (QUADS) {
@@ -64,8 +67,14 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   float quat[4];
   load_quat(in, known, quat);
   const float opacity = in.opacities[known];
-  const std::int32_t begin = id < 0 ? 0 : args.rows.row_offsets[u],
-                     end = id < 0 ? 0 : args.rows.row_offsets[u + 1];
+  RowGradient<float> v_row{};
+  int view = 0;
+  const auto load_row = [&](std::int64_t r) {
+    if (r >= end) return;
+    view = args.rows.camera_ids[r];
+    v_row = args.v.geometry(r);
+  };
+  load_row(begin);
   load_cameras(in, cameras);
   const WarpRows warp{first, args.rows.n_visible - first, id, static_cast<int>(threadIdx.x) / 32, lane};
   auto own = sink.begin(shared, warp);
@@ -78,10 +87,10 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   GaussianGradient<float> gradient{};
   float axis_weight = 0.f;
   PoseGradient<float>* no_pose = nullptr;
-  for (std::int64_t r = begin; r < end; ++r) {
-    const int view = args.rows.camera_ids[r];
-    project_row_vjp(cameras[view], gaussian, in.options, args.v.geometry(r), &gradient, no_pose);
+  for (std::int64_t r = begin; r < end;) {
+    project_row_vjp(cameras[view], gaussian, in.options, v_row, &gradient, no_pose);
     if (args.scale_reg) axis_weight += args.scale_reg[view];
+    load_row(++r);
   }
 
   // The colours after the geometry, so that their coefficients are in registers for no longer than needed.
