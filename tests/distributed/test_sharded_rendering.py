@@ -182,18 +182,19 @@ def test_rendering_alone_composites_no_ring():
 
 def _render_half(ranks):
     torch.set_num_threads(1)
-    table, views = shard(ranks), cameras(4)
+    table, views = shard(ranks), cameras(4, device=ranks.device)
     ranges = TileOwners(ranks).divide(range(4), WIDTH, HEIGHT)
     results = []
     for half in (False, True):
         frame = pipeline.forward(table, views, OPTIONS, share=Share(ranks, ranges, half))
         gradients = pipeline.backward(table, frame, torch.ones_like(frame.renders))
-        results.append((frame.renders, gradients[4]))
+        results.append((frame.renders.cpu(), gradients[4].cpu()))
     return results
 
 
-def test_half_precision_exchange_is_close_but_not_the_same():
-    for (exact, exact_gradient), (half, half_gradient) in run_ranks(_render_half, 2):
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(2))
+def test_half_precision_exchange_is_close_but_not_the_same(world_size, device):
+    for (exact, exact_gradient), (half, half_gradient) in run_ranks(_render_half, world_size, device=device):
         error = (exact - half).abs()
         assert 0 < error.max() < 0.02 and error.mean() < 1e-3
         assert 0 < relative(half_gradient, exact_gradient) < 0.02

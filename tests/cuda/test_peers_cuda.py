@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows written to other ranks' memory and back: here all buffers lie on one GPU, and ranks take turns."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from cuda_scenes import Scene, ops
+
+from blitzgs.distributed.rows import PeerSpace, Traffic
+from blitzgs.ops.scatter import sum_rows
+
+VIEWS, WIDTH, HEIGHT = 2, 150, 100
+TILES = VIEWS * 10 * 7
+# Overlapping, as a rank composites some tiles around its own; the third composites nothing.
+BEGINS, ENDS = [0, 60, 100, 100], [70, 110, 100, TILES]
+
+
+class Rank:
+    """One rank's Gaussians, and what its counting pass found."""
+
+    def __init__(self, number, n):
+        scene = Scene(n, VIEWS, WIDTH, HEIGHT, seed=number)
+        self.number = number
+        self.ids = (torch.arange(n, device="cuda") * 7919 + number) % 100_003
+        self.arguments = (
+            *scene.parameters("cuda"), None, None, WIDTH, HEIGHT, 16, scene.degree, 0.1, 1e10, 0.3, 0.0,
+            False, True, BEGINS, ENDS,
+        )  # fmt: skip
+        self.plan, self.carry, self.totals = ops.project_count(*self.arguments)
+
+    def rows(self):
+        return ops.project_emit(*self.arguments, self.plan, self.carry, self.totals.cpu())
+
+    def send(self, everyone, buffers, capacity):
+        return ops.project_emit_to_peers_(
+            *self.arguments, self.plan, everyone, self.number, self.ids, buffers, capacity
+        )
+
+
+def exchange(counts, room=None):
+    """All ranks' rows are written; also what each would have to be given."""
+    ranks = [Rank(m, n) for m, n in enumerate(counts)]
+    everyone = torch.stack([rank.totals for rank in ranks]).cpu()
+    traffic = [Traffic.of(everyone.tolist(), torch.empty(VIEWS), m) for m in range(len(ranks))]
+    capacity = -(-traffic[0].most // 32) * 32 if room is None else room
+    words = 22 * max(capacity, 1)
+    buffers = [torch.empty(words, dtype=torch.int32, device="cuda") for _ in ranks]
+    spaces = [
+        PeerSpace(SimpleNamespace(rank=m, buffers=buffers, exchanges=1), traffic[m], capacity, 1)
+        for m in range(len(ranks))
+    ]
+    return ranks, spaces, [rank.send(everyone, buffers, capacity) for rank in ranks]
+
+
+@pytest.mark.parametrize("counts", [(3000, 900, 0, 40), (1, 0, 0, 2)])
+def test_rows_arrive_and_their_gradients_return(counts):
+    ranks, spaces, sent = exchange(counts)
+    expected = [rank.rows() for rank in ranks]
+    for got, want in zip(sent, expected, strict=True):
+        for a, b in zip(got[:12], want, strict=True):
+            assert torch.equal(a, b)
+    for m, space in enumerate(spaces):
+        wanted = []
+        for rank, rows in zip(ranks, expected, strict=True):
+            here = (rows[11] >> m & 1).bool()
+            columns = (rows[4], rows[5], rows[7], rows[8], rows[6], rows[1], rank.ids[rows[0].long()])
+            part = [column[here] for column in columns]
+            order = (part[6] * VIEWS + part[5]).argsort()
+            wanted.append([column[order] for column in part])
+        assert [len(part[0]) for part in wanted] == space.traffic.received
+        begin = 0
+        for part in wanted:
+            arrived = [column[begin : begin + len(part[0])] for column in space.arrived()]
+            order = (arrived[6] * VIEWS + arrived[5]).argsort()
+            for a, b in zip(arrived, part, strict=True):
+                assert torch.equal(a[order], b)
+            begin += len(part[0])
+    returned = []
+    for space in spaces:
+        splats = space.arrived()
+        columns = [splats.means2d, splats.conics, splats.opacities[:, None], splats.colors]
+        packed = torch.cat([*columns, torch.ones_like(splats.conics)], 1)
+        returned.append(space.write_back(packed))
+    for m, space in enumerate(spaces):
+        rows, masks, bases = expected[m], sent[m][11], sent[m][12]
+        sums = sum_rows(returned[m], masks, bases, space.traffic.sent, [2, 3, 1, 3])
+        times = sum((masks >> k & 1) for k in range(len(ranks)))[:, None]
+        for got, column in zip(sums, (rows[4], rows[5], rows[7][:, None], rows[8]), strict=True):
+            assert torch.equal(got, times * column)
+
+
+def test_nothing_is_written_where_room_is_too_small():
+    ranks, spaces, sent = exchange((500, 300, 0, 0), room=32)
+    assert spaces[0].traffic.most > 32
+    for rows in sent:
+        assert len(rows[0]) == len(rows[2]) == 0 and rows[3].tolist() == [0]
+
+
+@pytest.mark.parametrize("width", [1, 4, 9])
+def test_parts_of_rows_return(width):
+    sizes, starts, offset = [700, 0, 5], [3, 0, 900], 17
+    values = torch.randn(sum(sizes), 12, device="cuda")
+    buffers = [torch.full((10_000,), -1, dtype=torch.int32, device="cuda") for _ in sizes]
+    ops.return_to_peers_(values, width, sizes, buffers, offset, starts)
+    begin = 0
+    for buffer, size, start in zip(buffers, sizes, starts, strict=True):
+        first = offset + start * width
+        end = first + size * width
+        got = buffer[first:end].view(torch.float32).view(size, width)
+        assert torch.equal(got, values[begin : begin + size, :width])
+        assert (buffer[:first] == -1).all() and (buffer[end:] == -1).all()
+        begin += size
+
+
+@pytest.mark.parametrize("n_values", [0, 5, 100])
+def test_a_meeting_with_ranks_that_have_come(n_values):
+    mail = [torch.zeros(3 + 3 * 100, dtype=torch.int64, device="cuda") for _ in range(3)]
+    for meeting in (4, 5):
+        for rank in range(3):
+            others = [m for m in range(3) if m != rank]
+            mail[rank][others] = meeting  # as they would announce themselves
+            values = torch.arange(n_values, device="cuda") + 1000 * rank + meeting
+            ops.meet_peers_(mail, rank, meeting, values if n_values else None, 20.0)
+            for letters in mail:
+                assert int(letters[rank]) == meeting
+                assert torch.equal(letters[3 + rank * n_values :][:n_values], values)
+
+
+def test_ranks_on_two_streams_wait_for_each_other():
+    mail = [torch.zeros(8, dtype=torch.int64, device="cuda") for _ in range(2)]
+    values = torch.tensor([[10], [11]], device="cuda")
+    streams = [torch.cuda.Stream() for _ in range(2)]
+    # Kernels are loaded at their first launch, for which the device must not be waiting.
+    torch.cuda._sleep(1)
+    ops.meet_peers_(mail[:1], 0, 0, None, 1.0)
+    torch.cuda.synchronize()
+    for rank, stream in enumerate(streams):
+        with torch.cuda.stream(stream):
+            if rank == 1:
+                torch.cuda._sleep(20_000_000)
+            ops.meet_peers_(mail, rank, 1, values[rank], 20.0)
+    torch.cuda.synchronize()
+    assert [letters[:4].tolist() for letters in mail] == [[1, 1, 10, 11]] * 2

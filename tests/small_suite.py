@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The small suite: a minute of CUDA tests that launch every kernel; compute-sanitizer runs it.
+
+python tests/small_suite.py [test ...]        # runs the suite, or other tests
+python tests/small_suite.py --kernels         # also lists what was launched; fails where a kernel was not
+"""
+
+from __future__ import annotations
+
+import collections
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+INTERSECT, PROJECT, RASTERIZE, PEERS = (
+    f"tests/cuda/test_{name}_cuda.py::test_" for name in ("intersect", "project", "rasterize", "peers")
+)
+OPS, BLOCKS = "tests/ops/test_", "tests/view/test_blocks.py::test_"
+TESTS = [
+    *(INTERSECT + test for test in (
+        "lists_match_the_cpu[False-8]", "lists_match_the_cpu[True-16]", "more_tiles_than_16_bits_hold",
+        "tile_ranges_cut_the_whole", "capacity_beyond_the_count", "a_long_run_of_equal_depths", "no_rows",
+    )),
+    *(PROJECT + test for test in (
+        "rows_match_the_cpu[0-False]", "rows_match_the_cpu[1-True]", "rows_match_the_cpu[2-False]",
+        "rows_match_the_cpu[3-True]", "active_rows_and_views", "gradients_match_float64[0-True]",
+        "gradients_match_float64[3-False]", "nothing_visible[behind]", "ranks_of_rows_match_the_cpu",
+        "rows_with_nan_vanish_and_spread_nowhere",
+    )),
+    # Gradients: absolute ones too, deterministic, channels, tile size.
+    *(RASTERIZE + test for test in (
+        "image_matches_float64[3-8]", "image_matches_float64[4-16]", "image_matches_float64[9-32]",
+        "gradients_match_float64[False-False-3-8]", "gradients_match_float64[False-False-3-16]",
+        "gradients_match_float64[False-False-3-32]", "gradients_match_float64[False-False-4-16]",
+        "gradients_match_float64[False-True-3-16]", "gradients_match_float64[False-True-9-8]",
+        "gradients_match_float64[True-False-3-16]", "gradients_match_float64[True-False-9-16]",
+        "gradients_match_float64[True-True-9-32]", "packed_gradients_are_the_same[3]",
+        "gradients_of_some_of_the_composited_tiles[False]", "empty_lists_give_the_background",
+    )),
+    *(PEERS + test for test in (
+        "rows_arrive_and_their_gradients_return", "parts_of_rows_return",
+        "a_meeting_with_ranks_that_have_come",
+    )),
+    # Rows, coefficients, degree, views, sparse.
+    *(f"{OPS}project_step.py::test_equals_backward_and_step[{case}-cuda]" for case in (
+        "1007-16-3-3-False", "1007-16-2-1-True", "1007-16-1-2-False", "333-16-0-1-False", "333-4-1-2-False",
+        "333-25-3-1-False",
+    )),
+    *(OPS + test for test in (
+        "lazy_adam.py::test_float32_drift_of_any_second_moment[40-30-cuda]",
+        "lazy_adam.py::test_float32_drift_of_any_second_moment[700-400-cuda]",
+        "photometric.py::test_float32_matches_the_definition[shape0-True-cuda]",
+        "photometric.py::test_float32_matches_the_definition[shape4-False-cuda]",
+        "photometric.py::test_a_partition_of_the_tiles_adds_up_to_the_whole[16-cuda]",
+        "photometric.py::test_loss_and_ssim_are_means[cuda]",
+        "route.py::test_cuda_equals_cpu[3000]",
+        "scatter.py::test_rows_reach_their_groups[6000-cuda]",
+        "scatter.py::test_sums_follow_the_rows_back[5000-cuda]",
+        "density_stats.py::test_matches_the_definition[True-cuda]",
+        "knn_distances.py::test_matches_a_kd_tree[uniform-3-cuda]",
+        "knn_distances.py::test_small_clouds[cuda]",
+        "voxel_keys.py::test_matches_the_formula[cuda-dtype2]",
+    )),
+    *(BLOCKS + test for test in (
+        "no_visible_row_is_missed_and_most_others_are_dropped[0-cuda]",
+        "a_row_that_is_not_finite_is_not_seen_amidst_a_view[cuda]",
+        "the_set_does_not_depend_on_the_room_for_it[cuda]", "no_rows_stepped_leave_all_bounds_alone[cuda]",
+        "odd_sizes[257-cuda]", "morton_order_keeps_neighbours_together[cuda]", "opcheck[cuda]",
+    )),
+]  # fmt: skip
+
+# Name and number of parameters: two kernels of different files may have the same name.
+Kernel = tuple[str, int]
+_KERNEL = re.compile(
+    r"__global__\s+void\s+(?:__launch_bounds__\((?:[^()]|\([^()]*\))*\)\s*)?(\w+)\(([^{;]*?)\)\s*\{"
+)
+
+
+def _pieces(text: str) -> int:
+    """Parameters in a list: commas that lie in no brackets, and one."""
+    depth, commas = 0, 0
+    for c in text:
+        depth += (c in "(<[{") - (c in ")>]}")
+        commas += c == "," and depth == 0
+    return commas + 1
+
+
+def kernels_in_source() -> dict[Kernel, str]:
+    """Every kernel of csrc and its file."""
+    found = {}
+    for path in sorted((ROOT / "csrc").rglob("*.cu*")):
+        for name, parameters in _KERNEL.findall(path.read_text()):
+            found[name, _pieces(parameters)] = str(path.relative_to(ROOT))
+    return found
+
+
+def kernel_of(signature: str) -> Kernel | None:
+    """The kernel of a name as the profiler prints it; None: not of this library."""
+    text = signature.replace("(anonymous namespace)", "anonymous").removeprefix("void ")
+    if not text.startswith("blitzgs::"):
+        return None
+    depth, names = 0, [""]
+    for i, c in enumerate(text):
+        if c == "(" and depth == 0:
+            return "".join(names).rpartition("::")[2], _pieces(text[i + 1 : text.rindex(")")])
+        depth += (c == "<") - (c == ">")
+        if depth == 0 and c != ">":
+            names.append(c)
+    return None
+
+
+def launched(tests: list[str]) -> tuple[int, collections.Counter[str]]:
+    """Run tests; their exit status, and how often each kernel was launched, by full name."""
+    import pytest
+    import torch
+
+    kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=kinds) as profile:
+        status = pytest.main(["-q", "--no-header", *tests])
+        torch.cuda.synchronize()
+    events = profile.profiler.kineto_results.events()
+    on_gpu = [e.name() for e in events if e.device_type() == torch.profiler.DeviceType.CUDA]
+    return status, collections.Counter(on_gpu)
+
+
+def main(arguments: list[str]) -> int:
+    import pytest
+
+    tests = [a for a in arguments if a != "--kernels"] or TESTS
+    if "--kernels" not in arguments:
+        return pytest.main(["-q", "--no-header", *tests])
+    status, counts = launched(tests)
+    times: dict[Kernel, list[int]] = {}
+    for name, count in counts.items():
+        kernel = kernel_of(name)
+        if kernel is not None:
+            times.setdefault(kernel, []).append(count)
+    missing = 0
+    for kernel, path in kernels_in_source().items():
+        counted = times.pop(kernel, [])
+        missing += not counted
+        print(f"{sum(counted):7d} launches, {len(counted):2d} variants: {kernel[0]} ({path})")
+    print(f"not in the sources: {sorted(times)}" if times else f"{missing} kernels were not launched")
+    return status or int(missing > 0 or bool(times))
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT))
+    sys.exit(main(sys.argv[1:]))
