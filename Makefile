@@ -71,14 +71,15 @@ test-cxx:
 test-slow: venv-test build
 	$(RUN) $(PYTHON) -m pytest -q -m slow --timeout 3600 tests
 
-# The CUDA kernels under compute-sanitizer, every allocation with bounds of its own.
-SANITIZE_TESTS ?= tests/cuda tests/ops tests/view tests/stress
-sanitize:
-	@for tool in memcheck racecheck initcheck synccheck; do \
-	  echo "$$tool:"; \
-	  PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool $$tool --error-exitcode 1 \
-	    $(PYTHON) -m pytest -q -m "cuda and not slow" $(SANITIZE_TESTS) || exit 1; \
-	done
+# Every CUDA kernel under compute-sanitizer, each allocation with bounds of its own; -j4 runs the tools side by side.
+# Other tests than the small suite: make sanitize SANITIZE_TESTS="tests/cuda tests/ops"
+SANITIZE_TESTS ?=
+SANITIZERS = memcheck racecheck initcheck synccheck
+sanitize: $(SANITIZERS:%=sanitize-%)
+	$(PYTHON) tests/small_suite.py --kernels
+sanitize-%:
+	PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool $* --error-exitcode 1 \
+	  $(PYTHON) tests/small_suite.py $(SANITIZE_TESTS)
 
 lint:
 	$(RUN) ruff check .

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The list of the small suite is kept up by hand: its tests exist, and kernels are told apart."""
+
+import subprocess
+import sys
+
+from tests.small_suite import ROOT, TESTS, kernel_of, kernels_in_source
+
+
+def test_every_test_of_the_list_exists():
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", *TESTS]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+
+
+def test_every_kernel_of_the_sources_is_found_and_has_a_name_of_its_own():
+    declared = sum(path.read_text().count("__global__") for path in (ROOT / "csrc").rglob("*.cu*"))
+    assert len(kernels_in_source()) == declared > 40
+
+
+def test_names_as_the_profiler_prints_them():
+    hidden = "blitzgs::cuda::(anonymous namespace)::"
+    target = f"{hidden}GoToRanks"
+    emit = f"void {hidden}emit_kernel<3, true, {target}>(blitzgs::Inputs<float>, long, {target})"
+    assert kernel_of(emit) == ("emit_kernel", 3)
+    assert kernel_of(f"{hidden}prepare(blitzgs::AdamArgs<float>, int const*)") == ("prepare", 2)
+    assert kernel_of("void at::native::copy<blitzgs::Row>(int)") is None
+    assert kernel_of("Memset (Device)") is None
