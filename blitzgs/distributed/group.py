@@ -161,6 +161,9 @@ class Ranks:
         self.watchdog.enter(name)
         try:
             result = call()
+        except torch.OutOfMemoryError:
+            self.watchdog.leave()
+            raise  # this rank's own, and the message for the others
         except RuntimeError as error:
             self.watchdog.leave()
             raise RuntimeError(f"{self.watchdog.diagnose(name)} ({error})") from error

@@ -139,7 +139,7 @@ class PeerSpace:
         visible = everyone[:, 3 : 3 + n_views].sum(0)
         needed = 0
         while True:
-            peers.reserve((_ROW_WORDS + _GRADIENT_WORDS) * needed)
+            ranks.reading(partial(peers.reserve, (_ROW_WORDS + _GRADIENT_WORDS) * needed))
             room = len(peers.buffers[0]) // (_ROW_WORDS + _GRADIENT_WORDS) // _ALIGNMENT * _ALIGNMENT
             result = ranks.reading(partial(project, known, peers.buffers, room))
             traffic = Traffic.of(known.tolist(), visible, ranks.rank)

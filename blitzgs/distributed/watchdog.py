@@ -4,7 +4,7 @@
 Each rank publishes what it is doing in the job's key-value store, from a thread of its own. A rank that has
 waited in a collective for longer than the timeout reads what the others published, prints which of them
 never arrived, and exits; torchrun then ends the job. A rank that raises publishes its error first, so that
-the others report the culprit's message and not a closed socket.
+the others report the culprit's message and not a closed socket; those that wait for it end at once.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from datetime import timedelta
 from torch._C._distributed_c10d import PrefixStore, TCPStore
 
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
+# How long a rank goes on waiting when another is known to have failed.
+GRACE_SECONDS = 4.0
 
 
 def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
@@ -147,8 +149,14 @@ class Watchdog:
             try:
                 self._publish()
                 since = self.waiting_since
-                if since is not None and time.monotonic() - since > self.timeout_seconds:
-                    self._abort(f"waited {self.timeout_seconds:.0f} s in {self.name}")
+                if since is None:
+                    continue
+                waited, limit = time.monotonic() - since, self.timeout_seconds
+                # A rank that has failed comes to no collective any more; Gloo may yet say so itself.
+                if waited > GRACE_SECONDS and self._first_failure():
+                    limit = min(limit, GRACE_SECONDS)
+                if waited > limit:
+                    self._abort(f"waited {limit:.0f} s in {self.name}")
             except RuntimeError:
                 return  # the store's host is gone; the collectives report that themselves
 

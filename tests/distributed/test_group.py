@@ -59,11 +59,17 @@ def test_missing_gpu_is_named():
         Ranks.from_environment("cuda:99")
 
 
+def _out_of_memory():
+    raise torch.OutOfMemoryError("no room for shard 1")
+
+
 def _fail(ranks, how):
     ranks.barrier()
     if ranks.rank == 1:
         if how == "raise":
             raise ValueError("shard 1 has a hole")
+        if how == "memory":
+            ranks.reading(_out_of_memory)
         if how == "kill":
             os.kill(os.getpid(), 9)
         time.sleep(60)
@@ -75,6 +81,7 @@ def _fail(ranks, how):
     ("how", "expected"),
     [
         ("raise", "rank 1 failed: ValueError: shard 1 has a hole"),
+        ("memory", "rank 1 failed: OutOfMemoryError: no room for shard 1"),
         ("kill", "rank 1 has not arrived"),
         ("hang", "exit code 75"),
     ],
@@ -88,3 +95,19 @@ def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
         assert "waited 5 s in all_reduce: rank 1 has not arrived" in failure.value.blame
     assert expected in failure.value.messages[0]
     assert expected in failure.value.messages[2]
+
+
+def _fail_and_stay(ranks):
+    ranks.barrier()
+    if ranks.rank == 1:
+        ranks.watchdog.report_failure("shard 1 has a hole")
+        time.sleep(60)
+    ranks.all_reduce(torch.zeros(4))
+
+
+def test_nobody_waits_for_a_rank_that_has_failed():
+    start = time.monotonic()
+    with pytest.raises(RankError) as failure:
+        run_ranks(_fail_and_stay, 2, timeout_seconds=600.0, limit=45)
+    assert time.monotonic() - start < 45
+    assert "exit code 75" in failure.value.messages[0]
