@@ -10,7 +10,7 @@ intersection, and its reverse between their gradients.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,11 +18,14 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.exchange import (
+    FIRST_PART,
     Route,
+    SecondPart,
     plan_route,
     read_traffic,
     send,
     send_back,
+    send_back_in_parts,
     send_back_packed,
 )
 from blitzgs.distributed.ownership import Share
@@ -140,6 +143,7 @@ class RowGradients(NamedTuple):
         colors: [P, 3].
         returns: says where they are in parts, [S, ...], from the ranks that composited the rows, and how to
             add them up (`blitzgs.ops.scatter.sum_rows`); such are valid until the next exchange.
+        second: what is still on its way, until `parts` is exhausted; None: nothing.
     """
 
     means2d: Tensor
@@ -147,6 +151,27 @@ class RowGradients(NamedTuple):
     opacities: Tensor
     colors: Tensor
     returns: Returns = OWN_VALUES
+    second: SecondPart | None = None
+
+    def parts(self, rows: Rows) -> Iterator[Rows]:
+        """Iterate over the visible Gaussians in parts, each once the gradients of its rows are there.
+
+        Args:
+            rows: the frame's.
+
+        Yields:
+            The rows, with `visible_ids` and `row_offsets` of a part. What a loop does with them, it queues on
+            the current stream: another one for the second part.
+        """
+        if self.second is None:
+            yield rows
+            return
+        first, stream, _ = self.second
+        ids, offsets = rows.visible_ids, rows.row_offsets
+        yield rows._replace(visible_ids=ids[:first], row_offsets=offsets[: first + 1])
+        with torch.cuda.stream(stream):
+            yield rows._replace(visible_ids=ids[first:], row_offsets=offsets[first:])
+        torch.cuda.current_stream().wait_stream(stream)
 
 
 def forward(
@@ -206,13 +231,17 @@ def forward(
     )
 
 
-def backward_rows(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> RowGradients:
+def backward_rows(
+    frame: Frame, v_renders: Tensor, mark: Mark = unmarked, in_parts: bool = False
+) -> RowGradients:
     """Carry image gradients back to the projected rows.
 
     Args:
         frame: from `forward`.
         v_renders: gradient of the loss by the images, [B, H, W, 3]; this rank's tiles matter.
         mark: called at the end of each stage: "raster back", "exchange back".
+        in_parts: where it pays, leave some on their way: the caller goes through `RowGradients.parts` before
+            anything else.
     """
     views, options, splats, share = frame.views, frame.options, frame.splats, frame.share
     tiles = (0, -1) if share is None else share.tiles
@@ -221,11 +250,13 @@ def backward_rows(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> Row
         frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders,
     )  # fmt: skip
     grid = (len(views), views.width, views.height, options.tile_size, *tiles)
-    returns = OWN_VALUES
+    returns, second = OWN_VALUES, None
     if v_renders.is_cuda:
         packed = torch.ops.blitzgs.rasterize_bwd_packed(*arguments, *grid, options.deterministic)
         mark("raster back")
-        if frame.route is not None and frame.route.space is not None:
+        if frame.route is not None and in_parts and frame.route.pays_in_parts:
+            packed, returns, second = send_back_in_parts(packed, frame.route)
+        elif frame.route is not None and frame.route.space is not None:
             packed, returns = send_back_packed(packed, frame.route)
         columns: Sequence[Tensor] = gradient_columns(packed)
     else:
@@ -235,7 +266,7 @@ def backward_rows(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> Row
         columns = send_back(columns, frame.route, share.ranks)
     mark("exchange back")
     means2d, conics, opacities, colors = columns
-    return RowGradients(means2d, conics, opacities, colors, returns)
+    return RowGradients(means2d, conics, opacities, colors, returns, second)
 
 
 def backward(
@@ -298,12 +329,12 @@ def _project(
 
         def project(everyone: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
             return torch.ops.blitzgs.project_emit_to_peers_(
-                *arguments, plan, everyone, rank, ids, buffers, capacity
+                *arguments, plan, everyone, rank, ids, buffers, capacity, FIRST_PART
             )
 
-        (*written, places), space = PeerSpace.fill(totals, len(views), asking.ranks, project)
+        (*written, places, filled), space = PeerSpace.fill(totals, len(views), asking.ranks, project)
         rows = Rows._make((*written, space.traffic.counts))
-        route = Route(space.traffic, rows.rank_masks, places=places, space=space)
+        route = Route(space.traffic, rows.rank_masks, places=places, space=space, filled=filled)
         return rows, space.arrived(), route, space.traffic.n_isects, space.traffic.visible
     traffic = None if asking is None else read_traffic(totals, len(views), asking.ranks)
     counts = start_copy(totals)[:3] if traffic is None else traffic.counts

@@ -37,10 +37,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
       "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor plan, Tensor everyone, "
-      "int rank, Tensor ids, Tensor(a!)[] buffers, int capacity) -> (Tensor gaussian_ids, "
+      "int rank, Tensor ids, Tensor(a!)[] buffers, int capacity, float first_part) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
-      "Tensor rank_masks, Tensor places)");
+      "Tensor rank_masks, Tensor places, Tensor filled)");
   m.def(
       "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
       "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "
@@ -77,8 +77,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "columns");
   m.def(
       "return_to_peers_(Tensor values, int width, int[] group_sizes, Tensor(a!)[] buffers, int offset, "
-      "int[] starts) -> ()");
-  m.def("meet_peers_(Tensor(a!)[] mail, int rank, int meeting, Tensor? values, float timeout_seconds) -> ()");
+      "int[] starts, Tensor? fronts, bool back) -> ()");
+  m.def(
+      "meet_peers_(Tensor(a!)[] mail, int rank, int meeting, Tensor? values, int first, "
+      "float timeout_seconds) -> ()");
 
   // Alpha compositing.
   m.def(

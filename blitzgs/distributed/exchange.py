@@ -11,7 +11,9 @@ Rows travel in one of two ways. Where the ranks share memory (`blitzgs.distribut
 itself writes each row into the columns that other ranks composite from, so that the links work while it
 computes; `PeerSpace` tells it where. Otherwise rows are packed, carried by one all-to-all and taken apart.
 Either way the places of rows among those of a rank are kept in 8 bytes per 32 rows, and serve the way back
-too.
+too. Over shared memory gradients may return in two parts, so that the second travels while the optimiser
+works on the first: the projection writes the rows of the first Gaussians to the front of each group and the
+others to its back.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,6 +40,12 @@ from blitzgs.ops.scatter import (
     words_per_row,
 )
 
+# Gradients come back in two parts: those of this share of the visible Gaussians, which the optimiser waits
+# for, and the rest, which travels while the optimiser works on the first. About wire / (wire + optimiser).
+FIRST_PART = 0.375
+# In one part where no rank has this many rows to send or get: too little travels to be worth a meeting more.
+LEAST_ROWS = 1 << 18
+
 
 @dataclass
 class Route:
@@ -50,6 +58,9 @@ class Route:
             them as they are.
         places: int64, of the rows sent, see `blitzgs.ops.scatter`; None: not sent yet.
         space: where peers write; None: rows travel by collectives.
+        filled: where peers write, int64 [2, M]: how many of the rows for each rank are of the first part of
+            the Gaussians (`FIRST_PART`), and lie in front of the others, whose number follows.
+        fronts: int64 [M], how many that is of the rows from each rank; None: not known yet.
     """
 
     traffic: Traffic
@@ -57,6 +68,27 @@ class Route:
     halves: Tensor | None = None
     places: Tensor | None = None
     space: PeerSpace | None = None
+    filled: Tensor | None = None
+    fronts: Tensor | None = None
+
+    @property
+    def pays_in_parts(self) -> bool:
+        """Whether gradients had better return in two parts; the same on all ranks."""
+        return self.space is not None and self.traffic.most >= LEAST_ROWS
+
+
+class SecondPart(NamedTuple):
+    """The part of returning gradients that is still on its way.
+
+    Attributes:
+        first: the gradients of the rows of this many visible Gaussians, from the first on, are there.
+        stream: those of the others are, for what is queued on this stream.
+        sent: what has to live until then.
+    """
+
+    first: int
+    stream: torch.cuda.Stream
+    sent: Tensor
 
 
 def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
@@ -120,7 +152,8 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
         they are valid until the next exchange.
     """
     if route.space is not None:
-        route.space.peers.meet()
+        assert route.filled is not None
+        route.fronts = route.space.peers.share(route.filled[0])[:, ranks.rank]
         return splats
     columns = [splats.means2d, splats.depths, splats.camera_ids, splats.ids]
     if route.halves is None:
@@ -179,6 +212,29 @@ def send_back_packed(packed: Tensor, route: Route) -> tuple[Tensor, Returns]:
     returned = route.space.write_back(packed)
     route.space.peers.meet()
     return returned, _returns(route)
+
+
+def send_back_in_parts(packed: Tensor, route: Route) -> tuple[Tensor, Returns, SecondPart]:
+    """As `send_back_packed`, but wait only for the gradients of the first Gaussians.
+
+    Returns:
+        As `send_back_packed`; what to know of the rest.
+    """
+    assert route.space is not None and route.fronts is not None
+    space, peers, main = route.space, route.space.peers, torch.cuda.current_stream()
+    second = peers.second
+    assert second is not None
+    returned = space.write_back(packed, route.fronts)
+    second.wait_stream(main)
+    peers.meet()
+    met = main.record_event()
+    with torch.cuda.stream(second):
+        space.write_back(packed, route.fronts, back=True)
+        # Whoever comes to the second meeting has come to the first.
+        second.wait_event(met)
+        peers.meet()
+    first = int(FIRST_PART * int(route.traffic.counts[0]))
+    return returned, _returns(route), SecondPart(first, second, packed)
 
 
 def _returns(route: Route) -> Returns:

@@ -6,17 +6,18 @@ number of the last meeting each rank came to, and the numbers it brought. `rows`
 rows that arrive for this rank's tiles, column by column, so that intersection and compositing read them where
 they lie; behind them the gradients that come back for the rows this rank sent.
 
-A step is, in stream order on every rank: meeting A with the counts (`share`), rows written to the others,
-meeting B, compositing and its gradient, gradients written to the others, meeting C, reading those. A meeting
-is a barrier between streams: work queued behind it, on any rank, finds done what any rank queued before it.
-Hence
+A step is, in stream order on every rank: meeting A with the counts, rows written to the others, meeting B
+with where their groups are cut, compositing and its gradient, gradients written to the others, meeting C,
+reading those. With the gradients in two parts, the second is written and meets (D) on a stream of its own,
+after C, while the first is read; the main stream then waits for it. A meeting is a barrier between streams:
+work queued behind it, on any rank, finds done what any rank queued before it. Hence
 
-- rows and gradients are read after the meeting that follows their writing: B and C;
+- rows and gradients are read after the meeting that follows their writing: B, and C or D;
 - arriving rows of a step overwrite those of the step before after A; whoever read those had queued that
   before its own A;
 - returning gradients are written after A and B, and those of the step before were read before A;
-- the counts of a step are copied to the host before B, and the next ones are written at the next A. Where
-  nothing but counts travels this way and no B follows, `share` holds a meeting of its own first.
+- the numbers that ranks bring to a meeting are read before the next that has numbers, and overwritten at the
+  one after that: there are two places for them, used in turn.
 
 Between A and the writing every rank waits for the counts on the host, so when buffers have to grow, no kernel
 of any rank uses them. A rank that dies leaves the others in a meeting: their hosts wait in `Ranks.reading`,
@@ -39,8 +40,9 @@ if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
 
 MAX_PEERS = 16
-# Numbers that a rank may bring to a meeting.
+# Numbers that a rank may bring to a meeting; there are two places for them.
 MAX_VALUES = 256
+_MAIL_WORDS = 1 + 2 * MAX_VALUES
 # Buffers grow to this many times what is needed, so that they seldom do.
 HEADROOM = 1.25
 _LEAST_WORDS = 1 << 20
@@ -57,6 +59,7 @@ class Peers:
     Attributes:
         buffers: int32 [words] of each rank, mapped here.
         exchanges: how often rows were written: tells whose rows are in the buffers.
+        second: stream for the second part of returning gradients.
     """
 
     def __init__(self, ranks: Ranks, mail: Tensor, timeout_seconds: float) -> None:
@@ -64,8 +67,9 @@ class Peers:
         self.timeout_seconds = timeout_seconds
         self.buffers: list[Tensor] = []
         self.exchanges = 0
+        self.second = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._meetings = 0
-        self._shown = False  # whether numbers of the last meeting may still be read somewhere
+        self._shared = 0  # how many of them had numbers
         self._handles: dict[str, Any] = {}  # the mappings live as long as these
         self._mail = self._map("mail", mail)
 
@@ -77,31 +81,31 @@ class Peers:
         mapped[self.rank] = mine
         return mapped
 
-    def meet(self, values: Tensor | None = None) -> None:
-        """Meet the other ranks, in stream order.
-
-        Args:
-            values: int64 [n] that every rank gets to see, n <= MAX_VALUES, the same on all; None: nothing.
-        """
-        self._meetings += 1
-        self._shown = values is not None
-        torch.ops.blitzgs.meet_peers_(self._mail, self.rank, self._meetings, values, self.timeout_seconds)
+    def meet(self) -> None:
+        """Meet the other ranks, in stream order."""
+        self._meet(None, self.world_size)
 
     def share(self, values: Tensor) -> Tensor:
-        """Show numbers to all ranks.
+        """Meet the other ranks and show them numbers.
 
         Args:
             values: int64 [n], n <= MAX_VALUES, the same on all ranks.
 
         Returns:
-            int64 [M, n], valid until `share` is called again.
+            int64 [M, n], valid until `share` is called for the second time after this.
         """
-        if self._shown:
-            # A rank may have come out of the last meeting and not have copied its numbers yet.
-            self.meet()
-        self.meet(values)
-        count = self.world_size * len(values)
-        return self._mail[self.rank][self.world_size : self.world_size + count].view(self.world_size, -1)
+        # A rank may have come out of the last meeting and not have read its numbers yet.
+        place = self._shared % 2
+        self._shared += 1
+        first, count = self.world_size * (1 + place * MAX_VALUES), self.world_size * len(values)
+        self._meet(values, first)
+        return self._mail[self.rank][first : first + count].view(self.world_size, -1)
+
+    def _meet(self, values: Tensor | None, first: int) -> None:
+        self._meetings += 1
+        torch.ops.blitzgs.meet_peers_(
+            self._mail, self.rank, self._meetings, values, first, self.timeout_seconds
+        )
 
     def reserve(self, words: int) -> None:
         """Make every rank's buffer hold `words` 32-bit words. Collective: all ranks ask for the same.
@@ -132,7 +136,7 @@ def connect(ranks: Ranks, timeout_seconds: float) -> Peers | str:
     obstacle, mail = _obstacle(places, ranks.rank), None
     if obstacle is None:
         try:
-            words = ranks.world_size * (1 + MAX_VALUES)
+            words = ranks.world_size * _MAIL_WORDS
             mail = symmetric.empty(words, dtype=torch.int64, device=ranks.device).zero_()
         except RuntimeError as error:
             obstacle = f"rank {ranks.rank}: {error}"

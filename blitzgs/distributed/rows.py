@@ -158,11 +158,13 @@ class PeerSpace:
             begin += self.capacity * words
         return Splats(*columns)
 
-    def write_back(self, packed: Tensor) -> Tensor:
+    def write_back(self, packed: Tensor, fronts: Tensor | None = None, back: bool = False) -> Tensor:
         """Write the gradients of the rows that arrived to their owners.
 
         Args:
             packed: [R, 9 or more], of `rasterize_bwd_packed`.
+            fronts: int64 [M], only of so many rows from each rank, from the first on; None: of all.
+            back: instead, only of the others.
 
         Returns:
             [S, 9], those of the rows this rank sent; they may be read after the next meeting.
@@ -178,7 +180,7 @@ class PeerSpace:
         offset, me = self.capacity * _ROW_WORDS, self.peers.rank
         before = [sum(row[:me]) for row in self.traffic.rows]
         torch.ops.blitzgs.return_to_peers_(
-            packed, _GRADIENT_WORDS, self.traffic.received, self.peers.buffers, offset, before
+            packed, _GRADIENT_WORDS, self.traffic.received, self.peers.buffers, offset, before, fronts, back
         )
         count = sum(self.traffic.sent)
         mine = self.peers.buffers[me][offset : offset + count * _GRADIENT_WORDS]

@@ -86,7 +86,7 @@ class Stepper:
             The gradients of the rows, valid until the next `forward`.
         """
         table = self._table
-        gradients = pipeline.backward_rows(frame, terms.v_renders, mark)
+        gradients = pipeline.backward_rows(frame, terms.v_renders, mark, in_parts=True)
         self._optimiser.step(table, frame, gradients, terms.scale_reg, step)
         mark("optimiser")
         self._blocks.update(table, frame.rows.visible_ids)

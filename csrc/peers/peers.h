@@ -7,11 +7,13 @@
 //
 // return_to_peers_, the way back: the first `width` values of each received row of values [R, W], group m of
 // them from rank m, go to rank m's buffer, from row starts[m] of those there, which begin at word `offset`.
+// With fronts [M], on the device: only the first fronts[m] rows of group m or, with `back`, only the others;
+// the latter leaves most of the GPU to kernels of other streams.
 //
 // meet_peers_, a barrier in stream order: what any rank queued before it is done, and visible, when what any
 // rank queues behind it runs. Each rank also leaves its `values` with every other. mail[m], int64: [M] the
-// last meeting each rank came to, then [M, n] their values. A rank that waits for longer than timeout_seconds
-// aborts its kernels, so that its process sees an error.
+// last meeting each rank came to; from word `first` on [M, n] their values. A rank that waits for longer than
+// timeout_seconds aborts its kernels, so that its process sees an error.
 #pragma once
 #include "scatter/scatter.h"
 
@@ -24,16 +26,20 @@ struct PeerMail {
   int count, rank;
 };
 
-// values [R, stride]. Target m: where the first `width` of each row of group m go, [size[m], width].
+// values [R, stride]. Target m: where the first `width` of each row of group m go, [size[m], width]. fronts:
+// null, or that of group m at fronts[m * fronts_stride].
 struct PeerReturn {
   const float* values;
   int stride, width;
   RowGroups groups;
   float* targets[kMaxPeers];
+  const std::int64_t* fronts;
+  std::int64_t fronts_stride;
+  bool back;
 };
 
 namespace cuda {
-void meet(const PeerMail&, std::int64_t meeting, const std::int64_t* values, int n_values,
+void meet(const PeerMail&, std::int64_t meeting, const std::int64_t* values, int n_values, std::int64_t first,
           double timeout_seconds, Workspace&, CudaStream);
 void return_rows(const PeerReturn&, Workspace&, CudaStream);
 }  // namespace cuda

@@ -10,7 +10,11 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kMeetThreads = 128, kReturnThreads = 256, kReturnWords = 2048;
+constexpr int kMeetThreads = 128;
+// A block's threads and the words that each has on the way at once. Few large blocks: beside another kernel
+// (`back`), they should keep it off few multiprocessors, and these many bytes in flight fill the links.
+constexpr int kReturnThreads = 1024, kReturnAhead = 8, kReturnWords = kReturnThreads * kReturnAhead;
+constexpr unsigned kReturnBlocks = 264, kReturnBlocksBack = 24;
 
 __device__ std::uint64_t nanoseconds() {
   std::uint64_t now;
@@ -31,10 +35,10 @@ __device__ std::int64_t look(const std::int64_t* flag) {
 // One block. A thread announces this rank to one peer and waits for that peer.
 __global__ void __launch_bounds__(kMeetThreads)
     meet_kernel(const PeerMail mail, std::int64_t meeting, const std::int64_t* values, int n_values,
-                std::uint64_t timeout) {
+                std::int64_t first, std::uint64_t timeout) {
   for (int i = threadIdx.x; i < mail.count * n_values; i += kMeetThreads) {
     const int m = i / n_values, k = i - m * n_values;
-    mail.of[m][mail.count + mail.rank * n_values + k] = values[k];
+    mail.of[m][first + mail.rank * n_values + k] = values[k];
   }
   __threadfence_system();
   __syncthreads();
@@ -47,38 +51,56 @@ __global__ void __launch_bounds__(kMeetThreads)
   }
 }
 
-// Block x: kReturnWords words of group x % M. Neighbouring blocks write to different ranks, so that no link
-// waits for another.
+// Block x: kReturnWords words at a time of group x % M. Neighbouring blocks write to different ranks, so that
+// no link waits for another.
 template <int WIDTH>
 __global__ void __launch_bounds__(kReturnThreads) return_kernel(const __grid_constant__ PeerReturn job) {
   const int m = static_cast<int>(blockIdx.x) % job.groups.count, width = WIDTH > 0 ? WIDTH : job.width;
   const float* from = job.values + job.groups.start[m] * job.stride;
   float* to = job.targets[m];
-  const std::int64_t words = job.groups.size[m] * width;
-  const std::int64_t first = static_cast<int>(blockIdx.x) / job.groups.count * std::int64_t{kReturnWords} -
-                             words_past_line(to) + threadIdx.x;
+  std::int64_t begin = 0, end = job.groups.size[m];
+  if (job.fronts) {
+    const std::int64_t front = min(max(job.fronts[m * job.fronts_stride], std::int64_t{0}), end);
+    (job.back ? begin : end) = front;
+  }
+  begin *= width;
+  end *= width;
+  const auto part = static_cast<int>(blockIdx.x) / job.groups.count,
+             parts = static_cast<int>(gridDim.x) / job.groups.count;
+  for (std::int64_t first =
+           begin - words_past_line(to + begin) + part * std::int64_t{kReturnWords} + threadIdx.x;
+       first < end; first += parts * std::int64_t{kReturnWords}) {
+    float values[kReturnAhead];
 #pragma unroll
-  for (int k = 0; k < kReturnWords; k += kReturnThreads) {
-    const std::int64_t i = first + k;
-    if (i < 0 || i >= words) continue;
-    const auto row = static_cast<std::int64_t>(static_cast<std::uint64_t>(i) / width);
-    to[i] = from[row * job.stride + (i - row * width)];
+    for (int k = 0; k < kReturnAhead; ++k) {
+      const std::int64_t i = first + k * kReturnThreads;
+      if (i < begin || i >= end) continue;
+      const auto row = static_cast<std::int64_t>(static_cast<std::uint64_t>(i) / width);
+      values[k] = from[row * job.stride + (i - row * width)];
+    }
+#pragma unroll
+    for (int k = 0; k < kReturnAhead; ++k) {
+      const std::int64_t i = first + k * kReturnThreads;
+      if (i >= begin && i < end) to[i] = values[k];
+    }
   }
 }
 
 }  // namespace
 
 void meet(const PeerMail& mail, std::int64_t meeting, const std::int64_t* values, int n_values,
-          double timeout_seconds, Workspace&, CudaStream stream) {
+          std::int64_t first, double timeout_seconds, Workspace&, CudaStream stream) {
   const auto timeout = static_cast<std::uint64_t>(1e9 * timeout_seconds);
-  meet_kernel<<<1, kMeetThreads, 0, stream>>>(mail, meeting, values, n_values, timeout);
+  meet_kernel<<<1, kMeetThreads, 0, stream>>>(mail, meeting, values, n_values, first, timeout);
   check_launch("meet_peers");
 }
 
 void return_rows(const PeerReturn& job, Workspace&, CudaStream stream) {
   const std::int64_t most = *std::max_element(job.groups.size, job.groups.size + job.groups.count);
   if (most == 0) return;
-  const unsigned blocks = job.groups.count * (blocks_for(most * job.width, kReturnWords) + 1);
+  const unsigned ranks = job.groups.count, limit = job.back ? kReturnBlocksBack : kReturnBlocks;
+  const unsigned blocks =
+      ranks * std::min(blocks_for(most * job.width, kReturnWords) + 1, blocks_for(limit, ranks));
   const auto kernel = job.width == 9 ? return_kernel<9> : return_kernel<0>;
   kernel<<<blocks, kReturnThreads, 0, stream>>>(job);
   check_launch("return_to_peers");

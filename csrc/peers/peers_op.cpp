@@ -7,7 +7,8 @@ namespace {
 
 void return_to_peers(const Tensor& values, std::int64_t width, const std::vector<std::int64_t>& group_sizes,
                      std::vector<Tensor> buffers, std::int64_t offset,
-                     const std::vector<std::int64_t>& starts) {
+                     const std::vector<std::int64_t>& starts, const std::optional<Tensor>& fronts,
+                     bool back) {
   constexpr const char* kOp = "return_to_peers_";
   PeerReturn job{};
   job.groups = checked_groups(kOp, "group_sizes", group_sizes);
@@ -26,12 +27,20 @@ void return_to_peers(const Tensor& values, std::int64_t width, const std::vector
     job.targets[m] =
         reinterpret_cast<float*>(mutable_data<std::int32_t>(buffers[m]) + offset) + starts[m] * width;
   }
+  if (fronts) {
+    check_dtype(kOp, "fronts", *fronts, ScalarType::Long);
+    check_shape(kOp, "fronts", *fronts, {job.groups.count});
+    job.fronts = data<std::int64_t>(*fronts);
+    job.fronts_stride = fronts->stride(0);
+  }
+  STD_TORCH_CHECK(fronts || !back, "blitzgs::", kOp, ": back needs fronts");
+  job.back = back;
   DeviceScope scope(held);
   cuda::return_rows(job, scope.workspace, scope.stream);
 }
 
 void meet_peers(std::vector<Tensor> mail, std::int64_t rank, std::int64_t meeting,
-                const std::optional<Tensor>& values, double timeout_seconds) {
+                const std::optional<Tensor>& values, std::int64_t first, double timeout_seconds) {
   constexpr const char* kOp = "meet_peers_";
   check_peers(kOp, mail, ScalarType::Long);
   const auto count = static_cast<std::int64_t>(mail.size());
@@ -44,14 +53,15 @@ void meet_peers(std::vector<Tensor> mail, std::int64_t rank, std::int64_t meetin
     STD_TORCH_CHECK(values->is_contiguous(), "blitzgs::", kOp, ": values must be contiguous");
     n_values = values->size(0);
   }
-  STD_TORCH_CHECK(count * (1 + n_values) <= mail[0].size(0), "blitzgs::", kOp, ": ", n_values, " values of ",
-                  count, " ranks do not fit into ", mail[0].size(0), " words");
+  STD_TORCH_CHECK(first >= count && first + count * n_values <= mail[0].size(0), "blitzgs::", kOp, ": ",
+                  n_values, " values of ", count, " ranks from word ", first, " on do not fit behind ", count,
+                  " words into ", mail[0].size(0));
   PeerMail letters{};
   letters.count = static_cast<int>(count);
   letters.rank = static_cast<int>(rank);
   for (std::int64_t m = 0; m < count; ++m) letters.of[m] = mutable_data<std::int64_t>(mail[m]);
   DeviceScope scope(mail[rank]);
-  cuda::meet(letters, meeting, data_or_null<std::int64_t>(values), static_cast<int>(n_values),
+  cuda::meet(letters, meeting, data_or_null<std::int64_t>(values), static_cast<int>(n_values), first,
              timeout_seconds, scope.workspace, scope.stream);
 }
 

@@ -81,10 +81,13 @@ struct ProjectOutputs {
 inline constexpr RowColumns<const std::int32_t> kEmittedColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
 
 // Where emitted rows go besides (CUDA): each to the ranks of its rank mask, as `scatter` does
-// (scatter/scatter.h). ids [N]; row_ids [P] and places are written too.
+// (scatter/scatter.h). ids [N]; row_ids [P], places and filled [2, M] are written too. In each group the rows
+// of the first `first_visible` Gaussians come first: those within its first filled[0][m].
 struct ProjectScatter {
   const std::int64_t* ids;
+  std::int64_t first_visible;
   std::int64_t* row_ids;
+  std::int64_t* filled;
   RowPlace* places;
   RowGroups groups;
   ScatterTargets targets;

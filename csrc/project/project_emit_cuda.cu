@@ -195,17 +195,21 @@ void project_emit<float>(const Inputs& in, const RankTiles& rank_tiles, const vo
 
 void project_emit_to_ranks(const Inputs& in, const RankTiles& rank_tiles, const ProjectIds& ids,
                            std::int64_t n_rows, const ProjectOutputs<float>& out,
-                           const ProjectScatter& scatter, Workspace& workspace, CudaStream stream) {
+                           const ProjectScatter& scatter, Workspace&, CudaStream stream) {
   const auto words = [](const auto* column) { return reinterpret_cast<const std::int32_t*>(column); };
-  auto* filled = workspace.allocate<std::int32_t>(scatter.groups.count);
-  check(cudaMemsetAsync(filled, 0, scatter.groups.count * sizeof(*filled), stream), "project_emit");
+  const std::size_t bytes = 2 * scatter.groups.count * sizeof(*scatter.filled);
+  check(cudaMemsetAsync(scatter.filled, 0, bytes, stream), "project_emit");
   RowColumns<const std::int32_t> columns = kEmittedColumns;
   const std::int32_t* data[] = {words(out.means2d),    words(out.conics), words(out.opacities),
                                 words(out.colors),     words(out.depths), ids.camera_ids,
                                 words(scatter.row_ids)};
   std::copy(std::begin(data), std::end(data), columns.data);
-  const GoToRanks destination{scatter.ids,    scatter.row_ids, {columns, out.rank_masks, n_rows},
-                              scatter.groups, scatter.targets, {filled, scatter.places}};
+  const GoToRanks destination{scatter.ids,
+                              scatter.row_ids,
+                              {columns, out.rank_masks, n_rows},
+                              scatter.groups,
+                              scatter.targets,
+                              {scatter.filled, scatter.places, ids.row_offsets + scatter.first_visible}};
   emit_rows(in, rank_tiles, ids, n_rows, out, destination, stream);
 }
 

@@ -188,7 +188,7 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
 
 #ifdef BLITZGS_BACKEND_CUDA
 using SentRowTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                                  Tensor, Tensor, Tensor, Tensor>;
+                                  Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // What every rank's project_count summed up, [M, project_totals(B, M)] on the host.
 struct Announced {
@@ -224,7 +224,7 @@ SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, c
                                      bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
                                      const std::vector<std::int64_t>& tile_ends, const Tensor& plan,
                                      const Tensor& everyone, std::int64_t rank, const Tensor& ids,
-                                     std::vector<Tensor> buffers, std::int64_t capacity) {
+                                     std::vector<Tensor> buffers, std::int64_t capacity, double first_part) {
   constexpr const char* kOp = "project_emit_to_peers_";
   const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
                   height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
@@ -240,6 +240,8 @@ SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, c
                   n_ranks, ", got ", rank);
   check_dtype(kOp, "ids", ids, ScalarType::Long);
   check_shape(kOp, "ids", ids, {f.p.count});
+  STD_TORCH_CHECK(first_part >= 0 && first_part <= 1, "blitzgs::", kOp,
+                  ": first_part must be in [0, 1], got ", first_part);
   const Tensor every_id = as_contiguous(ids);
   DeviceScope scope(f.p.means);
   backend::project_wait(scope.stream);
@@ -255,17 +257,22 @@ SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, c
     }
   }
   const RowGroups groups = checked_groups(kOp, "everyone", group_sizes);
-  Tensor row_ids, places;
+  Tensor row_ids, places, filled = make_empty(f.p.means, {2, n_ranks}, ScalarType::Long);
+  const auto first_visible = static_cast<std::int64_t>(first_part * static_cast<double>(sizes.visible));
   const auto send = [&](const auto& in, const ProjectIds& listed, std::int64_t n_rows, const auto& out) {
     row_ids = make_empty(f.p.means, {n_rows}, ScalarType::Long);
     places = make_places(f.p.means, n_rows, groups);
-    const ProjectScatter scatter{data<std::int64_t>(every_id), mutable_data<std::int64_t>(row_ids),
-                                 places_of(places), groups,
+    const ProjectScatter scatter{data<std::int64_t>(every_id),
+                                 first_visible,
+                                 mutable_data<std::int64_t>(row_ids),
+                                 mutable_data<std::int64_t>(filled),
+                                 places_of(places),
+                                 groups,
                                  peer_targets(kOp, buffers, kEmittedColumns, capacity, starts, groups)};
     cuda::project_emit_to_ranks(in, f.ranks, listed, n_rows, out, scatter, scope.workspace, scope.stream);
   };
   auto rows = emit_rows(kOp, f, plan, sizes, scope, send);
-  return std::tuple_cat(std::move(rows), std::tuple{places});
+  return std::tuple_cat(std::move(rows), std::tuple{places, filled});
 }
 #endif
 

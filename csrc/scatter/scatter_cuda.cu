@@ -92,12 +92,12 @@ __global__ void __launch_bounds__(kSumThreads)
 void scatter(const ScatterRows& rows, const RowGroups& groups, const ScatterTargets& targets,
              RowPlace* places, Workspace& workspace, CudaStream stream) {
   if (rows.count == 0) return;
-  auto* filled = workspace.allocate<std::int32_t>(groups.count);
+  auto* filled = workspace.allocate<std::int64_t>(groups.count);
   check(cudaMemsetAsync(filled, 0, groups.count * sizeof(*filled), stream), "scatter_rows");
   dispatch_ranks(groups.count, [&](auto ranks) {
     scatter_kernel<ranks.value>
         <<<static_cast<unsigned>(scatter_blocks(rows.count)), kScatterBlock, 0, stream>>>(
-            rows, groups, targets, ScatterState{filled, places});
+            rows, groups, targets, ScatterState{filled, places, nullptr});
   });
   check_launch("scatter_rows");
 }

@@ -30,10 +30,24 @@ struct ScatterShared {
   int count[RANKS], base[RANKS];
 };
 
-// What all blocks share: how far each group is filled (zeroed before), and what `scatter` returns.
+// What all blocks share: how far each group is filled from its front and, [M] more, from its back (zeroed
+// before), and what `scatter` returns. Blocks that begin at row *split or later fill from the back, the
+// others, or all of them without `split`, from the front.
 struct ScatterState {
-  std::int32_t* filled;
+  std::int64_t* filled;
   RowPlace* places;
+  const std::int32_t* split;
+
+  __device__ bool from_back(std::int64_t first) const { return split && first >= *split; }
+  // Takes `count` places of group m; returns the first.
+  __device__ std::int64_t take(const RowGroups& groups, int m, int count, bool from_back) const {
+    if (count == 0) return 0;
+    auto* end = reinterpret_cast<unsigned long long*>(filled) + (from_back ? groups.count + m : m);
+    const auto taken = static_cast<std::int64_t>(atomicAdd(end, static_cast<unsigned long long>(count)));
+    if (!from_back) return taken;
+    const std::int64_t begin = groups.size[m] - taken - count;
+    return begin > 0 ? begin : 0;
+  }
 };
 
 // Counts a warp's rows for each rank, whose masks the lanes bring.
@@ -109,9 +123,9 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
   if (static_cast<int>(threadIdx.x) < n_ranks) {
     const int m = threadIdx.x;
     const int count = scan_warps(shared.before[m]);
-    const int base = count ? atomicAdd(state.filled + m, count) : 0;
+    const std::int64_t base = state.take(groups, m, count, state.from_back(first));
     const std::int64_t room = groups.size[m] - base;
-    shared.base[m] = base;
+    shared.base[m] = static_cast<int>(base);
     shared.count[m] = room >= count ? count : room > 0 ? static_cast<int>(room) : 0;
   }
   __syncthreads();

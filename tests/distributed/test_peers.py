@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows written to other GPUs' memory: what collectives carry too, and clear errors where it cannot be."""
 
+import dataclasses
 import os
 import time
 
@@ -8,12 +9,16 @@ import pytest
 import torch
 
 from blitzgs import pipeline
+from blitzgs.distributed import exchange
 from blitzgs.distributed.exchange import send_back, send_back_packed
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.distributed.peers import MAX_VALUES, Peers
 from blitzgs.model import GaussianTable
 from blitzgs.ops.scatter import sum_rows
+from blitzgs.training.config import OptimiserConfig, ScheduleConfig
+from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.schedule import Schedule
 from tests.distributed.rank_harness import RankError, run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
 from tests.training.tiny import random_gaussians
@@ -85,6 +90,42 @@ def test_peers_bring_what_collectives_bring(world_size):
     assert len(set(sizes)) == 1
 
 
+def _steps_in_parts(ranks):
+    """Steps with gradients that return at once and in two parts: the same bits, also of tiny shards."""
+    assert ranks.peers is not None, ranks.transport
+    exchange.LEAST_ROWS = 0
+    options = dataclasses.replace(OPTIONS, sh_degree=3, deterministic=True)
+    views, sums = cameras(3, device=ranks.device), []
+    optimiser = LazyAdam(OptimiserConfig(), Schedule(ScheduleConfig()), 1.0, ranks.device)
+    for count in (3, 700, 100_000, 0):
+        share = Share(ranks, TileOwners(ranks).divide(range(3), views.width, views.height))
+        small = _table(count, ranks)
+        columns = {name: small[name] for name in small if "exp_avg" not in name}
+        columns["sh"] = torch.nn.functional.pad(small["sh"], (0, 0, 0, 15))  # fused only so
+        tables = [GaussianTable.create({name: x.clone() for name, x in columns.items()}) for _ in range(2)]
+        for table, in_parts in zip(tables, (False, True), strict=True):
+            for step in (1, 2):
+                frame = pipeline.forward(table, views, options, share=share)
+                v_renders = frame.renders * 1e-3 + 1e-4
+                gradients = pipeline.backward_rows(frame, v_renders, in_parts=in_parts)
+                assert (gradients.second is not None) == in_parts
+                optimiser.step(table, frame, gradients, None, step)
+                if in_parts and count > 700:
+                    front, back = frame.route.filled.tolist()
+                    assert [a + b for a, b in zip(front, back, strict=True)] == frame.route.traffic.sent
+                    assert min(front) > 0 and min(back) > 0
+        for name in tables[0]:
+            assert torch.equal(tables[0][name], tables[1][name]), name
+        sums.append((tables[0]["last_step"] == 2).sum().item())
+    assert min(sums[1:3]) > 0
+    return sums
+
+
+@pytest.mark.parametrize("_", [pytest.param(0, marks=TWO_GPUS)])
+def test_gradients_in_two_parts_are_those_at_once(_):
+    assert len(run_ranks(_steps_in_parts, 2, device="cuda", transport="peer")) == 2
+
+
 def _overtaken(ranks):
     table, views = _table(300, ranks), cameras(2, device=ranks.device)
     share = Share(ranks, TileOwners(ranks).divide(range(2), views.width, views.height))
@@ -119,22 +160,23 @@ def test_a_rank_that_leaves_a_meeting_is_named(how):
     assert "waited 3 s in read: rank 1 has not" in failure.value.blame
 
 
-def test_counts_are_not_overwritten_before_all_have_read_them(monkeypatch):
-    """Between two calls of `share` every rank meets the others once more, if only for that."""
+def test_numbers_are_not_overwritten_before_all_have_read_them(monkeypatch):
+    """Two calls of `share` in turn use different places."""
     met = []
     monkeypatch.setattr(Peers, "_map", lambda self, name, mine: [mine])
     monkeypatch.setattr(
         torch.ops.blitzgs,
         "meet_peers_",
-        lambda mail, rank, number, values, timeout: met.append((number, values is not None)),
+        lambda mail, rank, number, values, first, timeout: met.append((number, values is not None, first)),
     )
-    peers = Peers(Ranks(), torch.zeros(1 + MAX_VALUES, dtype=torch.int64), 1.0)
+    mail = torch.arange(1 + 2 * MAX_VALUES)
+    peers = Peers(Ranks(), mail, 1.0)
     numbers = torch.arange(3)
-    assert peers.share(numbers).shape == (1, 3)
-    peers.meet()  # as after rows were written
+    assert peers.share(numbers).tolist() == [[1, 2, 3]]
+    peers.meet()
+    assert peers.share(numbers).tolist() == [[MAX_VALUES + 1, MAX_VALUES + 2, MAX_VALUES + 3]]
     peers.share(numbers)
-    peers.share(numbers)
-    assert met == [(1, True), (2, False), (3, True), (4, False), (5, True)]
+    assert met == [(1, True, 1), (2, False, 1), (3, True, MAX_VALUES + 1), (4, True, 1)]
 
 
 def _refused(rank):
