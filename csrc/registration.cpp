@@ -77,7 +77,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "columns");
   m.def(
       "return_to_peers_(Tensor values, int width, int[] group_sizes, Tensor(a!)[] buffers, int offset, "
-      "int[] starts, Tensor? fronts, bool back) -> ()");
+      "int[] starts, int rank, Tensor? fronts, bool back) -> ()");
   m.def(
       "meet_peers_(Tensor(a!)[] mail, int rank, int meeting, Tensor? values, int first, "
       "float timeout_seconds) -> ()");

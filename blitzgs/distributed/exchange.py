@@ -42,7 +42,7 @@ from blitzgs.ops.scatter import (
 
 # Gradients come back in two parts: those of this share of the visible Gaussians, which the optimiser waits
 # for, and the rest, which travels while the optimiser works on the first. About wire / (wire + optimiser).
-FIRST_PART = 0.375
+FIRST_PART = 0.3125
 # In one part where no rank has this many rows to send or get: too little travels to be worth a meeting more.
 LEAST_ROWS = 1 << 18
 

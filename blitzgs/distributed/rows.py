@@ -163,8 +163,8 @@ class PeerSpace:
 
         Args:
             packed: [R, 9 or more], of `rasterize_bwd_packed`.
-            fronts: int64 [M], only of so many rows from each rank, from the first on; None: of all.
-            back: instead, only of the others.
+            fronts: int64 [M], only of so many rows from each other rank, from the first on; None: of all.
+            back: instead, only of the rest of those.
 
         Returns:
             [S, 9], those of the rows this rank sent; they may be read after the next meeting.
@@ -180,7 +180,15 @@ class PeerSpace:
         offset, me = self.capacity * _ROW_WORDS, self.peers.rank
         before = [sum(row[:me]) for row in self.traffic.rows]
         torch.ops.blitzgs.return_to_peers_(
-            packed, _GRADIENT_WORDS, self.traffic.received, self.peers.buffers, offset, before, fronts, back
+            packed,
+            _GRADIENT_WORDS,
+            self.traffic.received,
+            self.peers.buffers,
+            offset,
+            before,
+            me,
+            fronts,
+            back,
         )
         count = sum(self.traffic.sent)
         mine = self.peers.buffers[me][offset : offset + count * _GRADIENT_WORDS]

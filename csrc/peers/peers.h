@@ -7,8 +7,9 @@
 //
 // return_to_peers_, the way back: the first `width` values of each received row of values [R, W], group m of
 // them from rank m, go to rank m's buffer, from row starts[m] of those there, which begin at word `offset`.
-// With fronts [M], on the device: only the first fronts[m] rows of group m or, with `back`, only the others;
-// the latter leaves most of the GPU to kernels of other streams.
+// With fronts [M], on the device: of the groups of ranks other than `rank`, this one, only the first
+// fronts[m] rows or, with `back`, only the rest, which leaves most of the GPU to kernels of other streams; of
+// this rank's own all or, with `back`, none.
 //
 // meet_peers_, a barrier in stream order: what any rank queued before it is done, and visible, when what any
 // rank queues behind it runs. Each rank also leaves its `values` with every other. mail[m], int64: [M] the
@@ -35,6 +36,7 @@ struct PeerReturn {
   float* targets[kMaxPeers];
   const std::int64_t* fronts;
   std::int64_t fronts_stride;
+  int rank;
   bool back;
 };
 

@@ -11,10 +11,11 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kMeetThreads = 128;
-// A block's threads and the words that each has on the way at once. Few large blocks: beside another kernel
-// (`back`), they should keep it off few multiprocessors, and these many bytes in flight fill the links.
-constexpr int kReturnThreads = 1024, kReturnAhead = 8, kReturnWords = kReturnThreads * kReturnAhead;
-constexpr unsigned kReturnBlocks = 264, kReturnBlocksBack = 24;
+// A block's threads and the words that each has on the way at once. `back` runs beside the projection's
+// backward pass: with a third of a multiprocessor's registers its few blocks take the place of one of that
+// kernel's each, and yet have enough on the way to fill the links.
+constexpr int kReturnThreads = 512, kReturnAhead = 8, kReturnWords = kReturnThreads * kReturnAhead;
+constexpr unsigned kReturnBlocks = 528, kReturnBlocksBack = 48;
 
 __device__ std::uint64_t nanoseconds() {
   std::uint64_t now;
@@ -51,22 +52,26 @@ __global__ void __launch_bounds__(kMeetThreads)
   }
 }
 
-// Block x: kReturnWords words at a time of group x % M. Neighbouring blocks write to different ranks, so that
-// no link waits for another.
+// Groups that a launch writes.
+BLITZGS_HD int return_groups(const PeerReturn& job) { return job.groups.count - job.back; }
+
+// Block x: kReturnWords words at a time of the x-th group, from the first again after the last. Neighbouring
+// blocks write to different ranks, so that no link waits for another.
 template <int WIDTH>
-__global__ void __launch_bounds__(kReturnThreads) return_kernel(const __grid_constant__ PeerReturn job) {
-  const int m = static_cast<int>(blockIdx.x) % job.groups.count, width = WIDTH > 0 ? WIDTH : job.width;
+__global__ void __launch_bounds__(kReturnThreads, 3) return_kernel(const __grid_constant__ PeerReturn job) {
+  const int n_groups = return_groups(job), width = WIDTH > 0 ? WIDTH : job.width;
+  int m = static_cast<int>(blockIdx.x) % n_groups;
+  if (job.back && m >= job.rank) ++m;
   const float* from = job.values + job.groups.start[m] * job.stride;
   float* to = job.targets[m];
   std::int64_t begin = 0, end = job.groups.size[m];
-  if (job.fronts) {
+  if (job.fronts && m != job.rank) {
     const std::int64_t front = min(max(job.fronts[m * job.fronts_stride], std::int64_t{0}), end);
     (job.back ? begin : end) = front;
   }
   begin *= width;
   end *= width;
-  const auto part = static_cast<int>(blockIdx.x) / job.groups.count,
-             parts = static_cast<int>(gridDim.x) / job.groups.count;
+  const int part = static_cast<int>(blockIdx.x) / n_groups, parts = static_cast<int>(gridDim.x) / n_groups;
   for (std::int64_t first =
            begin - words_past_line(to + begin) + part * std::int64_t{kReturnWords} + threadIdx.x;
        first < end; first += parts * std::int64_t{kReturnWords}) {
@@ -97,10 +102,10 @@ void meet(const PeerMail& mail, std::int64_t meeting, const std::int64_t* values
 
 void return_rows(const PeerReturn& job, Workspace&, CudaStream stream) {
   const std::int64_t most = *std::max_element(job.groups.size, job.groups.size + job.groups.count);
-  if (most == 0) return;
-  const unsigned ranks = job.groups.count, limit = job.back ? kReturnBlocksBack : kReturnBlocks;
+  const unsigned groups = return_groups(job), limit = job.back ? kReturnBlocksBack : kReturnBlocks;
+  if (most == 0 || groups == 0) return;
   const unsigned blocks =
-      ranks * std::min(blocks_for(most * job.width, kReturnWords) + 1, blocks_for(limit, ranks));
+      groups * std::min(blocks_for(most * job.width, kReturnWords) + 1, blocks_for(limit, groups));
   const auto kernel = job.width == 9 ? return_kernel<9> : return_kernel<0>;
   kernel<<<blocks, kReturnThreads, 0, stream>>>(job);
   check_launch("return_to_peers");

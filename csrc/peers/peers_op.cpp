@@ -7,8 +7,8 @@ namespace {
 
 void return_to_peers(const Tensor& values, std::int64_t width, const std::vector<std::int64_t>& group_sizes,
                      std::vector<Tensor> buffers, std::int64_t offset,
-                     const std::vector<std::int64_t>& starts, const std::optional<Tensor>& fronts,
-                     bool back) {
+                     const std::vector<std::int64_t>& starts, std::int64_t rank,
+                     const std::optional<Tensor>& fronts, bool back) {
   constexpr const char* kOp = "return_to_peers_";
   PeerReturn job{};
   job.groups = checked_groups(kOp, "group_sizes", group_sizes);
@@ -34,6 +34,9 @@ void return_to_peers(const Tensor& values, std::int64_t width, const std::vector
     job.fronts_stride = fronts->stride(0);
   }
   STD_TORCH_CHECK(fronts || !back, "blitzgs::", kOp, ": back needs fronts");
+  STD_TORCH_CHECK(rank >= 0 && rank < job.groups.count, "blitzgs::", kOp, ": rank must be in [0, ",
+                  job.groups.count, "), got ", rank);
+  job.rank = static_cast<int>(rank);
   job.back = back;
   DeviceScope scope(held);
   cuda::return_rows(job, scope.workspace, scope.stream);
