@@ -8,9 +8,9 @@ import torch
 from cuda_scenes import Scene, ops
 
 from blitzgs.distributed.rows import PeerSpace, Traffic
-from blitzgs.ops.scatter import sum_rows
+from blitzgs.ops.scatter import Returns, sum_rows
 
-VIEWS, WIDTH, HEIGHT = 2, 150, 100
+VIEWS, WIDTH, HEIGHT, FIRST_PART = 2, 150, 100, 0.4
 TILES = VIEWS * 10 * 7
 # Overlapping, as a rank composites some tiles around its own; the third composites nothing.
 BEGINS, ENDS = [0, 60, 100, 100], [70, 110, 100, TILES]
@@ -34,7 +34,7 @@ class Rank:
 
     def send(self, everyone, buffers, capacity):
         return ops.project_emit_to_peers_(
-            *self.arguments, self.plan, everyone, self.number, self.ids, buffers, capacity
+            *self.arguments, self.plan, everyone, self.number, self.ids, buffers, capacity, FIRST_PART
         )
 
 
@@ -53,8 +53,8 @@ def exchange(counts, room=None):
     return ranks, spaces, [rank.send(everyone, buffers, capacity) for rank in ranks]
 
 
-@pytest.mark.parametrize("counts", [(3000, 900, 0, 40), (1, 0, 0, 2)])
-def test_rows_arrive_and_their_gradients_return(counts):
+@pytest.mark.parametrize("counts,in_parts", [((3000, 900, 0, 40), False), ((3000, 900, 0, 40), True), ((1, 0, 0, 2), True)])
+def test_rows_arrive_and_their_gradients_return(counts, in_parts):
     ranks, spaces, sent = exchange(counts)
     expected = [rank.rows() for rank in ranks]
     for got, want in zip(sent, expected, strict=True):
@@ -76,18 +76,42 @@ def test_rows_arrive_and_their_gradients_return(counts):
             for a, b in zip(arrived, part, strict=True):
                 assert torch.equal(a[order], b)
             begin += len(part[0])
+    filled = torch.stack([rows[13] for rows in sent])
+    assert filled.sum(1).tolist() == spaces[0].traffic.rows
     returned = []
-    for space in spaces:
+    for m, space in enumerate(spaces):
         splats = space.arrived()
         columns = [splats.means2d, splats.conics, splats.opacities[:, None], splats.colors]
         packed = torch.cat([*columns, torch.ones_like(splats.conics)], 1)
-        returned.append(space.write_back(packed))
+        if in_parts:
+            fronts = filled[:, 0, m]
+            space.write_back(packed, fronts)
+            returned.append(space.write_back(packed, fronts, back=True))
+        else:
+            returned.append(space.write_back(packed))
     for m, space in enumerate(spaces):
-        rows, masks, bases = expected[m], sent[m][11], sent[m][12]
-        sums = sum_rows(returned[m], masks, bases, space.traffic.sent, [2, 3, 1, 3])
+        rows, masks, places = expected[m], sent[m][11], sent[m][12]
+        sums = sum_rows(returned[m], Returns(places, space.traffic.sent), len(masks), [2, 3, 1, 3])
         times = sum((masks >> k & 1) for k in range(len(ranks)))[:, None]
         for got, column in zip(sums, (rows[4], rows[5], rows[7][:, None], rows[8]), strict=True):
             assert torch.equal(got, times * column)
+
+
+@pytest.mark.parametrize("count", [3, 20_000])
+def test_rows_of_the_first_gaussians_lie_in_front(count):
+    ranks, spaces, sent = exchange((count, 10, 10, count))
+    for rank, space, rows in zip(ranks, spaces, sent, strict=True):
+        first = rows[3][int(FIRST_PART * len(rows[2]))].item()  # rows before are of the first Gaussians
+        for m, target in enumerate(spaces):
+            begin = sum(target.traffic.received[: rank.number])
+            arrived = target.arrived()
+            keys = arrived.ids[begin:][: space.traffic.sent[m]] * VIEWS
+            keys += arrived.camera_ids[begin:][: space.traffic.sent[m]]
+            mine = rank.ids[rows[0][:first].long()] * VIEWS + rows[1][:first]
+            mine = mine[(rows[11][:first] >> m & 1).bool()]
+            front = int(rows[13][0, m])
+            assert torch.isin(mine, keys[:front]).all()
+            assert front <= len(mine) + 256  # a block's rows stay together
 
 
 def test_nothing_is_written_where_room_is_too_small():
@@ -97,12 +121,18 @@ def test_nothing_is_written_where_room_is_too_small():
         assert len(rows[0]) == len(rows[2]) == 0 and rows[3].tolist() == [0]
 
 
-@pytest.mark.parametrize("width", [1, 4, 9])
-def test_parts_of_rows_return(width):
+@pytest.mark.parametrize("width,in_parts", [(1, False), (4, False), (9, False), (9, True)])
+def test_parts_of_rows_return(width, in_parts):
     sizes, starts, offset = [700, 0, 5], [3, 0, 900], 17
     values = torch.randn(sum(sizes), 12, device="cuda")
     buffers = [torch.full((10_000,), -1, dtype=torch.int32, device="cuda") for _ in sizes]
-    ops.return_to_peers_(values, width, sizes, buffers, offset, starts)
+    fronts = torch.tensor([[400, 0], [0, 0], [9, 0]], device="cuda")[:, 0]
+    if in_parts:
+        ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 1, fronts, False)
+        assert (buffers[0][offset + (3 + 400) * width :] == -1).all()
+        ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 1, fronts, True)
+    else:
+        ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 0, None, False)
     begin = 0
     for buffer, size, start in zip(buffers, sizes, starts, strict=True):
         first = offset + start * width
@@ -115,16 +145,16 @@ def test_parts_of_rows_return(width):
 
 @pytest.mark.parametrize("n_values", [0, 5, 100])
 def test_a_meeting_with_ranks_that_have_come(n_values):
-    mail = [torch.zeros(3 + 3 * 100, dtype=torch.int64, device="cuda") for _ in range(3)]
-    for meeting in (4, 5):
+    mail = [torch.zeros(3 + 3 * 101, dtype=torch.int64, device="cuda") for _ in range(3)]
+    for meeting, first in ((4, 3), (5, 6)):
         for rank in range(3):
             others = [m for m in range(3) if m != rank]
             mail[rank][others] = meeting  # as they would announce themselves
             values = torch.arange(n_values, device="cuda") + 1000 * rank + meeting
-            ops.meet_peers_(mail, rank, meeting, values if n_values else None, 20.0)
+            ops.meet_peers_(mail, rank, meeting, values if n_values else None, first, 20.0)
             for letters in mail:
                 assert int(letters[rank]) == meeting
-                assert torch.equal(letters[3 + rank * n_values :][:n_values], values)
+                assert torch.equal(letters[first + rank * n_values :][:n_values], values)
 
 
 def test_ranks_on_two_streams_wait_for_each_other():
@@ -133,12 +163,12 @@ def test_ranks_on_two_streams_wait_for_each_other():
     streams = [torch.cuda.Stream() for _ in range(2)]
     # Kernels are loaded at their first launch, for which the device must not be waiting.
     torch.cuda._sleep(1)
-    ops.meet_peers_(mail[:1], 0, 0, None, 1.0)
+    ops.meet_peers_(mail[:1], 0, 0, None, 1, 1.0)
     torch.cuda.synchronize()
     for rank, stream in enumerate(streams):
         with torch.cuda.stream(stream):
             if rank == 1:
                 torch.cuda._sleep(20_000_000)
-            ops.meet_peers_(mail, rank, 1, values[rank], 20.0)
+            ops.meet_peers_(mail, rank, 1, values[rank], 2, 20.0)
     torch.cuda.synchronize()
     assert [letters[:4].tolist() for letters in mail] == [[1, 1, 10, 11]] * 2
