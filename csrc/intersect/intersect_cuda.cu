@@ -10,6 +10,7 @@
 
 #include <cuda/std/functional>
 
+#include "common/arrays.h"
 #include "intersect/running_sum.cuh"
 #include "intersect/touched_tiles.cuh"
 
@@ -216,27 +217,23 @@ struct DepthOrder {
 
 DepthOrder order_by_depth(const Input& in, Workspace& workspace, CudaStream stream) {
   const std::int64_t n = in.n_rows;
-  auto* keys = workspace.allocate<std::uint32_t>(n);
-  auto* sorted_keys = workspace.allocate<std::uint32_t>(n);
-  auto* unsorted = workspace.allocate<std::int32_t>(n);
-  DepthOrder order{workspace.allocate<Touched>(n), workspace.allocate<std::int32_t>(n)};
-  depth_keys_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, keys, unsorted, order.touched);
+  auto [touched, keys, sorted_keys, unsorted, rows] =
+      allocate_arrays<Touched, std::uint32_t, std::uint32_t, std::int32_t, std::int32_t>(n, workspace);
+  depth_keys_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, keys, unsorted, touched);
   check_launch("intersect");
-  sort_pairs(keys, sorted_keys, unsorted, order.rows, n, 32, workspace, stream);
+  sort_pairs(keys, sorted_keys, unsorted, rows, n, 32, workspace, stream);
   if (in.ids) {
-    order_ties_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(sorted_keys, order.rows, in.ids, n);
+    order_ties_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(sorted_keys, rows, in.ids, n);
     check_launch("intersect");
   }
-  return order;
+  return {touched, rows};
 }
 
 template <class Key>
 void list_entries(const Input& in, const DepthOrder& order, std::int64_t capacity, std::int32_t* isect_rows,
                   std::int64_t* tile_offsets, Workspace& workspace, CudaStream stream) {
   const std::int64_t n_tiles = in.grid.tile_end - in.grid.tile_begin;
-  auto* keys = workspace.allocate<Key>(capacity);
-  auto* sorted_keys = workspace.allocate<Key>(capacity);
-  auto* entries = workspace.allocate<std::int32_t>(capacity);
+  auto [keys, sorted_keys, entries] = allocate_arrays<Key, Key, std::int32_t>(capacity, workspace);
   const unsigned blocks = blocks_for(in.n_rows, kEmitRows);
   const RunningSum running(blocks, workspace, stream);
   emit_kernel<<<blocks, kThreads, 0, stream>>>(in, order.touched, order.rows, running, capacity, keys,
