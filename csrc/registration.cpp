@@ -46,7 +46,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "
       "int sh_degree, float eps2d, bool antialiased, bool raw, Tensor v_means2d, Tensor v_conics, "
       "Tensor? v_depths, Tensor v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats, "
-      "Tensor? places=None, int[] group_sizes=[]) -> (Tensor v_means, Tensor v_quats, "
+      "Tensor? places=None, int[] group_sizes=[], bool dense=False) -> (Tensor v_means, Tensor v_quats, "
       "Tensor v_scales, Tensor v_opacities, Tensor v_sh, Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible rows.
   m.def(

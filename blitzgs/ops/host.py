@@ -20,7 +20,7 @@ def start_copy(tensor: Tensor) -> Tensor:
 
 def to_host(tensor: Tensor) -> Tensor:
     """Return a small tensor's values on the CPU; waits for the device that holds it."""
-    if not tensor.is_cuda or torch.compiler.is_compiling():
+    if not tensor.is_cuda:
         return tensor.cpu()
     values = start_copy(tensor)
     torch.cuda.current_stream(tensor.device).synchronize()

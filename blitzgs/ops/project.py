@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
-from blitzgs.ops.host import to_host
+from blitzgs._library import without_autograd
+from blitzgs.ops.host import start_copy
+
+project_emit = without_autograd(torch.ops.blitzgs.project_emit)
 
 
 class Rows(NamedTuple):
@@ -90,22 +92,29 @@ def project(
         RuntimeError: a wrong shape, dtype or value, by name.
         ValueError: `sparse_grad` under `torch.compile`.
     """
-    return project_rows(
+    arguments = (
         means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width, height, tile_size,
-        sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw, sparse_grad=sparse_grad,
+        sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
     )  # fmt: skip
+    plan, counts = _counted(arguments)
+    if not torch.compiler.is_compiling():
+        return Rows._make((*_ProjectEmit.apply(*arguments[:6], plan, sparse_grad), counts))  # type: ignore[no-untyped-call]
+    if sparse_grad:
+        raise ValueError("sparse_grad is not supported under torch.compile")
+    return Rows._make((*torch.ops.blitzgs.project_emit(*arguments[:6], *plan), counts))
 
 
-def project_rows(*arguments: Any, sparse_grad: bool = False) -> Rows:
-    """`project` with the positional arguments of its ops, from means to raw, and no ranks to ask."""
+def project_rows(*arguments: Any) -> Rows:
+    """`project` without gradients, with the positional arguments of its ops, from means to raw."""
+    plan, counts = _counted(arguments)
+    return Rows._make((*project_emit(*arguments[:6], *plan), counts))
+
+
+def _counted(arguments: tuple[Any, ...]) -> tuple[tuple[Any, ...], Tensor]:
+    """Count the rows: returns what `project_emit` takes after viewmats, and counts, for which it waits."""
     plan, carry, totals = torch.ops.blitzgs.project_count(*arguments, [], [])
-    counts = to_host(totals)[:3]
-    arguments = (*arguments, [], [], plan, carry, counts)
-    if torch.compiler.is_compiling():
-        if sparse_grad:
-            raise ValueError("sparse_grad is not supported under torch.compile")
-        return Rows._make((*torch.ops.blitzgs.project_emit(*arguments), counts))
-    return Rows._make((*_ProjectEmit.apply(*arguments, sparse_grad), counts))  # type: ignore[no-untyped-call]
+    counts = (totals.cpu() if torch.compiler.is_compiling() else start_copy(totals))[:3]
+    return (*arguments[6:], [], [], plan, carry, counts), counts
 
 
 @torch.library.register_fake("blitzgs::project_count")
@@ -157,13 +166,14 @@ def _(
     visible_ids: Tensor,
     *rest: Any,
 ) -> Any:
-    U = visible_ids.shape[0]
+    dense = any(rest[16:])
+    length = (means if dense else visible_ids).shape[0]
     return (
-        means.new_empty(U, 3),
-        means.new_empty(U, 4),
-        means.new_empty(U, 3),
-        means.new_empty(U),
-        means.new_empty(U, 0 if sh is None else sh.shape[1], 3),
+        means.new_empty(length, 3),
+        means.new_empty(length, 4),
+        means.new_empty(length, 3),
+        means.new_empty(length),
+        means.new_empty(length, 0 if sh is None else sh.shape[1], 3),
         means.new_empty(viewmats.shape[0] if rest[13] else 0, 4, 4),
     )
 
@@ -182,40 +192,28 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
-    means, quats, scales, opacities, sh, viewmats, Ks, camera_ids, visible_ids, row_offsets = (
-        ctx.saved_tensors
-    )
-    v = Rows._make((*v_output, None))
-    P = camera_ids.shape[0]
-    zeros = means.new_zeros(P, 3)
-    gradients = torch.ops.blitzgs.project_bwd(
-        means,
-        quats,
-        scales,
-        opacities,
-        sh,
-        viewmats,
-        Ks,
-        camera_ids,
-        visible_ids,
-        row_offsets,
-        *ctx.options,
-        zeros[:, :2] if v.means2d is None else v.means2d,
-        zeros if v.conics is None else v.conics,
-        v.depths,
-        zeros[:, 0] if v.opacities is None else v.opacities,
-        zeros if sh is not None and v.colors is None else v.colors,
-        None,
-        ctx.needs_input_grad[5],
-    )
-    ids = visible_ids.long()
-    sparse = (ctx.sparse_grad,) * 3 + (ctx.sparse_grad and sh is not None,) * 2
-    parameters = zip(
-        (means, quats, scales, opacities, sh), gradients, sparse, ctx.needs_input_grad, strict=False
-    )
-    of_all = [_of_all(ids, *parameter) if needed else None for *parameter, needed in parameters]
-    v_viewmats = gradients[5] if ctx.needs_input_grad[5] else None
-    return (*of_all, v_viewmats, *(None,) * 18)
+    return (*_gradients(ctx, v_output), *(None,) * 18)
+
+
+def _gradients(ctx: Any, v_output: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
+    """Return the gradients of means, quats, scales, opacities, sh and viewmats, where they are needed."""
+    parameters, (viewmats, Ks, *rows) = ctx.saved_tensors[:5], ctx.saved_tensors[5:]
+    means, *_, sh = parameters
+    *needed, need_viewmats = ctx.needs_input_grad[:6]
+    # Where all are to be dense, the kernel writes them so; a dense one that nobody needs would cost memory.
+    dense = not ctx.sparse_grad and all(needed if sh is not None else needed[:4])
+    *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
+        *parameters, viewmats, Ks, *rows, *ctx.options, *_row_gradients(means, sh, rows[0], v_output), None,
+        need_viewmats, dense=dense,
+    )  # fmt: skip
+    if not dense:
+        ids = rows[1].long()
+        sparse = (ctx.sparse_grad,) * 3 + (ctx.sparse_grad and sh is not None,) * 2
+        columns = zip(parameters, gradients, sparse, needed, strict=True)
+        gradients = [_of_all(ids, *column) if wanted else None for *column, wanted in columns]
+    elif sh is None:
+        gradients[4] = None
+    return (*gradients, v_viewmats if need_viewmats else None)
 
 
 def _of_all(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> Tensor:
@@ -227,22 +225,42 @@ def _of_all(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> T
     return torch.zeros_like(parameter).index_copy_(0, ids, gradient)
 
 
+def _row_gradients(
+    means: Tensor, sh: Tensor | None, camera_ids: Tensor, v_output: tuple[Tensor | None, ...]
+) -> tuple[Tensor | None, ...]:
+    """Return the gradients of means2d, conics, depths, opacities and colors as `project_bwd` takes them."""
+    v = Rows._make((*v_output, None))
+    needed = [v.means2d, v.conics, v.opacities] + ([] if sh is None else [v.colors])
+    if any(gradient is None for gradient in needed):
+        zeros = means.new_zeros(len(camera_ids), 3)
+        v = v._replace(
+            means2d=zeros[:, :2] if v.means2d is None else v.means2d,
+            conics=zeros if v.conics is None else v.conics,
+            opacities=zeros[:, 0] if v.opacities is None else v.opacities,
+            colors=zeros if v.colors is None and sh is not None else v.colors,
+        )
+    return v.means2d, v.conics, v.depths, v.opacities, v.colors
+
+
 class _ProjectEmit(torch.autograd.Function):
     """`project_emit` and the argument `sparse_grad`, outside of `torch.compile`.
 
-    The formula is the one registered below, whose way through torch takes 0.2 ms of the host's time.
+    The formula is the one registered below, whose way through torch takes 0.2 ms of the host's time. Each
+    argument takes time: those without a gradient are one.
     """
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        rows = torch.ops.blitzgs.project_emit(*arguments[:-1])
-        _setup_context(ctx, arguments[:-1], rows)
-        ctx.sparse_grad = arguments[-1]
+        *parameters, plan, sparse_grad = arguments
+        inputs = (*parameters, *plan)
+        rows = project_emit(*inputs)
+        _setup_context(ctx, inputs, rows)
+        ctx.sparse_grad = sparse_grad
         return rows
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
-        return (*_backward(ctx, *v_output), None)
+        return (*_gradients(ctx, v_output), None, None)
 
 
 torch.library.register_autograd("blitzgs::project_emit", _backward, setup_context=_setup_context)

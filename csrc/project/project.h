@@ -93,10 +93,12 @@ struct ProjectScatter {
   ScatterTargets targets;
 };
 
-// Gradients by visible Gaussian, [U, ...] (sh [U, K, 3], null without sh); viewmats [B, 4, 4] or null.
+// Gradients by visible Gaussian, [U, ...] (sh [U, K, 3], null without sh), or, where `dense`, by Gaussian:
+// [N, ...], zeros, of which the rows of the visible are written. viewmats [B, 4, 4] or null.
 template <class T>
 struct ProjectGradients {
   T *means, *quats, *scales, *opacities, *sh, *viewmats;
+  bool dense = false;
 };
 
 // What the backward pass knows of the forward pass.

@@ -9,7 +9,7 @@ namespace {
 
 constexpr int kPoseThreads = 256;
 
-// Stores the gradients, compact.
+// Stores the gradients, compact or dense.
 struct StoreGradients {
   struct Shared {};
   struct Own {};
@@ -20,23 +20,39 @@ struct StoreGradients {
   __device__ void take(Shared&, Own&, const WarpRows& warp, TripleStage& triple, const Vec3<float>& v_mean,
                        const float4& v_quat, const Vec3<float>& v_scale, float v_opacity) const {
     if (warp.id >= 0) {
-      out.opacities[warp.first + warp.lane] = v_opacity;
-      reinterpret_cast<float4*>(out.quats)[warp.first + warp.lane] = v_quat;
+      out.opacities[row(warp)] = v_opacity;
+      reinterpret_cast<float4*>(out.quats)[row(warp)] = v_quat;
     }
-    triple.store(v_mean, out.means + 3 * warp.first, warp.count, warp.lane);
-    triple.store(v_scale, out.scales + 3 * warp.first, warp.count, warp.lane);
+    if (out.dense) {
+      triple.scatter(v_mean, out.means, warp.id, warp.lane);
+      triple.scatter(v_scale, out.scales, warp.id, warp.lane);
+    } else {
+      triple.store(v_mean, out.means + 3 * warp.first, warp.count, warp.lane);
+      triple.store(v_scale, out.scales + 3 * warp.first, warp.count, warp.lane);
+    }
   }
   template <int DEGREE>
   __device__ void take_sh(Shared&, Own&, const WarpRows& warp, const ShStage<DEGREE>& stage) const {
-    if (out.sh) stage.store(out.sh + stride * warp.first, stride, warp.count, warp.lane);
+    if (!out.sh) return;
+    if (out.dense) {
+      stage.scatter(out.sh, stride, warp.id, warp.lane);
+    } else {
+      stage.store(out.sh + stride * warp.first, stride, warp.count, warp.lane);
+    }
   }
   template <int DEGREE>
   __device__ void take_sh(Shared&, Own&, const WarpRows& warp, const ShRow<DEGREE>& v_sh) const {
     if (!out.sh || warp.id < 0) return;
-    float* target = out.sh + stride * (warp.first + warp.lane);
+    float* target = out.sh + stride * row(warp);
 #pragma unroll
     for (int i = 0; i < ShRow<DEGREE>::kCount; ++i) target[i] = v_sh.values[i];
     for (int i = ShRow<DEGREE>::kCount; i < stride; ++i) target[i] = 0.f;
+  }
+
+ private:
+  // The lane's own.
+  __device__ std::int64_t row(const WarpRows& warp) const {
+    return out.dense ? warp.id : warp.first + warp.lane;
   }
 };
 

@@ -75,17 +75,21 @@ BackwardTensors project_bwd(const Tensor& means, const Tensor& quats, const Tens
                             const Tensor& v_means2d, const Tensor& v_conics, const OptionalTensor& v_depths,
                             const Tensor& v_row_opacities, const OptionalTensor& v_colors,
                             const OptionalTensor& scale_reg, bool need_viewmats, const OptionalTensor& places,
-                            const std::vector<std::int64_t>& group_sizes) {
+                            const std::vector<std::int64_t>& group_sizes, bool dense) {
   constexpr const char* kOp = "project_bwd";
   const Parameters p(kOp, means, quats, scales, opacities, sh, viewmats, Ks, sh_degree);
   const Backward b(kOp, p, camera_ids, visible_ids, row_offsets, width, height, sh_degree, eps2d, antialiased,
                    raw, scale_reg);
   HeldRowGradients v(kOp, p.means.scalar_type(), camera_ids.numel(), v_means2d, v_conics, v_depths,
                      v_row_opacities, v_colors, places, group_sizes);
-  const std::int64_t U = b.visible();
-  Tensor v_means = make_empty(p.means, {U, 3}), v_quats = make_empty(p.means, {U, 4}),
-         v_scales = make_empty(p.means, {U, 3}), v_opacities = make_empty(p.means, {U}),
-         v_sh = make_empty(p.means, {U, p.sh_stride, 3}),
+  const std::int64_t length = dense ? p.count : b.visible();
+  const auto rows_of = [&](std::vector<std::int64_t> shape) {
+    Tensor rows = make_empty(p.means, shape);
+    if (dense) TORCH_ERROR_CODE_CHECK(aoti_torch_zero_(rows.get()));
+    return rows;
+  };
+  Tensor v_means = rows_of({length, 3}), v_quats = rows_of({length, 4}), v_scales = rows_of({length, 3}),
+         v_opacities = rows_of({length}), v_sh = rows_of({length, p.sh_stride, 3}),
          v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {
@@ -94,7 +98,7 @@ BackwardTensors project_bwd(const Tensor& means, const Tensor& quats, const Tens
         b.inputs<T>(), b.rows(), v.source<T>(scope), data_or_null<T>(b.scale_reg),
         ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
                             mutable_data<T>(v_opacities), sh ? mutable_data<T>(v_sh) : nullptr,
-                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr},
+                            need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense},
         scope.workspace, scope.stream);
   });
   return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};

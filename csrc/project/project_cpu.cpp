@@ -130,19 +130,20 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
   const ActiveGaussian<T> gaussian = load_gaussian(in, id);
   GaussianGradient<T> gradient{};
   T axis_weight = T(0);
-  if (out.sh) std::fill_n(out.sh + stride * u, stride, T(0));
+  const std::int64_t at = out.dense ? id : u;
+  if (out.sh) std::fill_n(out.sh + stride * at, stride, T(0));
   for (std::int64_t r = rows.row_offsets[u]; r < rows.row_offsets[u + 1]; ++r) {
     const int view = rows.camera_ids[r];
     PoseGradient<T>* pose = poses ? poses + view : nullptr;
     project_row_vjp(cameras[view], gaussian, in.options, v.geometry(r), &gradient, pose);
     if (in.sh && v.colored()) {
       row_color_vjp(cameras[view], gaussian.mean, in.sh + stride * id, in.options.sh_degree, v.colors + 3 * r,
-                    out.sh + stride * u, &gradient.mean, pose);
+                    out.sh + stride * at, &gradient.mean, pose);
     }
     if (scale_reg) axis_weight += scale_reg[view];
   }
   activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
-                        {out.means + 3 * u, out.quats + 4 * u, out.scales + 3 * u, out.opacities + u});
+                        {out.means + 3 * at, out.quats + 4 * at, out.scales + 3 * at, out.opacities + at});
 }
 
 // Adds one block's pose gradients, [B] of them, to its slice [B, 12] of doubles.

@@ -95,6 +95,17 @@ struct TripleStage {
     }
     __syncwarp();
   }
+  // Stores each lane's row as row `id` of `out` (id < 0: nowhere).
+  __device__ __forceinline__ void scatter(const Vec3<float>& mine, float* out, std::int32_t id, int lane) {
+    set(lane, mine);
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+      const int at = i * 32 + lane;
+      const std::int64_t row = __shfl_sync(0xffffffffu, id, at / 3);
+      if (row >= 0) out[3 * row + at % 3] = values[at];
+    }
+    __syncwarp();
+  }
 };
 
 // The SH coefficients of one Gaussian in use at a degree, in registers.
@@ -174,6 +185,15 @@ struct ShStage {
     for (int at = lane; at < 32 * rest; at += 32) {
       const int row = at / rest, quad = Row::kQuads + at % rest;
       if (row < rows) reinterpret_cast<float4*>(out + stride * row)[quad] = {0.f, 0.f, 0.f, 0.f};
+    }
+  }
+  // Stores each lane's row as row `id` of `out` (id < 0: nowhere), the coefficients in use.
+  __device__ __forceinline__ void scatter(float* out, std::int64_t stride, std::int32_t id, int lane) const {
+#pragma unroll
+    for (int i = 0; i < Row::kQuads; ++i) {
+      const int at = i * 32 + lane, slot = at / Row::kQuads, quad = at % Row::kQuads;
+      const std::int64_t row = __shfl_sync(0xffffffffu, id, slot);
+      if (row >= 0) reinterpret_cast<float4*>(out + stride * row)[quad] = quads[slot * kPitch + quad];
     }
   }
 };

@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.project import project
 from blitzgs.ops.route import route_count
-from tests.helpers import PARAMETERS, orbit_camera, random_scene, reference_images, relative_error
+from tests.helpers import BACKENDS, PARAMETERS, orbit_camera, random_scene, reference_images, relative_error
 
 FLOATS = ("means2d", "conics", "depths", "opacities", "colors")
 
@@ -167,6 +167,35 @@ def test_gradients_are_repeatable_and_sum_over_views():
     torch.set_num_threads(threads)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
     assert all(a.abs().sum() > 0 for a in first)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("degree, coefficients", [(3, 16), (1, 16), (2, 9), (0, 1), (None, 0)])
+def test_dense_gradients_are_the_compact_ones_where_they_belong(backend, degree, coefficients):
+    device, dtype = backend
+    scene = random_scene(n=700, cameras=2, width=20, height=16, dtype=dtype, device=device)
+    scene.means[::2] *= 20.0  # seen by no view
+    sh = None if degree is None else scene.colors[:, :coefficients].contiguous()
+    rows = project_scene(scene, sh=sh, sh_degree=degree or 0)
+    generator = torch.Generator().manual_seed(1)
+    v = [
+        None if width == 0 else torch.randn(len(rows.depths), width, generator=generator).to(device, dtype)
+        for width in (2, 3, 1, 1, 3 if sh is not None else 0)
+    ]
+    arguments = (
+        scene.means, scene.quats, scene.scales, scene.opacities, sh, scene.viewmats, scene.Ks,
+        rows.camera_ids, rows.visible_ids, rows.row_offsets, scene.width, scene.height, degree or 0, 0.3,
+        True, False, v[0], v[1], v[2][:, 0], v[3][:, 0], v[4], None, True,
+    )  # fmt: skip
+    compact = torch.ops.blitzgs.project_bwd(*arguments)
+    dense = torch.ops.blitzgs.project_bwd(*arguments, dense=True)
+    ids = rows.visible_ids.long()
+    assert 10 < len(ids) < 600
+    for part, whole in zip(compact[:5], dense[:5], strict=True):
+        expected = part.new_zeros(700, *part.shape[1:]).index_copy(0, ids, part)
+        assert torch.equal(whole, expected)
+    assert torch.equal(compact[5], dense[5])
+    torch.library.opcheck(torch.ops.blitzgs.project_bwd, arguments, {"dense": True})
 
 
 def test_scale_regulariser_adds_the_slope_of_the_smallest_axis():
