@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from blitzgs.lazy_dict import Later, LazyDict
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import Rows, project
 from blitzgs.ops.rasterize import rasterize
@@ -89,7 +91,8 @@ def rasterization(
         Images [C, H, W, D] (depth last), alphas [C, H, W, 1], and meta: camera_ids, gaussian_ids (None unless
         packed; ordered by Gaussian, then view), radii, means2d, depths, conics, opacities, tile_width,
         tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets (int64), width, height, tile_size,
-        n_cameras. `meta["means2d"]` takes `retain_grad()`.
+        n_cameras. `meta["means2d"]` takes `retain_grad()`. Meta is a `LazyDict`: what the image does not need
+        is worked out when it is first read.
 
     Raises:
         ValueError: an argument that is not supported or does not fit, by name.
@@ -129,46 +132,63 @@ def rasterization(
         sparse_grad=sparse_grad,
     )
     n_cameras = viewmats.shape[0]
-    cameras, gaussians = rows.camera_ids.long(), rows.gaussian_ids.long()
-    means2d = rows.means2d if packed else _dense(rows.means2d, cameras, gaussians, n_cameras, len(means))
-    row_means2d = means2d if packed else means2d[cameras, gaussians]
-    splats = (row_means2d, rows.conics, rows.opacities)
+    seen = _Seen(rows, n_cameras, len(means))
+    means2d = rows.means2d if packed else seen.of_all(rows.means2d)
+    splats = (means2d if packed else seen.of_rows(means2d), rows.conics, rows.opacities)
     grid: dict[str, Any] = {
         "n_cameras": n_cameras,
         "width": width,
         "height": height,
         "tile_size": tile_size,
     }
-    lists = intersect(*splats, rows.depths, rows.camera_ids, n_isects=int(rows.counts[2]), **grid)
+    n_isects = rows.counts.tolist()[2]
+    lists = intersect(*splats, rows.depths, rows.camera_ids, n_isects=n_isects, **grid)
     composited = lists
     if means.is_cuda and tile_size not in CUDA_TILE_SIZES:
         grid["tile_size"] = CUDA_TILE_SIZES[1]
         composited = intersect(*splats, rows.depths, rows.camera_ids, **grid)
     renders, alphas = rasterize(
         *splats,
-        _channels(rows, colors, cameras, gaussians, render_mode, sh_degree),
+        _channels(seen, colors, render_mode, sh_degree),
         *composited,
         backgrounds=_background_channels(backgrounds, render_mode),
-        means2d_abs=_absolute_gradient_probe(means2d, cameras, gaussians, packed) if absgrad else None,
+        means2d_abs=_absolute_gradient_probe(means2d, None if packed else seen) if absgrad else None,
         **grid,
     )
     alphas = alphas[..., None]
     if render_mode.endswith("ED"):
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    meta = _meta(
-        rows,
-        cameras,
-        gaussians,
-        means2d,
-        *lists,
-        packed,
-        len(means),
-        n_cameras,
-        width,
-        height,
-        tile_size,
-    )
-    return renders, alphas, meta
+    return renders, alphas, _meta(seen, means2d, *lists, packed, width, height, tile_size)
+
+
+class _Seen:
+    """The rows, and where they stand among the Gaussians of each view; int64, made when first asked for."""
+
+    def __init__(self, rows: Rows, n_cameras: int, n: int) -> None:
+        self.rows, self.n_cameras, self.n = rows, n_cameras, n
+
+    @cached_property
+    def cameras(self) -> Tensor:
+        return self.rows.camera_ids.long()
+
+    @cached_property
+    def gaussians(self) -> Tensor:
+        return self.rows.gaussian_ids.long()
+
+    @cached_property
+    def places(self) -> Tensor:
+        """[P] places in [C * N]."""
+        return self.gaussians if self.n_cameras == 1 else self.cameras * self.n + self.gaussians
+
+    def of_all(self, values: Tensor) -> Tensor:
+        """Return rows' values [P, ...] as [C, N, ...], zero where a view does not see a Gaussian."""
+        zeros = values.new_zeros(self.n_cameras * self.n, *values.shape[1:])
+        dense = zeros.index_copy(0, self.places, values)
+        return dense.view(self.n_cameras, self.n, *values.shape[1:])
+
+    def of_rows(self, dense: Tensor) -> Tensor:
+        """Return what rows have of [C, N, ...]: [P, ...]."""
+        return dense.flatten(0, 1).index_select(0, self.places)
 
 
 def _reject_unsupported(arguments: dict[str, Any]) -> None:
@@ -223,26 +243,18 @@ def _hide_non_finite(opacities: Tensor, colors: Tensor) -> Tensor:
     return torch.where(finite, opacities, torch.zeros_like(opacities))
 
 
-def _dense(values: Tensor, cameras: Tensor, gaussians: Tensor, n_cameras: int, n: int) -> Tensor:
-    """Scatter row values [P, ...] to [C, N, ...], zero where a view does not see a Gaussian."""
-    zeros = values.new_zeros(n_cameras, n, *values.shape[1:])
-    return zeros.index_put((cameras, gaussians), values)
-
-
-def _channels(
-    rows: Rows, colors: Tensor, cameras: Tensor, gaussians: Tensor, render_mode: str, sh_degree: int | None
-) -> Tensor:
+def _channels(seen: _Seen, colors: Tensor, render_mode: str, sh_degree: int | None) -> Tensor:
     """Return what is composited, per row [P, D]."""
-    depths = rows.depths[:, None]
+    rows = seen.rows
     if "RGB" not in render_mode:
-        return depths
+        return rows.depths[:, None]
     if sh_degree is not None:
         values = rows.colors
     elif colors.dim() == 2:
-        values = colors[gaussians]
+        values = colors.index_select(0, rows.gaussian_ids)
     else:
-        values = colors[cameras, gaussians]
-    return values if render_mode == "RGB" else torch.cat([values, depths], dim=1)
+        values = colors[seen.cameras, seen.gaussians]
+    return values if render_mode == "RGB" else torch.cat([values, rows.depths[:, None]], dim=1)
 
 
 def _background_channels(backgrounds: Tensor | None, render_mode: str) -> Tensor | None:
@@ -253,28 +265,38 @@ def _background_channels(backgrounds: Tensor | None, render_mode: str) -> Tensor
     return torch.cat([backgrounds, torch.zeros_like(backgrounds[:, :1])], dim=1)
 
 
-def _absolute_gradient_probe(means2d: Tensor, cameras: Tensor, gaussians: Tensor, packed: bool) -> Tensor:
-    """Return zeros [P, 2] whose gradient, the absolute sums, is stored as `means2d.absgrad` in backward."""
+def _absolute_gradient_probe(means2d: Tensor, seen: _Seen | None) -> Tensor:
+    """Return zeros [P, 2] whose gradient, the absolute sums, is stored as `means2d.absgrad` in backward.
+
+    With `seen`, means2d and so the gradient are of all Gaussians.
+    """
     probe = torch.zeros_like(means2d, requires_grad=True)
     probe.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient))
-    return probe * 1.0 if packed else probe[cameras, gaussians]
+    return probe * 1.0 if seen is None else seen.of_rows(probe)
 
 
 def _meta(
-    rows: Rows,
-    cameras: Tensor,
-    gaussians: Tensor,
+    seen: _Seen,
     means2d: Tensor,
     isect_rows: Tensor,
     tile_offsets: Tensor,
     packed: bool,
-    n: int,
-    n_cameras: int,
     width: int,
     height: int,
     tile_size: int,
-) -> dict[str, Any]:
+) -> LazyDict:
+    rows, n_cameras = seen.rows, seen.n_cameras
     tile_width, tile_height = -(-width // tile_size), -(-height // tile_size)
+    with_gradient = torch.is_grad_enabled()
+
+    def of_all(values: Tensor) -> Tensor:
+        with torch.set_grad_enabled(with_gradient):  # as when meta was made
+            return seen.of_all(values)
+
+    def isect_ids() -> Tensor:
+        depths = rows.depths.detach().index_select(0, isect_rows)
+        return _isect_ids(depths, tile_offsets, n_cameras, tile_width * tile_height)
+
     per_row = {
         "radii": rows.radii,
         "depths": rows.depths,
@@ -282,33 +304,28 @@ def _meta(
         "opacities": rows.opacities,
         "tiles_per_gauss": rows.tiles_touched,
     }
-    if not packed:
-        per_row = {k: _dense(v, cameras, gaussians, n_cameras, n) for k, v in per_row.items()}
-    depths = rows.depths.detach().index_select(0, isect_rows)
-    return {
-        "camera_ids": cameras if packed else None,
-        "gaussian_ids": gaussians if packed else None,
-        "means2d": means2d,
-        **per_row,
-        "tile_width": tile_width,
-        "tile_height": tile_height,
-        "isect_ids": _isect_ids(depths, tile_offsets, n_cameras, tile_width * tile_height),
-        "flatten_ids": isect_rows if packed else (cameras * n + gaussians).index_select(0, isect_rows).int(),
-        "isect_offsets": tile_offsets[:-1].reshape(n_cameras, tile_height, tile_width),
-        "width": width,
-        "height": height,
-        "tile_size": tile_size,
-        "n_cameras": n_cameras,
-        "n_batches": 1,
-    }
+    return LazyDict(
+        camera_ids=Later(lambda: seen.cameras) if packed else None,
+        gaussian_ids=Later(lambda: seen.gaussians) if packed else None,
+        means2d=means2d,
+        **(per_row if packed else {k: Later(partial(of_all, v)) for k, v in per_row.items()}),
+        tile_width=tile_width,
+        tile_height=tile_height,
+        isect_ids=Later(isect_ids),
+        flatten_ids=isect_rows if packed else Later(lambda: seen.places.index_select(0, isect_rows).int()),
+        isect_offsets=Later(lambda: tile_offsets[:-1].reshape(n_cameras, tile_height, tile_width)),
+        width=width,
+        height=height,
+        tile_size=tile_size,
+        n_cameras=n_cameras,
+        n_batches=1,
+    )
 
 
 def _isect_ids(depths: Tensor, tile_offsets: Tensor, n_cameras: int, n_tiles: int) -> Tensor:
     """Return gsplat's sort keys, int64 [I]: camera | tile | float32 depth bits, from high to low."""
-    cameras = torch.arange(n_cameras, device=depths.device) << 32 + n_tiles.bit_length()
-    tiles = torch.arange(0, n_tiles << 32, 1 << 32, device=depths.device)
-    keys = (cameras[:, None] + tiles).flatten()
-    counts = tile_offsets[1:] - tile_offsets[:-1]
-    return keys.repeat_interleave(counts, output_size=len(depths)).bitwise_or_(
-        depths.float().view(torch.int32)
-    )
+    entries = torch.arange(len(depths), device=depths.device)
+    keys = torch.searchsorted(tile_offsets[1:], entries, right=True)
+    if n_cameras > 1:
+        keys += keys // n_tiles * ((1 << n_tiles.bit_length()) - n_tiles)
+    return keys.bitwise_left_shift_(32).bitwise_or_(depths.float().view(torch.int32))

@@ -170,6 +170,18 @@ def test_packed_and_dense_meta_say_the_same():
     assert (dense["radii"][invisible] == 0).all()
 
 
+def test_meta_read_late_is_differentiable_as_the_call_was():
+    scene = random_scene(n=20).leaves()
+    with torch.no_grad():
+        _, _, constant = rasterize_scene(scene, packed=False)
+    _, _, meta = rasterize_scene(scene, packed=False)
+    with torch.no_grad():
+        depths = meta["depths"]
+    assert depths.requires_grad and not constant["depths"].requires_grad
+    depths.sum().backward()
+    assert scene.means.grad.any()
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_meta_lists_are_sorted_and_consistent(device):
     scene = random_scene(n=90, cameras=2, width=50, height=37, device=device)

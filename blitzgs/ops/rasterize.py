@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs._library import without_autograd
 from blitzgs.ops.intersect import tile_counts
+
+rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
 
 
 def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -78,13 +80,13 @@ def rasterize(
     Raises:
         RuntimeError: wrong shapes or dtypes, or a tile range outside the images.
     """
-    compiling = torch.compiler.is_compiling()
-    forward: Callable[..., Any] = torch.ops.blitzgs.rasterize_fwd if compiling else _Rasterize.apply
-    renders, transmittances, _, _, _ = forward(
-        means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets, n_cameras, width,
-        height, tile_size, tile_begin, tile_end, means2d_abs,
-    )  # fmt: skip
-    alphas = 1 - transmittances
+    splats = (means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets)
+    grid = (n_cameras, width, height, tile_size, tile_begin, tile_end)
+    if torch.compiler.is_compiling():
+        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid, means2d_abs)
+        alphas = 1 - transmittances
+    else:
+        renders, alphas = _Rasterize.apply(*splats, grid, means2d_abs)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
         alphas = alphas * _owned_pixels(alphas, tile_size, tile_begin, tile_end)
     return renders, alphas
@@ -163,9 +165,13 @@ def _(
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    splats, grid, means2d_abs = inputs[:7], inputs[7:13], inputs[13]
-    renders, transmittances, last_ids, tile_work, aux = output
+    *_, last_ids, tile_work, aux = output
     ctx.mark_non_differentiable(last_ids, tile_work, aux)
+    _save(ctx, inputs[:7], inputs[7:13], inputs[13], output)
+
+
+def _save(ctx: Any, splats: Any, grid: Any, means2d_abs: Tensor | None, output: tuple[Tensor, ...]) -> None:
+    renders, transmittances, last_ids, _, aux = output
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*splats, renders, transmittances, last_ids, aux)
     ctx.grid = grid
@@ -175,36 +181,58 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
 def _backward(
     ctx: Any, v_renders: Tensor | None, v_transmittances: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
-    if v_renders is None and v_transmittances is None:
-        return (None,) * 14
+    v_alphas = None if v_transmittances is None else -v_transmittances
+    *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas)
+    return (*splat_gradients, *(None,) * 8, v_abs)
+
+
+def _gradients(
+    ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None, may_pack: bool = False
+) -> tuple[Tensor | None, ...]:
+    """Return the gradients of means2d, conics, row_opacities, colors, backgrounds and means2d_abs.
+
+    With `may_pack`, on CUDA, they may be columns of one table, which `project_bwd` reads as it is.
+    """
+    if v_renders is None and v_alphas is None:
+        return (None,) * 6
     *splats, renders, transmittances, last_ids, aux = ctx.saved_tensors
     if v_renders is None:
         v_renders = torch.zeros_like(renders)
-    v_alphas = None if v_transmittances is None else -v_transmittances
-    v_means2d, v_conics, v_opacities, v_colors, v_abs = torch.ops.blitzgs.rasterize_bwd(
-        *splats, renders, transmittances, last_ids, aux, v_renders, v_alphas, *ctx.grid, ctx.absgrad,
-        torch.are_deterministic_algorithms_enabled(),
-    )  # fmt: skip
-    v_backgrounds = None
+    arguments = (*splats, renders, transmittances, last_ids, aux, v_renders)
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    v_abs = v_backgrounds = None
+    v_splats: Sequence[Tensor]
+    if may_pack and renders.is_cuda and renders.shape[-1] == 3 and v_alphas is None and not ctx.absgrad:
+        v_splats = gradient_columns(
+            torch.ops.blitzgs.rasterize_bwd_packed(*arguments, *ctx.grid, deterministic)
+        )
+    else:
+        *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
+            *arguments, v_alphas, *ctx.grid, ctx.absgrad, deterministic
+        )
     if ctx.needs_input_grad[4]:
         v_backgrounds = torch.einsum("bhwd,bhw->bd", v_renders, transmittances)
-    splat_gradients = (v_means2d, v_conics, v_opacities, v_colors, v_backgrounds)
-    return (*splat_gradients, *(None,) * 8, v_abs if ctx.absgrad else None)
+    return (*v_splats, v_backgrounds, v_abs if ctx.absgrad else None)
 
 
 class _Rasterize(torch.autograd.Function):
-    """`rasterize_fwd` outside of `torch.compile`.
+    """Renders and alphas outside of `torch.compile`.
 
     The formula is the one registered below, whose way through torch takes 0.2 ms of the host's time.
     """
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> Any:
-        output = torch.ops.blitzgs.rasterize_fwd(*arguments)
-        _setup_context(ctx, arguments, output)
-        return output
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
+        *splats, grid, means2d_abs = arguments
+        output = rasterize_fwd(*splats, *grid)
+        _save(ctx, splats, grid, means2d_abs, output)
+        return output[0], 1 - output[1]
 
-    backward = staticmethod(_backward)
+    @staticmethod
+    def backward(ctx: Any, *v_output: Tensor | None) -> tuple[Tensor | None, ...]:
+        v_renders, v_alphas = v_output
+        *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, may_pack=True)
+        return (*splat_gradients, None, None, None, v_abs)
 
 
 torch.library.register_autograd("blitzgs::rasterize_fwd", _backward, setup_context=_setup_context)

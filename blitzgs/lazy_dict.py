@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A dict some of whose values cost nothing until they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+
+class Later:
+    """A value that `LazyDict` works out when it is first read."""
+
+    __slots__ = ("compute",)
+
+    def __init__(self, compute: Callable[[], Any]) -> None:
+        self.compute = compute
+
+
+class LazyDict(dict[str, Any]):
+    """A dict whose `Later` values are replaced by what they compute when they are first read.
+
+    In every other way a dict: no reader sees a `Later`, copies and pickles are plain dicts, and any value may
+    be replaced or deleted.
+    """
+
+    def __getitem__(self, key: str) -> Any:
+        value = super().__getitem__(key)
+        if isinstance(value, Later):
+            value = self[key] = value.compute()
+        return value
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the keys; defined so that `dict(self)` and `**self` read values by `__getitem__`."""
+        return super().__iter__()
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the value of a key, or `default`."""
+        return self[key] if key in self else default  # noqa: SIM401
+
+    def setdefault(self, key: str, default: Any = None) -> Any:
+        """Return the value of a key, which is `default` from now on where there was none."""
+        return self[key] if key in self else super().setdefault(key, default)
+
+    def pop(self, key: str, *default: Any) -> Any:
+        """Remove a key and return its value, or `default`."""
+        self.get(key)
+        return super().pop(key, *default)
+
+    def popitem(self) -> tuple[str, Any]:
+        """Remove the last key and return it and its value."""
+        return self._settled().popitem()
+
+    def values(self) -> Any:
+        """Return a view of the values."""
+        return self._settled().values()
+
+    def items(self) -> Any:
+        """Return a view of the keys and values."""
+        return self._settled().items()
+
+    def copy(self) -> dict[str, Any]:
+        """Return a plain dict of the same values."""
+        return dict(self)
+
+    def __eq__(self, other: object) -> bool:
+        return dict(self) == other
+
+    def __ne__(self, other: object) -> bool:
+        return dict(self) != other
+
+    def __or__(self, other: Any) -> Any:
+        return dict(self) | other
+
+    def __ror__(self, other: Any) -> Any:
+        return other | dict(self)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        return dict, (dict(self),)
+
+    def _settled(self) -> Any:
+        """Compute what is left; returns the same dict, to be read as a plain one."""
+        for key in self:
+            self[key]
+        return super()
