@@ -5,8 +5,10 @@
 
 Gradients for every parameter; SH degree 3, float32. Ours: the ops of the training step in order (project,
 intersect, rasterize and their gradients, in compact rows), and the same through `blitzgs.rasterization` and
-autograd (with its meta; with dense gradients, and with sparse ones). gsplat: `rasterization` and autograd,
-packed and not. Each figure is a median over repeats of CUDA event times; memory is the peak above the inputs.
+autograd: with dense gradients, with sparse ones, and with every entry of meta read. gsplat: `rasterization`
+and autograd, packed and not. Torch's autograd hands the backward pass of CUDA tensors to a thread of its own
+and waits for it; "1 thread" is without that (`torch.autograd.set_multithreading_enabled(False)`). Each figure
+is a median over repeats of CUDA event times; memory is the peak above the inputs.
 """
 
 from __future__ import annotations
@@ -105,8 +107,15 @@ class OurRender:
 class CallRender:
     """The same work by one call, `rasterization` of gsplat or of BlitzGS, and autograd."""
 
-    def __init__(self, scene: BenchmarkScene, rasterization: Callable[..., Any], packed: bool) -> None:
-        self.rasterization, self.packed, self.scene = rasterization, packed, scene
+    def __init__(
+        self,
+        scene: BenchmarkScene,
+        rasterization: Callable[..., Any],
+        one_thread: bool = False,
+        read_meta: bool = False,
+    ) -> None:
+        self.rasterization, self.scene = rasterization, scene
+        self.one_thread, self.read_meta = one_thread, read_meta
         s = scene
         self.parameters = [
             t.detach().clone().requires_grad_() for t in (s.means, s.quats, s.scales, s.opacities, s.sh)
@@ -115,15 +124,17 @@ class CallRender:
     def forward(self) -> Tensor:
         """Return the image [B, H, W, 3]."""
         s = self.scene
-        self.image, _, _ = self.rasterization(
-            *self.parameters, s.viewmats, s.Ks, s.width, s.height, sh_degree=3, packed=self.packed
+        self.image, _, meta = self.rasterization(
+            *self.parameters, s.viewmats, s.Ks, s.width, s.height, sh_degree=3
         )
+        self.meta = list(meta.values()) if self.read_meta else meta
         return self.image
 
     def backward(self, v_renders: Tensor) -> None:
         """Differentiate through autograd."""
-        torch.autograd.grad(self.image, self.parameters, v_renders)
-        del self.image
+        with torch.autograd.set_multithreading_enabled(not self.one_thread):
+            torch.autograd.grad(self.image, self.parameters, v_renders)
+        del self.image, self.meta
 
 
 def event_times(steps: list[Callable[[], Any]], repeats: int, warmup: int = 5) -> list[float]:
@@ -173,11 +184,21 @@ def run(name: str, repeats: int) -> dict[str, Any]:
     result["stages"] = stages(ours, v, repeats)
     del ours.saved, ours.splats, ours.lists, ours.rows, ours.v_rows, ours.gradients
     sparse = partial(rasterization, sparse_grad=True)
-    calls = {"rasterization": (rasterization, True), "same, sparse": (sparse, True)}
+    calls: dict[str, Callable[[], CallRender]] = {
+        "rasterization": lambda: CallRender(scene, rasterization),
+        "sparse": lambda: CallRender(scene, sparse),
+        "sparse, meta": lambda: CallRender(scene, sparse, read_meta=True),
+        "sparse, 1 thread": lambda: CallRender(scene, sparse, one_thread=True),
+    }
     if gsplat is not None:
-        calls |= {"gsplat": (gsplat.rasterization, False), "gsplat packed": (gsplat.rasterization, True)}
+        dense, packed = (partial(gsplat.rasterization, packed=flag) for flag in (False, True))
+        calls |= {
+            "gsplat": lambda: CallRender(scene, dense),
+            "gsplat packed": lambda: CallRender(scene, packed),
+            "gsplat, 1 thread": lambda: CallRender(scene, dense, one_thread=True),
+        }
     for label, call in calls.items():
-        theirs = CallRender(scene, *call)
+        theirs = call()
         result[label] = measure(theirs, v, repeats)
         result[label]["image_difference"] = float((theirs.forward().detach() - image).abs().mean())
         del theirs
@@ -200,10 +221,9 @@ def main() -> None:
         rows, entries = result["rows"], result["intersections"]
         print(f"{result['scene']}: {result['visible']} visible, {rows} rows, {entries} intersections")
         print("  " + "  ".join(f"{k} {v:.3f}" for k, v in result["stages"].items()))
-        for label in ("blitzgs", "rasterization", "same, sparse", "gsplat", "gsplat packed"):
-            if label in result:
-                r = result[label]
-                print(f"  {label:14s} forward {r['forward']:7.3f}  backward {r['backward']:7.3f}  "
+        for label, r in result.items():
+            if label not in ("scene", "visible", "rows", "intersections", "stages"):
+                print(f"  {label:16s} forward {r['forward']:7.3f}  backward {r['backward']:7.3f}  "
                       f"total {r['total']:7.3f} ms  peak {r['peak_gb']:.2f} GB  "
                       f"x{r['total'] / result['blitzgs']['total']:.2f}", flush=True)  # fmt: skip
         torch.cuda.empty_cache()

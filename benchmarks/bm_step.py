@@ -16,6 +16,7 @@ import argparse
 import statistics
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from bm_render import CallRender
@@ -125,7 +126,7 @@ class GsplatStep:
     def __init__(self, scene: BenchmarkScene) -> None:
         from gsplat import rasterization
 
-        self.render = CallRender(scene, rasterization, packed=False)
+        self.render = CallRender(scene, partial(rasterization, packed=False))
         self.batch = random_photographs(scene)
         weights = ((1 - LOSS.ssim) / self.batch.samples, -LOSS.ssim / self.batch.samples)
         self.weights = [weight / len(scene.viewmats) for weight in weights]
