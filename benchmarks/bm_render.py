@@ -27,6 +27,7 @@ from torch import Tensor
 
 from blitzgs import rasterization
 from blitzgs.ops.project import project_rows
+from blitzgs.ops.rasterize import gradient_columns, rasterize_fwd
 
 try:
     import gsplat
@@ -71,19 +72,20 @@ class OurRender:
         """Composite the tiles."""
         r = self.rows
         self.splats = (r[4], r[5], r[7], r[8], None, *self.lists)
-        self.saved = ops.rasterize_fwd(*self.splats, *self.grid)
+        self.saved = rasterize_fwd(*self.splats, *self.grid)
 
     def rasterize_backward(self, v_renders: Tensor) -> None:
         """Differentiate the compositing."""
         renders, rest, last, _, aux = self.saved
-        self.v_rows = ops.rasterize_bwd(
-            *self.splats, renders, rest, last, aux, v_renders, None, *self.grid, False, False
+        packed = ops.rasterize_bwd_packed(
+            *self.splats, renders, rest, last, aux, v_renders, *self.grid, False
         )
+        self.v_rows = gradient_columns(packed)
 
     def project_backward(self) -> None:
         """Differentiate the projection, to compact rows."""
         r, s = self.rows, self.scene
-        v_means2d, v_conics, v_opacities, v_colors, _ = self.v_rows
+        v_means2d, v_conics, v_opacities, v_colors = self.v_rows
         self.gradients = ops.project_bwd(
             *self.parameters, *self.cameras, r[1], r[2], r[3], s.width, s.height, 3, 0.3, False, True,
             v_means2d, v_conics, None, v_opacities, v_colors, None, False,
