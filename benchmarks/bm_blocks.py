@@ -14,6 +14,7 @@ from timing import median_ms
 from torch import Tensor
 
 from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.lazy_adam import schedule_table
 from blitzgs.ops.project import project
 from blitzgs.view.blocks import BlockIndex, morton_order
@@ -43,10 +44,10 @@ def main() -> None:
     table.permute(morton_order(table["means"]))
     index = BlockIndex(table, schedule)
 
-    def cull(*cameras: Tensor) -> tuple[Tensor, Tensor]:
+    def cull(*cameras: Tensor) -> ActiveRows:
         return index.active(table, *cameras, scene.width, scene.height, 0.1, 1e6)
 
-    active, active_views = cull(*views)
+    active, active_views = cull(*views).listed()
 
     def rows_of(**options: Tensor) -> int:
         columns = (table[name] for name in PARAMETERS)

@@ -52,7 +52,7 @@ def active_rows(scene: BenchmarkScene) -> tuple[Tensor, Tensor]:
     update_block_bounds_(bounds, None, raw["means"], raw["scales"])
     return cull_blocks(
         bounds, raw["means"], raw["scales"], scene.viewmats, scene.Ks, scene.width, scene.height, 0.01, 1e10
-    )
+    ).listed()
 
 
 def backward_arguments(scene: BenchmarkScene, rows: Rows) -> tuple[Any, ...]:

@@ -89,10 +89,37 @@ class RenderOptions:
 
 
 class Active(NamedTuple):
-    """The Gaussians worth projecting: ascending rows int32 [A], their views as bits int32 [A]; None: all."""
+    """The Gaussians worth projecting: ascending rows int32 [A], their views as bits int32 [A]; None: all.
+
+    With `count`, int32 [1], only the first `count` of the A are set.
+    """
 
     ids: Tensor | None = None
     views: Tensor | None = None
+    count: Tensor | None = None
+
+
+class RowRoom:
+    """Room for the rows of a frame, by what the frames before needed.
+
+    CUDA then writes rows before the host knows how many there are; where there is too little room they are
+    written once more.
+
+    Attributes:
+        sizes: visible Gaussians and rows that there is room for; zeros: the host waits.
+    """
+
+    def __init__(self) -> None:
+        self.sizes = (0, 0)
+
+    def learn(self, counts: Tensor) -> None:
+        """Take note of what a frame needed: `Rows.counts`."""
+        # Views differ: what the largest one of late needed, and some more.
+        visible, rows = (
+            max(needed * 9 // 8, room - room // 256)
+            for needed, room in zip(counts.tolist(), self.sizes, strict=False)
+        )
+        self.sizes = (visible, rows)
 
 
 class Frame(NamedTuple):
@@ -180,6 +207,7 @@ def forward(
     options: RenderOptions,
     active: Active | None = None,
     share: Share | None = None,
+    room: RowRoom | None = None,
     mark: Mark = unmarked,
 ) -> Frame:
     """Render views of a table whose active rows are up to date.
@@ -191,6 +219,8 @@ def forward(
         active: rows and views to consider; None: all.
         share: who composites which tiles; every rank of the job calls this with its table. None: render all
             of the views from this table alone.
+        room: for the rows, of the frames before; the result does not depend on it. None: wait for their
+            number.
         mark: called at the end of each stage: "project", "exchange", "sort", "raster".
 
     Returns:
@@ -198,7 +228,9 @@ def forward(
         ranks shared the work.
     """
     count, tiles = len(views), (0, -1)
-    rows, splats, route, n_isects, visible = _project(table, views, options, active, share)
+    room = room or RowRoom()
+    rows, splats, route, n_isects, visible = _project(table, views, options, active, share, room)
+    room.learn(rows.counts)
     mark("project")
     if share is not None and route is not None:
         splats, tiles = send(splats, route, share.ranks), share.composited
@@ -307,6 +339,7 @@ def _project(
     options: RenderOptions,
     active: Active | None,
     share: Share | None,
+    room: RowRoom,
 ) -> tuple[Rows, Splats, Route | None, int, Tensor]:
     """Project a table and, on several ranks, agree on which row goes where: `forward`'s one wait.
 
@@ -321,15 +354,15 @@ def _project(
     arguments = (
         *table.parameters, views.viewmats, views.Ks, active.ids, active.views, views.width, views.height,
         options.tile_size, options.sh_degree, options.near_plane, options.far_plane, options.eps2d, 0.0,
-        options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted],
+        options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted], active.count,
     )  # fmt: skip
     plan, carry, totals = torch.ops.blitzgs.project_count(*arguments)
     if asking is not None and asking.ranks.peers is not None:
         rank, ids = asking.ranks.rank, table["id"]
 
-        def project(everyone: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
+        def project(everyone: Tensor, known: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
             return torch.ops.blitzgs.project_emit_to_peers_(
-                *arguments, plan, everyone, rank, ids, buffers, capacity, FIRST_PART
+                *arguments, plan, everyone, known, rank, ids, buffers, capacity, *room.sizes, FIRST_PART
             )
 
         (*written, places, filled), space = PeerSpace.fill(totals, len(views), asking.ranks, project)
@@ -338,7 +371,9 @@ def _project(
         return rows, space.arrived(), route, space.traffic.n_isects, space.traffic.visible
     traffic = None if asking is None else read_traffic(totals, len(views), asking.ranks)
     counts = start_copy(totals)[:3] if traffic is None else traffic.counts
-    rows = Rows._make((*torch.ops.blitzgs.project_emit(*arguments, plan, carry, counts), counts))
+    sizes = room.sizes if traffic is None else (0, 0)  # known already
+    emitted = torch.ops.blitzgs.project_emit(*arguments, plan, carry, totals, counts, *sizes)
+    rows = Rows._make((*emitted, counts))
     splats = Splats(
         rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
         table["id"].index_select(0, rows.gaussian_ids),

@@ -14,30 +14,32 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
       "Tensor? moment_step, Tensor? table, Tensor viewmats, Tensor Ks, int width, int height, "
-      "float near_plane, float far_plane, float eps2d, int room) -> (Tensor active_ids, "
-      "Tensor active_views)");
+      "float near_plane, float far_plane, float eps2d) -> (Tensor active_ids, Tensor active_views, "
+      "Tensor count)");
 
   // Projection: parameters to screen-space rows, ordered by (Gaussian, view).
   m.def(
       "project_count(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
       "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
-      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends) -> (Tensor plan, Tensor carry, "
-      "Tensor totals)");
+      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count=None) -> "
+      "(Tensor plan, Tensor carry, Tensor totals)");
   m.def(
       "project_emit(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
       "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
-      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor plan, Tensor carry, "
-      "Tensor counts) -> (Tensor gaussian_ids, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, "
+      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count, Tensor plan, "
+      "Tensor carry, Tensor totals, Tensor counts, int visible_room, int row_room) -> (Tensor gaussian_ids, "
+      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, "
       "Tensor means2d, Tensor conics, Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, "
       "Tensor tiles_touched, Tensor rank_masks)");
   m.def(
       "project_emit_to_peers_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh, "
       "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
-      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor plan, Tensor everyone, "
-      "int rank, Tensor ids, Tensor(a!)[] buffers, int capacity, float first_part) -> (Tensor gaussian_ids, "
+      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count, Tensor plan, "
+      "Tensor everyone, Tensor counts, int rank, Tensor ids, Tensor(a!)[] buffers, int capacity, "
+      "int visible_room, int row_room, float first_part) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor places, Tensor filled)");
@@ -128,7 +130,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "ids, "
       "Tensor(d!) last_step, Tensor(e!) moment_step, Tensor table, Tensor lr_table, int step, "
       "int explicit_steps, float beta1, "
-      "float beta2, float eps) -> ()");
+      "float beta2, float eps, Tensor? count=None) -> ()");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "

@@ -29,7 +29,7 @@ _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
 # Gradients of means2d, conics, opacities and colors as they return, `rasterize_bwd_packed` has them in front.
 _GRADIENT_WORDS = 9
 # Writes rows to the peers: see `PeerSpace.fill`.
-Projection = Callable[[Tensor, list[Tensor], int], Any]
+Projection = Callable[[Tensor, Tensor, list[Tensor], int], Any]
 # A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
 _ALIGNMENT = 32
 
@@ -126,8 +126,9 @@ class PeerSpace:
             totals: of `project_count`, with the tiles of each rank; int64 [3 + B + 2 M].
             n_views: B.
             ranks: the job, with peers.
-            project: given all ranks' totals, which are on their way to the CPU, the buffers and how many rows
-                each has room for: waits, and writes this rank's rows if there is room for everyone's.
+            project: given all ranks' totals, the same on their way to the CPU, the buffers and how many rows
+                each has room for: writes this rank's rows if there is room for everyone's, and waits for the
+                totals.
 
         Returns:
             What `project` returned, and where the rows are.
@@ -141,7 +142,7 @@ class PeerSpace:
         while True:
             ranks.reading(partial(peers.reserve, (_ROW_WORDS + _GRADIENT_WORDS) * needed))
             room = len(peers.buffers[0]) // (_ROW_WORDS + _GRADIENT_WORDS) // _ALIGNMENT * _ALIGNMENT
-            result = ranks.reading(partial(project, known, peers.buffers, room))
+            result = ranks.reading(partial(project, everyone, known, peers.buffers, room))
             traffic = Traffic.of(known.tolist(), visible, ranks.rank)
             if traffic.most <= room:
                 peers.exchanges += 1

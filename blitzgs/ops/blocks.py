@@ -35,6 +35,27 @@ class PendingSteps(NamedTuple):
     table: Tensor
 
 
+class ActiveRows(NamedTuple):
+    """The rows that some view may see: the first `count` of lists with room for all N.
+
+    Nobody has waited for the count, so ops that take the lists take it with them.
+
+    Attributes:
+        ids: int32 [N], ascending.
+        views: int32 [N], bit v set when view v may see the row.
+        count: int32 [1], on the device of the others.
+    """
+
+    ids: Tensor
+    views: Tensor
+    count: Tensor
+
+    def listed(self) -> tuple[Tensor, Tensor]:
+        """Return the rows there are and their views, int32 [A] each; waits for the device."""
+        count = int(self.count)
+        return self.ids[:count], self.views[:count]
+
+
 def morton_keys(points: Tensor) -> Tensor:
     """Return each point's position along the Morton curve of the cloud's bounding cube.
 
@@ -82,8 +103,7 @@ def cull_blocks(
     far_plane: float,
     eps2d: float = 0.3,
     pending: PendingSteps | None = None,
-    room: int | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> ActiveRows:
     """Return the rows that may show in at least one of B views, without reading those of blocks outside.
 
     Conservative: every row that projection would emit is in the set, whatever of its pending steps has been
@@ -101,27 +121,24 @@ def cull_blocks(
         far_plane: rows at z > far_plane are not seen.
         eps2d: screen-space blur, pixels squared.
         pending: as given to `update_block_bounds_`.
-        room: rows of memory to take for the set; one that turns out larger takes longer. None: N.
-
-    Returns:
-        (active_ids int32 [A] ascending, active_views int32 [A]: bit v set when view v may see the row).
 
     Raises:
         RuntimeError: wrong shapes or dtypes, or more than 32 views.
     """
-    return torch.ops.blitzgs.cull_blocks(
-        bounds,
-        means,
-        scales,
-        *_pending_arguments(pending),
-        viewmats,
-        Ks,
-        width,
-        height,
-        near_plane,
-        far_plane,
-        eps2d,
-        len(means) if room is None else room,
+    return ActiveRows._make(
+        torch.ops.blitzgs.cull_blocks(
+            bounds,
+            means,
+            scales,
+            *_pending_arguments(pending),
+            viewmats,
+            Ks,
+            width,
+            height,
+            near_plane,
+            far_plane,
+            eps2d,
+        )
     )
 
 
@@ -142,6 +159,6 @@ def _(*_args: object) -> None:
 
 
 @torch.library.register_fake("blitzgs::cull_blocks")
-def _(bounds: Tensor, *_args: object) -> tuple[Tensor, Tensor]:
-    count = torch.library.get_ctx().new_dynamic_size()
-    return bounds.new_empty(count, dtype=torch.int32), bounds.new_empty(count, dtype=torch.int32)
+def _(bounds: Tensor, means: Tensor, *_args: object) -> tuple[Tensor, Tensor, Tensor]:
+    ids, views, count = (bounds.new_empty(n, dtype=torch.int32) for n in (len(means), len(means), 1))
+    return ids, views, count

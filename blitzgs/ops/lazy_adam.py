@@ -93,12 +93,14 @@ def lazy_adam_catch_up_(
     beta1: float,
     beta2: float,
     eps: float,
+    count: Tensor | None = None,
 ) -> None:
     """Bring the parameters of the rows `ids` (None: all rows) to where dense Adam has them after ``step``.
 
     In place. Rows that stand at `step` already are left untouched. Moments and `moment_step` stay: the next
     step with a gradient applies the decay they still owe, beta^(step - moment_step). Arguments as in
-    `lazy_adam_step_`; ``step`` may be 0 (nothing to do).
+    `lazy_adam_step_`; ``step`` may be 0 (nothing to do). ``count``, int32 [1]: only the first `count` of `ids`
+    are rows; nobody waits for it.
 
     Raises:
         ValueError: decay rates outside their range.
@@ -119,6 +121,7 @@ def lazy_adam_catch_up_(
         beta1,
         beta2,
         eps,
+        count,
     )
 
 

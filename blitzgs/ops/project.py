@@ -114,7 +114,7 @@ def _counted(arguments: tuple[Any, ...]) -> tuple[tuple[Any, ...], Tensor]:
     """Count the rows: returns what `project_emit` takes after viewmats, and counts, for which it waits."""
     plan, carry, totals = torch.ops.blitzgs.project_count(*arguments, [], [])
     counts = (totals.cpu() if torch.compiler.is_compiling() else start_copy(totals))[:3]
-    return (*arguments[6:], [], [], plan, carry, counts), counts
+    return (*arguments[6:], [], [], None, plan, carry, totals, counts, 0, 0), counts
 
 
 @torch.library.register_fake("blitzgs::project_count")
@@ -182,7 +182,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
     means, quats, scales, opacities, sh, viewmats, Ks = inputs[:7]
     width, height, _, sh_degree = inputs[9:13]
     eps2d, _, antialiased, raw = inputs[15:19]
-    rows = Rows._make((*output, inputs[-1]))
+    rows = Rows._make((*output, None))
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(
         means, quats, scales, opacities, sh, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets
@@ -192,7 +192,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
-    return (*_gradients(ctx, v_output), *(None,) * 18)
+    return (*_gradients(ctx, v_output), *(None,) * 22)
 
 
 def _gradients(ctx: Any, v_output: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:

@@ -36,8 +36,13 @@ class LazyAdam:
         self._sparse = config.sparse
         self.pending_table = None if config.sparse else schedule_table(self.lr_table, *self._betas)
 
-    def catch_up(self, table: GaussianTable, ids: Tensor | None, step: int) -> None:
-        """Bring the parameters of rows `ids` (int32 [A]; None: all) to the state after `step`."""
+    def catch_up(
+        self, table: GaussianTable, ids: Tensor | None, step: int, count: Tensor | None = None
+    ) -> None:
+        """Bring the parameters of rows `ids` (int32 [A]; None: all) to the state after `step`.
+
+        ``count``, int32 [1]: only the first `count` of `ids` are rows.
+        """
         if self._sparse:
             return
         lazy_adam_catch_up_(
@@ -51,6 +56,7 @@ class LazyAdam:
             step,
             *self._betas,
             self._eps,
+            count,
         )
 
     def step(

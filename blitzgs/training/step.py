@@ -9,7 +9,7 @@ from blitzgs import pipeline
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.model import GaussianTable
-from blitzgs.pipeline import Active, Frame, Mark, RenderOptions, RowGradients, Views, unmarked
+from blitzgs.pipeline import Active, Frame, Mark, RenderOptions, RowGradients, RowRoom, Views, unmarked
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms
@@ -41,6 +41,7 @@ class Stepper:
         """
         self._table, self._optimiser, self._owners = table, optimiser, owners
         self._loss, self._length_unit, self._half = loss, length_unit, half_exchange
+        self._room = RowRoom()
         self.reindex()
 
     def reindex(self) -> None:
@@ -65,10 +66,10 @@ class Stepper:
         table, ranks, views = self._table, self._owners.ranks, batch.views
         active = self._active(views, options)
         mark("other")
-        self._optimiser.catch_up(table, active.ids, step - 1)
+        self._optimiser.catch_up(table, active.ids, step - 1, active.count)
         mark("optimiser")
         share = None if batch.ranges is None else Share(ranks, batch.ranges, self._half)
-        frame = pipeline.forward(table, views, options, active, share, mark)
+        frame = pipeline.forward(table, views, options, active, share, self._room, mark)
         terms = loss_terms(frame, batch, self._loss, self._length_unit)
         mark("loss")
         if batch.ranges is None:
@@ -96,11 +97,8 @@ class Stepper:
     def _active(self, views: Views, options: RenderOptions) -> Active:
         """Find the Gaussians that the views may see."""
         near, far = options.near_plane, options.far_plane
-        # Their number is waited for, and so, in stream order, the other ranks' part in the step before.
-        return self._owners.ranks.reading(
-            lambda: Active(
-                *self._blocks.active(
-                    self._table, views.viewmats, views.Ks, views.width, views.height, near, far, options.eps2d
-                )
+        return Active(
+            *self._blocks.active(
+                self._table, views.viewmats, views.Ks, views.width, views.height, near, far, options.eps2d
             )
         )

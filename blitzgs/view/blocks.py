@@ -7,7 +7,14 @@ import torch
 from torch import Tensor
 
 from blitzgs.model import GaussianTable
-from blitzgs.ops.blocks import BLOCK_ROWS, PendingSteps, cull_blocks, morton_keys, update_block_bounds_
+from blitzgs.ops.blocks import (
+    BLOCK_ROWS,
+    ActiveRows,
+    PendingSteps,
+    cull_blocks,
+    morton_keys,
+    update_block_bounds_,
+)
 
 
 def morton_order(means: Tensor) -> Tensor:
@@ -37,7 +44,6 @@ class BlockIndex:
                 pending; None: rows stand where they are.
         """
         self._schedule = schedule
-        self._room = len(table) // 4
         count = -(-len(table) // BLOCK_ROWS)
         self._bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
         self.update(table, None)
@@ -52,19 +58,16 @@ class BlockIndex:
         near_plane: float,
         far_plane: float,
         eps2d: float = 0.3,
-    ) -> tuple[Tensor, Tensor]:
-        """Return the rows that may show (int32 [A], ascending) and their views (int32 [A], one bit each).
+    ) -> ActiveRows:
+        """Return the rows that may show and their views.
 
         The result depends on each row's own state alone, neither on the order of the rows nor on how they are
         divided among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
         """
-        active = cull_blocks(
+        return cull_blocks(
             self._bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
-            eps2d, self._pending(table), self._room,
+            eps2d, self._pending(table),
         )  # fmt: skip
-        # Views differ; the largest set so far, and some more, is room enough for most that follow.
-        self._room = max(self._room, min(len(active[0]) * 9 // 8, len(table)))
-        return active
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:
         """Take note that the optimiser stepped the rows `ids` (int32 [U]; None: any row may have changed).

@@ -264,10 +264,9 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
                          Workspace&, CudaStream);
 void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
                 CullPlan& plan, Workspace&, CudaStream);
-// Writes the first `room` active rows. Returns how many there are, for which CUDA waits, but not for the
-// rows.
-std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* active_ids,
-                       std::int32_t* active_views, CudaStream);
+// active_ids, active_views [n]: the active rows come first; count [1]: how many they are.
+void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views,
+               std::int32_t* count, CudaStream);
 }  // namespace cpu
 namespace cuda {
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
@@ -275,8 +274,8 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
                          Workspace&, CudaStream);
 void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
                 CullPlan& plan, Workspace&, CudaStream);
-std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* active_ids,
-                       std::int32_t* active_views, CudaStream);
+void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views,
+               std::int32_t* count, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

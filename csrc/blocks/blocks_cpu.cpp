@@ -79,8 +79,8 @@ void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& ca
   for (std::int64_t block = 0; block < blocks; ++block) active[block] += plan.rows_before[block];
 }
 
-std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* active_ids,
-                       std::int32_t* active_views, CudaStream) {
+void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views,
+               std::int32_t* count, CudaStream) {
   parallel_for(0, blocks_of(plan.n), 64, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
       if (!plan.blocks[block].some) continue;
@@ -89,13 +89,13 @@ std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* ac
       const std::int64_t first = block * kBlockRows;
       for (std::int64_t row = first; row < first + rows_in_block(plan.n, block); ++row) {
         const std::uint32_t mask = mixed ? plan.masks[row] : plan.blocks[block].all;
-        if (!mask || at >= room) continue;
+        if (!mask) continue;
         active_ids[at] = static_cast<std::int32_t>(row);
         active_views[at++] = static_cast<std::int32_t>(mask);
       }
     }
   });
-  return plan.rows_before[blocks_of(plan.n)];
+  *count = plan.rows_before[blocks_of(plan.n)];
 }
 
 }  // namespace blitzgs::cpu

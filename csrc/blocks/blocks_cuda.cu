@@ -2,7 +2,6 @@
 #include <cub/device/device_scan.cuh>
 
 #include <algorithm>
-#include <atomic>
 
 #include "blocks/blocks.h"
 #include "common/cuda_check.h"
@@ -122,13 +121,10 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
   }
 }
 
-// A warp a block. The host is told the number of active rows first of all.
-__global__ void emit_rows(const CullPlan plan, std::int64_t room, std::int32_t* active_ids,
-                          std::int32_t* active_views, volatile std::int32_t* total) {
-  if (blockIdx.x == 0 && threadIdx.x == 0) {
-    *total = plan.rows_before[blocks_of(plan.n)];
-    __threadfence_system();
-  }
+// A warp a block.
+__global__ void emit_rows(const CullPlan plan, std::int32_t* active_ids, std::int32_t* active_views,
+                          std::int32_t* count_out) {
+  if (blockIdx.x == 0 && threadIdx.x == 0) *count_out = plan.rows_before[blocks_of(plan.n)];
   const std::int64_t block = blockIdx.x * std::int64_t{kWarps} + threadIdx.x / 32;
   if (block >= blocks_of(plan.n)) return;
   const BlockViews seen = plan.blocks[block];
@@ -142,43 +138,13 @@ __global__ void emit_rows(const CullPlan plan, std::int64_t room, std::int32_t* 
     const std::uint32_t mask = local >= count ? 0 : mixed ? plan.masks[row] : seen.all;
     const std::uint32_t ballot = __ballot_sync(~0u, mask != 0);
     const std::int64_t place = at + __popc(ballot & ((1u << lane) - 1));
-    if (mask && place < room) {
+    if (mask) {
       active_ids[place] = static_cast<std::int32_t>(row);
       active_views[place] = static_cast<std::int32_t>(mask);
     }
     at += __popc(ballot);
   }
 }
-
-// A number >= 0 that a kernel writes to the host's memory. The host learns of it while the kernel still runs:
-// sooner than by a copy, which starts after the kernel and takes longer than many of them.
-class ToldNumber {
- public:
-  ToldNumber() { check(cudaHostAlloc(&place_, sizeof(*place_), cudaHostAllocPortable), "cull_blocks"); }
-  ~ToldNumber() { cudaFreeHost(place_); }
-  ToldNumber(const ToldNumber&) = delete;
-  ToldNumber& operator=(const ToldNumber&) = delete;
-
-  // Where the next kernel shall write; nobody else may be about to.
-  std::int32_t* expect() {
-    std::atomic_ref(*place_).store(-1);
-    return place_;
-  }
-
-  std::int32_t wait(CudaStream stream) {
-    for (int tries = 1;; ++tries) {
-      const std::int32_t number = std::atomic_ref(*place_).load();
-      if (number >= 0) return number;
-      if (tries % 1024 != 0) continue;
-      // A kernel that failed tells nothing.
-      const cudaError_t status = cudaStreamQuery(stream);
-      if (status != cudaErrorNotReady) check(status, "cull_blocks");
-    }
-  }
-
- private:
-  std::int32_t* place_ = nullptr;
-};
 
 unsigned persistent_blocks(std::int64_t blocks) {
   return static_cast<unsigned>(std::min<std::int64_t>(blocks, kResident * multiprocessors()));
@@ -236,14 +202,15 @@ void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& ca
         "cull_blocks");
 }
 
-std::int64_t cull_emit(const CullPlan& plan, std::int64_t room, std::int32_t* active_ids,
-                       std::int32_t* active_views, CudaStream stream) {
-  if (plan.n == 0) return 0;
-  static thread_local ToldNumber total;
-  emit_rows<<<blocks_for(blocks_of(plan.n), kWarps), kBlockRows, 0, stream>>>(plan, room, active_ids,
-                                                                              active_views, total.expect());
+void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views,
+               std::int32_t* count, CudaStream stream) {
+  if (plan.n == 0) {
+    check(cudaMemsetAsync(count, 0, sizeof(*count), stream), "cull_blocks");
+    return;
+  }
+  emit_rows<<<blocks_for(blocks_of(plan.n), kWarps), kBlockRows, 0, stream>>>(plan, active_ids, active_views,
+                                                                              count);
   check_launch("cull_blocks");
-  return total.wait(stream);
 }
 
 }  // namespace blitzgs::cuda

@@ -96,13 +96,13 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, co
                                mutable_data<float>(bounds), scope.workspace, scope.stream);
 }
 
-std::tuple<Tensor, Tensor> cull_blocks(const Tensor& bounds, const Tensor& means, const Tensor& scales,
-                                       const std::vector<Tensor>& moments,
-                                       const std::optional<Tensor>& last_step,
-                                       const std::optional<Tensor>& moment_step,
-                                       const std::optional<Tensor>& table, const Tensor& viewmats_in,
-                                       const Tensor& Ks_in, std::int64_t width, std::int64_t height,
-                                       double near_plane, double far_plane, double eps2d, std::int64_t room) {
+std::tuple<Tensor, Tensor, Tensor> cull_blocks(const Tensor& bounds, const Tensor& means,
+                                               const Tensor& scales, const std::vector<Tensor>& moments,
+                                               const std::optional<Tensor>& last_step,
+                                               const std::optional<Tensor>& moment_step,
+                                               const std::optional<Tensor>& table, const Tensor& viewmats_in,
+                                               const Tensor& Ks_in, std::int64_t width, std::int64_t height,
+                                               double near_plane, double far_plane, double eps2d) {
   const char* op = "cull_blocks";
   const HeldRows held = hold_rows(op, means, scales, moments, last_step, moment_step, table);
   check_bounds(op, bounds, held.rows.n);
@@ -122,18 +122,12 @@ std::tuple<Tensor, Tensor> cull_blocks(const Tensor& bounds, const Tensor& means
   CullPlan plan{};
   backend::cull_count(held.rows, data<float>(bounds), camera, static_cast<int>(views), plan, scope.workspace,
                       scope.stream);
-  while (true) {
-    // Written before anybody knows how many there are, so that the device does not wait for the host.
-    Tensor active_ids = make_empty(bounds, {room}, ScalarType::Int);
-    Tensor active_views = make_empty(bounds, {room}, ScalarType::Int);
-    const std::int64_t total = backend::cull_emit(plan, room, mutable_data<std::int32_t>(active_ids),
-                                                  mutable_data<std::int32_t>(active_views), scope.stream);
-    if (total <= room) {
-      return {torch::stable::narrow(active_ids, 0, 0, total),
-              torch::stable::narrow(active_views, 0, 0, total)};
-    }
-    room = total;
-  }
+  Tensor active_ids = make_empty(bounds, {held.rows.n}, ScalarType::Int);
+  Tensor active_views = make_empty(bounds, {held.rows.n}, ScalarType::Int);
+  Tensor count = make_empty(bounds, {1}, ScalarType::Int);
+  backend::cull_emit(plan, mutable_data<std::int32_t>(active_ids), mutable_data<std::int32_t>(active_views),
+                     mutable_data<std::int32_t>(count), scope.stream);
+  return {active_ids, active_views, count};
 }
 
 }  // namespace

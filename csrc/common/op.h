@@ -124,6 +124,22 @@ const T* data_or_null(const std::optional<Tensor>& tensor) {
   return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
 }
 
+// How many entries at most a list of `room` has of which the first count [1] are set (all without a count).
+// Nobody waits: a count on the GPU is read by the kernels themselves.
+inline std::int64_t most_listed(const char* op, const std::optional<Tensor>& count, std::int64_t room) {
+  if (!count) return room;
+  check_dtype(op, "the count of a list", *count, ScalarType::Int);
+  check_shape(op, "the count of a list", *count, {1});
+#ifdef BLITZGS_BACKEND_CUDA
+  return room;
+#else
+  const std::int64_t listed = *data<std::int32_t>(*count);
+  STD_TORCH_CHECK(listed >= 0 && listed <= room, "blitzgs::", op, ": a list of ", room, " cannot have ",
+                  listed, " entries");
+  return listed;
+#endif
+}
+
 class TorchWorkspace final : public Workspace {
  public:
   explicit TorchWorkspace(const Tensor& like) : like_(like) {}

@@ -50,6 +50,7 @@ struct AdamArgs {
   AdamColumn<T> columns[kAdamColumns];
   const std::int32_t* ids;  // [n] rows, unique; null = row i is i
   std::int64_t n;
+  const std::int32_t* count;  // CUDA, catching up: how many of the n there are, on the device; null: all
   std::int32_t *last_step, *moment_step;  // [N]
   const double* table;                    // [S+1, kAdamTable]
   const float* lr_table;                  // [S+1, 6]

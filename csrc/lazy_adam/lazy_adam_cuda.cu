@@ -14,7 +14,7 @@ namespace {
 // A row of SH degree 3 has 12 packs of SH, one quaternion and seven more numbers: a thread each.
 constexpr int kRows = 16;  // rows per block
 constexpr int kThreads = kRows * (12 + 8);
-constexpr int kCatchUpBlocks = 4;  // per multiprocessor
+constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
 constexpr int kPrepareThreads = 64, kListThreads = 256;
 
 // What rows that catch up may need: all of a launch go to the same step, so it is worked out once instead of
@@ -52,36 +52,42 @@ __device__ void pay_elements(const AdamArgs<float>& args, const AdamDebt<float>&
   }
 }
 
+__device__ std::int64_t listed(const AdamArgs<float>& args) { return args.count ? *args.count : args.n; }
+
 // Lists the debtors and notes that they will have paid. Those for whom the rules do not do, which only steps
 // early in a schedule have, pay at once, each by a whole warp.
 __global__ void __launch_bounds__(kListThreads)
     list_debtors(const __grid_constant__ AdamArgs<float> args, const Prepared prepared, Debtor* debtors) {
-  const std::int64_t i = blockIdx.x * std::int64_t{kListThreads} + threadIdx.x;
-  Debtor mine{-1, 0, {}};
-  bool explicitly = false;
-  if (i < args.n) {
-    const std::int32_t row = args.ids ? args.ids[i] : static_cast<std::int32_t>(i);
-    const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
-    if (adam_moves(args, from, stand)) {
-      mine = {row, from, prepared.decays[from - stand]};
-      explicitly = prepared.debts[from].explicit_up_to >= 0;
+  const std::int64_t n = listed(args);
+  for (std::int64_t first = blockIdx.x * std::int64_t{kListThreads}; first < n;
+       first += gridDim.x * std::int64_t{kListThreads}) {
+    const std::int64_t i = first + threadIdx.x;
+    Debtor mine{-1, 0, {}};
+    bool explicitly = false;
+    if (i < n) {
+      const std::int32_t row = args.ids ? args.ids[i] : static_cast<std::int32_t>(i);
+      const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
+      if (adam_moves(args, from, stand)) {
+        mine = {row, from, prepared.decays[from - stand]};
+        explicitly = prepared.debts[from].explicit_up_to >= 0;
+      }
+      if (from < args.step) args.last_step[row] = args.step;
     }
-    if (from < args.step) args.last_step[row] = args.step;
+    for (unsigned left = __ballot_sync(~0u, explicitly); left; left &= left - 1) {
+      const int lane = __ffs(left) - 1;
+      const std::int64_t row = __shfl_sync(~0u, mine.row, lane);
+      const AdamDebt<float>& debt = prepared.debts[__shfl_sync(~0u, mine.from, lane)];
+      const Decay here{__shfl_sync(~0u, mine.here.first, lane), __shfl_sync(~0u, mine.here.second, lane)};
+      pay_elements<0>(args, debt, here, row);
+      pay_elements<1>(args, debt, here, row);
+      pay_elements<2>(args, debt, here, row);
+      pay_elements<3>(args, debt, here, row);
+      pay_elements<4>(args, debt, here, row);
+    }
+    if (explicitly) mine.row = -1;
+    if (i < n) debtors[i] = mine;
+    if (__any_sync(~0u, mine.row >= 0) && threadIdx.x % 32 == 0) *prepared.owing = true;
   }
-  for (unsigned left = __ballot_sync(~0u, explicitly); left; left &= left - 1) {
-    const int lane = __ffs(left) - 1;
-    const std::int64_t row = __shfl_sync(~0u, mine.row, lane);
-    const AdamDebt<float>& debt = prepared.debts[__shfl_sync(~0u, mine.from, lane)];
-    const Decay here{__shfl_sync(~0u, mine.here.first, lane), __shfl_sync(~0u, mine.here.second, lane)};
-    pay_elements<0>(args, debt, here, row);
-    pay_elements<1>(args, debt, here, row);
-    pay_elements<2>(args, debt, here, row);
-    pay_elements<3>(args, debt, here, row);
-    pay_elements<4>(args, debt, here, row);
-  }
-  if (explicitly) mine.row = -1;
-  if (i < args.n) debtors[i] = mine;
-  if (__any_sync(~0u, mine.row >= 0) && threadIdx.x % 32 == 0) *prepared.owing = true;
 }
 
 // Calls update<Column, Width>(local row, pack) for what is a thread's to do in every kRows rows. ShPacks:
@@ -132,15 +138,16 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
     catch_up_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
                     const Debtor* debtors) {
   if (!*prepared.owing) return;
+  const std::int64_t n = listed(args);
   const auto pay = [&]<int Column, int Width>(int local, int pack) {
     const std::int64_t stride = gridDim.x * std::int64_t{kRows};
     std::int64_t i = blockIdx.x * std::int64_t{kRows} + local;
     Debtor next{-1, 0, {}};
-    if (i < args.n) next = debtors[i];
-    while (i < args.n) {
+    if (i < n) next = debtors[i];
+    while (i < n) {
       const Debtor debtor = next;
       i += stride;
-      if (i < args.n) next = debtors[i];
+      if (i < n) next = debtors[i];
       if (debtor.row >= 0) pay_pack<Column, Width>(args, prepared.debts, debtor, pack);
     }
   };
@@ -184,10 +191,13 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
                           workspace.allocate<Decay>(args.step + 1), workspace.allocate<bool>(1)};
   auto* debtors = workspace.allocate<Debtor>(args.n);
   prepare<<<blocks_for(args.step + 1, kPrepareThreads), kPrepareThreads, 0, stream>>>(args, prepared);
-  list_debtors<<<blocks_for(args.n, kListThreads), kListThreads, 0, stream>>>(args, prepared, debtors);
+  // The device is filled once, as n may be far more than there are.
+  const auto filled = [&](int items, int per_multiprocessor) {
+    return std::min(blocks_for(args.n, items), unsigned(per_multiprocessor * multiprocessors()));
+  };
+  list_debtors<<<filled(kListThreads, kListBlocks), kListThreads, 0, stream>>>(args, prepared, debtors);
   const auto kernel = args.columns[4].width == 48 ? catch_up_kernel<4, 12> : catch_up_kernel<1, 0>;
-  const unsigned blocks = std::min(blocks_for(args.n, kRows), unsigned(kCatchUpBlocks * multiprocessors()));
-  kernel<<<blocks, kThreads, 0, stream>>>(args, prepared, debtors);
+  kernel<<<filled(kRows, kCatchUpBlocks), kThreads, 0, stream>>>(args, prepared, debtors);
   check_launch("lazy_adam catch-up");
 }
 

@@ -39,7 +39,8 @@ void lazy_adam_step_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
 void lazy_adam_catch_up_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
                          std::vector<Tensor> exp_avg_sqs, const std::optional<Tensor>& ids, Tensor last_step,
                          Tensor moment_step, const Tensor& table, const Tensor& lr_table, std::int64_t step,
-                         std::int64_t explicit_steps, double beta1, double beta2, double eps) {
+                         std::int64_t explicit_steps, double beta1, double beta2, double eps,
+                         const std::optional<Tensor>& count) {
   constexpr const char* kOp = "lazy_adam_catch_up_";
   AdamTensors state{kOp,      params, exp_avgs,       exp_avg_sqs, last_step, moment_step, table,
                     lr_table, step,   explicit_steps, beta1,       beta2,     eps,         false};
@@ -50,10 +51,11 @@ void lazy_adam_catch_up_(std::vector<Tensor> params, std::vector<Tensor> exp_avg
     check_shape(kOp, "ids", *ids, {-1});
     list = as_contiguous(*ids);
   }
-  const std::int64_t n = list ? list->size(0) : state.rows();
+  const std::int64_t n = most_listed(kOp, count, list ? list->size(0) : state.rows());
   DeviceScope scope(state.like());
   dispatch_floating(state.like(), [&](auto zero) {
-    const auto args = state.arguments<decltype(zero)>(data_or_null<std::int32_t>(list), n);
+    auto args = state.arguments<decltype(zero)>(data_or_null<std::int32_t>(list), n);
+    args.count = data_or_null<std::int32_t>(count);
     if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
   });
 }

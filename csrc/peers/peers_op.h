@@ -33,20 +33,21 @@ inline void check_starts(const char* op, const std::vector<Tensor>& buffers,
   }
 }
 
-// Where each group's columns begin when the columns of a buffer are `capacity` rows long.
+// Where the columns of each rank's buffer begin when they are `capacity` rows long.
 template <class Word>
 ScatterTargets peer_targets(const char* op, std::vector<Tensor>& buffers, const RowColumns<Word>& columns,
-                            std::int64_t capacity, const std::vector<std::int64_t>& starts,
-                            const RowGroups& groups) {
-  check_starts(op, buffers, starts, groups, capacity);
-  STD_TORCH_CHECK(capacity * columns.begin[columns.count] <= buffers[0].size(0), "blitzgs::", op, ": ",
-                  capacity, " rows do not fit into a buffer of ", buffers[0].size(0), " words");
+                            std::int64_t capacity, int n_ranks) {
+  check_peers(op, buffers, ScalarType::Int);
+  STD_TORCH_CHECK(static_cast<int>(buffers.size()) == n_ranks, "blitzgs::", op, ": ", n_ranks,
+                  " ranks need as many buffers, got ", buffers.size());
+  STD_TORCH_CHECK(capacity >= 0 && capacity <= std::numeric_limits<std::int32_t>::max() &&
+                      capacity * columns.begin[columns.count] <= buffers[0].size(0),
+                  "blitzgs::", op, ": ", capacity, " rows do not fit into a buffer of ", buffers[0].size(0),
+                  " words");
   ScatterTargets targets{};
-  for (int m = 0; m < groups.count; ++m) {
+  for (int m = 0; m < n_ranks; ++m) {
     for (int c = 0; c < columns.count; ++c) {
-      const std::int64_t width = columns.begin[c + 1] - columns.begin[c];
-      targets.words[m][c] =
-          mutable_data<std::int32_t>(buffers[m]) + capacity * columns.begin[c] + starts[m] * width;
+      targets.words[m][c] = mutable_data<std::int32_t>(buffers[m]) + capacity * columns.begin[c];
     }
   }
   return targets;

@@ -11,9 +11,10 @@
 //
 // Rows are ordered by (Gaussian, view). Every value of a row depends on its Gaussian and view alone, so rows
 // are bit-identical however Gaussians are divided among calls. Counting comes first: project_count finds, in
-// few bytes per candidate, which views see it, and sums up what there will be. Told those sums, project_list
-// writes which Gaussian and view each row is of, and project_emit the rows; SH is evaluated for them alone.
-// None waits for the device; project_wait does. O(candidates * B + rows); no output of size N.
+// few bytes per candidate, which views see it, and sums up what there will be. Given room for that much,
+// project_list writes which Gaussian and view each row is of, and project_emit the rows; SH is evaluated for
+// them alone. Nobody waits for the device: on CUDA these two find the sums there, and where the room was a
+// guess that is too small they write nothing. O(candidates * B + rows); no output of size N.
 //
 // On several ranks, rank_tiles says which tiles each composites. The walk over a row's tiles that counts them
 // then also finds the ranks that the row has to reach.
@@ -34,7 +35,8 @@ namespace blitzgs {
 
 // means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3] or null; viewmats [B, 4, 4],
 // Ks [B, 3, 3]. Candidates: rows active_ids (ascending), or all N when null; bit v of active_views[c] allows
-// view v for candidate c (null: all views).
+// view v for candidate c (null: all views). n_active (CUDA, on the device): how many of the n_candidates
+// there are; null: all.
 template <class T>
 struct ProjectInputs {
   const T *means, *quats, *scales, *opacities, *sh, *viewmats, *Ks;
@@ -42,6 +44,7 @@ struct ProjectInputs {
   std::int64_t n_candidates;
   int n_views;
   ProjectOptions<T> options;
+  const std::int32_t* n_active = nullptr;
 };
 
 // What project_count sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P rows,
@@ -57,9 +60,15 @@ inline constexpr std::int64_t kProjectBlock = 1024;
 
 inline std::int64_t project_blocks(std::int64_t items) { return (items + kProjectBlock - 1) / kProjectBlock; }
 
-// What project_emit has to be told: project_totals' first two.
+// Visible Gaussians and rows.
 struct ProjectSizes {
   std::int64_t visible, rows;
+};
+
+// How many there is room for, and what project_count summed up. On the CPU the room is what is needed.
+struct ProjectRoom {
+  ProjectSizes sizes;
+  const std::int64_t* totals;
 };
 
 // Which Gaussian and view each row is of, and where the rows of each visible Gaussian begin: [P], [P], [U],
@@ -81,15 +90,20 @@ struct ProjectOutputs {
 inline constexpr RowColumns<const std::int32_t> kEmittedColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
 
 // Where emitted rows go besides (CUDA): each to the ranks of its rank mask, as `scatter` does
-// (scatter/scatter.h). ids [N]; row_ids [P], places and filled [2, M] are written too. In each group the rows
-// of the first `first_visible` Gaussians come first: those within its first filled[0][m].
+// (scatter/scatter.h), in every target behind the rows of the ranks before this one, unless some rank has
+// more than `capacity` rows to send or to get: then nothing is written, here and, as all ranks know of it, at
+// no other. everyone: project_totals of each rank, on the device. targets: where the columns of each rank's
+// rows begin. ids [N]; row_ids [P], places and filled [2, M] are written too. In each group the rows of the
+// first `first_part` of the visible Gaussians come first: those within its first filled[0][m].
 struct ProjectScatter {
   const std::int64_t* ids;
-  std::int64_t first_visible;
+  double first_part;
   std::int64_t* row_ids;
   std::int64_t* filled;
   RowPlace* places;
-  RowGroups groups;
+  const std::int64_t* everyone;
+  int n_ranks, rank;
+  std::int64_t capacity;
   ScatterTargets targets;
 };
 
@@ -115,14 +129,12 @@ std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
 void project_count(const ProjectInputs<T>&, const RankTiles& rank_tiles, void* plan, Workspace& carry,
                    std::int64_t* totals, Workspace&, CudaStream);
-// Returns when the host can read what was queued to be copied to it.
-void project_wait(CudaStream);
 template <class T>
-void project_list(const ProjectInputs<T>&, const void* plan, const ProjectSizes&, const ProjectIds&,
+void project_list(const ProjectInputs<T>&, const void* plan, const ProjectRoom&, const ProjectIds&,
                   Workspace&, CudaStream);
 template <class T>
 void project_emit(const ProjectInputs<T>&, const RankTiles&, const void* carry, const ProjectIds&,
-                  std::int64_t n_rows, const ProjectOutputs<T>&, Workspace&, CudaStream);
+                  const ProjectRoom&, const ProjectOutputs<T>&, Workspace&, CudaStream);
 // scale_reg [B] or null: adds scale_reg[b] * d(min_j s_j) for each row in view b (the paper's L_scale).
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
@@ -133,15 +145,14 @@ std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
 void project_count(const ProjectInputs<T>&, const RankTiles& rank_tiles, void* plan, Workspace& carry,
                    std::int64_t* totals, Workspace&, CudaStream);
-void project_wait(CudaStream);
 template <class T>
-void project_list(const ProjectInputs<T>&, const void* plan, const ProjectSizes&, const ProjectIds&,
+void project_list(const ProjectInputs<T>&, const void* plan, const ProjectRoom&, const ProjectIds&,
                   Workspace&, CudaStream);
 template <class T>
 void project_emit(const ProjectInputs<T>&, const RankTiles&, const void* carry, const ProjectIds&,
-                  std::int64_t n_rows, const ProjectOutputs<T>&, Workspace&, CudaStream);
+                  const ProjectRoom&, const ProjectOutputs<T>&, Workspace&, CudaStream);
 void project_emit_to_ranks(const ProjectInputs<float>&, const RankTiles&, const ProjectIds&,
-                           std::int64_t n_rows, const ProjectOutputs<float>&, const ProjectScatter&,
+                           const ProjectRoom&, const ProjectOutputs<float>&, const ProjectScatter&,
                            Workspace&, CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const RowGradientSource&, const T* scale_reg,

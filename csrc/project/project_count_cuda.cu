@@ -17,15 +17,15 @@ constexpr int kBatch = 4;  // candidates of a lane at a time
 constexpr int kCountThreads = 128, kCountBlocks = 4096;
 
 // The views that may see each of kBatch candidates first, first + 32, ..., from the mean, then the scale.
-__device__ void quick_views(const Inputs& in, const Frustum* frusta, std::int64_t first,
-                            std::uint32_t* maybe) {
+__device__ void quick_views(const Inputs& in, std::int64_t n_candidates, const Frustum* frusta,
+                            std::int64_t first, std::uint32_t* maybe) {
   std::int64_t ids[kBatch];
   Vec3<float> means[kBatch];
   float norms[kBatch];
 #pragma unroll
   for (int k = 0; k < kBatch; ++k) {
     const std::int64_t c = first + 32 * k;
-    const bool present = c < in.n_candidates;
+    const bool present = c < n_candidates;
     ids[k] = present ? candidate_id(in, c) : 0;
     maybe[k] = !present ? 0u : in.active_views ? static_cast<std::uint32_t>(in.active_views[c]) : ~0u;
     if (in.n_views < 32) maybe[k] &= (1u << in.n_views) - 1u;
@@ -111,6 +111,13 @@ __global__ void __launch_bounds__(kCountThreads, 6)
   __shared__ Sums sums;
   __shared__ std::uint32_t left_views[kCountThreads / 32][kMostSegment];
   __shared__ std::uint16_t left_slots[kCountThreads / 32][kMostSegment];
+  const std::int64_t n_candidates = candidates_of(in), n_segments = segments_of(n_candidates);
+  const int segment = segment_of(n_candidates);
+  for (std::int64_t s = n_segments + blockIdx.x * std::int64_t{kCountThreads} + threadIdx.x;
+       s <= most_segments(in.n_candidates); s += gridDim.x * std::int64_t{kCountThreads}) {
+    plan.before[s] = 0;
+  }
+  if (blockIdx.x * std::int64_t{kCountThreads / 32} >= n_segments) return;
   for (int i = threadIdx.x; i < static_cast<int>(sizeof(Sums) / 4); i += kCountThreads) {
     reinterpret_cast<unsigned*>(&sums)[i] = 0;
   }
@@ -123,8 +130,6 @@ __global__ void __launch_bounds__(kCountThreads, 6)
   const unsigned below = (1u << lane) - 1u;
   std::uint32_t* const left = left_views[warp];
   std::uint16_t* const slots = left_slots[warp];
-  const int segment = segment_of(in.n_candidates);
-  const std::int64_t n_segments = segments_of(in.n_candidates);
   std::int64_t tiles = 0, visible = 0, rows = 0;
   unsigned of_view = 0;  // rows of view `lane`
   for (std::int64_t s = blockIdx.x * (kCountThreads / 32) + warp; s < n_segments;
@@ -132,7 +137,7 @@ __global__ void __launch_bounds__(kCountThreads, 6)
     int n_left = 0;
     for (int batch = 0; batch < segment; batch += 32 * kBatch) {
       std::uint32_t maybe[kBatch];
-      quick_views(in, frusta, s * segment + batch + lane, maybe);
+      quick_views(in, n_candidates, frusta, s * segment + batch + lane, maybe);
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) {
         const unsigned some = __ballot_sync(0xffffffffu, maybe[k] != 0);
@@ -181,7 +186,6 @@ __global__ void __launch_bounds__(kCountThreads, 6)
     atomicAdd(&sums.visible, static_cast<unsigned long long>(visible));
     atomicAdd(&sums.rows, static_cast<unsigned long long>(rows));
   }
-  if (blockIdx.x == 0 && threadIdx.x == 0) plan.before[n_segments] = 0;
   __syncthreads();
   if (sums.rows > 0) store_sums(sums, in, rank_tiles.n_ranks, totals);
 }
@@ -189,7 +193,7 @@ __global__ void __launch_bounds__(kCountThreads, 6)
 }  // namespace
 
 std::size_t project_plan_bytes(std::int64_t candidates) {
-  return static_cast<std::size_t>(segments_of(candidates) + 1) * sizeof(std::int64_t) +
+  return static_cast<std::size_t>(most_segments(candidates) + 1) * sizeof(std::int64_t) +
          static_cast<std::size_t>(candidates) * (sizeof(std::uint32_t) + sizeof(std::uint16_t));
 }
 
@@ -198,7 +202,7 @@ void project_count<float>(const Inputs& in, const RankTiles& rank_tiles, void* p
                           std::int64_t* totals, Workspace& workspace, CudaStream stream) {
   const std::size_t bytes = project_totals(in.n_views, rank_tiles.n_ranks) * sizeof(std::int64_t);
   check(cudaMemsetAsync(totals, 0, bytes, stream), "project_count");
-  const std::int64_t segments = segments_of(in.n_candidates);
+  const std::int64_t segments = most_segments(in.n_candidates);
   const NewPlan plan(plan_memory, in.n_candidates);
   if (segments == 0 || in.n_views == 0) return;
   const auto grid = std::min<std::int64_t>(kCountBlocks, blocks_for(segments, kCountThreads / 32));
@@ -214,7 +218,5 @@ void project_count<float>(const Inputs& in, const RankTiles& rank_tiles, void* p
   scan(nullptr);
   scan(workspace.allocate_bytes(scratch_bytes));
 }
-
-void project_wait(CudaStream stream) { check(cudaStreamSynchronize(stream), "project_emit"); }
 
 }  // namespace blitzgs::cuda

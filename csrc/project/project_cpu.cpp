@@ -174,8 +174,6 @@ void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_v
 
 }  // namespace
 
-void project_wait(CudaStream) {}
-
 std::size_t project_plan_bytes(std::int64_t candidates) {
   return static_cast<std::size_t>(2 * (project_blocks(candidates) + 1)) * sizeof(std::int64_t) +
          static_cast<std::size_t>(candidates) * sizeof(std::uint32_t);
@@ -222,8 +220,9 @@ void project_count(const ProjectInputs<T>& in, const RankTiles& rank_tiles, void
 }
 
 template <class T>
-void project_list(const ProjectInputs<T>& in, const void* plan_memory, const ProjectSizes& sizes,
+void project_list(const ProjectInputs<T>& in, const void* plan_memory, const ProjectRoom& room,
                   const ProjectIds& ids, Workspace&, CudaStream) {
+  const ProjectSizes& sizes = room.sizes;
   const std::int64_t blocks = project_blocks(in.n_candidates);
   const MadePlan plan(plan_memory, in.n_candidates);
   if (plan.visible_before[blocks] != sizes.visible || plan.rows_before[blocks] != sizes.rows) {
@@ -250,10 +249,10 @@ void project_list(const ProjectInputs<T>& in, const void* plan_memory, const Pro
 
 template <class T>
 void project_emit(const ProjectInputs<T>& in, const RankTiles&, const void* carry, const ProjectIds& ids,
-                  std::int64_t n_rows, const ProjectOutputs<T>& out, Workspace&, CudaStream) {
+                  const ProjectRoom& room, const ProjectOutputs<T>& out, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const auto* rows = static_cast<const KeptRow<T>*>(carry);
-  parallel_for(0, n_rows, kProjectBlock, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(0, room.sizes.rows, kProjectBlock, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t row = begin; row < end; ++row) {
       emit_row(in, cameras[ids.camera_ids[row]], ids.gaussian_ids[row], row, rows[row], out);
     }
@@ -279,14 +278,14 @@ void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const Proj
   if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                             \
-  template void project_count<T>(const ProjectInputs<T>&, const RankTiles&, void*, Workspace&,             \
-                                 std::int64_t*, Workspace&, CudaStream);                                   \
-  template void project_list<T>(const ProjectInputs<T>&, const void*, const ProjectSizes&,                 \
-                                const ProjectIds&, Workspace&, CudaStream);                                \
-  template void project_emit<T>(const ProjectInputs<T>&, const RankTiles&, const void*, const ProjectIds&, \
-                                std::int64_t, const ProjectOutputs<T>&, Workspace&, CudaStream);           \
-  template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&, \
+#define BLITZGS_INSTANTIATE(T)                                                                               \
+  template void project_count<T>(const ProjectInputs<T>&, const RankTiles&, void*, Workspace&,               \
+                                 std::int64_t*, Workspace&, CudaStream);                                     \
+  template void project_list<T>(const ProjectInputs<T>&, const void*, const ProjectRoom&, const ProjectIds&, \
+                                Workspace&, CudaStream);                                                     \
+  template void project_emit<T>(const ProjectInputs<T>&, const RankTiles&, const void*, const ProjectIds&,   \
+                                const ProjectRoom&, const ProjectOutputs<T>&, Workspace&, CudaStream);       \
+  template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,   \
                                const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)

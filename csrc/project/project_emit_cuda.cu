@@ -18,12 +18,14 @@ constexpr int kEmitThreads = 128, kEmitBlocks = 5;
 
 // Which Gaussian and view each row is of. A warp takes a segment.
 __global__ void __launch_bounds__(kListThreads)
-    list_rows_kernel(const Inputs in, const MadePlan plan, const ProjectSizes sizes, const ProjectIds out) {
+    list_rows_kernel(const Inputs in, const MadePlan plan, const ProjectRoom room, const ProjectIds out) {
   const int lane = threadIdx.x % 32;
   const std::int64_t s = (blockIdx.x * static_cast<std::int64_t>(kListThreads) + threadIdx.x) / 32;
+  const std::int64_t candidates = candidates_of(in);
+  const ProjectSizes sizes = fitting(room);
   if (s == 0 && lane == 0) out.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
-  if (s >= segments_of(in.n_candidates)) return;
-  const std::int64_t before = plan.before[s], first_candidate = s * segment_of(in.n_candidates);
+  if (s >= segments_of(candidates) || sizes.rows == 0) return;
+  const std::int64_t before = plan.before[s], first_candidate = s * segment_of(candidates);
   const auto count = static_cast<int>((plan.before[s + 1] >> 32) - (before >> 32));
   std::int64_t at = before & 0xffffffff;
   for (int first = 0; first < count; first += 32) {
@@ -109,24 +111,60 @@ __device__ void emit_row(const Inputs& in, const RankTiles& rank_tiles, const Pr
 struct StayHere {
   static constexpr int kRows = kEmitThreads;
 };
+
+// What this rank writes to the others, as its device works it out; sizes come first, as in project_totals.
+struct Admitted {
+  ProjectSizes sizes;
+  std::int64_t rows[kMaxPeers], starts[kMaxPeers];
+  std::int32_t split;  // rows of the first part
+};
 struct GoToRanks {
   static constexpr int kRows = kScatterBlock;
   const std::int64_t* ids;
   std::int64_t* row_ids;
   ScatterRows rows;
-  RowGroups groups;
   ScatterTargets targets;
+  const Admitted* admitted;
   ScatterState state;
+  int n_ranks;
 };
 
+// One warp, a lane a rank. Rows that do not fit, here or at some rank, are not admitted.
+__global__ void admit_kernel(const __grid_constant__ ProjectScatter scatter, int n_views, ProjectSizes room,
+                             const std::int32_t* row_offsets, Admitted* out) {
+  const int m = threadIdx.x, n_ranks = scatter.n_ranks;
+  const std::int64_t stride = kTotalViews + n_views + 2 * n_ranks;
+  const auto rows = [&](int source, int target) {
+    return scatter.everyone[source * stride + kTotalViews + n_views + 2 * target];
+  };
+  std::int64_t sent = 0, received = 0, start = 0;
+  if (m < n_ranks) {
+    for (int other = 0; other < n_ranks; ++other) {
+      if (other == scatter.rank) start = received;
+      sent += rows(m, other);
+      received += rows(other, m);
+    }
+    out->rows[m] = rows(scatter.rank, m);
+    out->starts[m] = start;
+    scatter.filled[m] = scatter.filled[n_ranks + m] = 0;
+  }
+  const bool admitted = __all_sync(0xffffffffu, sent <= scatter.capacity && received <= scatter.capacity);
+  if (m > 0) return;
+  const ProjectSizes sizes = fitting({room, scatter.everyone + scatter.rank * stride});
+  out->sizes = admitted ? sizes : ProjectSizes{0, 0};
+  out->split = row_offsets[static_cast<std::int64_t>(scatter.first_part * static_cast<double>(sizes.visible))];
+}
+
 // Apart, so that its registers are not added to those of the projection.
-__device__ __noinline__ void send_block(ScatterShared<kMaxPeers>& shared, const GoToRanks& to) {
-  scatter_block<kEmitThreads>(shared, to.rows, to.groups, to.targets, to.state);
+__device__ __noinline__ void send_block(ScatterShared<kMaxPeers>& shared, const GoToRanks& to,
+                                        std::int64_t n_rows) {
+  scatter_block<kEmitThreads>(shared, to.rows, n_rows, {to.admitted->rows, to.admitted->starts, to.n_ranks},
+                              to.targets, to.state);
 }
 
 template <int DEGREE, bool QUADS, class DESTINATION>
 __global__ void __launch_bounds__(kEmitThreads, kEmitBlocks)
-    emit_kernel(const Inputs in, const RankTiles rank_tiles, const ProjectIds ids, std::int64_t n_rows,
+    emit_kernel(const Inputs in, const RankTiles rank_tiles, const ProjectIds ids, const ProjectRoom room,
                 const ProjectOutputs<float> out, const __grid_constant__ DESTINATION destination) {
   union Shared {
     ShStage<DEGREE> stages[QUADS ? kEmitThreads / 32 : 1];
@@ -137,10 +175,16 @@ __global__ void __launch_bounds__(kEmitThreads, kEmitBlocks)
   __shared__ TripleStage triples[kEmitThreads / 32];
   const int warp = threadIdx.x / 32;
   ShStage<DEGREE>& stage = shared.stages[QUADS ? warp : 0];
+  const std::int64_t begin = blockIdx.x * std::int64_t{DESTINATION::kRows};
+  // Asked for together with the number of rows, whether or not there is this one.
+  const std::int32_t asked =
+      begin + threadIdx.x < room.sizes.rows ? ids.gaussian_ids[begin + threadIdx.x] : -1;
+  const std::int64_t n_rows = fitting(room).rows;
+  if (begin >= n_rows) return;
 #pragma unroll 1
   for (int first = 0; first < DESTINATION::kRows; first += kEmitThreads) {
-    const std::int64_t i = blockIdx.x * std::int64_t{DESTINATION::kRows} + first + threadIdx.x;
-    const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
+    const std::int64_t i = begin + first + threadIdx.x;
+    const std::int32_t id = i >= n_rows ? -1 : first == 0 ? asked : ids.gaussian_ids[i];
     int sh_slot = 0;
     if constexpr (QUADS) sh_slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, threadIdx.x % 32);
     if (first == 0) {
@@ -155,18 +199,18 @@ __global__ void __launch_bounds__(kEmitThreads, kEmitBlocks)
   }
   if constexpr (std::is_same_v<DESTINATION, GoToRanks>) {
     __syncthreads();
-    send_block(shared.scatter, destination);
+    send_block(shared.scatter, destination, n_rows);
   }
 }
 
 template <class DESTINATION>
-void emit_rows(const Inputs& in, const RankTiles& rank_tiles, const ProjectIds& ids, std::int64_t n_rows,
+void emit_rows(const Inputs& in, const RankTiles& rank_tiles, const ProjectIds& ids, const ProjectRoom& room,
                const ProjectOutputs<float>& out, const DESTINATION& destination, CudaStream stream) {
-  if (n_rows == 0) return;
+  if (room.sizes.rows == 0) return;
   dispatch_sh(in, [&](auto degree, auto quads) {
     emit_kernel<degree.value, quads.value, DESTINATION>
-        <<<blocks_for(n_rows, DESTINATION::kRows), kEmitThreads, 0, stream>>>(in, rank_tiles, ids, n_rows,
-                                                                              out, destination);
+        <<<blocks_for(room.sizes.rows, DESTINATION::kRows), kEmitThreads, 0, stream>>>(
+            in, rank_tiles, ids, room, out, destination);
   });
   check_launch("project_emit");
 }
@@ -174,31 +218,32 @@ void emit_rows(const Inputs& in, const RankTiles& rank_tiles, const ProjectIds& 
 }  // namespace
 
 template <>
-void project_list<float>(const Inputs& in, const void* plan_memory, const ProjectSizes& sizes,
+void project_list<float>(const Inputs& in, const void* plan_memory, const ProjectRoom& room,
                          const ProjectIds& ids, Workspace&, CudaStream stream) {
-  if (sizes.rows == 0) {
+  if (room.sizes.rows == 0) {
     check(cudaMemsetAsync(ids.row_offsets, 0, sizeof(std::int32_t), stream), "project_emit");
     return;
   }
   const MadePlan plan(plan_memory, in.n_candidates);
-  list_rows_kernel<<<blocks_for(segments_of(in.n_candidates), kListThreads / 32), kListThreads, 0, stream>>>(
-      in, plan, sizes, ids);
+  list_rows_kernel<<<blocks_for(most_segments(in.n_candidates), kListThreads / 32), kListThreads, 0,
+                     stream>>>(in, plan, room, ids);
   check_launch("project_emit");
 }
 
 template <>
 void project_emit<float>(const Inputs& in, const RankTiles& rank_tiles, const void*, const ProjectIds& ids,
-                         std::int64_t n_rows, const ProjectOutputs<float>& out, Workspace&,
+                         const ProjectRoom& room, const ProjectOutputs<float>& out, Workspace&,
                          CudaStream stream) {
-  emit_rows(in, rank_tiles, ids, n_rows, out, StayHere{}, stream);
+  emit_rows(in, rank_tiles, ids, room, out, StayHere{}, stream);
 }
 
 void project_emit_to_ranks(const Inputs& in, const RankTiles& rank_tiles, const ProjectIds& ids,
-                           std::int64_t n_rows, const ProjectOutputs<float>& out,
-                           const ProjectScatter& scatter, Workspace&, CudaStream stream) {
+                           const ProjectRoom& room, const ProjectOutputs<float>& out,
+                           const ProjectScatter& scatter, Workspace& workspace, CudaStream stream) {
   const auto words = [](const auto* column) { return reinterpret_cast<const std::int32_t*>(column); };
-  const std::size_t bytes = 2 * scatter.groups.count * sizeof(*scatter.filled);
-  check(cudaMemsetAsync(scatter.filled, 0, bytes, stream), "project_emit");
+  auto* admitted = workspace.allocate<Admitted>(1);
+  admit_kernel<<<1, 32, 0, stream>>>(scatter, in.n_views, room.sizes, ids.row_offsets, admitted);
+  check_launch("project_emit");
   RowColumns<const std::int32_t> columns = kEmittedColumns;
   const std::int32_t* data[] = {words(out.means2d),    words(out.conics), words(out.opacities),
                                 words(out.colors),     words(out.depths), ids.camera_ids,
@@ -206,11 +251,12 @@ void project_emit_to_ranks(const Inputs& in, const RankTiles& rank_tiles, const 
   std::copy(std::begin(data), std::end(data), columns.data);
   const GoToRanks destination{scatter.ids,
                               scatter.row_ids,
-                              {columns, out.rank_masks, n_rows},
-                              scatter.groups,
+                              {columns, out.rank_masks, room.sizes.rows},
                               scatter.targets,
-                              {scatter.filled, scatter.places, ids.row_offsets + scatter.first_visible}};
-  emit_rows(in, rank_tiles, ids, n_rows, out, destination, stream);
+                              admitted,
+                              {scatter.filled, scatter.places, &admitted->split},
+                              scatter.n_ranks};
+  emit_rows(in, rank_tiles, ids, {room.sizes, &admitted->sizes.visible}, out, destination, stream);
 }
 
 }  // namespace blitzgs::cuda

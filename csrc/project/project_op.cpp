@@ -6,6 +6,7 @@
 #include "project/project_op.h"
 
 #ifdef BLITZGS_BACKEND_CUDA
+#include "common/stream_point.h"
 #include "peers/peers_op.h"
 #endif
 
@@ -15,7 +16,7 @@ namespace {
 // The arguments that project_count and project_emit share.
 struct Forward {
   Parameters p;
-  OptionalTensor ids, views;
+  OptionalTensor ids, views, active_count;
   std::int64_t candidates;
   ProjectOptions<double> options;
   RankTiles ranks;
@@ -25,11 +26,13 @@ struct Forward {
           const OptionalTensor& active_ids, const OptionalTensor& active_views, std::int64_t width,
           std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, double near_plane,
           double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw,
-          const std::vector<std::int64_t>& tile_begins, const std::vector<std::int64_t>& tile_ends)
+          const std::vector<std::int64_t>& tile_begins, const std::vector<std::int64_t>& tile_ends,
+          const OptionalTensor& n_active)
       : p(op, means, quats, scales, opacities, sh, viewmats, Ks, sh_degree),
         ids(contiguous_or_none(active_ids)),
         views(contiguous_or_none(active_views)),
-        candidates(ids ? ids->numel() : p.count),
+        active_count(n_active),
+        candidates(most_listed(op, active_count, ids ? ids->numel() : p.count)),
         options{static_cast<int>(width),
                 static_cast<int>(height),
                 static_cast<int>(tile_size),
@@ -49,7 +52,7 @@ struct Forward {
       check_dtype(op, "active_ids", *ids, ScalarType::Int);
     }
     if (views) {
-      check_shape(op, "active_views", *views, {candidates});
+      check_shape(op, "active_views", *views, {ids ? ids->numel() : p.count});
       check_dtype(op, "active_views", *views, ScalarType::Int);
     }
     STD_TORCH_CHECK(tile_begins.size() == tile_ends.size() && tile_begins.size() <= kMaxRanks,
@@ -70,6 +73,7 @@ struct Forward {
     in.active_ids = data_or_null<std::int32_t>(ids);
     in.active_views = data_or_null<std::int32_t>(views);
     in.n_candidates = candidates;
+    in.n_active = data_or_null<std::int32_t>(active_count);
     return in;
   }
 };
@@ -94,10 +98,10 @@ std::tuple<Tensor, Tensor, Tensor> project_count(
     const OptionalTensor& active_views, std::int64_t width, std::int64_t height, std::int64_t tile_size,
     std::int64_t sh_degree, double near_plane, double far_plane, double eps2d, double radius_clip,
     bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
-    const std::vector<std::int64_t>& tile_ends) {
+    const std::vector<std::int64_t>& tile_ends, const OptionalTensor& active_count) {
   const Forward f("project_count", means, quats, scales, opacities, sh, viewmats, Ks, active_ids,
                   active_views, width, height, tile_size, sh_degree, near_plane, far_plane, eps2d,
-                  radius_clip, antialiased, raw, tile_begins, tile_ends);
+                  radius_clip, antialiased, raw, tile_begins, tile_ends, active_count);
   const std::size_t bytes = backend::project_plan_bytes(f.candidates);
   Tensor plan = make_empty(f.p.means, {static_cast<std::int64_t>((bytes + 7) / 8)}, ScalarType::Long);
   Tensor totals = make_empty(f.p.means, {project_totals(f.p.n_views, f.ranks.n_ranks)}, ScalarType::Long);
@@ -119,44 +123,75 @@ void check_plan(const char* op, const Forward& f, const Tensor& plan) {
   check_shape(op, "plan", plan, {(bytes + 7) / 8});
 }
 
-// Lists the rows of a plan and calls launch(inputs, ids, rows, outputs) to have them written.
+// Tensors for rows, in the order of RowTensors.
+std::vector<Tensor> make_rows(const Forward& f, const ProjectSizes& room) {
+  const std::int64_t U = room.visible, P = room.rows;
+  const auto make = [&](std::vector<std::int64_t> shape, ScalarType dtype) {
+    return make_empty(f.p.means, shape, dtype);
+  };
+  const auto ints = ScalarType::Int, dtype = f.p.means.scalar_type();
+  return {make({P}, ints),     make({P}, ints),     make({U}, ints),
+          make({U + 1}, ints), make({P, 2}, dtype), make({P, 3}, dtype),
+          make({P}, dtype),    make({P}, dtype),    make({f.p.sh ? P : 0, 3}, dtype),
+          make({P, 2}, ints),  make({P}, ints),     make({f.ranks.n_ranks > 0 ? P : 0}, ScalarType::Long)};
+}
+
+// Without the rows that turned out not to be needed.
+void shorten(std::vector<Tensor>& rows, const ProjectSizes& sizes) {
+  for (std::size_t i = 0; i < std::tuple_size_v<RowTensors>; ++i) {
+    const std::int64_t length = i == 2 ? sizes.visible : i == 3 ? sizes.visible + 1 : sizes.rows;
+    if (rows[i].size(0) > length) rows[i] = torch::stable::narrow(rows[i], 0, 0, length);
+  }
+}
+
+// Lists the rows of a plan and calls launch(inputs, ids, room, outputs) to have them written.
 template <class F>
-RowTensors emit_rows(const char* op, const Forward& f, const Tensor& plan, const ProjectSizes& sizes,
-                     DeviceScope& scope, const F& launch) {
-  STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ", sizes.rows,
-                  " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
-  const std::int64_t U = sizes.visible, P = sizes.rows;
-  const auto ints = ScalarType::Int;
-  Tensor gaussian_ids = make_empty(f.p.means, {P}, ints), camera_ids = make_empty(f.p.means, {P}, ints),
-         visible_ids = make_empty(f.p.means, {U}, ints), row_offsets = make_empty(f.p.means, {U + 1}, ints);
-  const ProjectIds listed{mutable_data<std::int32_t>(gaussian_ids), mutable_data<std::int32_t>(camera_ids),
-                          mutable_data<std::int32_t>(visible_ids), mutable_data<std::int32_t>(row_offsets)};
-  std::vector<Tensor> out;
+std::vector<Tensor> queue_rows(const Forward& f, const Tensor& plan, const std::int64_t* totals,
+                               const ProjectSizes& sizes, DeviceScope& scope, const F& launch) {
+  std::vector<Tensor> out = make_rows(f, sizes);
+  const ProjectIds listed{mutable_data<std::int32_t>(out[0]), mutable_data<std::int32_t>(out[1]),
+                          mutable_data<std::int32_t>(out[2]), mutable_data<std::int32_t>(out[3])};
   dispatch_floating(f.p.means, [&](auto zero) {
     using T = decltype(zero);
     const ProjectInputs<T> in = f.inputs<T>();
-    backend::project_list(in, plan.const_data_ptr(), sizes, listed, scope.workspace, scope.stream);
-    // Only now the other outputs: the device has waited for the sizes long enough.
-    out = {make_empty(f.p.means, {P, 2}),
-           make_empty(f.p.means, {P, 3}),
-           make_empty(f.p.means, {P}),
-           make_empty(f.p.means, {P}),
-           make_empty(f.p.means, {f.p.sh ? P : 0, 3}),
-           make_empty(f.p.means, {P, 2}, ints),
-           make_empty(f.p.means, {P}, ints),
-           make_empty(f.p.means, {f.ranks.n_ranks > 0 ? P : 0}, ScalarType::Long)};
-    const ProjectOutputs<T> rows{mutable_data<T>(out[0]),
-                                 mutable_data<T>(out[1]),
-                                 mutable_data<T>(out[2]),
-                                 mutable_data<T>(out[3]),
-                                 mutable_data<T>(out[4]),
-                                 mutable_data<std::int32_t>(out[5]),
-                                 mutable_data<std::int32_t>(out[6]),
-                                 f.ranks.n_ranks > 0 ? mutable_data<std::int64_t>(out[7]) : nullptr};
-    launch(in, listed, P, rows);
+    const ProjectRoom room{sizes, totals};
+    backend::project_list(in, plan.const_data_ptr(), room, listed, scope.workspace, scope.stream);
+    const ProjectOutputs<T> rows{mutable_data<T>(out[4]),
+                                 mutable_data<T>(out[5]),
+                                 mutable_data<T>(out[6]),
+                                 mutable_data<T>(out[7]),
+                                 mutable_data<T>(out[8]),
+                                 mutable_data<std::int32_t>(out[9]),
+                                 mutable_data<std::int32_t>(out[10]),
+                                 f.ranks.n_ranks > 0 ? mutable_data<std::int64_t>(out[11]) : nullptr};
+    launch(in, listed, room, rows);
   });
-  return {gaussian_ids, camera_ids, visible_ids, row_offsets, out[0], out[1],
-          out[2],       out[3],     out[4],      out[5],      out[6], out[7]};
+  return out;
+}
+
+// Calls queue(room), which has the rows written that there is room for, and returns what that returns, of the
+// length that `known` tells once the host was told. CUDA does not wait for this: rows are written into the
+// room that was guessed, and written again in the rare case that it was too small. known() is called when
+// what was queued before is done.
+template <class Known, class Queue>
+std::vector<Tensor> write_rows(const char* op, ProjectSizes room, [[maybe_unused]] CudaStream stream,
+                               const Known& known, const Queue& queue) {
+  std::vector<Tensor> rows;
+#ifdef BLITZGS_BACKEND_CUDA
+  const cuda::StreamPoint told(stream);
+  if (room.visible > 0 && room.rows > 0) rows = queue(room);
+  told.wait();
+#endif
+  const ProjectSizes sizes = known();
+  STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ", sizes.rows,
+                  " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
+  if (rows.empty() || sizes.visible > room.visible || sizes.rows > room.rows) rows = queue(sizes);
+  shorten(rows, sizes);
+  return rows;
+}
+
+RowTensors as_tuple(const std::vector<Tensor>& r) {
+  return {r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11]};
 }
 
 RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& scales,
@@ -166,24 +201,32 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
                         std::int64_t tile_size, std::int64_t sh_degree, double near_plane, double far_plane,
                         double eps2d, double radius_clip, bool antialiased, bool raw,
                         const std::vector<std::int64_t>& tile_begins,
-                        const std::vector<std::int64_t>& tile_ends, const Tensor& plan, const Tensor& carry,
-                        const Tensor& counts) {
+                        const std::vector<std::int64_t>& tile_ends, const OptionalTensor& active_count,
+                        const Tensor& plan, const Tensor& carry, const Tensor& totals, const Tensor& counts,
+                        std::int64_t visible_room, std::int64_t row_room) {
   constexpr const char* kOp = "project_emit";
   const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
                   height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
-                  tile_begins, tile_ends);
+                  tile_begins, tile_ends, active_count);
   check_plan(kOp, f, plan);
+  check_dtype(kOp, "totals", totals, ScalarType::Long);
+  check_shape(kOp, "totals", totals, {project_totals(f.p.n_views, f.ranks.n_ranks)});
   check_dtype(kOp, "counts", counts, ScalarType::Long);
   STD_TORCH_CHECK(counts.is_cpu() && counts.numel() >= 2, "blitzgs::", kOp,
                   ": counts must be the totals of project_count, on the CPU");
   DeviceScope scope(f.p.means);
-  backend::project_wait(scope.stream);
-  const auto* totals = data<std::int64_t>(counts);
-  const auto write = [&](const auto& in, const ProjectIds& ids, std::int64_t n_rows, const auto& rows) {
-    backend::project_emit(in, f.ranks, carry.const_data_ptr(), ids, n_rows, rows, scope.workspace,
-                          scope.stream);
+  const auto known = [&] {
+    const auto* numbers = data<std::int64_t>(counts);
+    return ProjectSizes{numbers[kTotalVisible], numbers[kTotalRows]};
   };
-  return emit_rows(kOp, f, plan, {totals[kTotalVisible], totals[kTotalRows]}, scope, write);
+  const auto queue = [&](const ProjectSizes& sizes) {
+    return queue_rows(f, plan, data<std::int64_t>(totals), sizes, scope,
+                      [&](const auto& in, const ProjectIds& ids, const ProjectRoom& room, const auto& rows) {
+                        backend::project_emit(in, f.ranks, carry.const_data_ptr(), ids, room, rows,
+                                              scope.workspace, scope.stream);
+                      });
+  };
+  return as_tuple(write_rows(kOp, {visible_room, row_room}, scope.stream, known, queue));
 }
 
 #ifdef BLITZGS_BACKEND_CUDA
@@ -197,82 +240,81 @@ struct Announced {
   int n_ranks;
 
   std::int64_t rows(int source, int target) const { return totals[source * stride + first + 2 * target]; }
-  // Rows that go to `target` from the ranks before `end`.
-  std::int64_t before(int target, int end) const {
-    std::int64_t sum = 0;
-    for (int source = 0; source < end; ++source) sum += rows(source, target);
-    return sum;
-  }
   // Most rows that any rank sends or gets.
   std::int64_t most() const {
     std::int64_t result = 0;
     for (int m = 0; m < n_ranks; ++m) {
-      std::int64_t sent = 0;
-      for (int target = 0; target < n_ranks; ++target) sent += rows(m, target);
-      result = std::max({result, sent, before(m, n_ranks)});
+      std::int64_t sent = 0, received = 0;
+      for (int other = 0; other < n_ranks; ++other) sent += rows(m, other), received += rows(other, m);
+      result = std::max({result, sent, received});
     }
     return result;
   }
 };
 
-SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, const Tensor& scales,
-                                     const Tensor& opacities, const Tensor& sh, const Tensor& viewmats,
-                                     const Tensor& Ks, const OptionalTensor& active_ids,
-                                     const OptionalTensor& active_views, std::int64_t width,
-                                     std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree,
-                                     double near_plane, double far_plane, double eps2d, double radius_clip,
-                                     bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
-                                     const std::vector<std::int64_t>& tile_ends, const Tensor& plan,
-                                     const Tensor& everyone, std::int64_t rank, const Tensor& ids,
-                                     std::vector<Tensor> buffers, std::int64_t capacity, double first_part) {
+SentRowTensors project_emit_to_peers(
+    const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities, const Tensor& sh,
+    const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& active_ids,
+    const OptionalTensor& active_views, std::int64_t width, std::int64_t height, std::int64_t tile_size,
+    std::int64_t sh_degree, double near_plane, double far_plane, double eps2d, double radius_clip,
+    bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
+    const std::vector<std::int64_t>& tile_ends, const OptionalTensor& active_count, const Tensor& plan,
+    const Tensor& everyone, const Tensor& counts, std::int64_t rank, const Tensor& ids,
+    std::vector<Tensor> buffers, std::int64_t capacity, std::int64_t visible_room, std::int64_t row_room,
+    double first_part) {
   constexpr const char* kOp = "project_emit_to_peers_";
   const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
                   height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
-                  tile_begins, tile_ends);
+                  tile_begins, tile_ends, active_count);
   check_plan(kOp, f, plan);
-  const int n_ranks = f.ranks.n_ranks, me = static_cast<int>(rank);
+  const int n_ranks = f.ranks.n_ranks;
   const std::int64_t n_totals = project_totals(f.p.n_views, n_ranks);
-  check_dtype(kOp, "everyone", everyone, ScalarType::Long);
-  check_shape(kOp, "everyone", everyone, {n_ranks, n_totals});
-  STD_TORCH_CHECK(everyone.is_cpu() && everyone.is_contiguous() && rank >= 0 && rank < n_ranks,
-                  "blitzgs::", kOp,
-                  ": everyone must be the totals of each rank, contiguous on the CPU, and rank one of ",
-                  n_ranks, ", got ", rank);
+  for (const Tensor& told : {everyone, counts}) {
+    check_dtype(kOp, "everyone", told, ScalarType::Long);
+    check_shape(kOp, "everyone", told, {n_ranks, n_totals});
+    STD_TORCH_CHECK(told.is_contiguous(), "blitzgs::", kOp, ": everyone must be contiguous");
+  }
+  STD_TORCH_CHECK(!everyone.is_cpu() && counts.is_cpu() && rank >= 0 && rank < n_ranks, "blitzgs::", kOp,
+                  ": everyone must be the totals of each rank on the GPU, counts the same on the CPU, and ",
+                  "rank one of ", n_ranks, ", got ", rank);
   check_dtype(kOp, "ids", ids, ScalarType::Long);
   check_shape(kOp, "ids", ids, {f.p.count});
   STD_TORCH_CHECK(first_part >= 0 && first_part <= 1, "blitzgs::", kOp,
                   ": first_part must be in [0, 1], got ", first_part);
   const Tensor every_id = as_contiguous(ids);
+  const ScatterTargets targets = peer_targets(kOp, buffers, kEmittedColumns, capacity, n_ranks);
   DeviceScope scope(f.p.means);
-  backend::project_wait(scope.stream);
-  const Announced announced{data<std::int64_t>(everyone), n_totals, kTotalViews + f.p.n_views, n_ranks};
-  std::vector<std::int64_t> group_sizes(n_ranks), starts(n_ranks);
-  ProjectSizes sizes{};
-  if (announced.most() <= capacity) {
-    const std::int64_t* mine = announced.totals + rank * n_totals;
-    sizes = {mine[kTotalVisible], mine[kTotalRows]};
-    for (int m = 0; m < n_ranks; ++m) {
-      group_sizes[m] = announced.rows(me, m);
-      starts[m] = announced.before(m, me);
-    }
-  }
-  const RowGroups groups = checked_groups(kOp, "everyone", group_sizes);
-  Tensor row_ids, places, filled = make_empty(f.p.means, {2, n_ranks}, ScalarType::Long);
-  const auto first_visible = static_cast<std::int64_t>(first_part * static_cast<double>(sizes.visible));
-  const auto send = [&](const auto& in, const ProjectIds& listed, std::int64_t n_rows, const auto& out) {
-    row_ids = make_empty(f.p.means, {n_rows}, ScalarType::Long);
-    places = make_places(f.p.means, n_rows, groups);
-    const ProjectScatter scatter{data<std::int64_t>(every_id),
-                                 first_visible,
-                                 mutable_data<std::int64_t>(row_ids),
-                                 mutable_data<std::int64_t>(filled),
-                                 places_of(places),
-                                 groups,
-                                 peer_targets(kOp, buffers, kEmittedColumns, capacity, starts, groups)};
-    cuda::project_emit_to_ranks(in, f.ranks, listed, n_rows, out, scatter, scope.workspace, scope.stream);
+  const auto known = [&] {
+    const auto* numbers = data<std::int64_t>(counts);
+    const Announced announced{numbers, n_totals, kTotalViews + f.p.n_views, n_ranks};
+    if (announced.most() > capacity) return ProjectSizes{0, 0};
+    return ProjectSizes{numbers[rank * n_totals + kTotalVisible], numbers[rank * n_totals + kTotalRows]};
   };
-  auto rows = emit_rows(kOp, f, plan, sizes, scope, send);
-  return std::tuple_cat(std::move(rows), std::tuple{places, filled});
+  const auto* shown = data<std::int64_t>(everyone);
+  const auto queue = [&](const ProjectSizes& sizes) {
+    Tensor places = make_places(f.p.means, sizes.rows, n_ranks);
+    Tensor filled = make_empty(f.p.means, {2, n_ranks}, ScalarType::Long);
+    std::vector<Tensor> rows = queue_rows(
+        f, plan, shown + rank * n_totals, sizes, scope,
+        [&](const auto& in, const ProjectIds& listed, const ProjectRoom& room, const auto& out) {
+          const ProjectScatter scatter{data<std::int64_t>(every_id),
+                                       first_part,
+                                       scope.workspace.template allocate<std::int64_t>(sizes.rows),
+                                       mutable_data<std::int64_t>(filled),
+                                       places_of(places),
+                                       shown,
+                                       n_ranks,
+                                       static_cast<int>(rank),
+                                       capacity,
+                                       targets};
+          cuda::project_emit_to_ranks(in, f.ranks, listed, room, out, scatter, scope.workspace, scope.stream);
+        });
+    rows.insert(rows.end(), {places, filled});
+    return rows;
+  };
+  std::vector<Tensor> rows = write_rows(kOp, {visible_room, row_room}, scope.stream, known, queue);
+  const std::int64_t runs = place_runs(rows[0].size(0));
+  return std::tuple_cat(as_tuple(rows), std::tuple{torch::stable::narrow(rows[12], 0, 0, runs), rows[13]});
 }
 #endif
 

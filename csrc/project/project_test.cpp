@@ -75,8 +75,9 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
                        p.row_offsets.data()};
   const ProjectOutputs<double> out{p.means2d.data(), p.conics.data(), p.depths.data(), p.opacities.data(),
                                    p.colors.data(),  p.radii.data(),  p.tiles.data(),  p.rank_masks.data()};
-  cpu::project_list(in, plan, p.sizes, ids, workspace, nullptr);
-  cpu::project_emit(in, ranks, carry.last(), ids, p.sizes.rows, out, workspace, nullptr);
+  const ProjectRoom room{p.sizes, p.totals.data()};
+  cpu::project_list(in, plan, room, ids, workspace, nullptr);
+  cpu::project_emit(in, ranks, carry.last(), ids, room, out, workspace, nullptr);
   return p;
 }
 

@@ -28,6 +28,13 @@ struct ScatterShared {
   std::uint8_t list[RANKS][kScatterBlock];  // the block's rows that go to each rank, ascending
   int before[RANKS][kScatterWarps];
   int count[RANKS], base[RANKS];
+  std::int64_t target[RANKS];  // the row of the rank's columns that the block's begin at
+};
+
+// How many rows go to each rank, and the row of its target that they begin at (null: 0).
+struct ScatterSizes {
+  const std::int64_t *sizes, *starts;
+  int n_ranks;
 };
 
 // What all blocks share: how far each group is filled from its front and, [M] more, from its back (zeroed
@@ -40,12 +47,12 @@ struct ScatterState {
 
   __device__ bool from_back(std::int64_t first) const { return split && first >= *split; }
   // Takes `count` places of group m; returns the first.
-  __device__ std::int64_t take(const RowGroups& groups, int m, int count, bool from_back) const {
+  __device__ std::int64_t take(const ScatterSizes& groups, int m, int count, bool from_back) const {
     if (count == 0) return 0;
-    auto* end = reinterpret_cast<unsigned long long*>(filled) + (from_back ? groups.count + m : m);
+    auto* end = reinterpret_cast<unsigned long long*>(filled) + (from_back ? groups.n_ranks + m : m);
     const auto taken = static_cast<std::int64_t>(atomicAdd(end, static_cast<unsigned long long>(count)));
     if (!from_back) return taken;
-    const std::int64_t begin = groups.size[m] - taken - count;
+    const std::int64_t begin = groups.sizes[m] - taken - count;
     return begin > 0 ? begin : 0;
   }
 };
@@ -103,20 +110,21 @@ __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::ui
   }
 }
 
-// Scatters rows [kScatterBlock * blockIdx.x, ...). All THREADS threads of the block call this; the rows must
-// be visible to all of them.
+// Scatters rows [kScatterBlock * blockIdx.x, ...) of n_rows, whatever rows.count says. All THREADS threads of
+// the block call this; the rows must be visible to all of them.
 template <int THREADS, int RANKS>
-__device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& rows, const RowGroups& groups,
-                              const ScatterTargets& targets, const ScatterState& state) {
+__device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& rows, std::int64_t n_rows,
+                              const ScatterSizes& groups, const ScatterTargets& targets,
+                              const ScatterState& state) {
   constexpr int kRounds = kScatterBlock / THREADS;
-  const int n_ranks = groups.count;
+  const int n_ranks = groups.n_ranks;
   const RowColumns<const std::int32_t>& columns = rows.columns;
   const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
   std::int64_t masks[kRounds];
 #pragma unroll
   for (int round = 0; round < kRounds; ++round) {
     const int slot = round * THREADS + static_cast<int>(threadIdx.x);
-    masks[round] = first + slot < rows.count ? rows.masks[first + slot] : 0;
+    masks[round] = first + slot < n_rows ? rows.masks[first + slot] : 0;
     count_by_warp(shared.before, slot, masks[round], n_ranks);
   }
   __syncthreads();
@@ -124,8 +132,9 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
     const int m = threadIdx.x;
     const int count = scan_warps(shared.before[m]);
     const std::int64_t base = state.take(groups, m, count, state.from_back(first));
-    const std::int64_t room = groups.size[m] - base;
+    const std::int64_t room = groups.sizes[m] - base;
     shared.base[m] = static_cast<int>(base);
+    shared.target[m] = base + (groups.starts ? groups.starts[m] : 0);
     shared.count[m] = room >= count ? count : room > 0 ? static_cast<int>(room) : 0;
   }
   __syncthreads();
@@ -137,7 +146,7 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
       const unsigned going = __ballot_sync(0xffffffffu, goes);
       if (goes)
         shared.list[m][place_in_block(shared.before[m], slot, going)] = static_cast<std::uint8_t>(slot);
-      if (slot % 32 == 0 && first + slot < rows.count) {
+      if (slot % 32 == 0 && first + slot < n_rows) {
         state.places[(first + slot) / kPlaceRows * n_ranks + m] = {
             shared.base[m] + shared.before[m][slot / 32], going};
       }
@@ -148,7 +157,7 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
     const int m = run / columns.count, c = run - m * columns.count;
     const int width = columns.begin[c + 1] - columns.begin[c];
     const std::int32_t* from = columns.data[c] + first * width;
-    std::int32_t* to = targets.words[m][c] + static_cast<std::int64_t>(shared.base[m]) * width;
+    std::int32_t* to = targets.words[m][c] + shared.target[m] * width;
     const std::uint8_t* list = shared.list[m];
     const int n = shared.count[m];
     switch (width) {

@@ -14,7 +14,7 @@ std::tuple<Tensor, Tensor> scatter_rows(const std::vector<Tensor>& columns, cons
   const auto& columns_in = held.rows.columns;
   const std::int64_t words = columns_in.begin[columns_in.count];
   Tensor packed = make_empty(held.masks, {total_rows(groups) * words}, ScalarType::Int);
-  Tensor places = make_places(held.masks, held.rows.count, groups);
+  Tensor places = make_places(held.masks, held.rows.count, groups.count);
   ScatterTargets targets{};
   for (int m = 0; m < groups.count; ++m) {
     for (int c = 0; c < columns_in.count; ++c) {

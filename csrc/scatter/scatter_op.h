@@ -91,8 +91,8 @@ RowValues<T> own_values(const T* values, std::int64_t width, std::int64_t rows) 
   return {values, static_cast<int>(width), rows, nullptr, {}};
 }
 
-inline Tensor make_places(const Tensor& like, std::int64_t rows, const RowGroups& groups) {
-  return make_empty(like, {place_runs(rows), groups.count}, ScalarType::Long);
+inline Tensor make_places(const Tensor& like, std::int64_t rows, std::int64_t n_ranks) {
+  return make_empty(like, {place_runs(rows), n_ranks}, ScalarType::Long);
 }
 
 inline RowPlace* places_of(Tensor& places) {

@@ -25,23 +25,27 @@ class Rank:
         self.ids = (torch.arange(n, device="cuda") * 7919 + number) % 100_003
         self.arguments = (
             *scene.parameters("cuda"), None, None, WIDTH, HEIGHT, 16, scene.degree, 0.1, 1e10, 0.3, 0.0,
-            False, True, BEGINS, ENDS,
+            False, True, BEGINS, ENDS, None,
         )  # fmt: skip
         self.plan, self.carry, self.totals = ops.project_count(*self.arguments)
 
     def rows(self):
-        return ops.project_emit(*self.arguments, self.plan, self.carry, self.totals.cpu())
+        counts = self.totals.cpu()
+        return ops.project_emit(*self.arguments, self.plan, self.carry, self.totals, counts, 0, 0)
 
-    def send(self, everyone, buffers, capacity):
+    def send(self, everyone, buffers, capacity, guessed):
+        """guessed: the room for this rank's own rows, a multiple of what is needed."""
+        room = [int(guessed * n) for n in self.totals[:2].tolist()]
         return ops.project_emit_to_peers_(
-            *self.arguments, self.plan, everyone, self.number, self.ids, buffers, capacity, FIRST_PART
+            *self.arguments, self.plan, everyone, everyone.cpu(), self.number, self.ids, buffers, capacity,
+            *room, FIRST_PART,
         )
 
 
-def exchange(counts, room=None):
+def exchange(counts, guessed, room=None):
     """All ranks' rows are written; also what each would have to be given."""
     ranks = [Rank(m, n) for m, n in enumerate(counts)]
-    everyone = torch.stack([rank.totals for rank in ranks]).cpu()
+    everyone = torch.stack([rank.totals for rank in ranks])
     traffic = [Traffic.of(everyone.tolist(), torch.empty(VIEWS), m) for m in range(len(ranks))]
     capacity = -(-traffic[0].most // 32) * 32 if room is None else room
     words = 22 * max(capacity, 1)
@@ -50,13 +54,14 @@ def exchange(counts, room=None):
         PeerSpace(SimpleNamespace(rank=m, buffers=buffers, exchanges=1), traffic[m], capacity, 1)
         for m in range(len(ranks))
     ]
-    return ranks, spaces, [rank.send(everyone, buffers, capacity) for rank in ranks]
+    return ranks, spaces, [rank.send(everyone, buffers, capacity, guessed) for rank in ranks]
 
 
+@pytest.mark.parametrize("guessed", [0, 0.9, 1, 2.5])
 @pytest.mark.parametrize("counts", [(3000, 900, 0, 40), (1, 0, 0, 2)])
 @pytest.mark.parametrize("in_parts", [False, True])
-def test_rows_arrive_and_their_gradients_return(counts, in_parts):
-    ranks, spaces, sent = exchange(counts)
+def test_rows_arrive_and_their_gradients_return(counts, guessed, in_parts):
+    ranks, spaces, sent = exchange(counts, guessed)
     expected = [rank.rows() for rank in ranks]
     for got, want in zip(sent, expected, strict=True):
         for a, b in zip(got[:12], want, strict=True):
@@ -100,7 +105,7 @@ def test_rows_arrive_and_their_gradients_return(counts, in_parts):
 
 @pytest.mark.parametrize("count", [3, 20_000])
 def test_rows_of_the_first_gaussians_lie_in_front(count):
-    ranks, spaces, sent = exchange((count, 10, 10, count))
+    ranks, spaces, sent = exchange((count, 10, 10, count), 1.25)
     for rank, space, rows in zip(ranks, spaces, sent, strict=True):
         first = rows[3][int(FIRST_PART * len(rows[2]))].item()  # rows before are of the first Gaussians
         for m, target in enumerate(spaces):
@@ -115,8 +120,9 @@ def test_rows_of_the_first_gaussians_lie_in_front(count):
             assert front <= len(mine) + 256  # a block's rows stay together
 
 
-def test_nothing_is_written_where_room_is_too_small():
-    ranks, spaces, sent = exchange((500, 300, 0, 0), room=32)
+@pytest.mark.parametrize("guessed", [0, 2])
+def test_nothing_is_written_where_room_is_too_small(guessed):
+    ranks, spaces, sent = exchange((500, 300, 0, 0), guessed, room=32)
     assert spaces[0].traffic.most > 32
     for rows in sent:
         assert len(rows[0]) == len(rows[2]) == 0 and rows[3].tolist() == [0]

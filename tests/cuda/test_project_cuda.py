@@ -115,10 +115,33 @@ def test_ranks_of_rows_match_the_cpu(scene):
         0.0, False, True, [0, 30, 30, 50], [40, 30, 90, 140],
     )  # fmt: skip
     plan, carry, totals = ops.project_count(*arguments)
-    expected = ops.project_emit(*arguments, plan, carry, totals)
+    expected = ops.project_emit(*arguments, None, plan, carry, totals, totals, 0, 0)
     on_gpu = [a.cuda() if torch.is_tensor(a) else a for a in arguments]
     plan, carry, counted = ops.project_count(*on_gpu)
     assert torch.equal(counted.cpu(), totals)
-    rows = ops.project_emit(*on_gpu, plan, carry, counted.cpu())
+    rows = ops.project_emit(*on_gpu, None, plan, carry, counted, counted.cpu(), 0, 0)
     assert torch.equal(rows[11].cpu(), expected[11])
     assert totals[5::2].tolist() == [(expected[11] >> m & 1).sum().item() for m in range(4)]
+
+
+@pytest.mark.parametrize("rows_seen", [True, False])
+def test_rows_do_not_depend_on_the_room_that_was_guessed(scene, rows_seen):
+    arguments = [
+        *scene.parameters("cuda"), None, None, scene.width, scene.height, 16, scene.degree, 0.1, 1e10, 0.3,
+        0.0, False, True, [], [], None,
+    ]  # fmt: skip
+    if not rows_seen:
+        arguments[0] = torch.full_like(arguments[0], 1e6)
+    plan, carry, totals = ops.project_count(*arguments)
+    counts = totals.cpu()
+    visible, rows = counts[:2].tolist()
+    assert (rows > visible > 100) == rows_seen
+    expected = ops.project_emit(*arguments, plan, carry, totals, counts, 0, 0)
+    assert len(expected[0]) == rows and len(expected[2]) == visible
+    rooms = [(visible, rows), (visible - 1, rows), (visible, rows - 1), (1, 1), (visible + 1, rows + 200)]
+    for room in [*rooms, (2 * visible + 3, 3 * rows + 1000)]:
+        told = counts.new_empty(counts.shape, pin_memory=True).copy_(totals, non_blocking=True)
+        for a, b in zip(
+            ops.project_emit(*arguments, plan, carry, totals, told, *room), expected, strict=True
+        ):
+            assert a.is_contiguous() and torch.equal(a, b)

@@ -1,0 +1,24 @@
+// SPDX-License-Identifier: Apache-2.0
+// CUDA only: a point in a stream that the host waits for while it goes on queueing work behind it.
+#pragma once
+#include "common/stream.h"
+
+struct CUevent_st;  // cudaEvent_t is a pointer to this
+
+namespace blitzgs::cuda {
+
+class StreamPoint {
+ public:
+  // Behind what is queued now.
+  explicit StreamPoint(CudaStream);
+  ~StreamPoint();
+  StreamPoint(const StreamPoint&) = delete;
+  StreamPoint& operator=(const StreamPoint&) = delete;
+
+  void wait() const;
+
+ private:
+  CUevent_st* event_ = nullptr;
+};
+
+}  // namespace blitzgs::cuda

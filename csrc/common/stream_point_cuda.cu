@@ -1,0 +1,17 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "common/stream_point.h"
+
+#include "common/cuda_check.h"
+
+namespace blitzgs::cuda {
+
+StreamPoint::StreamPoint(CudaStream stream) {
+  check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming), "an event");
+  check(cudaEventRecord(event_, stream), "an event");
+}
+
+StreamPoint::~StreamPoint() { cudaEventDestroy(event_); }
+
+void StreamPoint::wait() const { check(cudaEventSynchronize(event_), "what was queued so far"); }
+
+}  // namespace blitzgs::cuda
