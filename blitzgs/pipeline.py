@@ -91,12 +91,12 @@ class RenderOptions:
 class Active(NamedTuple):
     """The Gaussians worth projecting: ascending rows int32 [A], their views as bits int32 [A]; None: all.
 
-    With `count`, int32 [1], only the first `count` of the A are set.
+    With `length`, int32 [1], only the first `length` of the A are set.
     """
 
     ids: Tensor | None = None
     views: Tensor | None = None
-    count: Tensor | None = None
+    length: Tensor | None = None
 
 
 class RowRoom:
@@ -354,7 +354,7 @@ def _project(
     arguments = (
         *table.parameters, views.viewmats, views.Ks, active.ids, active.views, views.width, views.height,
         options.tile_size, options.sh_degree, options.near_plane, options.far_plane, options.eps2d, 0.0,
-        options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted], active.count,
+        options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted], active.length,
     )  # fmt: skip
     plan, carry, totals = torch.ops.blitzgs.project_count(*arguments)
     if asking is not None and asking.ranks.peers is not None:

@@ -19,9 +19,11 @@ work queued behind it, on any rank, finds done what any rank queued before it. H
 - the numbers that ranks bring to a meeting are read before the next that has numbers, and overwritten at the
   one after that: there are two places for them, used in turn.
 
-Between A and the writing every rank waits for the counts on the host, so when buffers have to grow, no kernel
-of any rank uses them. A rank that dies leaves the others in a meeting: their hosts wait in `Ranks.reading`,
-where the watchdog finds them, and a meeting that lasts longer than that aborts the process's kernels.
+Rows are queued for writing behind A while the counts are on their way to the host. Where they do not fit into
+somebody's buffer no rank writes any, which each finds from the same counts; then all wait for the counts, so
+when buffers have to grow, no kernel of any rank uses them. A rank that dies leaves the others in a meeting:
+their hosts wait in `Ranks.reading`, where the watchdog finds them, and a meeting that lasts longer than that
+aborts the process's kernels.
 """
 
 from __future__ import annotations

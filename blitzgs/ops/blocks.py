@@ -36,24 +36,24 @@ class PendingSteps(NamedTuple):
 
 
 class ActiveRows(NamedTuple):
-    """The rows that some view may see: the first `count` of lists with room for all N.
+    """The rows that some view may see: the first `length` of lists with room for all N.
 
-    Nobody has waited for the count, so ops that take the lists take it with them.
+    Nobody has waited for the length, so ops that take the lists take it with them.
 
     Attributes:
         ids: int32 [N], ascending.
         views: int32 [N], bit v set when view v may see the row.
-        count: int32 [1], on the device of the others.
+        length: int32 [1], on the device of the others.
     """
 
     ids: Tensor
     views: Tensor
-    count: Tensor
+    length: Tensor
 
     def listed(self) -> tuple[Tensor, Tensor]:
         """Return the rows there are and their views, int32 [A] each; waits for the device."""
-        count = int(self.count)
-        return self.ids[:count], self.views[:count]
+        length = int(self.length)
+        return self.ids[:length], self.views[:length]
 
 
 def morton_keys(points: Tensor) -> Tensor:

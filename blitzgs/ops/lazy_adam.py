@@ -99,8 +99,8 @@ def lazy_adam_catch_up_(
 
     In place. Rows that stand at `step` already are left untouched. Moments and `moment_step` stay: the next
     step with a gradient applies the decay they still owe, beta^(step - moment_step). Arguments as in
-    `lazy_adam_step_`; ``step`` may be 0 (nothing to do). ``count``, int32 [1]: only the first `count` of `ids`
-    are rows; nobody waits for it.
+    `lazy_adam_step_`; ``step`` may be 0 (nothing to do). ``count``, int32 [1]: only the first `count` of
+    `ids` are rows; nobody waits for it.
 
     Raises:
         ValueError: decay rates outside their range.

@@ -66,7 +66,7 @@ class Stepper:
         table, ranks, views = self._table, self._owners.ranks, batch.views
         active = self._active(views, options)
         mark("other")
-        self._optimiser.catch_up(table, active.ids, step - 1, active.count)
+        self._optimiser.catch_up(table, active.ids, step - 1, active.length)
         mark("optimiser")
         share = None if batch.ranges is None else Share(ranks, batch.ranges, self._half)
         frame = pipeline.forward(table, views, options, active, share, self._room, mark)
