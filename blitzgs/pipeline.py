@@ -230,7 +230,6 @@ def forward(
     count, tiles = len(views), (0, -1)
     room = room or RowRoom()
     rows, splats, route, n_isects, visible = _project(table, views, options, active, share, room)
-    room.learn(rows.counts)
     mark("project")
     if share is not None and route is not None:
         splats, tiles = send(splats, route, share.ranks), share.composited
@@ -247,6 +246,7 @@ def forward(
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
         count, views.width, views.height, options.tile_size, *tiles,
     )  # fmt: skip
+    room.learn(rows.counts)
     mark("raster")
     return Frame(
         views,
