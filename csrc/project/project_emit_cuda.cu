@@ -225,8 +225,8 @@ void project_list<float>(const Inputs& in, const void* plan_memory, const Projec
     return;
   }
   const MadePlan plan(plan_memory, in.n_candidates);
-  list_rows_kernel<<<blocks_for(most_segments(in.n_candidates), kListThreads / 32), kListThreads, 0,
-                     stream>>>(in, plan, room, ids);
+  const std::int64_t segments = std::max<std::int64_t>(1, most_segments(in.n_candidates));
+  list_rows_kernel<<<blocks_for(segments, kListThreads / 32), kListThreads, 0, stream>>>(in, plan, room, ids);
   check_launch("project_emit");
 }
 

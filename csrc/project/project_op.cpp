@@ -140,7 +140,7 @@ std::vector<Tensor> make_rows(const Forward& f, const ProjectSizes& room) {
 void shorten(std::vector<Tensor>& rows, const ProjectSizes& sizes) {
   for (std::size_t i = 0; i < std::tuple_size_v<RowTensors>; ++i) {
     const std::int64_t length = i == 2 ? sizes.visible : i == 3 ? sizes.visible + 1 : sizes.rows;
-    if (rows[i].size(0) > length) rows[i] = torch::stable::narrow(rows[i], 0, 0, length);
+    if (rows[i].size(0) > length) rows[i] = first_rows(rows[i], length);
   }
 }
 
@@ -314,7 +314,7 @@ SentRowTensors project_emit_to_peers(
   };
   std::vector<Tensor> rows = write_rows(kOp, {visible_room, row_room}, scope.stream, known, queue);
   const std::int64_t runs = place_runs(rows[0].size(0));
-  return std::tuple_cat(as_tuple(rows), std::tuple{torch::stable::narrow(rows[12], 0, 0, runs), rows[13]});
+  return std::tuple_cat(as_tuple(rows), std::tuple{first_rows(rows[12], runs), rows[13]});
 }
 #endif
 

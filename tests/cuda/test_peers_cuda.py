@@ -35,11 +35,11 @@ class Rank:
 
     def send(self, everyone, buffers, capacity, guessed):
         """guessed: the room for this rank's own rows, a multiple of what is needed."""
-        room = [int(guessed * n) for n in self.totals[:2].tolist()]
+        room = [int(guessed * n) + 1 * (guessed > 2) for n in self.totals[:2].tolist()]
         return ops.project_emit_to_peers_(
             *self.arguments, self.plan, everyone, everyone.cpu(), self.number, self.ids, buffers, capacity,
             *room, FIRST_PART,
-        )
+        )  # fmt: skip
 
 
 def exchange(counts, guessed, room=None):
@@ -49,7 +49,7 @@ def exchange(counts, guessed, room=None):
     traffic = [Traffic.of(everyone.tolist(), torch.empty(VIEWS), m) for m in range(len(ranks))]
     capacity = -(-traffic[0].most // 32) * 32 if room is None else room
     words = 22 * max(capacity, 1)
-    buffers = [torch.empty(words, dtype=torch.int32, device="cuda") for _ in ranks]
+    buffers = [torch.full((words,), -1, dtype=torch.int32, device="cuda") for _ in ranks]
     spaces = [
         PeerSpace(SimpleNamespace(rank=m, buffers=buffers, exchanges=1), traffic[m], capacity, 1)
         for m in range(len(ranks))
@@ -126,6 +126,8 @@ def test_nothing_is_written_where_room_is_too_small(guessed):
     assert spaces[0].traffic.most > 32
     for rows in sent:
         assert len(rows[0]) == len(rows[2]) == 0 and rows[3].tolist() == [0]
+    for buffer in spaces[0].peers.buffers:
+        assert (buffer == -1).all()
 
 
 @pytest.mark.parametrize("width,in_parts", [(1, False), (4, False), (9, False), (9, True)])
