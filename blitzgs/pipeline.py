@@ -227,8 +227,21 @@ def forward(
         The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
         ranks shared the work.
     """
+    # Past autograd's Python: an op that is differentiable elsewhere spends 20 us of the host's time there.
+    with torch._C._AutoDispatchBelowAutograd():
+        return _forward(table, views, options, active or Active(), share, room or RowRoom(), mark)
+
+
+def _forward(
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: Active,
+    share: Share | None,
+    room: RowRoom,
+    mark: Mark,
+) -> Frame:
     count, tiles = len(views), (0, -1)
-    room = room or RowRoom()
     rows, splats, route, n_isects, visible = _project(table, views, options, active, share, room)
     mark("project")
     if share is not None and route is not None:
@@ -337,7 +350,7 @@ def _project(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
-    active: Active | None,
+    active: Active,
     share: Share | None,
     room: RowRoom,
 ) -> tuple[Rows, Splats, Route | None, int, Tensor]:
@@ -347,7 +360,6 @@ def _project(
     go (None: they stay); at least the number of intersections to composite here; rows of each view over all
     ranks, int64 [B].
     """
-    active = active or Active()
     # Halves are routed by what arrives: rounding may move a splat's border over that of a tile.
     asking = share if share is not None and not share.half else None
     wanted = [] if asking is None else [asking.ranges.composited(m) for m in range(asking.ranks.world_size)]
