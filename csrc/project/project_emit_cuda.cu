@@ -152,7 +152,8 @@ __global__ void admit_kernel(const __grid_constant__ ProjectScatter scatter, int
   if (m > 0) return;
   const ProjectSizes sizes = fitting({room, scatter.everyone + scatter.rank * stride});
   out->sizes = admitted ? sizes : ProjectSizes{0, 0};
-  out->split = row_offsets[static_cast<std::int64_t>(scatter.first_part * static_cast<double>(sizes.visible))];
+  out->split =
+      row_offsets[static_cast<std::int64_t>(scatter.first_part * static_cast<double>(sizes.visible))];
 }
 
 // Apart, so that its registers are not added to those of the projection.
@@ -249,13 +250,10 @@ void project_emit_to_ranks(const Inputs& in, const RankTiles& rank_tiles, const 
                                 words(out.colors),     words(out.depths), ids.camera_ids,
                                 words(scatter.row_ids)};
   std::copy(std::begin(data), std::end(data), columns.data);
-  const GoToRanks destination{scatter.ids,
-                              scatter.row_ids,
-                              {columns, out.rank_masks, room.sizes.rows},
-                              scatter.targets,
-                              admitted,
-                              {scatter.filled, scatter.places, &admitted->split},
-                              scatter.n_ranks};
+  const GoToRanks destination{
+      scatter.ids,     scatter.row_ids, {columns, out.rank_masks, room.sizes.rows},
+      scatter.targets, admitted,        {scatter.filled, scatter.places, &admitted->split},
+      scatter.n_ranks};
   emit_rows(in, rank_tiles, ids, {room.sizes, &admitted->sizes.visible}, out, destination, stream);
 }
 

@@ -252,16 +252,18 @@ struct Announced {
   }
 };
 
-SentRowTensors project_emit_to_peers(
-    const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities, const Tensor& sh,
-    const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& active_ids,
-    const OptionalTensor& active_views, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t sh_degree, double near_plane, double far_plane, double eps2d, double radius_clip,
-    bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
-    const std::vector<std::int64_t>& tile_ends, const OptionalTensor& active_count, const Tensor& plan,
-    const Tensor& everyone, const Tensor& counts, std::int64_t rank, const Tensor& ids,
-    std::vector<Tensor> buffers, std::int64_t capacity, std::int64_t visible_room, std::int64_t row_room,
-    double first_part) {
+SentRowTensors project_emit_to_peers(const Tensor& means, const Tensor& quats, const Tensor& scales,
+                                     const Tensor& opacities, const Tensor& sh, const Tensor& viewmats,
+                                     const Tensor& Ks, const OptionalTensor& active_ids,
+                                     const OptionalTensor& active_views, std::int64_t width,
+                                     std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree,
+                                     double near_plane, double far_plane, double eps2d, double radius_clip,
+                                     bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
+                                     const std::vector<std::int64_t>& tile_ends,
+                                     const OptionalTensor& active_count, const Tensor& plan,
+                                     const Tensor& everyone, const Tensor& counts, std::int64_t rank,
+                                     const Tensor& ids, std::vector<Tensor> buffers, std::int64_t capacity,
+                                     std::int64_t visible_room, std::int64_t row_room, double first_part) {
   constexpr const char* kOp = "project_emit_to_peers_";
   const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
                   height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
