@@ -23,6 +23,11 @@ __global__ void __launch_bounds__(kListThreads)
   const std::int64_t s = (blockIdx.x * static_cast<std::int64_t>(kListThreads) + threadIdx.x) / 32;
   const std::int64_t candidates = candidates_of(in);
   const ProjectSizes sizes = fitting(room);
+  // What emitting reads before it knows how many rows there are.
+  for (std::int64_t i = sizes.rows + blockIdx.x * std::int64_t{kListThreads} + threadIdx.x;
+       i < room.sizes.rows; i += gridDim.x * std::int64_t{kListThreads}) {
+    out.gaussian_ids[i] = -1;
+  }
   if (s == 0 && lane == 0) out.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
   if (s >= segments_of(candidates) || sizes.rows == 0) return;
   const std::int64_t before = plan.before[s], first_candidate = s * segment_of(candidates);
