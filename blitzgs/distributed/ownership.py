@@ -201,7 +201,7 @@ class TileOwners:
 
     def _read(self, key: Hashable) -> NDArray[np.float64]:
         sums, begin, end = self._costs[key]
-        return sums.read()[begin:end].numpy().astype(np.float64)
+        return sums.read().numpy()[begin:end].astype(np.float64)
 
 
 def divide(cost: NDArray[np.float64], parts: int) -> tuple[int, ...]:

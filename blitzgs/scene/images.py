@@ -159,9 +159,11 @@ class ImageStore:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _result(self, kind: str, index: int) -> UInt8:
-        return self._submit(kind, index).result()
+        found = self._submit(kind, index)
+        return found.result() if isinstance(found, Future) else found
 
-    def _submit(self, kind: str, index: int) -> Future[UInt8]:
+    def _submit(self, kind: str, index: int) -> UInt8 | Future[UInt8]:
+        """What is decoded, or will be."""
         key = (kind, index)
         # What is no longer pending is decoded: both are looked up under one lock, or a thread held up between
         # the two would have it decoded again.
@@ -169,11 +171,9 @@ class ImageStore:
             if key in self._pending:
                 return self._pending[key]
             found = self._decoded.get(key)
-            if found is None:
-                future = self._pending[key] = self._pool.submit(self._produce, kind, index)
-            else:
-                future = Future()
-                future.set_result(found)
+            if found is not None:
+                return found
+            future = self._pending[key] = self._pool.submit(self._produce, kind, index)
             return future
 
     def _produce(self, kind: str, index: int) -> UInt8:

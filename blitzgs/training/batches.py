@@ -51,8 +51,63 @@ class Batch:
     ranges: TileRanges | None
 
 
+class _Memory:
+    """Where batches of one shape are put together and uploaded from; one and the same memory on the CPU.
+
+    Everything lies in one piece, so that few calls fill and upload it: at each of them this thread and that
+    which launches kernels may have to wait for one another.
+
+    Attributes:
+        shape: views, height, width, and whether there are masks.
+        numbers: on the host, float32: `ViewSet.write`'s, then the samples of each view.
+        pixels: on the host, uint8 [B, H, W, 3].
+        counted: on the host, uint8 [B, H, W]; None without masks.
+    """
+
+    def __init__(self, shape: tuple[int, int, int, bool], device: torch.device) -> None:
+        self.shape = shape
+        count, height, width, masked = shape
+        area, on_gpu = count * height * width, device.type == "cuda"
+        # Each part begins where a tensor of its own would: at a multiple of 256 bytes.
+        self._begin = _aligned(4 * count * (VIEW_NUMBERS + 1))
+        self._end = _aligned(self._begin + 3 * area)
+        size = self._end + masked * area
+        self._host = torch.empty(size, dtype=torch.uint8, pin_memory=on_gpu)
+        self._device = torch.empty(size, dtype=torch.uint8, device=device) if on_gpu else self._host
+        numbers, pixels, counted = self._parts(self._host)
+        self.numbers, self.pixels = numbers.numpy(), pixels.numpy()
+        self.counted = None if counted is None else counted.numpy()
+        numbers, self._targets, self._masks = self._parts(self._device)
+        self._views = unpack_views(numbers[:-count], width, height)
+        self._samples = numbers[-count:]
+
+    def _parts(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        count, height, width, masked = self.shape
+        numbers = memory[: 4 * count * (VIEW_NUMBERS + 1)].view(torch.float32)
+        pixels = memory[self._begin :][: 3 * count * height * width].view(count, height, width, 3)
+        return numbers, pixels, memory[self._end :].view(count, height, width) if masked else None
+
+    def upload(self, rows: list[tuple[int, int]]) -> None:
+        """Start to upload all but the pixel rows before the first and after the last of `rows`."""
+        if self._device is self._host:
+            return
+        count, height, width, _ = self.shape
+        needed = [view * height + y for view, (y0, y1) in enumerate(rows) if y0 < y1 for y in (y0, y1)]
+        first, last = (needed[0], needed[-1]) if needed else (0, 0)
+        begin, end = (self._begin + 3 * width * y for y in (first, last))
+        parts = [(0, end)] if first == 0 else [(0, self._begin), (begin, end)]
+        if self._masks is not None:
+            parts.append((self._end, len(self._host)))
+        for begin, end in parts:
+            self._device[begin:end].copy_(self._host[begin:end], non_blocking=True)
+
+    def batch(self, indices: list[int], ranges: TileRanges | None) -> Batch:
+        """Return the batch that is uploaded here."""
+        return Batch(indices, self._views, self._targets, self._masks, self._samples, ranges)
+
+
 class _Slot:
-    """Where one batch is put together and uploaded from; on CUDA, memory that is used again and again.
+    """The memory of one batch; on CUDA it is used again and again.
 
     Attributes:
         uploaded: on CUDA, the upload of the newest batch.
@@ -61,23 +116,17 @@ class _Slot:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._memory: dict[str, tuple[Tensor, Tensor]] = {}
+        self._memory: _Memory | None = None
         if device.type == "cuda":
             self.uploaded, self.read = torch.cuda.Event(), torch.cuda.Event()
 
-    def reserve(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Return host memory to fill and the device memory that it is for; one and the same on the CPU."""
+    def reserve(self, shape: tuple[int, int, int, bool]) -> _Memory:
+        """Return memory for a batch of a shape."""
         if self._device.type != "cuda":
-            tensor = torch.empty(shape, dtype=dtype)
-            return tensor, tensor
-        memory = self._memory.get(name)
-        if memory is None or memory[0].shape != shape:
-            memory = (
-                torch.empty(shape, dtype=dtype, pin_memory=True),
-                torch.empty(shape, dtype=dtype, device=self._device),
-            )
-            self._memory[name] = memory
-        return memory
+            return _Memory(shape, self._device)
+        if self._memory is None or self._memory.shape != shape:
+            self._memory = _Memory(shape, self._device)
+        return self._memory
 
 
 class BatchLoader:
@@ -122,7 +171,7 @@ class BatchLoader:
         # One that is in use, and those that are ready or being made.
         self._free = deque(_Slot(device) for _ in range(ahead + 2))
         self._used: _Slot | None = None
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="batches")
+        self._worker = ThreadPoolExecutor(1, "batches", self._enter)
 
     def get(self, step: int, last: int) -> Batch:
         """Return the batch of a step (0-based) and start on those that follow it, up to step `last` - 1."""
@@ -152,6 +201,11 @@ class BatchLoader:
         """Stop the thread."""
         self._worker.shutdown(wait=True, cancel_futures=True)
 
+    def _enter(self) -> None:
+        """Have the thread's calls run on its stream."""
+        if self._stream is not None:
+            torch.cuda.set_stream(self._stream)
+
     def _divide(self, indices: list[int]) -> TileRanges | None:
         if self._owners is None:
             return None
@@ -170,32 +224,26 @@ class BatchLoader:
         masks = [self._images.mask(index) for index in indices]
         samples = [self._samples(index, mask) for index, mask in zip(indices, masks, strict=True)]
         strips = [
-            self._images.get(index)[y0:y1] if y0 < y1 else None
+            self._images.get(index).numpy()[y0:y1] if y0 < y1 else None
             for index, (y0, y1) in zip(indices, rows, strict=True)
         ]
         slot = self._free.popleft()  # not before: images that cannot be read must not keep it
         if self._stream is not None:
             slot.uploaded.synchronize()  # the pinned memory is free, long since
             self._stream.wait_event(slot.read)
-        with torch.cuda.stream(self._stream):
-            pixels, targets = slot.reserve("targets", (count, height, width, 3), torch.uint8)
-            for view, (strip, (y0, y1)) in enumerate(zip(strips, rows, strict=True)):
-                if strip is not None:
-                    pixels[view, y0:y1].copy_(strip)
-                    _upload(targets[view, y0:y1], pixels[view, y0:y1])
-            whole = stack_masks(masks, width, height)
-            if whole is not None:
-                counted, placed = slot.reserve("masks", (count, height, width), torch.uint8)
-                _upload(placed, counted.copy_(whole))
-                whole = placed
-            numbers, constants = slot.reserve("constants", (count * (VIEW_NUMBERS + 1),), torch.float32)
-            self._views.write(indices, numbers[:-count].numpy())
-            numbers[-count:] = torch.tensor(samples)
-            _upload(constants, numbers)
-            if self._stream is not None:
-                slot.uploaded.record(self._stream)
-        views = unpack_views(constants[:-count], width, height)
-        return Batch(indices, views, targets, whole, constants[-count:], ranges), slot
+        memory = slot.reserve((count, height, width, any(mask is not None for mask in masks)))
+        for view, (strip, (y0, y1)) in enumerate(zip(strips, rows, strict=True)):
+            if strip is not None:
+                memory.pixels[view, y0:y1] = strip
+        if memory.counted is not None:
+            for place, mask in zip(memory.counted, masks, strict=True):
+                place[...] = 1 if mask is None else mask.numpy()
+        self._views.write(indices, memory.numbers[:-count])
+        memory.numbers[-count:] = samples
+        memory.upload(rows)
+        if self._stream is not None:
+            slot.uploaded.record(self._stream)
+        return memory.batch(indices, ranges), slot
 
     def _samples(self, index: int, mask: Tensor | None) -> float:
         if index not in self._counts:
@@ -205,14 +253,5 @@ class BatchLoader:
         return self._counts[index]
 
 
-def _upload(device: Tensor, host: Tensor) -> None:
-    if device.is_cuda:
-        device.copy_(host, non_blocking=True)
-
-
-def stack_masks(masks: list[Tensor | None], width: int, height: int) -> Tensor | None:
-    """Stack the masks of a batch; a view without one counts everywhere. None when no view has one."""
-    if all(mask is None for mask in masks):
-        return None
-    whole = torch.ones(height, width, dtype=torch.uint8)
-    return torch.stack([whole if mask is None else mask for mask in masks])
+def _aligned(size: int) -> int:
+    return -(-size // 256) * 256

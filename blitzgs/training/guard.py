@@ -57,7 +57,7 @@ def _check_loss(
     step: int, names: Sequence[str], sums: HostSum, table: GaussianTable, frame: Frame | None
 ) -> None:
     # Plain numbers: every step comes here while the GPU waits, and an op takes longer than they all.
-    finite = [math.isfinite(value) for value in sums.read()[: 2 * len(names)].tolist()]
+    finite = [math.isfinite(value) for value in sums.read().numpy()[: 2 * len(names)].tolist()]
     if not all(finite):
         l1, ssim = finite[: len(names)], finite[len(names) :]
         views = ", ".join(f"'{name}'" for name, *good in zip(names, l1, ssim, strict=True) if not all(good))
