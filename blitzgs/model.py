@@ -10,6 +10,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from blitzgs.ops.take_rows import take_rows
+
 # The learned parameters, before activation: log scales, opacity logits, unnormalised quaternions.
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 EXP_AVGS = tuple(f"exp_avg.{name}" for name in PARAMETERS)
@@ -208,18 +210,9 @@ class GaussianTable:
             new: as for `append`.
         """
         self._check_new(new)
-        count = len(self)
-        places = (rows >= count).nonzero().squeeze(1)
-        chosen = rows[places] - count
-        # New rows are written after; until then they are copies of some old one.
-        sources = rows.clamp(max=max(count - 1, 0))
+        # One after the other, so that no more than one column is there twice.
         for name, column in self.columns.items():
-            if count == 0:
-                renewed = column.new_empty((len(rows), *column.shape[1:]))
-            else:
-                renewed = column.index_select(0, sources)
-            renewed[places] = new[name][chosen] if name in new else 0
-            self.columns[name] = renewed
+            self.columns[name] = take_rows(column, rows, new.get(name))
 
     def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
         """Move every row to a rank. Collective: every rank calls it; rows arrive by source rank, in order.
@@ -234,8 +227,8 @@ class GaussianTable:
         received = ranks.exchange_counts(counts).tolist()
         for name in list(self.columns):
             column = self.columns.pop(name)
-            self.columns[name] = ranks.all_to_all(column[order], sent, received)
+            self.columns[name] = ranks.all_to_all(take_rows(column, order), sent, received)
 
     def _select(self, rows: Tensor) -> None:
         for name, column in self.columns.items():
-            self.columns[name] = column.index_select(0, rows)
+            self.columns[name] = take_rows(column, rows)

@@ -136,6 +136,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
       "weight, Tensor? places=None, int[] group_sizes=[]) -> ()");
 
+  // Rows of a table, old and new, in another order.
+  m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
+
   // Scene initialisation.
   m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");
   m.def("knn_distances(Tensor points, int k) -> Tensor");

@@ -60,6 +60,7 @@ TESTS = [
         "density_stats.py::test_matches_the_definition[True-cuda]",
         "knn_distances.py::test_matches_a_kd_tree[uniform-3-cuda]",
         "knn_distances.py::test_small_clouds[cuda]",
+        "take_rows.py::test_bits_and_unaligned_columns[cuda]",
         "voxel_keys.py::test_matches_the_formula[cuda-dtype2]",
     )),
     *(BLOCKS + test for test in (
