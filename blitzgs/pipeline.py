@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -252,9 +253,7 @@ def _forward(
         views.width, views.height, options.tile_size, *tiles, n_isects,
     )  # fmt: skip
     mark("sort")
-    backgrounds = None
-    if any(options.background):
-        backgrounds = torch.tensor(options.background, device=table.device).repeat(count, 1)
+    backgrounds = _backgrounds(options.background, count, table.device)
     composited = torch.ops.blitzgs.rasterize_fwd(
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
         count, views.width, views.height, options.tile_size, *tiles,
@@ -274,6 +273,12 @@ def _forward(
         tile_offsets,
         *composited,
     )
+
+
+@lru_cache(maxsize=16)
+def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.device) -> Tensor | None:
+    """Return a colour for each of `count` views, [B, 3]; None: black. Kept, as its way to a GPU is a wait."""
+    return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
 
 
 def backward_rows(

@@ -170,6 +170,25 @@ def test_packed_and_dense_meta_say_the_same():
     assert (dense["radii"][invisible] == 0).all()
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_call_does_not_depend_on_those_before(device):
+    """What calls before needed decides how much room the next one's rows get first."""
+    few, many = (random_scene(n=n, width=33, height=17, device=device).leaves() for n in (5, 3000))
+
+    def render(scene):
+        image, _, meta = rasterize_scene(scene)
+        gradients = torch.autograd.grad(image.sum(), [getattr(scene, name) for name in PARAMETERS])
+        return image, gradients, {k: v for k, v in meta.items() if isinstance(v, torch.Tensor)}
+
+    first = render(many)
+    for scene in (few, many):
+        image, gradients, meta = render(scene)
+    assert torch.equal(image, first[0])
+    assert all(torch.equal(meta[name], value) for name, value in first[2].items())
+    for gradient, expected in zip(gradients, first[1], strict=True):
+        assert relative_error(gradient, expected) < 1e-5  # atomic sums are in no particular order
+
+
 def test_meta_read_late_is_differentiable_as_the_call_was():
     scene = random_scene(n=20).leaves()
     with torch.no_grad():
