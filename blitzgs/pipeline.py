@@ -137,7 +137,7 @@ class Frame(NamedTuple):
         backgrounds: [B, 3]; None: black.
         isect_rows: int32 [I], splats by tile, front to back.
         tile_offsets: int64 [B * T + 1].
-        renders: [B, H, W, 3]; pixels that this rank does not composite are zero.
+        renders: [B, H, W, 3]; like the next two undefined where other ranks composite.
         transmittances: [B, H, W], share of the background that shows.
         last_ids: int32 [B, H, W], for the backward pass.
         tile_work: int32 [B * T], list entries each composited tile went through.
@@ -256,7 +256,7 @@ def _forward(
     backgrounds = _backgrounds(options.background, count, table.device)
     composited = torch.ops.blitzgs.rasterize_fwd(
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
-        count, views.width, views.height, options.tile_size, *tiles,
+        count, views.width, views.height, options.tile_size, *tiles, clear_rest=False,
     )  # fmt: skip
     room.learn(rows.counts)
     mark("raster")

@@ -89,7 +89,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "rasterize_fwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
       "backgrounds, "
       "Tensor isect_rows, Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, "
-      "int tile_begin, int tile_end, Tensor? means2d_abs=None) -> (Tensor renders, Tensor transmittances, "
+      "int tile_begin, int tile_end, Tensor? means2d_abs=None, bool clear_rest=True) -> (Tensor renders, "
+      "Tensor transmittances, "
       "Tensor last_ids, "
       "Tensor tile_work, Tensor aux)");
   m.def(

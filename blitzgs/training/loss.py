@@ -103,7 +103,7 @@ def batch_psnr(frame: Frame, batch: Batch) -> Tensor:
         error *= batch.masks != 0
     if frame.share is not None:
         ranks, ranges = frame.share.ranks, frame.share.ranges
-        error *= ranges.pixel_mask(ranks.rank, error.device)
+        error = error.where(ranges.pixel_mask(ranks.rank, error.device), 0.0)
     total = error.sum()
     if frame.share is not None:
         frame.share.ranks.all_reduce(total)

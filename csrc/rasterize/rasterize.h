@@ -13,7 +13,8 @@
 //   tile_offsets from intersect  ->  renders [B, H, W, D]; transmittances [B, H, W] (final T; alpha = 1 - T);
 //   last_ids int32 [B, H, W]: 1 + index in the tile's list of the last composited entry, 0 for none;
 //   tile_work int32 [B*T]: list entries processed before every pixel of the tile had ended (or the list
-//   had): what the tile cost. Pixels of unowned tiles are zero in all outputs, transmittance included.
+//   had): what the tile cost. Pixels of unowned tiles are zero in all outputs, transmittance included, with
+//   clear_rest; otherwise they are not written.
 //
 // Exact: a pixel depends on its tile's list and the rows in it alone, so tile ranges, batch position, threads
 // and (CPU) the instruction set change no bit. The CPU float32 kernel does the same operations with and
@@ -56,6 +57,7 @@ struct RasterizeOutput {
   T* transmittances;
   std::int32_t* last_ids;
   std::int32_t* tile_work;
+  bool clear_rest;
 };
 
 template <class T>
@@ -82,7 +84,7 @@ inline constexpr std::int64_t kPackedGradient = 12;
 
 // aux is the backend's own memory between forward and backward, 64-byte aligned and of
 // rasterize_aux_bytes(), which may depend on the shapes and the number of entries, not on values on the
-// device. All outputs are written in full.
+// device.
 namespace cpu {
 std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, std::int64_t n_isects,
                                  int n_channels);

@@ -6,6 +6,7 @@
 // them through shared memory, and each lane then sums for one entry: the weights against the pixels'
 // gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic follow.
 #include <algorithm>
+#include <optional>
 #include <stdexcept>
 #include <string>
 
@@ -24,6 +25,7 @@ struct BackwardArguments {
   const std::int32_t* isect_rows;
   const std::int64_t* tile_offsets;
   TileGrid grid;
+  TileOrder order;
   RasterizeSaved<float> saved;
   PackedGradient* row_gradients;    // [P], added to atomically, or null
   PackedGradient* entry_gradients;  // [I], written once each (deterministic)
@@ -136,7 +138,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) :
   extern __shared__ __align__(16) unsigned char shared_bytes[];
   Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
-  const TilePlace tile = locate_tile<TILE>(args.grid, args.grid.tile_begin + blockIdx.x);
+  const TilePlace tile = locate_tile<TILE>(args.grid, args.order.tile(static_cast<int>(blockIdx.x)));
   const std::int64_t start = args.tile_offsets[tile.tile];
   if (args.tile_offsets[tile.tile + 1] == start) return;
   const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
@@ -222,8 +224,7 @@ void launch_backward(const BackwardArguments& args, CudaStream stream) {
   const auto kernel = backward_kernel<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>;
   constexpr int kBytes = sizeof(BackwardShared<TILE, CHANNELS, DETERMINISTIC>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_bwd");
-  const auto tiles = static_cast<unsigned>(args.grid.tile_end - args.grid.tile_begin);
-  kernel<<<tiles, TILE * TILE, kBytes, stream>>>(args);
+  kernel<<<static_cast<unsigned>(args.order.n_tiles), TILE * TILE, kBytes, stream>>>(args);
   check_launch("rasterize_bwd");
 }
 
@@ -252,6 +253,12 @@ void check_supported(const RasterizeInput<float>& in) {
   }
 }
 
+// Of the tiles that are differentiated: fewer than were composited, on several ranks.
+__global__ void __launch_bounds__(kOrderThreads)
+    order_tiles_kernel(TileOrder order, const std::int64_t* tile_offsets) {
+  order.add(tile_offsets, static_cast<int>(blockIdx.x * kOrderThreads + threadIdx.x));
+}
+
 // The gradients of each row, a chunk of channels at a time.
 class PackedRows {
  public:
@@ -260,7 +267,14 @@ class PackedRows {
       : in_(in), saved_(saved), aux_(aux), n_isects_(n_isects), stream_(stream) {
     check_supported(in);
     empty_ = n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin;
-    if (!deterministic || empty_) return;
+    if (empty_) return;
+    order_.emplace(in.grid, workspace, stream);
+    if (order_->unordered() > 0) {
+      order_tiles_kernel<<<blocks_for(order_->unordered(), kOrderThreads), kOrderThreads, 0, stream>>>(
+          *order_, in.tile_offsets);
+      check_launch("rasterize_bwd");
+    }
+    if (!deterministic) return;
     entries_ = static_cast<PackedGradient*>(workspace.allocate_bytes(n_isects * sizeof(PackedGradient)));
     sorted_ = sort_entries(in.isect_rows, n_isects, in.n_rows, workspace, stream);
   }
@@ -276,8 +290,8 @@ class PackedRows {
     if (entries_) {
       check(cudaMemsetAsync(entries_, 0, n_isects_ * sizeof(PackedGradient), stream_), "rasterize_bwd");
     }
-    const BackwardArguments args{aux_rows(aux_), chunk,  in_.backgrounds, in_.isect_rows, in_.tile_offsets,
-                                 in_.grid,       saved_, packed,          entries_};
+    const BackwardArguments args{aux_rows(aux_), chunk,   in_.backgrounds, in_.isect_rows, in_.tile_offsets,
+                                 in_.grid,       *order_, saved_,          packed,         entries_};
     if (in_.grid.tile_size == 8) {
       dispatch_backward<8>(args, absolute, stream_);
     } else if (in_.grid.tile_size == 16) {
@@ -299,6 +313,7 @@ class PackedRows {
   CudaStream stream_;
   bool empty_;
   EntriesByRow sorted_{};
+  std::optional<TileOrder> order_;
   PackedGradient* entries_ = nullptr;
 };
 

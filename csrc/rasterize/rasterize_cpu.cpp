@@ -209,7 +209,7 @@ std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, std::int6
 template <class T>
 void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t, void* aux,
                    Workspace& workspace, CudaStream) {
-  clear_unowned(in, out);
+  if (out.clear_rest) clear_unowned(in, out);
   const SplatRow<T>* splats =
       pack_rows(in, sizeof(T) == 4 ? static_cast<SplatRow<T>*>(aux) : allocate_rows<T>(in.n_rows, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, false);

@@ -17,6 +17,7 @@ struct ForwardArguments {
   const std::int32_t* isect_rows;
   const std::int64_t* tile_offsets;
   TileGrid grid;
+  TileOrder order;
   RasterizeOutput<float> out;
 };
 
@@ -36,8 +37,14 @@ __device__ __forceinline__ PackedRow pack_row(const RasterizeInput<float>& in, s
   return row;
 }
 
-// A warp's rows go through shared memory, so that each store fills whole sectors.
-__global__ void pack_rows_kernel(RasterizeInput<float> in, PackedRow* rows, float4* colors) {
+// The last blocks order the tiles; the others pack rows. A warp's rows go through shared memory, so that each
+// store fills whole sectors.
+__global__ void prepare_kernel(RasterizeInput<float> in, PackedRow* rows, float4* colors, TileOrder order) {
+  const auto pack_blocks = static_cast<unsigned>((in.n_rows + kPackThreads - 1) / kPackThreads);
+  if (blockIdx.x >= pack_blocks) {
+    order.add(in.tile_offsets, static_cast<int>((blockIdx.x - pack_blocks) * kPackThreads + threadIdx.x));
+    return;
+  }
   __shared__ PackedRow stages[kPackThreads];
   const PackedRow* stage = stages + threadIdx.x / 32 * 32;
   const int lane = threadIdx.x % 32;
@@ -138,7 +145,7 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
 template <int TILE>
 inline constexpr int kForwardBatch = TILE == 8 ? 64 : 256;
 
-// The first blocks are the owned tiles; the rest write zeros.
+// The first blocks are the owned tiles; the rest, if wanted, write zeros.
 template <int TILE, int CHANNELS>
 __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
     forward_kernel(const ForwardArguments args) {
@@ -147,13 +154,13 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
   auto& batch = *reinterpret_cast<EntryBatch<TILE, kBatch>*>(shared_bytes);
   __shared__ int tile_work;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
-  const std::int64_t owned = args.grid.tile_end - args.grid.tile_begin;
-  std::int64_t index = args.grid.tile_begin + blockIdx.x;
-  if (blockIdx.x >= owned)
-    index = blockIdx.x - owned < args.grid.tile_begin ? blockIdx.x - owned : blockIdx.x;
+  const int block = static_cast<int>(blockIdx.x), owned = args.order.n_tiles;
+  const std::int64_t index = block < owned                          ? args.order.tile(block)
+                             : block - owned < args.grid.tile_begin ? block - owned
+                                                                    : block;
   const TilePlace tile = locate_tile<TILE>(args.grid, index);
   const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
-  if (blockIdx.x >= owned) {
+  if (block >= owned) {
     constexpr float kBlack[CHANNELS] = {};
     if (pixel.inside) write_pixel<CHANNELS>(args, pixel, tile.camera, kBlack, 0.f, 0);
     if (thread == 0 && args.chunk.first == 0) args.out.tile_work[tile.tile] = 0;
@@ -204,7 +211,8 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
 
 template <int TILE>
 void launch_forward(const ForwardArguments& args, CudaStream stream) {
-  const auto tiles = static_cast<unsigned>(args.grid.count());
+  const auto tiles = static_cast<unsigned>(args.out.clear_rest ? args.grid.count() : args.order.n_tiles);
+  if (tiles == 0) return;
   const auto kernel = args.chunk.count == 4 ? forward_kernel<TILE, 4> : forward_kernel<TILE, 3>;
   constexpr int kBytes = sizeof(EntryBatch<TILE, kForwardBatch<TILE>>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_fwd");
@@ -220,22 +228,21 @@ std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, std::int6
 
 template <>
 void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out, std::int64_t,
-                          void* aux, Workspace&, CudaStream stream) {
+                          void* aux, Workspace& workspace, CudaStream stream) {
   if (in.grid.count() == 0) return;
   float4* colors = in.n_channels <= 4 ? const_cast<float4*>(aux_colors(aux, in.n_rows)) : nullptr;
-  if (in.n_rows > 0) {
-    pack_rows_kernel<<<blocks_for(in.n_rows, kPackThreads), kPackThreads, 0, stream>>>(
-        in, static_cast<PackedRow*>(aux), colors);
-    check_launch("pack_rows");
+  const TileOrder order(in.grid, workspace, stream);
+  const unsigned blocks = blocks_for(in.n_rows, kPackThreads) + blocks_for(order.unordered(), kPackThreads);
+  if (blocks > 0) {
+    prepare_kernel<<<blocks, kPackThreads, 0, stream>>>(in, static_cast<PackedRow*>(aux), colors, order);
+    check_launch("rasterize_fwd");
   }
   for (int first = 0; first < in.n_channels; first += 4) {
-    const ForwardArguments args{aux_rows(aux),
-                                {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},
-                                in.backgrounds,
-                                in.isect_rows,
-                                in.tile_offsets,
-                                in.grid,
-                                out};
+    const ForwardArguments args{
+        aux_rows(aux),   {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},
+        in.backgrounds,  in.isect_rows,
+        in.tile_offsets, in.grid,
+        order,           out};
     if (in.grid.tile_size == 8) {
       launch_forward<8>(args, stream);
     } else if (in.grid.tile_size == 16) {

@@ -71,7 +71,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
     std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t tile_begin, std::int64_t tile_end, const std::optional<Tensor>&) {
+    std::int64_t tile_begin, std::int64_t tile_end, const std::optional<Tensor>&, bool clear_rest) {
   constexpr const char* kOp = "rasterize_fwd";
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
@@ -89,7 +89,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
   dispatch_floating(splats.means2d, [&](auto zero) {
     using T = decltype(zero);
     const RasterizeOutput<T> out{mutable_data<T>(renders), mutable_data<T>(transmittances),
-                                 mutable_data<std::int32_t>(last_ids), mutable_data<std::int32_t>(tile_work)};
+                                 mutable_data<std::int32_t>(last_ids), mutable_data<std::int32_t>(tile_work),
+                                 clear_rest};
     backend::rasterize_fwd(splats.input<T>(), out, n_isects, mutable_data<void>(aux), scope.workspace,
                            scope.stream);
   });

@@ -12,6 +12,7 @@
 
 #include "common/cuda_check.h"
 #include "rasterize/rasterize.h"
+#include "rasterize/tile_order.cuh"
 
 namespace blitzgs::cuda {
 

@@ -53,7 +53,8 @@ def _exchange(table, ranks, room=None):
         returned = send_back_packed(torch.cat((*columns, torch.ones_like(got.conics)), 1), frame.route)
         sums = sum_rows(*returned, len(frame.rows.means2d), [2, 3, 1, 3])
         sums[2] = sums[2].squeeze(1)
-    return [*arrived, *sums, frame.renders, frame.visible]
+    own = ranges.pixel_mask(ranks.rank, ranks.device)
+    return [*arrived, *sums, frame.renders[own], frame.visible]
 
 
 def _both_ways(ranks):
