@@ -33,7 +33,7 @@ from blitzgs.distributed.ownership import Share
 from blitzgs.distributed.rows import PeerSpace, Splats
 from blitzgs.model import GaussianTable
 from blitzgs.ops.host import start_copy
-from blitzgs.ops.project import Rows
+from blitzgs.ops.project import RowRoom, Rows
 from blitzgs.ops.rasterize import gradient_columns
 from blitzgs.ops.scatter import OWN_VALUES, Returns
 
@@ -98,29 +98,6 @@ class Active(NamedTuple):
     ids: Tensor | None = None
     views: Tensor | None = None
     length: Tensor | None = None
-
-
-class RowRoom:
-    """Room for the rows of a frame, by what the frames before needed.
-
-    CUDA then writes rows before the host knows how many there are; where there is too little room they are
-    written once more.
-
-    Attributes:
-        sizes: visible Gaussians and rows that there is room for; zeros: the host waits.
-    """
-
-    def __init__(self) -> None:
-        self.sizes = (0, 0)
-
-    def learn(self, counts: Tensor) -> None:
-        """Take note of what a frame needed: `Rows.counts`."""
-        # Views differ: what the largest one of late needed, and some more.
-        visible, rows = (
-            max(needed * 9 // 8, room - room // 256)
-            for needed, room in zip(counts.tolist(), self.sizes, strict=False)
-        )
-        self.sizes = (visible, rows)
 
 
 class Frame(NamedTuple):

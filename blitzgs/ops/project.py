@@ -32,6 +32,29 @@ class Rows(NamedTuple):
     counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
 
 
+class RowRoom:
+    """Room for the rows of a frame, by what the frames before needed.
+
+    CUDA then writes rows before the host knows how many there are; where there is too little room they are
+    written once more.
+
+    Attributes:
+        sizes: visible Gaussians and rows that there is room for; zeros: the host waits.
+    """
+
+    def __init__(self) -> None:
+        self.sizes = (0, 0)
+
+    def learn(self, counts: Tensor) -> None:
+        """Take note of what a frame needed: `Rows.counts`."""
+        # Views differ: what the largest one of late needed, and some more.
+        visible, rows = (
+            max(needed * 9 // 8, room - room // 256)
+            for needed, room in zip(counts.tolist(), self.sizes, strict=False)
+        )
+        self.sizes = (visible, rows)
+
+
 def project(
     means: Tensor,
     quats: Tensor,

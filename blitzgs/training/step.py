@@ -9,7 +9,8 @@ from blitzgs import pipeline
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.model import GaussianTable
-from blitzgs.pipeline import Active, Frame, Mark, RenderOptions, RowGradients, RowRoom, Views, unmarked
+from blitzgs.ops.project import RowRoom
+from blitzgs.pipeline import Active, Frame, Mark, RenderOptions, RowGradients, Views, unmarked
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms

@@ -15,6 +15,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.distributed.peers import MAX_VALUES, Peers
 from blitzgs.model import GaussianTable
+from blitzgs.ops.project import RowRoom
 from blitzgs.ops.scatter import sum_rows
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 from blitzgs.training.optimiser import LazyAdam
@@ -59,7 +60,7 @@ def _exchange(table, ranks, room=None):
 
 def _both_ways(ranks):
     """Exchanges of growing, shrinking and empty shards; each by peers and by collectives."""
-    peers, sizes, room = ranks.peers, [], pipeline.RowRoom()
+    peers, sizes, room = ranks.peers, [], RowRoom()
     assert peers is not None, ranks.transport
     for count in (3, 700, 400_000, 0, 1000):
         table = _table(count, ranks)
