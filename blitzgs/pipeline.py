@@ -32,6 +32,7 @@ from blitzgs.distributed.exchange import (
 from blitzgs.distributed.ownership import Share
 from blitzgs.distributed.rows import PeerSpace, Splats
 from blitzgs.model import GaussianTable
+from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.host import start_copy
 from blitzgs.ops.project import RowRoom, Rows
 from blitzgs.ops.rasterize import gradient_columns
@@ -87,17 +88,6 @@ class RenderOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tile_size: int = 16
     deterministic: bool = False
-
-
-class Active(NamedTuple):
-    """The Gaussians worth projecting: ascending rows int32 [A], their views as bits int32 [A]; None: all.
-
-    With `length`, int32 [1], only the first `length` of the A are set.
-    """
-
-    ids: Tensor | None = None
-    views: Tensor | None = None
-    length: Tensor | None = None
 
 
 class Frame(NamedTuple):
@@ -183,7 +173,7 @@ def forward(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
-    active: Active | None = None,
+    active: ActiveRows | None = None,
     share: Share | None = None,
     room: RowRoom | None = None,
     mark: Mark = unmarked,
@@ -194,7 +184,7 @@ def forward(
         table: the Gaussians.
         views: at most 32 views.
         options: how to render.
-        active: rows and views to consider; None: all.
+        active: rows to consider, and the views of each; None: all.
         share: who composites which tiles; every rank of the job calls this with its table. None: render all
             of the views from this table alone.
         room: for the rows, of the frames before; the result does not depend on it. None: wait for their
@@ -207,14 +197,14 @@ def forward(
     """
     # Past autograd's Python: an op that is differentiable elsewhere spends 20 us of the host's time there.
     with torch._C._AutoDispatchBelowAutograd():
-        return _forward(table, views, options, active or Active(), share, room or RowRoom(), mark)
+        return _forward(table, views, options, active, share, room or RowRoom(), mark)
 
 
 def _forward(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
-    active: Active,
+    active: ActiveRows | None,
     share: Share | None,
     room: RowRoom,
     mark: Mark,
@@ -332,7 +322,7 @@ def _project(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
-    active: Active,
+    active: ActiveRows | None,
     share: Share | None,
     room: RowRoom,
 ) -> tuple[Rows, Splats, Route | None, int, Tensor]:
@@ -345,18 +335,28 @@ def _project(
     # Halves are routed by what arrives: rounding may move a splat's border over that of a tile.
     asking = share if share is not None and not share.half else None
     wanted = [] if asking is None else [asking.ranges.composited(m) for m in range(asking.ranks.world_size)]
+    ids, bits, length = active or (None, None, None)
     arguments = (
-        *table.parameters, views.viewmats, views.Ks, active.ids, active.views, views.width, views.height,
+        *table.parameters, views.viewmats, views.Ks, ids, bits, views.width, views.height,
         options.tile_size, options.sh_degree, options.near_plane, options.far_plane, options.eps2d, 0.0,
-        options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted], active.length,
+        options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted], length,
     )  # fmt: skip
     plan, carry, totals = torch.ops.blitzgs.project_count(*arguments)
     if asking is not None and asking.ranks.peers is not None:
-        rank, ids = asking.ranks.rank, table["id"]
+        rank, persistent = asking.ranks.rank, table["id"]
 
         def project(everyone: Tensor, known: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
             return torch.ops.blitzgs.project_emit_to_peers_(
-                *arguments, plan, everyone, known, rank, ids, buffers, capacity, *room.sizes, FIRST_PART
+                *arguments,
+                plan,
+                everyone,
+                known,
+                rank,
+                persistent,
+                buffers,
+                capacity,
+                *room.sizes,
+                FIRST_PART,
             )
 
         (*written, places, filled), space = PeerSpace.fill(totals, len(views), asking.ranks, project)

@@ -10,7 +10,7 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.ops.project import RowRoom
-from blitzgs.pipeline import Active, Frame, Mark, RenderOptions, RowGradients, Views, unmarked
+from blitzgs.pipeline import Frame, Mark, RenderOptions, RowGradients, unmarked
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms
@@ -65,7 +65,10 @@ class Stepper:
             begin with [2 B].
         """
         table, ranks, views = self._table, self._owners.ranks, batch.views
-        active = self._active(views, options)
+        active = self._blocks.active(
+            table, views.viewmats, views.Ks, views.width, views.height, options.near_plane, options.far_plane,
+            options.eps2d,
+        )  # fmt: skip
         mark("other")
         self._optimiser.catch_up(table, active.ids, step - 1, active.length)
         mark("optimiser")
@@ -94,12 +97,3 @@ class Stepper:
         self._blocks.update(table, frame.rows.visible_ids)
         mark("other")
         return gradients
-
-    def _active(self, views: Views, options: RenderOptions) -> Active:
-        """Find the Gaussians that the views may see."""
-        near, far = options.near_plane, options.far_plane
-        return Active(
-            *self._blocks.active(
-                self._table, views.viewmats, views.Ks, views.width, views.height, near, far, options.eps2d
-            )
-        )
