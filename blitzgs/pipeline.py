@@ -33,7 +33,7 @@ from blitzgs.distributed.ownership import Share
 from blitzgs.distributed.rows import PeerSpace, Splats
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.host import start_copy
+from blitzgs.ops.host import tell_host
 from blitzgs.ops.project import RowRoom, Rows
 from blitzgs.ops.rasterize import gradient_columns
 from blitzgs.ops.scatter import OWN_VALUES, Returns
@@ -100,7 +100,8 @@ class Frame(NamedTuple):
         splats: what was composited: the rows, or those that the exchange brought here.
         share: who composites which tiles; None: one rank does all.
         route: of the exchange.
-        visible: int64 [B], Gaussians visible in each view, over all ranks.
+        visible: int64 [B], Gaussians visible in each view, over all ranks; like the gradients of rows valid
+            until the next exchange.
         backgrounds: [B, 3]; None: black.
         isect_rows: int32 [I], splats by tile, front to back.
         tile_offsets: int64 [B * T + 1].
@@ -364,7 +365,7 @@ def _project(
         route = Route(space.traffic, rows.rank_masks, places=places, space=space, filled=filled)
         return rows, space.arrived(), route, space.traffic.n_isects, space.traffic.visible
     traffic = None if asking is None else read_traffic(totals, len(views), asking.ranks)
-    counts = start_copy(totals)[:3] if traffic is None else traffic.counts
+    counts = tell_host(totals)[:3] if traffic is None else traffic.counts
     sizes = room.sizes if traffic is None else (0, 0)  # known already
     emitted = torch.ops.blitzgs.project_emit(*arguments, plan, carry, totals, counts, *sizes)
     rows = Rows._make((*emitted, counts))

@@ -82,7 +82,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int[] starts, int rank, Tensor? fronts, bool back) -> ()");
   m.def(
       "meet_peers_(Tensor(a!)[] mail, int rank, int meeting, Tensor? values, int first, "
-      "float timeout_seconds) -> ()");
+      "float timeout_seconds, Tensor(b!)? known=None) -> ()");
+  // Writes a small tensor into pinned memory of the host, behind what is queued (CUDA).
+  m.def("tell_host_(Tensor(a!) known, Tensor values) -> ()");
 
   // Alpha compositing.
   m.def(

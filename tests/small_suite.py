@@ -40,7 +40,7 @@ TESTS = [
     )),
     *(PEERS + test for test in (
         "rows_arrive_and_their_gradients_return", "parts_of_rows_return",
-        "a_meeting_with_ranks_that_have_come",
+        "a_meeting_with_ranks_that_have_come", "numbers_for_the_host_go_to_pinned_memory",
     )),
     # Rows, coefficients, degree, views, sparse.
     *(f"{OPS}project_step.py::test_equals_backward_and_step[{case}-cuda]" for case in (

@@ -153,7 +153,7 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
     """
     if route.space is not None:
         assert route.filled is not None
-        route.fronts = route.space.peers.share(route.filled[0])[:, ranks.rank]
+        route.fronts = route.space.peers.share(route.filled[0]).everyone[:, ranks.rank]
         return splats
     columns = [splats.means2d, splats.depths, splats.camera_ids, splats.ids]
     if route.halves is None:

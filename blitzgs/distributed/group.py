@@ -188,7 +188,7 @@ class Ranks:
         if self.world_size == 1:
             return values[None]
         if self.peers is not None:
-            return self.peers.share(values)
+            return self.peers.share(values).everyone
         everyone = values.new_empty(self.world_size * len(values))
         self._collective("share", lambda: dist.all_gather_into_tensor(everyone, values))
         return everyone.view(self.world_size, -1)

@@ -29,7 +29,7 @@ aborts the process's kernels.
 from __future__ import annotations
 
 import socket
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 import torch.distributed as dist
@@ -42,12 +42,30 @@ if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
 
 MAX_PEERS = 16
-# Numbers that a rank may bring to a meeting; there are two places for them.
+# Numbers that a rank may bring to a meeting; there are two places for them, and for their sums.
 MAX_VALUES = 256
-_MAIL_WORDS = 1 + 2 * MAX_VALUES
 # Buffers grow to this many times what is needed, so that they seldom do.
 HEADROOM = 1.25
 _LEAST_WORDS = 1 << 20
+
+
+class Shared(NamedTuple):
+    """Numbers that all ranks brought to a meeting; valid until the second such meeting after this.
+
+    Attributes:
+        everyone: int64 [M, n], those of each rank.
+        sums: int64 [n], over the ranks.
+        known: `everyone` on the CPU, once what was queued on the current stream was waited for.
+    """
+
+    everyone: Tensor
+    sums: Tensor
+    known: Tensor
+
+
+def mail_words(world_size: int) -> int:
+    """Length of a rank's mail, int64."""
+    return world_size + 2 * MAX_VALUES * (world_size + 1)
 
 
 class Peers:
@@ -55,7 +73,7 @@ class Peers:
 
     Args:
         ranks: the job.
-        mail: this rank's mail, symmetric memory, zeros.
+        mail: this rank's mail, symmetric memory, `mail_words` zeros.
         timeout_seconds: longest wait in a meeting.
 
     Attributes:
@@ -74,6 +92,7 @@ class Peers:
         self._shared = 0  # how many of them had numbers
         self._handles: dict[str, Any] = {}  # the mappings live as long as these
         self._mail = self._map("mail", mail)
+        self._known = torch.empty(2, MAX_VALUES * self.world_size, dtype=torch.int64, pin_memory=mail.is_cuda)
 
     def _map(self, name: str, mine: Tensor) -> list[Tensor]:
         """Map every rank's counterpart of a symmetric tensor; collective."""
@@ -85,28 +104,28 @@ class Peers:
 
     def meet(self) -> None:
         """Meet the other ranks, in stream order."""
-        self._meet(None, self.world_size)
+        self._meet(None, self.world_size, None)
 
-    def share(self, values: Tensor) -> Tensor:
+    def share(self, values: Tensor) -> Shared:
         """Meet the other ranks and show them numbers.
 
         Args:
-            values: int64 [n], n <= MAX_VALUES, the same on all ranks.
-
-        Returns:
-            int64 [M, n], valid until `share` is called for the second time after this.
+            values: int64 [n], n <= MAX_VALUES, the same n on all ranks.
         """
         # A rank may have come out of the last meeting and not have read its numbers yet.
         place = self._shared % 2
         self._shared += 1
-        first, count = self.world_size * (1 + place * MAX_VALUES), self.world_size * len(values)
-        self._meet(values, first)
-        return self._mail[self.rank][first : first + count].view(self.world_size, -1)
+        count, numbers = self.world_size, len(values)
+        first = count + place * MAX_VALUES * (count + 1)
+        known = self._known[place, : count * numbers].view(count, numbers)
+        self._meet(values, first, known)
+        brought = self._mail[self.rank][first : first + (count + 1) * numbers].view(count + 1, numbers)
+        return Shared(brought[:count], brought[count], known)
 
-    def _meet(self, values: Tensor | None, first: int) -> None:
+    def _meet(self, values: Tensor | None, first: int, known: Tensor | None) -> None:
         self._meetings += 1
         torch.ops.blitzgs.meet_peers_(
-            self._mail, self.rank, self._meetings, values, first, self.timeout_seconds
+            self._mail, self.rank, self._meetings, values, first, self.timeout_seconds, known
         )
 
     def reserve(self, words: int) -> None:
@@ -138,7 +157,7 @@ def connect(ranks: Ranks, timeout_seconds: float) -> Peers | str:
     obstacle, mail = _obstacle(places, ranks.rank), None
     if obstacle is None:
         try:
-            words = ranks.world_size * _MAIL_WORDS
+            words = mail_words(ranks.world_size)
             mail = symmetric.empty(words, dtype=torch.int64, device=ranks.device).zero_()
         except RuntimeError as error:
             obstacle = f"rank {ranks.rank}: {error}"

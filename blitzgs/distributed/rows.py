@@ -13,7 +13,6 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.peers import Peers
-from blitzgs.ops.host import start_copy
 
 # Columns of a row as peers write them: those of `Splats`, with dtype, words and shape of an element.
 _COLUMNS = (
@@ -65,7 +64,8 @@ class Traffic:
         rows: rows[s][d] that rank s sends to rank d.
         rank: this rank.
         n_isects: row-tile intersections among the rows received, or a few more.
-        visible: int64 [B], rows of each view before the exchange, over all ranks.
+        visible: int64 [B], rows of each view before the exchange, over all ranks; over shared memory valid
+            until the next exchange.
     """
 
     counts: Tensor
@@ -135,9 +135,8 @@ class PeerSpace:
         """
         peers = ranks.peers
         assert peers is not None
-        everyone = ranks.share(totals)
-        known = start_copy(everyone)
-        visible = everyone[:, 3 : 3 + n_views].sum(0)
+        everyone, sums, known = peers.share(totals)
+        visible = sums[3 : 3 + n_views]
         needed = 0
         while True:
             ranks.reading(partial(peers.reserve, (_ROW_WORDS + _GRADIENT_WORDS) * needed))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from blitzgs._library import without_autograd
-from blitzgs.ops.host import start_copy
+from blitzgs.ops.host import tell_host
 
 project_emit = without_autograd(torch.ops.blitzgs.project_emit)
 
@@ -136,7 +136,7 @@ def project_rows(*arguments: Any) -> Rows:
 def _counted(arguments: tuple[Any, ...]) -> tuple[tuple[Any, ...], Tensor]:
     """Count the rows: returns what `project_emit` takes after viewmats, and counts, for which it waits."""
     plan, carry, totals = torch.ops.blitzgs.project_count(*arguments, [], [])
-    counts = (totals.cpu() if torch.compiler.is_compiling() else start_copy(totals))[:3]
+    counts = (totals.cpu() if torch.compiler.is_compiling() else tell_host(totals))[:3]
     return (*arguments[6:], [], [], None, plan, carry, totals, counts, 0, 0), counts
 
 

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "peers/peers_op.h"
 
+#include "tell_host/tell_host_op.h"
+
 #ifdef BLITZGS_BACKEND_CUDA
 namespace blitzgs {
 namespace {
@@ -43,7 +45,8 @@ void return_to_peers(const Tensor& values, std::int64_t width, const std::vector
 }
 
 void meet_peers(std::vector<Tensor> mail, std::int64_t rank, std::int64_t meeting,
-                const std::optional<Tensor>& values, std::int64_t first, double timeout_seconds) {
+                const std::optional<Tensor>& values, std::int64_t first, double timeout_seconds,
+                std::optional<Tensor> known) {
   constexpr const char* kOp = "meet_peers_";
   check_peers(kOp, mail, ScalarType::Long);
   const auto count = static_cast<std::int64_t>(mail.size());
@@ -56,16 +59,18 @@ void meet_peers(std::vector<Tensor> mail, std::int64_t rank, std::int64_t meetin
     STD_TORCH_CHECK(values->is_contiguous(), "blitzgs::", kOp, ": values must be contiguous");
     n_values = values->size(0);
   }
-  STD_TORCH_CHECK(first >= count && first + count * n_values <= mail[0].size(0), "blitzgs::", kOp, ": ",
-                  n_values, " values of ", count, " ranks from word ", first, " on do not fit behind ", count,
-                  " words into ", mail[0].size(0));
+  STD_TORCH_CHECK(first >= count && first + (count + 1) * n_values <= mail[0].size(0), "blitzgs::", kOp,
+                  ": ", n_values, " values of ", count, " ranks and their sums from word ", first,
+                  " on do not fit behind ", count, " words into ", mail[0].size(0));
+  if (known) check_host_values(kOp, *known, {count, n_values});
   PeerMail letters{};
   letters.count = static_cast<int>(count);
   letters.rank = static_cast<int>(rank);
   for (std::int64_t m = 0; m < count; ++m) letters.of[m] = mutable_data<std::int64_t>(mail[m]);
   DeviceScope scope(mail[rank]);
   cuda::meet(letters, meeting, data_or_null<std::int64_t>(values), static_cast<int>(n_values), first,
-             timeout_seconds, scope.workspace, scope.stream);
+             timeout_seconds, known ? mutable_data<std::int64_t>(*known) : nullptr, scope.workspace,
+             scope.stream);
 }
 
 }  // namespace

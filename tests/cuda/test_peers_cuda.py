@@ -8,6 +8,7 @@ import torch
 from cuda_scenes import Scene, ops
 
 from blitzgs.distributed.rows import PeerSpace, Traffic
+from blitzgs.ops.host import tell_host
 from blitzgs.ops.scatter import Returns, sum_rows
 
 VIEWS, WIDTH, HEIGHT, FIRST_PART = 2, 150, 100, 0.4
@@ -154,20 +155,24 @@ def test_parts_of_rows_return(width, in_parts):
 
 @pytest.mark.parametrize("n_values", [0, 5, 100])
 def test_a_meeting_with_ranks_that_have_come(n_values):
-    mail = [torch.zeros(3 + 3 * 101, dtype=torch.int64, device="cuda") for _ in range(3)]
+    mail = [torch.zeros(3 + 3 * 102, dtype=torch.int64, device="cuda") for _ in range(3)]
+    known = torch.zeros(3, n_values, dtype=torch.int64, pin_memory=True)
     for meeting, first in ((4, 3), (5, 6)):
         for rank in range(3):
             others = [m for m in range(3) if m != rank]
             mail[rank][others] = meeting  # as they would announce themselves
             values = torch.arange(n_values, device="cuda") + 1000 * rank + meeting
-            ops.meet_peers_(mail, rank, meeting, values if n_values else None, first, 20.0)
+            ops.meet_peers_(mail, rank, meeting, values if n_values else None, first, 20.0, known)
             for letters in mail:
                 assert int(letters[rank]) == meeting
                 assert torch.equal(letters[first + rank * n_values :][:n_values], values)
+            brought = mail[rank][first:][: 4 * n_values].view(4, n_values)
+            assert torch.equal(brought[3], brought[:3].sum(0))
+            assert torch.equal(known, brought[:3].cpu())
 
 
 def test_ranks_on_two_streams_wait_for_each_other():
-    mail = [torch.zeros(8, dtype=torch.int64, device="cuda") for _ in range(2)]
+    mail = [torch.zeros(5, dtype=torch.int64, device="cuda") for _ in range(2)]
     values = torch.tensor([[10], [11]], device="cuda")
     streams = [torch.cuda.Stream() for _ in range(2)]
     # Kernels are loaded at their first launch, for which the device must not be waiting.
@@ -180,4 +185,14 @@ def test_ranks_on_two_streams_wait_for_each_other():
                 torch.cuda._sleep(20_000_000)
             ops.meet_peers_(mail, rank, 1, values[rank], 2, 20.0)
     torch.cuda.synchronize()
-    assert [letters[:4].tolist() for letters in mail] == [[1, 1, 10, 11]] * 2
+    assert [letters.tolist() for letters in mail] == [[1, 1, 10, 11, 21]] * 2
+
+
+def test_numbers_for_the_host_go_to_pinned_memory():
+    for n in (0, 1, 300):
+        values = torch.arange(n, device="cuda") + 7
+        known = tell_host(values)
+        torch.cuda.synchronize()
+        assert torch.equal(known, values.cpu())
+    with pytest.raises(RuntimeError, match="must be pinned memory"):
+        ops.tell_host_(torch.zeros(300, dtype=torch.int64), values)

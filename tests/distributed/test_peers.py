@@ -13,7 +13,7 @@ from blitzgs.distributed import exchange
 from blitzgs.distributed.exchange import send_back, send_back_packed
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
-from blitzgs.distributed.peers import MAX_VALUES, Peers
+from blitzgs.distributed.peers import MAX_VALUES, Peers, mail_words
 from blitzgs.model import GaussianTable
 from blitzgs.ops.project import RowRoom
 from blitzgs.ops.scatter import sum_rows
@@ -55,7 +55,7 @@ def _exchange(table, ranks, room=None):
         sums = sum_rows(*returned, len(frame.rows.means2d), [2, 3, 1, 3])
         sums[2] = sums[2].squeeze(1)
     own = ranges.pixel_mask(ranks.rank, ranks.device)
-    return [*arrived, *sums, frame.renders[own], frame.visible]
+    return [*arrived, *sums, frame.renders[own], frame.visible.clone()]
 
 
 def _both_ways(ranks):
@@ -173,16 +173,21 @@ def test_numbers_are_not_overwritten_before_all_have_read_them(monkeypatch):
     monkeypatch.setattr(
         torch.ops.blitzgs,
         "meet_peers_",
-        lambda mail, rank, number, values, first, timeout: met.append((number, values is not None, first)),
+        lambda mail, rank, number, values, first, timeout, known: met.append(
+            (number, values is not None, first, known is not None)
+        ),
     )
-    mail = torch.arange(1 + 2 * MAX_VALUES)
+    mail = torch.arange(mail_words(1))
     peers = Peers(Ranks(), mail, 1.0)
-    numbers = torch.arange(3)
-    assert peers.share(numbers).tolist() == [[1, 2, 3]]
+    numbers, second = torch.arange(3), 1 + 2 * MAX_VALUES
+    got = peers.share(numbers)
+    assert got.everyone.tolist() == [[1, 2, 3]] and got.sums.tolist() == [4, 5, 6]
     peers.meet()
-    assert peers.share(numbers).tolist() == [[MAX_VALUES + 1, MAX_VALUES + 2, MAX_VALUES + 3]]
-    peers.share(numbers)
-    assert met == [(1, True, 1), (2, False, 1), (3, True, MAX_VALUES + 1), (4, True, 1)]
+    later = peers.share(numbers)
+    assert later.everyone.tolist() == [[second, second + 1, second + 2]]
+    assert later.known.data_ptr() != got.known.data_ptr() == peers.share(numbers).known.data_ptr()
+    assert met == [(1, True, 1, True), (2, False, 1, False), (3, True, second, True), (4, True, 1, True)]
+    assert second + 2 * MAX_VALUES == len(mail)
 
 
 def _refused(rank):

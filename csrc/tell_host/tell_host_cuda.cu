@@ -1,0 +1,33 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "common/cuda_check.h"
+#include "tell_host/tell_host.h"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kThreads = 128;
+
+__global__ void tell_kernel(const std::int64_t* values, std::int64_t n, std::int64_t* known) {
+  const std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
+  if (i < n) known[i] = values[i];
+}
+
+}  // namespace
+
+std::int64_t* device_address(std::int64_t* pinned) {
+  cudaPointerAttributes found{};
+  check(cudaPointerGetAttributes(&found, pinned), "pinned memory");
+  if (found.type != cudaMemoryTypeHost || !found.devicePointer) {
+    throw std::runtime_error("blitzgs: what the GPU is to write for the host must be pinned memory");
+  }
+  return static_cast<std::int64_t*>(found.devicePointer);
+}
+
+void tell_host(const std::int64_t* values, std::int64_t n, std::int64_t* known, CudaStream stream) {
+  if (n == 0) return;
+  tell_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(values, n, device_address(known));
+  check_launch("tell_host");
+}
+
+}  // namespace blitzgs::cuda
