@@ -13,8 +13,8 @@
 //
 // meet_peers_, a barrier in stream order: what any rank queued before it is done, and visible, when what any
 // rank queues behind it runs. Each rank also leaves its `values` with every other. mail[m], int64: [M] the
-// last meeting each rank came to; from word `first` on [M, n] their values, then [n] their sums. known [M, n],
-// in pinned memory: the values for the host. A rank that waits for longer than timeout_seconds aborts its
+// last meeting each rank came to; from word `first` on [M, n] their values, then [n] their sums. known [M,
+// n], in pinned memory: the values for the host. A rank that waits for longer than timeout_seconds aborts its
 // kernels, so that its process sees an error.
 #pragma once
 #include "scatter/scatter.h"

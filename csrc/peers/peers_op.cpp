@@ -59,8 +59,8 @@ void meet_peers(std::vector<Tensor> mail, std::int64_t rank, std::int64_t meetin
     STD_TORCH_CHECK(values->is_contiguous(), "blitzgs::", kOp, ": values must be contiguous");
     n_values = values->size(0);
   }
-  STD_TORCH_CHECK(first >= count && first + (count + 1) * n_values <= mail[0].size(0), "blitzgs::", kOp,
-                  ": ", n_values, " values of ", count, " ranks and their sums from word ", first,
+  STD_TORCH_CHECK(first >= count && first + (count + 1) * n_values <= mail[0].size(0), "blitzgs::", kOp, ": ",
+                  n_values, " values of ", count, " ranks and their sums from word ", first,
                   " on do not fit behind ", count, " words into ", mail[0].size(0));
   if (known) check_host_values(kOp, *known, {count, n_values});
   PeerMail letters{};

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Numbers for the host, written into its pinned memory by the kernels themselves. CUDA only. A copy is done by
-// another engine of the GPU, which costs the stream a wait before and after it; a store costs nothing. They
-// are there once the host has waited for the kernel.
+// Numbers for the host, written into its pinned memory by the kernels themselves. CUDA only. A copy is done
+// by another engine of the GPU, which costs the stream a wait before and after it; a store costs nothing.
+// They are there once the host has waited for the kernel.
 #pragma once
 #include <cstdint>
 

@@ -6,7 +6,8 @@
 
 namespace blitzgs {
 
-inline void check_host_values(const char* op, const Tensor& known, std::initializer_list<std::int64_t> shape) {
+inline void check_host_values(const char* op, const Tensor& known,
+                              std::initializer_list<std::int64_t> shape) {
   check_dtype(op, "known", known, ScalarType::Long);
   check_shape(op, "known", known, shape);
   STD_TORCH_CHECK(known.is_cpu() && known.is_contiguous(), "blitzgs::", op,
