@@ -155,7 +155,7 @@ def test_parts_of_rows_return(width, in_parts):
 
 @pytest.mark.parametrize("n_values", [0, 5, 100])
 def test_a_meeting_with_ranks_that_have_come(n_values):
-    mail = [torch.zeros(3 + 3 * 102, dtype=torch.int64, device="cuda") for _ in range(3)]
+    mail = [torch.zeros(3 + 3 + 4 * 100, dtype=torch.int64, device="cuda") for _ in range(3)]
     known = torch.zeros(3, n_values, dtype=torch.int64, pin_memory=True)
     for meeting, first in ((4, 3), (5, 6)):
         for rank in range(3):
