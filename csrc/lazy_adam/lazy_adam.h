@@ -106,6 +106,16 @@ BLITZGS_HD AdamRule<T> adam_rule(const AdamArgs<T>& args, std::int32_t from, std
           {static_cast<T>(weights[0] * places[0]), static_cast<T>(weights[1] * places[1])}};
 }
 
+// The explicit_up_to of rules with errors up to this.
+template <class T>
+BLITZGS_HD T adam_explicit_up_to(const AdamArgs<T>& args, std::int32_t from, std::int32_t to, double error) {
+  const double rounding = sizeof(T) == 4 ? 5.9e-8 : 1.1e-16;
+  if (!(error > 2 * rounding)) return T(-1);
+  // eps is lost against the smallest place * sqrt(v); a_t >= 1, and after explicit_steps nothing counts.
+  const std::int32_t gap = to - from, reach = gap < args.explicit_steps ? gap : args.explicit_steps;
+  return static_cast<T>(args.eps / (rounding * args.table_row(reach)[kRootPower]));
+}
+
 template <class T>
 BLITZGS_HD AdamDebt<T> adam_debt(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
   AdamDebt<T> debt;
@@ -113,13 +123,7 @@ BLITZGS_HD AdamDebt<T> adam_debt(const AdamArgs<T>& args, std::int32_t from, std
   debt.to = to;
   double error = 0;
   for (int g = 0; g < kAdamGroups; ++g) debt.rules[g] = adam_rule(args, from, to, g, error);
-  const double rounding = sizeof(T) == 4 ? 5.9e-8 : 1.1e-16;
-  debt.explicit_up_to = T(-1);
-  if (error > 2 * rounding) {
-    // eps is lost against the smallest place * sqrt(v); a_t >= 1, and after explicit_steps nothing counts.
-    const std::int32_t gap = to - from, reach = gap < args.explicit_steps ? gap : args.explicit_steps;
-    debt.explicit_up_to = static_cast<T>(args.eps / (rounding * args.table_row(reach)[kRootPower]));
-  }
+  debt.explicit_up_to = adam_explicit_up_to(args, from, to, error);
   return debt;
 }
 

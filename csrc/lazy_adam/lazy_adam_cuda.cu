@@ -15,7 +15,8 @@ namespace {
 constexpr int kRows = 16;  // rows per block
 constexpr int kThreads = kRows * (12 + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
-constexpr int kPrepareThreads = 64, kListThreads = 256;
+constexpr int kPrepareLanes = 8, kPrepareThreads = 64, kListThreads = 256;
+static_assert(kPrepareLanes > kAdamGroups);
 
 // What rows that catch up may need: all of a launch go to the same step, so it is worked out once instead of
 // once a row.
@@ -25,12 +26,26 @@ struct Prepared {
   bool* owing;             // whether there are any debtors
 };
 
+// kPrepareLanes lanes a step, one for each rule: it is a chain of divisions that this kernel takes.
 __global__ void __launch_bounds__(kPrepareThreads)
     prepare(const __grid_constant__ AdamArgs<float> args, const Prepared prepared) {
-  const std::int32_t t = blockIdx.x * blockDim.x + threadIdx.x;
-  if (t == 0) *prepared.owing = false;
-  if (t <= args.target()) prepared.decays[t] = make_decay(args, t);
-  if (t < args.target()) prepared.debts[t] = adam_debt(args, t, args.target());
+  const auto thread = static_cast<std::int32_t>(blockIdx.x * kPrepareThreads + threadIdx.x);
+  const std::int32_t t = thread / kPrepareLanes, target = args.target();
+  const int group = thread % kPrepareLanes;
+  if (thread == 0) *prepared.owing = false;
+  if (t <= target && group == kPrepareLanes - 1) prepared.decays[t] = make_decay(args, t);
+  double error = 0;
+  if (t < target && group < kAdamGroups)
+    prepared.debts[t].rules[group] = adam_rule(args, t, target, group, error);
+#pragma unroll
+  for (int step = 1; step < kPrepareLanes; step *= 2) {
+    error = fmax(error, __shfl_xor_sync(~0u, error, step));
+  }
+  if (t >= target || group != 0) return;
+  AdamDebt<float>& debt = prepared.debts[t];
+  debt.from = t;
+  debt.to = target;
+  debt.explicit_up_to = adam_explicit_up_to(args, t, target, error);
 }
 
 // A row that catches up by the rules of the step that it stands at.
@@ -190,7 +205,8 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
   const Prepared prepared{workspace.allocate<AdamDebt<float>>(args.step),
                           workspace.allocate<Decay>(args.step + 1), workspace.allocate<bool>(1)};
   auto* debtors = workspace.allocate<Debtor>(args.n);
-  prepare<<<blocks_for(args.step + 1, kPrepareThreads), kPrepareThreads, 0, stream>>>(args, prepared);
+  prepare<<<blocks_for(args.step + 1, kPrepareThreads / kPrepareLanes), kPrepareThreads, 0, stream>>>(
+      args, prepared);
   // The device is filled once, as n may be far more than there are.
   const auto filled = [&](int items, int per_multiprocessor) {
     return std::min(blocks_for(args.n, items), unsigned(per_multiprocessor * multiprocessors()));
