@@ -78,6 +78,7 @@ class Peers:
 
     Attributes:
         buffers: int32 [words] of each rank, mapped here.
+        columns: of the rows in this rank's buffer, as `PeerSpace.arrived` has them; empty: not made yet.
         exchanges: how often rows were written: tells whose rows are in the buffers.
         second: stream for the second part of returning gradients.
     """
@@ -86,6 +87,7 @@ class Peers:
         self.rank, self.world_size, self.device = ranks.rank, ranks.world_size, ranks.device
         self.timeout_seconds = timeout_seconds
         self.buffers: list[Tensor] = []
+        self.columns: list[Tensor] = []
         self.exchanges = 0
         self.second = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._meetings = 0
@@ -135,7 +137,7 @@ class Peers:
         """
         if self.buffers and len(self.buffers[0]) >= words:
             return
-        self.buffers = []
+        self.buffers, self.columns = [], []
         size = -(-int(HEADROOM * words) // 4096) * 4096
         mine = symmetric.empty(size, dtype=torch.int32, device=self.device)
         # It is zeroed in stream order: that must be over before any peer can write.

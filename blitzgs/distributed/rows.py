@@ -150,13 +150,10 @@ class PeerSpace:
 
     def arrived(self) -> Splats:
         """Return the rows that arrive here; they may be read after the next meeting."""
-        mine, count = self.peers.buffers[self.peers.rank], sum(self.traffic.received)
-        columns, begin = [], 0
-        for dtype, words, shape in _COLUMNS:
-            column = mine[begin : begin + count * words].view(dtype)
-            columns.append(column.view(count, *shape))
-            begin += self.capacity * words
-        return Splats(*columns)
+        peers, count = self.peers, sum(self.traffic.received)
+        if len(peers.columns) == 0 or len(peers.columns[0]) != self.capacity:
+            peers.columns = _columns(peers.buffers[peers.rank], self.capacity)
+        return Splats(*(column[:count] for column in peers.columns))
 
     def write_back(self, packed: Tensor, fronts: Tensor | None = None, back: bool = False) -> Tensor:
         """Write the gradients of the rows that arrived to their owners.
@@ -193,3 +190,13 @@ class PeerSpace:
         count = sum(self.traffic.sent)
         mine = self.peers.buffers[me][offset : offset + count * _GRADIENT_WORDS]
         return mine.view(torch.float32).view(count, _GRADIENT_WORDS)
+
+
+def _columns(buffer: Tensor, capacity: int) -> list[Tensor]:
+    """Return the columns of a buffer, each of `capacity` rows."""
+    columns, begin = [], 0
+    for dtype, words, shape in _COLUMNS:
+        end = begin + capacity * words
+        columns.append(buffer[begin:end].view(dtype).view(capacity, *shape))
+        begin = end
+    return columns

@@ -52,7 +52,7 @@ def exchange(counts, guessed, room=None):
     words = 22 * max(capacity, 1)
     buffers = [torch.full((words,), -1, dtype=torch.int32, device="cuda") for _ in ranks]
     spaces = [
-        PeerSpace(SimpleNamespace(rank=m, buffers=buffers, exchanges=1), traffic[m], capacity, 1)
+        PeerSpace(SimpleNamespace(rank=m, columns=[], buffers=buffers, exchanges=1), traffic[m], capacity, 1)
         for m in range(len(ranks))
     ]
     return ranks, spaces, [rank.send(everyone, buffers, capacity, guessed) for rank in ranks]
