@@ -248,13 +248,24 @@ BLITZGS_HD std::uint32_t views_of_row(const CullView* views, int count, const Bl
   return mask;
 }
 
-// What cull_count leaves for cull_emit: the views of each block, those of the rows of mixed blocks, and the
-// active rows before each block.
+// What is known before rows are listed: the views of each block, those of the rows of mixed blocks, and how
+// many rows of each block are active.
 struct CullPlan {
-  BlockViews* blocks;         // [blocks_of(n)]
-  std::uint32_t* masks;       // [n]
-  std::int32_t* rows_before;  // [blocks_of(n) + 1]
+  BlockViews* blocks;    // [blocks_of(n)]
+  std::uint32_t* masks;  // [n]
+  std::int32_t* active;  // [blocks_of(n)]
   std::int64_t n;
+
+  CullPlan(std::int64_t rows, Workspace& workspace)
+      : blocks(workspace.allocate<BlockViews>(blocks_of(rows))),
+        masks(workspace.allocate<std::uint32_t>(rows)),
+        active(workspace.allocate<std::int32_t>(blocks_of(rows))),
+        n(rows) {}
+};
+
+// The active rows and their views come first in lists of n.
+struct ActiveList {
+  std::int32_t *ids, *views, *count;  // [n], [n], [1]
 };
 
 namespace cpu {
@@ -262,20 +273,15 @@ void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Worksp
 // ids null: every block. Otherwise the blocks of these rows.
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);
-void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                CullPlan& plan, Workspace&, CudaStream);
-// active_ids, active_views [n]: the active rows come first; count [1]: how many they are.
-void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views,
-               std::int32_t* count, CudaStream);
+void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
+                 const ActiveList&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);
-void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                CullPlan& plan, Workspace&, CudaStream);
-void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views,
-               std::int32_t* count, CudaStream);
+void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
+                 const ActiveList&, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -44,20 +44,16 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
   });
 }
 
-void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                CullPlan& plan, Workspace& workspace, CudaStream) {
+void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
+                 const ActiveList& list, Workspace& workspace, CudaStream) {
   CullView planes[kMaxViews];
   for (int view = 0; view < views; ++view) planes[view] = make_cull_view(camera, view);
   const std::int64_t blocks = blocks_of(rows.n);
-  plan.n = rows.n;
-  plan.blocks = workspace.allocate<BlockViews>(blocks);
-  plan.masks = workspace.allocate<std::uint32_t>(rows.n);
-  plan.rows_before = workspace.allocate<std::int32_t>(blocks + 1);
-  std::int32_t* active = plan.rows_before + 1;
+  const CullPlan plan(rows.n, workspace);
   parallel_for(0, blocks, 1024, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
       plan.blocks[block] = views_of_block(planes, views, bounds + block * kBlockBounds);
-      active[block] = plan.blocks[block].all ? rows_in_block(rows.n, block) : 0;
+      plan.active[block] = plan.blocks[block].all ? rows_in_block(rows.n, block) : 0;
     }
   });
   std::int32_t* mixed = workspace.allocate<std::int32_t>(blocks);
@@ -68,34 +64,34 @@ void cull_count(const BlockRows& rows, const float* bounds, const CullCamera& ca
   parallel_for(0, count, 16, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       const std::int64_t block = mixed[i], first = block * kBlockRows;
-      active[block] = 0;
+      plan.active[block] = 0;
       for (std::int64_t row = first; row < first + rows_in_block(rows.n, block); ++row) {
         plan.masks[row] = views_of_row(planes, views, plan.blocks[block], sweep_row(rows, row));
-        active[block] += plan.masks[row] != 0;
+        plan.active[block] += plan.masks[row] != 0;
       }
     }
   });
-  plan.rows_before[0] = 0;
-  for (std::int64_t block = 0; block < blocks; ++block) active[block] += plan.rows_before[block];
-}
-
-void cull_emit(const CullPlan& plan, std::int32_t* active_ids, std::int32_t* active_views,
-               std::int32_t* count, CudaStream) {
-  parallel_for(0, blocks_of(plan.n), 64, [&](std::int64_t begin, std::int64_t end) {
+  std::int32_t before = 0;
+  for (std::int64_t block = 0; block < blocks; ++block) {
+    const std::int32_t own = plan.active[block];
+    plan.active[block] = before;
+    before += own;
+  }
+  *list.count = before;
+  parallel_for(0, blocks, 64, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
       if (!plan.blocks[block].some) continue;
-      std::int64_t at = plan.rows_before[block];
-      const bool mixed = is_mixed(plan.blocks[block]);
+      std::int64_t at = plan.active[block];
+      const bool mixed_block = is_mixed(plan.blocks[block]);
       const std::int64_t first = block * kBlockRows;
-      for (std::int64_t row = first; row < first + rows_in_block(plan.n, block); ++row) {
-        const std::uint32_t mask = mixed ? plan.masks[row] : plan.blocks[block].all;
+      for (std::int64_t row = first; row < first + rows_in_block(rows.n, block); ++row) {
+        const std::uint32_t mask = mixed_block ? plan.masks[row] : plan.blocks[block].all;
         if (!mask) continue;
-        active_ids[at] = static_cast<std::int32_t>(row);
-        active_views[at++] = static_cast<std::int32_t>(mask);
+        list.ids[at] = static_cast<std::int32_t>(row);
+        list.views[at++] = static_cast<std::int32_t>(mask);
       }
     }
   });
-  *count = plan.rows_before[blocks_of(plan.n)];
 }
 
 }  // namespace blitzgs::cpu

@@ -119,14 +119,13 @@ std::tuple<Tensor, Tensor, Tensor> cull_blocks(const Tensor& bounds, const Tenso
                           static_cast<float>(near_plane), static_cast<float>(far_plane),
                           static_cast<float>(eps2d)};
   DeviceScope scope(bounds);
-  CullPlan plan{};
-  backend::cull_count(held.rows, data<float>(bounds), camera, static_cast<int>(views), plan, scope.workspace,
-                      scope.stream);
   Tensor active_ids = make_empty(bounds, {held.rows.n}, ScalarType::Int);
   Tensor active_views = make_empty(bounds, {held.rows.n}, ScalarType::Int);
   Tensor count = make_empty(bounds, {1}, ScalarType::Int);
-  backend::cull_emit(plan, mutable_data<std::int32_t>(active_ids), mutable_data<std::int32_t>(active_views),
-                     mutable_data<std::int32_t>(count), scope.stream);
+  const ActiveList list{mutable_data<std::int32_t>(active_ids), mutable_data<std::int32_t>(active_views),
+                        mutable_data<std::int32_t>(count)};
+  backend::cull_blocks(held.rows, data<float>(bounds), camera, static_cast<int>(views), list, scope.workspace,
+                       scope.stream);
   return {active_ids, active_views, count};
 }
 
