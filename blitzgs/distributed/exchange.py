@@ -230,9 +230,8 @@ def send_back_in_parts(packed: Tensor, route: Route) -> tuple[Tensor, Returns, S
     met = main.record_event()
     with torch.cuda.stream(second):
         space.write_back(packed, route.fronts, back=True)
-        # Whoever comes to the second meeting has come to the first.
-        second.wait_event(met)
-        peers.meet()
+        peers.meet_apart()
+        second.wait_event(met)  # some rows that are read there came with the first part
     first = int(FIRST_PART * int(route.traffic.counts[0]))
     return returned, _returns(route), SecondPart(first, second, packed)
 

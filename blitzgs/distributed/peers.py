@@ -8,11 +8,13 @@ they lie; behind them the gradients that come back for the rows this rank sent.
 
 A step is, in stream order on every rank: meeting A with the counts, rows written to the others, meeting B
 with where their groups are cut, compositing and its gradient, gradients written to the others, meeting C,
-reading those. With the gradients in two parts, the second is written and meets (D) on a stream of its own,
-after C, while the first is read; the main stream then waits for it. A meeting is a barrier between streams:
+reading those. With the gradients in two parts, the second is written and meets (D) on a stream of its own while
+the first meets C and is read; the main stream then waits for it. D counts by itself and does not wait for C: it
+would find the GPU filled by what reads the first part. A meeting is a barrier between streams:
 work queued behind it, on any rank, finds done what any rank queued before it. Hence
 
-- rows and gradients are read after the meeting that follows their writing: B, and C or D;
+- rows and gradients are read after the meeting that follows their writing: B, C, and the second part after D
+  as well;
 - arriving rows of a step overwrite those of the step before after A; whoever read those had queued that
   before its own A;
 - returning gradients are written after A and B, and those of the step before were read before A;
@@ -65,7 +67,7 @@ class Shared(NamedTuple):
 
 def mail_words(world_size: int) -> int:
     """Length of a rank's mail, int64."""
-    return world_size + 2 * MAX_VALUES * (world_size + 1)
+    return 2 * world_size + 2 * MAX_VALUES * (world_size + 1)
 
 
 class Peers:
@@ -94,6 +96,7 @@ class Peers:
         self._shared = 0  # how many of them had numbers
         self._handles: dict[str, Any] = {}  # the mappings live as long as these
         self._mail = self._map("mail", mail)
+        self._apart, self._meetings_apart = [letters[-self.world_size :] for letters in self._mail], 0
         self._known = torch.empty(2, MAX_VALUES * self.world_size, dtype=torch.int64, pin_memory=mail.is_cuda)
 
     def _map(self, name: str, mine: Tensor) -> list[Tensor]:
@@ -107,6 +110,13 @@ class Peers:
     def meet(self) -> None:
         """Meet the other ranks, in stream order."""
         self._meet(None, self.world_size, None)
+
+    def meet_apart(self) -> None:
+        """Meet the other ranks on the second stream, whatever meetings the first one is at."""
+        self._meetings_apart += 1
+        torch.ops.blitzgs.meet_peers_(
+            self._apart, self.rank, self._meetings_apart, None, self.world_size, self.timeout_seconds
+        )
 
     def share(self, values: Tensor) -> Shared:
         """Meet the other ranks and show them numbers.

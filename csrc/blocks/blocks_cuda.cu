@@ -4,7 +4,6 @@
 #include "blocks/blocks.h"
 #include "common/cuda_check.h"
 #include "common/multiprocessors.h"
-#include "intersect/running_sum.cuh"
 #include "math/morton_cuda.cuh"
 
 namespace blitzgs::cuda {
@@ -12,7 +11,7 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kWarps = kBlockRows / 32;
-constexpr int kListed = 16;   // blocks whose rows a CUDA block lists; up to 32
+constexpr int kGroup = kBlockRows;  // blocks whose active rows are added up: a thread each
 constexpr int kResident = 6;  // CUDA blocks of a row a thread that a multiprocessor holds, of any generation
 
 __global__ void make_keys(const float* points, std::int64_t n, const MortonBounds* bounds,
@@ -32,6 +31,15 @@ __device__ void append(bool present, std::int32_t item, std::int32_t* list, std:
   if (present) list[first + __popc(all & ((1u << lane) - 1))] = item;
 }
 
+// Rows ascend, so a block is listed where its first row is met; otherwise it is listed more often, which
+// costs time alone.
+__global__ void list_blocks(const std::int32_t* ids, std::int64_t n, std::int32_t* list,
+                            std::int32_t* length) {
+  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
+  const std::int32_t block = i < n ? ids[i] / kBlockRows : 0;
+  append(i < n && (i == 0 || ids[i - 1] / kBlockRows != block), block, list, length);
+}
+
 // The box around those of each kLanes neighbouring lanes.
 template <int kLanes>
 __device__ __forceinline__ SweptBox box_around(SweptBox box) {
@@ -48,48 +56,34 @@ __device__ __forceinline__ SweptBox box_around(SweptBox box) {
   return box;
 }
 
-// Bounds of one block, a thread a row; all threads call. Calls take turns 0 and 1, so that one barrier is
-// enough.
-__device__ void update_block(const BlockRows& rows, std::int64_t block, int turn, float* bounds) {
-  __shared__ SweptBox warps[2][kWarps];
+// The blocks of the list in turn, a thread a row. list null: all blocks.
+__global__ void __launch_bounds__(kBlockRows, kResident)
+    update_bounds(const BlockRows rows, const std::int32_t* list, const std::int32_t* length, float* bounds) {
+  __shared__ SweptBox warps[2][kWarps];  // they take turns, so that one barrier is enough
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  const bool present = threadIdx.x < rows_in_block(rows.n, block);
-  const SweptBox row = present ? sweep_row(rows, block * kBlockRows + threadIdx.x) : empty_box();
-  const SweptBox part = box_around<32>(row);
-  if (lane == 0) warps[turn][warp] = part;
-  const bool all_finite = __syncthreads_and(!present || !is_empty(row));
-  if (warp == 0) {
-    const SweptBox whole = box_around<kWarps>(warps[turn][lane % kWarps]);
-    if (lane == 0) store_bounds(whole, all_finite, bounds + block * kBlockBounds);
+  const std::int64_t count = list ? *length : blocks_of(rows.n);
+  const auto block_at = [&](std::int64_t i) { return i >= count ? 0 : list ? list[i] : i; };
+  std::int64_t block = block_at(blockIdx.x), next;
+  int turn = 0;
+  for (std::int64_t i = blockIdx.x; i < count; i += gridDim.x, turn ^= 1, block = next) {
+    next = block_at(i + gridDim.x);  // it arrives while this one is worked on
+    const bool present = threadIdx.x < rows_in_block(rows.n, block);
+    const SweptBox row = present ? sweep_row(rows, block * kBlockRows + threadIdx.x) : empty_box();
+    const SweptBox part = box_around<32>(row);
+    if (lane == 0) warps[turn][warp] = part;
+    const bool all_finite = __syncthreads_and(!present || !is_empty(row));
+    if (warp == 0) {
+      const SweptBox whole = box_around<kWarps>(warps[turn][lane % kWarps]);
+      if (lane == 0) store_bounds(whole, all_finite, bounds + block * kBlockBounds);
+    }
   }
 }
 
-__global__ void __launch_bounds__(kBlockRows, kResident) update_bounds(const BlockRows rows, float* bounds) {
-  int turn = 0;
-  for (std::int64_t block = blockIdx.x; block < blocks_of(rows.n); block += gridDim.x, turn ^= 1)
-    update_block(rows, block, turn, bounds);
-}
-
-// The same for the blocks of the rows ids [n], each CUDA block with kBlockRows of those. Rows ascend, so a
-// block is updated where its first row is met; otherwise more often, which costs time alone.
-__global__ void __launch_bounds__(kBlockRows, kResident)
-    update_bounds_of(const BlockRows rows, const std::int32_t* ids, std::int64_t n, float* bounds) {
-  __shared__ std::int32_t blocks[kBlockRows];
-  __shared__ int count;
-  if (threadIdx.x == 0) count = 0;
-  const std::int64_t i = blockIdx.x * std::int64_t{kBlockRows} + threadIdx.x;
-  const std::int32_t block = i < n ? ids[i] / kBlockRows : 0;
-  const bool first = i < n && (i == 0 || ids[i - 1] / kBlockRows != block);
-  __syncthreads();
-  append(first, block, blocks, &count);
-  __syncthreads();
-  for (int k = 0; k < count; ++k) update_block(rows, blocks[k], k % 2, bounds);
-}
-
-// One thread a block. Lists the mixed blocks, in any order, and counts the active rows of the others. Leaves
-// the planes of the views for test_rows.
+// One thread a block, a CUDA block a group. Lists the mixed blocks, in any order, and counts the active rows
+// of the others. Leaves the planes of the views for test_rows.
 __global__ void test_blocks(const float* bounds, CullCamera camera, int views, const CullPlan plan,
-                            std::int32_t* list, std::int32_t* length, CullView* planes_out) {
+                            std::int32_t* list, std::int32_t* length, std::int32_t* groups,
+                            CullView* planes_out) {
   __shared__ CullView planes[kMaxViews];
   const int thread = threadIdx.x;
   if (thread < views) {
@@ -99,17 +93,20 @@ __global__ void test_blocks(const float* bounds, CullCamera camera, int views, c
   __syncthreads();
   const std::int64_t blocks = blocks_of(plan.n), block = blockIdx.x * std::int64_t{blockDim.x} + thread;
   BlockViews seen{0, 0};
+  int active = 0;
   if (block < blocks) {
     plan.blocks[block] = seen = views_of_block(planes, views, bounds + block * kBlockBounds);
-    plan.active[block] = seen.all ? rows_in_block(plan.n, block) : 0;  // of a mixed one counted later
+    if (!is_mixed(seen)) plan.active[block] = active = seen.all ? rows_in_block(plan.n, block) : 0;
   }
+  active = __reduce_add_sync(~0u, active);
+  if (thread % 32 == 0 && active > 0) atomicAdd(groups + blockIdx.x, active);
   append(is_mixed(seen), static_cast<std::int32_t>(block), list, length);
 }
 
 // Blocks of the list in turn, a thread a row.
 __global__ void __launch_bounds__(kBlockRows, kResident)
     test_rows(const BlockRows rows, const CullView* planes, int views, const CullPlan plan,
-              const std::int32_t* list, const std::int32_t* length) {
+              const std::int32_t* list, const std::int32_t* length, std::int32_t* groups) {
   __shared__ CullView shared[kMaxViews];
   const std::int32_t count = *length;
   if (static_cast<std::int32_t>(blockIdx.x) >= count) return;
@@ -123,47 +120,56 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
       plan.masks[row] = mask;
     }
     const int total = __syncthreads_count(mask != 0);
-    if (threadIdx.x == 0) plan.active[block] = total;
+    if (threadIdx.x == 0) {
+      plan.active[block] = total;
+      atomicAdd(groups + block / kGroup, total);
+    }
   }
 }
 
-// A CUDA block has kListed blocks, a warp every kWarps-th of them.
-__global__ void __launch_bounds__(kBlockRows)
-    emit_rows(const CullPlan plan, const RunningSum running, const ActiveList list) {
-  __shared__ std::int32_t rows_before[kListed];
-  __shared__ BlockViews views_of[kListed];
-  const std::int64_t blocks = blocks_of(plan.n);
-  const int turn = running.take_turn(), warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  const std::int64_t first = turn * std::int64_t{kListed};
-  const bool present = lane < kListed && first + lane < blocks;
-  if (warp == 1 && present) views_of[lane] = plan.blocks[first + lane];
-  if (warp == 0) {
-    const std::int32_t own = present ? plan.active[first + lane] : 0;
-    const std::int32_t until = sum_of_lanes_until(own, lane), all = __shfl_sync(kFullWarp, until, 31);
-    const auto before = static_cast<std::int32_t>(running.sum_before(turn, all));
-    if (present) rows_before[lane] = before + until - own;
-    if (lane == 0 && first + kListed >= blocks) *list.count = before + all;
-  }
+// The active rows before a block, from the groups before its own and the blocks before it there; all threads
+// call.
+__device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* groups, std::int64_t block) {
+  __shared__ std::int32_t parts[kWarps];
+  const std::int64_t group = block / kGroup, near = group * kGroup + threadIdx.x;
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  std::int32_t sum = near < block ? plan.active[near] : 0;
+  for (std::int64_t i = threadIdx.x; i < group; i += kGroup) sum += groups[i];
+  sum = __reduce_add_sync(~0u, sum);
+  if (lane == 0) parts[warp] = sum;
   __syncthreads();
-  for (int i = warp; i < kListed && first + i < blocks; i += kWarps) {
-    const std::int64_t block = first + i;
-    const BlockViews seen = views_of[i];
-    if (!seen.some) continue;
-    const bool mixed = is_mixed(seen);
-    const int count = rows_in_block(plan.n, block);
-    std::int32_t at = rows_before[i];
+  return __reduce_add_sync(~0u, lane < kWarps ? parts[lane] : 0);
+}
+
+// A warp a block.
+__global__ void __launch_bounds__(kBlockRows)
+    emit_rows(const CullPlan plan, const std::int32_t* groups, const ActiveList out) {
+  const std::int64_t blocks = blocks_of(plan.n), first = blockIdx.x * std::int64_t{kWarps};
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const std::int64_t block = first + warp;
+  const std::int32_t before = rows_before(plan, groups, first);
+  const std::int32_t here = lane < kWarps && first + lane < blocks ? plan.active[first + lane] : 0;
+  if (blockIdx.x == gridDim.x - 1 && warp == 0) {
+    const std::int32_t all = before + __reduce_add_sync(~0u, here);
+    if (lane == 0) *out.count = all;
+  }
+  std::int32_t at = before + __reduce_add_sync(~0u, lane < warp ? here : 0);
+  if (block >= blocks) return;
+  const BlockViews seen = plan.blocks[block];
+  if (!seen.some) return;
+  const bool mixed = is_mixed(seen);
+  const int count = rows_in_block(plan.n, block);
 #pragma unroll
-    for (int local = lane; local < kBlockRows; local += 32) {
-      const std::int64_t row = block * kBlockRows + local;
-      const std::uint32_t mask = local >= count ? 0 : mixed ? plan.masks[row] : seen.all;
-      const std::uint32_t ballot = __ballot_sync(~0u, mask != 0);
-      const std::int32_t place = at + __popc(ballot & ((1u << lane) - 1));
-      if (mask) {
-        list.ids[place] = static_cast<std::int32_t>(row);
-        list.views[place] = static_cast<std::int32_t>(mask);
-      }
-      at += __popc(ballot);
+  for (int local = lane; local < kBlockRows; local += 32) {
+    const std::int64_t row = block * kBlockRows + local;
+    const std::uint32_t mask = local >= count ? 0 : mixed ? plan.masks[row] : seen.all;
+    const std::uint32_t ballot = __ballot_sync(~0u, mask != 0);
+    const std::int32_t place = at + __popc(ballot & ((1u << lane) - 1));
+    if (mask) {
+      out.ids[place] = static_cast<std::int32_t>(row);
+      out.views[place] = static_cast<std::int32_t>(mask);
     }
+    at += __popc(ballot);
   }
 }
 
@@ -182,14 +188,17 @@ void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Worksp
 }
 
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
-                         Workspace&, CudaStream stream) {
+                         Workspace& workspace, CudaStream stream) {
   const std::int64_t blocks = blocks_of(rows.n);
   if (blocks == 0 || (ids && n_ids == 0)) return;
+  std::int32_t *list = nullptr, *length = nullptr;
   if (ids) {
-    update_bounds_of<<<blocks_for(n_ids, kBlockRows), kBlockRows, 0, stream>>>(rows, ids, n_ids, bounds);
-  } else {
-    update_bounds<<<persistent_blocks(blocks), kBlockRows, 0, stream>>>(rows, bounds);
+    length = workspace.allocate<std::int32_t>(1 + n_ids);
+    list = length + 1;
+    check(cudaMemsetAsync(length, 0, sizeof(*length), stream), "update_block_bounds");
+    list_blocks<<<blocks_for(n_ids, 256), 256, 0, stream>>>(ids, n_ids, list, length);
   }
+  update_bounds<<<persistent_blocks(blocks), kBlockRows, 0, stream>>>(rows, list, length, bounds);
   check_launch("update_block_bounds");
 }
 
@@ -203,14 +212,13 @@ void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& c
   const CullPlan plan(rows.n, workspace);
   std::int32_t* list = workspace.allocate<std::int32_t>(blocks);
   CullView* planes = workspace.allocate<CullView>(views);
-  const unsigned listing = blocks_for(blocks, kListed);
-  const std::int64_t words = RunningSum::words(listing);
-  std::uint64_t* zeros = workspace.allocate<std::uint64_t>(words + 1);
-  auto* length = reinterpret_cast<std::int32_t*>(zeros + words);
-  check(cudaMemsetAsync(zeros, 0, (words + 1) * sizeof(*zeros), stream), "cull_blocks");
-  test_blocks<<<blocks_for(blocks, 256), 256, 0, stream>>>(bounds, camera, views, plan, list, length, planes);
-  test_rows<<<persistent_blocks(blocks), kBlockRows, 0, stream>>>(rows, planes, views, plan, list, length);
-  emit_rows<<<listing, kBlockRows, 0, stream>>>(plan, RunningSum(zeros), out);
+  const unsigned n_groups = blocks_for(blocks, kGroup);
+  std::int32_t *groups = workspace.allocate<std::int32_t>(n_groups + 1), *length = groups + n_groups;
+  check(cudaMemsetAsync(groups, 0, (n_groups + 1) * sizeof(*groups), stream), "cull_blocks");
+  test_blocks<<<n_groups, kGroup, 0, stream>>>(bounds, camera, views, plan, list, length, groups, planes);
+  test_rows<<<persistent_blocks(blocks), kBlockRows, 0, stream>>>(rows, planes, views, plan, list, length,
+                                                                  groups);
+  emit_rows<<<blocks_for(blocks, kWarps), kBlockRows, 0, stream>>>(plan, groups, out);
   check_launch("cull_blocks");
 }
 

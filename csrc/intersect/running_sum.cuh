@@ -27,12 +27,9 @@ __device__ __forceinline__ std::int32_t sum_of_lanes_until(std::int32_t value, i
 class RunningSum {
  public:
   RunningSum(unsigned n_blocks, Workspace& workspace, CudaStream stream)
-      : RunningSum(workspace.allocate<std::uint64_t>(words(n_blocks))) {
-    check(cudaMemsetAsync(turn_, 0, words(n_blocks) * sizeof(std::uint64_t), stream), "running sum");
+      : turn_(workspace.allocate<std::uint64_t>(n_blocks + 1)), states_(turn_ + 1) {
+    check(cudaMemsetAsync(turn_, 0, (n_blocks + 1) * sizeof(std::uint64_t), stream), "running sum");
   }
-  // In memory of so many words that the caller has set to zero, together with some of its own.
-  explicit RunningSum(std::uint64_t* zeros) : turn_(zeros), states_(zeros + 1) {}
-  static std::int64_t words(unsigned n_blocks) { return n_blocks + std::int64_t{1}; }
 
   // The block's number; called once by all its threads, and a barrier for them.
   __device__ int take_turn() const {
