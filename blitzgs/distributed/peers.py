@@ -8,10 +8,10 @@ they lie; behind them the gradients that come back for the rows this rank sent.
 
 A step is, in stream order on every rank: meeting A with the counts, rows written to the others, meeting B
 with where their groups are cut, compositing and its gradient, gradients written to the others, meeting C,
-reading those. With the gradients in two parts, the second is written and meets (D) on a stream of its own while
-the first meets C and is read; the main stream then waits for it. D counts by itself and does not wait for C: it
-would find the GPU filled by what reads the first part. A meeting is a barrier between streams:
-work queued behind it, on any rank, finds done what any rank queued before it. Hence
+reading those. With the gradients in two parts, the second is written and meets (D) on a stream of its own
+while the first meets C and is read; the main stream then waits for it. D counts by itself and does not wait
+for C: behind that it would find the GPU filled by what reads the first part. A meeting is a barrier between
+streams: work queued behind it, on any rank, finds done what any rank queued before it. Hence
 
 - rows and gradients are read after the meeting that follows their writing: B, C, and the second part after D
   as well;
