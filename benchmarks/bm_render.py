@@ -72,13 +72,13 @@ class OurRender:
         """Composite the tiles."""
         r = self.rows
         self.splats = (r[4], r[5], r[7], r[8], None, *self.lists)
-        self.saved = rasterize_fwd(*self.splats, *self.grid)
+        self.saved = rasterize_fwd(*self.splats, *self.grid, None, True, True)
 
     def rasterize_backward(self, v_renders: Tensor) -> None:
         """Differentiate the compositing."""
-        renders, rest, last, _, aux = self.saved
-        packed = ops.rasterize_bwd_packed(
-            *self.splats, renders, rest, last, aux, v_renders, *self.grid, False
+        renders, rest, last, _, aux, packed = self.saved
+        ops.rasterize_bwd_packed_(
+            *self.splats, renders, rest, last, aux, v_renders, *self.grid, False, packed
         )
         self.v_rows = gradient_columns(packed)
 

@@ -91,10 +91,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "rasterize_fwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
       "backgrounds, "
       "Tensor isect_rows, Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, "
-      "int tile_begin, int tile_end, Tensor? means2d_abs=None, bool clear_rest=True) -> (Tensor renders, "
-      "Tensor transmittances, "
-      "Tensor last_ids, "
-      "Tensor tile_work, Tensor aux)");
+      "int tile_begin, int tile_end, Tensor? means2d_abs=None, bool clear_rest=True, "
+      "bool backward_follows=False) -> (Tensor renders, Tensor transmittances, Tensor last_ids, "
+      "Tensor tile_work, Tensor aux, Tensor row_gradients)");
   m.def(
       "rasterize_bwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
       "backgrounds, "
@@ -104,10 +103,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "v_conics, "
       "Tensor v_row_opacities, Tensor v_colors, Tensor v_means2d_abs)");
   m.def(
-      "rasterize_bwd_packed(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
+      "rasterize_bwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
       "backgrounds, Tensor isect_rows, Tensor tile_offsets, Tensor renders, Tensor transmittances, Tensor "
       "last_ids, Tensor aux, Tensor v_renders, int n_cameras, int width, int height, int tile_size, "
-      "int tile_begin, int tile_end, bool deterministic) -> Tensor");
+      "int tile_begin, int tile_end, bool deterministic, Tensor(a!) packed) -> ()");
 
   // L1 and SSIM of the owned tiles; fwd_bwd does both at once when the weights of the sums are known.
   m.def(

@@ -199,7 +199,7 @@ def send_back_packed(packed: Tensor, route: Route) -> tuple[Tensor, Returns]:
     Nobody adds them up: that is left to who reads them, once.
 
     Args:
-        packed: [R, 9 or more], of `rasterize_bwd_packed`.
+        packed: [R, 9 or more], of `rasterize_bwd_packed_`.
         route: of these rows.
 
     Returns:

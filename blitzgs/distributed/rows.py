@@ -25,7 +25,7 @@ _COLUMNS = (
     (torch.int64, 2, ()),
 )
 _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
-# Gradients of means2d, conics, opacities and colors as they return, `rasterize_bwd_packed` has them in front.
+# Gradients of means2d, conics, opacities and colors as they return, `rasterize_bwd_packed_` has them in front.
 _GRADIENT_WORDS = 9
 # Writes rows to the peers: see `PeerSpace.fill`.
 Projection = Callable[[Tensor, Tensor, list[Tensor], int], Any]
@@ -159,7 +159,7 @@ class PeerSpace:
         """Write the gradients of the rows that arrived to their owners.
 
         Args:
-            packed: [R, 9 or more], of `rasterize_bwd_packed`.
+            packed: [R, 9 or more], of `rasterize_bwd_packed_`.
             fronts: int64 [M], only of so many rows from each other rank, from the first on; None: of all.
             back: instead, only of the rest of those.
 

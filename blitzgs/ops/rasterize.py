@@ -13,13 +13,36 @@ from blitzgs._library import without_autograd
 from blitzgs.ops.intersect import tile_counts
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
+_PACKED = 12  # kPackedGradient of csrc/rasterize/rasterize.h
+
+
+class GradientRoom:
+    """Where the backward pass adds up the gradients of rows on CUDA: zeros that the forward pass wrote.
+
+    They are good for one backward pass; later ones get zeros of their own.
+    """
+
+    def __init__(self, means2d: Tensor, zeros: Tensor) -> None:
+        """Keep the zeros.
+
+        Args:
+            means2d: of the P rows.
+            zeros: the last output of `rasterize_fwd`: [P, 12], or [0, 12] where no backward pass was foreseen.
+        """
+        self._means2d = means2d
+        self._zeros = zeros if len(zeros) == len(means2d) else None
+
+    def take(self) -> Tensor:
+        """Return zeros [P, 12]."""
+        zeros, self._zeros = self._zeros, None
+        return self._means2d.new_zeros(len(self._means2d), _PACKED) if zeros is None else zeros
 
 
 def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """View a table of the gradients of rows as columns.
 
     Args:
-        packed: [P, 9 or more], of the op `rasterize_bwd_packed` or the part of it that ranks send back.
+        packed: [P, 9 or more], of the op `rasterize_bwd_packed_` or the part of it that ranks send back.
 
     Returns:
         Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
@@ -86,7 +109,9 @@ def rasterize(
         renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid, means2d_abs)
         alphas = 1 - transmittances
     else:
-        renders, alphas = _Rasterize.apply(*splats, grid, means2d_abs)  # type: ignore[no-untyped-call]
+        # Whose gradients stay packed, see `_gradients`.
+        packed = means2d_abs is None and torch.is_grad_enabled() and any(x.requires_grad for x in splats[:4])
+        renders, alphas = _Rasterize.apply(*splats, grid, means2d_abs, packed)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
         alphas = alphas * _owned_pixels(alphas, tile_size, tile_begin, tile_end)
     return renders, alphas
@@ -119,15 +144,18 @@ def _(
     tile_end: int,
     means2d_abs: Tensor | None = None,
     clear_rest: bool = True,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    backward_follows: bool = False,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     pixels = (n_cameras, height, width)
     aux_size = torch.library.get_ctx().new_dynamic_size()  # each backend's own business
+    n_ready = torch.library.get_ctx().new_dynamic_size() if backward_follows else 0
     return (
         means2d.new_empty(*pixels, colors.shape[1]),
         means2d.new_empty(pixels),
         means2d.new_empty(pixels, dtype=torch.int32),
         means2d.new_empty(tile_offsets.shape[0] - 1, dtype=torch.int32),
         means2d.new_empty(aux_size, dtype=torch.uint8),
+        means2d.new_empty(n_ready, _PACKED),
     )
 
 
@@ -166,14 +194,15 @@ def _(
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    *_, last_ids, tile_work, aux = output
-    ctx.mark_non_differentiable(last_ids, tile_work, aux)
+    *_, last_ids, tile_work, aux, row_gradients = output
+    ctx.mark_non_differentiable(last_ids, tile_work, aux, row_gradients)
     _save(ctx, inputs[:7], inputs[7:13], inputs[13], output)
 
 
 def _save(ctx: Any, splats: Any, grid: Any, means2d_abs: Tensor | None, output: tuple[Tensor, ...]) -> None:
-    renders, transmittances, last_ids, _, aux = output
+    renders, transmittances, last_ids, _, aux, row_gradients = output
     ctx.set_materialize_grads(False)
+    ctx.room = GradientRoom(splats[0], row_gradients)
     ctx.save_for_backward(*splats, renders, transmittances, last_ids, aux)
     ctx.grid = grid
     ctx.absgrad = means2d_abs is not None and means2d_abs.requires_grad
@@ -184,7 +213,7 @@ def _backward(
 ) -> tuple[Tensor | None, ...]:
     v_alphas = None if v_transmittances is None else -v_transmittances
     *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas)
-    return (*splat_gradients, *(None,) * 8, v_abs, None)
+    return (*splat_gradients, *(None,) * 8, v_abs, None, None)
 
 
 def _gradients(
@@ -204,9 +233,9 @@ def _gradients(
     v_abs = v_backgrounds = None
     v_splats: Sequence[Tensor]
     if may_pack and renders.is_cuda and renders.shape[-1] == 3 and v_alphas is None and not ctx.absgrad:
-        v_splats = gradient_columns(
-            torch.ops.blitzgs.rasterize_bwd_packed(*arguments, *ctx.grid, deterministic)
-        )
+        packed = ctx.room.take()
+        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, *ctx.grid, deterministic, packed)
+        v_splats = gradient_columns(packed)
     else:
         *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
             *arguments, v_alphas, *ctx.grid, ctx.absgrad, deterministic
@@ -224,8 +253,8 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *splats, grid, means2d_abs = arguments
-        output = rasterize_fwd(*splats, *grid)
+        *splats, grid, means2d_abs, backward_follows = arguments
+        output = rasterize_fwd(*splats, *grid, None, True, backward_follows)
         _save(ctx, splats, grid, means2d_abs, output)
         return output[0], 1 - output[1]
 
@@ -233,7 +262,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *v_output: Tensor | None) -> tuple[Tensor | None, ...]:
         v_renders, v_alphas = v_output
         *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, may_pack=True)
-        return (*splat_gradients, None, None, None, v_abs)
+        return (*splat_gradients, None, None, None, v_abs, None)
 
 
 torch.library.register_autograd("blitzgs::rasterize_fwd", _backward, setup_context=_setup_context)

@@ -73,7 +73,7 @@ class Stepper:
         self._optimiser.catch_up(table, active.ids, step - 1, active.length)
         mark("optimiser")
         share = None if batch.ranges is None else Share(ranks, batch.ranges, self._half)
-        frame = pipeline.forward(table, views, options, active, share, self._room, mark)
+        frame = pipeline.forward(table, views, options, active, share, self._room, mark, True)
         terms = loss_terms(frame, batch, self._loss, self._length_unit)
         mark("loss")
         if batch.ranges is None:

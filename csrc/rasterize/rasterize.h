@@ -57,6 +57,7 @@ struct RasterizeOutput {
   T* transmittances;
   std::int32_t* last_ids;
   std::int32_t* tile_work;
+  T* row_gradients;  // null, or [P, kPackedGradient] to be zeroed; up to four channels on CUDA
   bool clear_rest;
 };
 
@@ -79,36 +80,41 @@ struct RasterizeGradients {
 };
 
 // Up to four channels on CUDA: the gradients of a row in kPackedGradient floats, mean2d 2, conic 3, opacity
-// 1, color, and the rest of no use.
+// 1, color, and the rest of no use. They are added to zeros, which forward may have written.
 inline constexpr std::int64_t kPackedGradient = 12;
 
-// aux is the backend's own memory between forward and backward, 64-byte aligned and of
-// rasterize_aux_bytes(), which may depend on the shapes and the number of entries, not on values on the
-// device.
+// The backend's own memory between forward and backward, 64-byte aligned. Its size, rasterize_aux_bytes(),
+// depends on shapes, not on values on the device; it fits the backward pass of a grid if a forward pass over
+// these tiles, or more of them, can have left it.
+struct RasterizeAux {
+  const void* data;
+  std::int64_t bytes;
+};
+
 namespace cpu {
-std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, std::int64_t n_isects,
-                                 int n_channels);
+std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, int n_channels);
+bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes);
 template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t n_isects,
-                   void* aux, Workspace&, CudaStream);
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, void* aux, Workspace&,
+                   CudaStream);
 template <class T>
 void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
-                   const void* aux, bool deterministic, const RasterizeGradients<T>& gradients, Workspace&,
-                   CudaStream);
+                   const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
+                   Workspace&, CudaStream);
 }  // namespace cpu
 
 namespace cuda {
-std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, std::int64_t n_isects,
-                                 int n_channels);
+std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, int n_channels);
+bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes);
 template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t n_isects,
-                   void* aux, Workspace&, CudaStream);
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, void* aux, Workspace&,
+                   CudaStream);
 template <class T>
 void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
-                   const void* aux, bool deterministic, const RasterizeGradients<T>& gradients, Workspace&,
-                   CudaStream);
+                   const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
+                   Workspace&, CudaStream);
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const void* aux, bool deterministic, float* packed,
+                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, float* packed,
                           Workspace&, CudaStream);
 }  // namespace cuda
 

@@ -6,7 +6,6 @@
 // them through shared memory, and each lane then sums for one entry: the weights against the pixels'
 // gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic follow.
 #include <algorithm>
-#include <optional>
 #include <stdexcept>
 #include <string>
 
@@ -138,7 +137,9 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) :
   extern __shared__ __align__(16) unsigned char shared_bytes[];
   Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
-  const TilePlace tile = locate_tile<TILE>(args.grid, args.order.tile(static_cast<int>(blockIdx.x)));
+  const std::int64_t index = args.order.tile(static_cast<int>(blockIdx.x));
+  if (index < args.grid.tile_begin || index >= args.grid.tile_end) return;  // composited, but not owned
+  const TilePlace tile = locate_tile<TILE>(args.grid, index);
   const std::int64_t start = args.tile_offsets[tile.tile];
   if (args.tile_offsets[tile.tile + 1] == start) return;
   const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
@@ -253,28 +254,20 @@ void check_supported(const RasterizeInput<float>& in) {
   }
 }
 
-// Of the tiles that are differentiated: fewer than were composited, on several ranks.
-__global__ void __launch_bounds__(kOrderThreads)
-    order_tiles_kernel(TileOrder order, const std::int64_t* tile_offsets) {
-  order.add(tile_offsets, static_cast<int>(blockIdx.x * kOrderThreads + threadIdx.x));
-}
-
 // The gradients of each row, a chunk of channels at a time.
 class PackedRows {
  public:
   PackedRows(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved, std::int64_t n_isects,
-             const void* aux, bool deterministic, Workspace& workspace, CudaStream stream)
-      : in_(in), saved_(saved), aux_(aux), n_isects_(n_isects), stream_(stream) {
+             const RasterizeAux& aux, bool deterministic, Workspace& workspace, CudaStream stream)
+      : in_(in),
+        saved_(saved),
+        aux_(aux.data),
+        n_isects_(n_isects),
+        stream_(stream),
+        empty_(n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin),
+        order_(order_in(aux, in)) {
     check_supported(in);
-    empty_ = n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin;
-    if (empty_) return;
-    order_.emplace(in.grid, workspace, stream);
-    if (order_->unordered() > 0) {
-      order_tiles_kernel<<<blocks_for(order_->unordered(), kOrderThreads), kOrderThreads, 0, stream>>>(
-          *order_, in.tile_offsets);
-      check_launch("rasterize_bwd");
-    }
-    if (!deterministic) return;
+    if (empty_ || !deterministic) return;
     entries_ = static_cast<PackedGradient*>(workspace.allocate_bytes(n_isects * sizeof(PackedGradient)));
     sorted_ = sort_entries(in.isect_rows, n_isects, in.n_rows, workspace, stream);
   }
@@ -284,14 +277,14 @@ class PackedRows {
             std::min(4, in_.n_channels - first)};
   }
 
-  void write(const ChannelChunk& chunk, bool absolute, PackedGradient* packed) const {
-    check(cudaMemsetAsync(packed, 0, in_.n_rows * sizeof(PackedGradient), stream_), "rasterize_bwd");
+  // packed: zeros.
+  void add(const ChannelChunk& chunk, bool absolute, PackedGradient* packed) const {
     if (empty_) return;
     if (entries_) {
       check(cudaMemsetAsync(entries_, 0, n_isects_ * sizeof(PackedGradient), stream_), "rasterize_bwd");
     }
     const BackwardArguments args{aux_rows(aux_), chunk,   in_.backgrounds, in_.isect_rows, in_.tile_offsets,
-                                 in_.grid,       *order_, saved_,          packed,         entries_};
+                                 in_.grid,       order_,  saved_,          packed,         entries_};
     if (in_.grid.tile_size == 8) {
       dispatch_backward<8>(args, absolute, stream_);
     } else if (in_.grid.tile_size == 16) {
@@ -306,14 +299,19 @@ class PackedRows {
   }
 
  private:
+  static TileOrder order_in(const RasterizeAux& aux, const RasterizeInput<float>& in) {
+    const std::int64_t begin = aux_order_begin(in.n_rows, in.n_channels);
+    return {in.grid, static_cast<char*>(const_cast<void*>(aux.data)) + begin, aux.bytes - begin};
+  }
+
   const RasterizeInput<float>& in_;
   const RasterizeSaved<float>& saved_;
   const void* aux_;
   std::int64_t n_isects_;
   CudaStream stream_;
   bool empty_;
+  TileOrder order_;  // as forward left it
   EntriesByRow sorted_{};
-  std::optional<TileOrder> order_;
   PackedGradient* entries_ = nullptr;
 };
 
@@ -321,7 +319,7 @@ class PackedRows {
 
 template <>
 void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const void* aux, bool deterministic,
+                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic,
                           const RasterizeGradients<float>& gradients, Workspace& workspace,
                           CudaStream stream) {
   if (in.n_rows == 0) return;
@@ -330,7 +328,8 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
   auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(in.n_rows * sizeof(PackedGradient)));
   for (int first = 0; first < in.n_channels; first += 4) {
     const ChannelChunk chunk = rows.chunk(first);
-    rows.write(chunk, absolute, packed);
+    check(cudaMemsetAsync(packed, 0, in.n_rows * sizeof(PackedGradient), stream), "rasterize_bwd");
+    rows.add(chunk, absolute, packed);
     unpack_kernel<<<blocks_for(in.n_rows, kUnpackThreads), kUnpackThreads, 0, stream>>>(
         packed, in.n_rows, chunk, absolute && first > 0, gradients);
     check_launch("rasterize_bwd");
@@ -338,12 +337,12 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
 }
 
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const void* aux, bool deterministic, float* packed,
+                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, float* packed,
                           Workspace& workspace, CudaStream stream) {
   static_assert(sizeof(PackedGradient) == kPackedGradient * sizeof(float));
   if (in.n_rows == 0) return;
   const PackedRows rows(in, saved, n_isects, aux, deterministic, workspace, stream);
-  rows.write(rows.chunk(0), false, reinterpret_cast<PackedGradient*>(packed));
+  rows.add(rows.chunk(0), false, reinterpret_cast<PackedGradient*>(packed));
 }
 
 }  // namespace blitzgs::cuda

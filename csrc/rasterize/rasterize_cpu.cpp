@@ -202,12 +202,16 @@ void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
 }  // namespace
 
 // The prepared rows of float32; float64, which is for checking, prepares them again in the backward pass.
-std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, std::int64_t, int) {
+std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, int) {
   return n_rows * static_cast<std::int64_t>(sizeof(SplatRow<float>));
 }
 
+bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes) {
+  return bytes == rasterize_aux_bytes(grid, n_rows, n_channels);
+}
+
 template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, std::int64_t, void* aux,
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, void* aux,
                    Workspace& workspace, CudaStream) {
   if (out.clear_rest) clear_unowned(in, out);
   const SplatRow<T>* splats =
@@ -224,8 +228,9 @@ void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, s
 }
 
 template <class T>
-void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t, const void* aux,
-                   bool, const RasterizeGradients<T>& gradients, Workspace& workspace, CudaStream) {
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t,
+                   const RasterizeAux& aux, bool, const RasterizeGradients<T>& gradients,
+                   Workspace& workspace, CudaStream) {
   const bool absgrad = gradients.v_means2d_abs != nullptr;
   const int width = partial_width(in.n_channels, absgrad);
   const std::int64_t n_owned = in.grid.tile_end - in.grid.tile_begin;
@@ -240,7 +245,7 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   parallel_for(0, in.n_rows * width, 1 << 16,
                [&](std::int64_t begin, std::int64_t end) { std::fill(sums + begin, sums + end, T(0)); });
 
-  const SplatRow<T>* splats = sizeof(T) == 4 ? static_cast<const SplatRow<T>*>(aux)
+  const SplatRow<T>* splats = sizeof(T) == 4 ? static_cast<const SplatRow<T>*>(aux.data)
                                              : pack_rows(in, allocate_rows<T>(in.n_rows, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, absgrad);
   const TileMemory<T> memory(in, workspace);
@@ -260,10 +265,11 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
 }
 
 #define BLITZGS_INSTANTIATE(T)                                                                             \
-  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, std::int64_t, void*, \
-                                 Workspace&, CudaStream);                                                  \
+  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, void*, Workspace&,   \
+                                 CudaStream);                                                              \
   template void rasterize_bwd<T>(const RasterizeInput<T>&, const RasterizeSaved<T>&, std::int64_t,         \
-                                 const void*, bool, const RasterizeGradients<T>&, Workspace&, CudaStream);
+                                 const RasterizeAux&, bool, const RasterizeGradients<T>&, Workspace&,      \
+                                 CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)
 #undef BLITZGS_INSTANTIATE

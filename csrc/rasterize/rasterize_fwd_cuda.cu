@@ -19,6 +19,7 @@ struct ForwardArguments {
   TileGrid grid;
   TileOrder order;
   RasterizeOutput<float> out;
+  std::int64_t quads, quads_per_block;  // of out.row_gradients, to be zeroed on the way
 };
 
 __device__ __forceinline__ PackedRow pack_row(const RasterizeInput<float>& in, std::int64_t i) {
@@ -145,6 +146,18 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
 template <int TILE>
 inline constexpr int kForwardBatch = TILE == 8 ? 64 : 256;
 
+// At most so many 16-byte stores of zeros a thread; where tiles are too few for that, they are no help.
+constexpr int kMostZeros = 16;
+
+// This block's share of the zeros that backward starts from. Compositing waits for instructions, not for
+// memory, so the stores cost next to nothing; they ask for no room in the L2 cache, which the rows need.
+__device__ __forceinline__ void zero_share(const ForwardArguments& args, int threads) {
+  auto* quads = reinterpret_cast<float4*>(args.out.row_gradients);
+  const std::int64_t begin = blockIdx.x * args.quads_per_block;
+  const std::int64_t end = min(begin + args.quads_per_block, args.quads);
+  for (std::int64_t i = begin + threadIdx.x; i < end; i += threads) __stcs(quads + i, float4{});
+}
+
 // The first blocks are the owned tiles; the rest, if wanted, write zeros.
 template <int TILE, int CHANNELS>
 __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
@@ -154,6 +167,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
   auto& batch = *reinterpret_cast<EntryBatch<TILE, kBatch>*>(shared_bytes);
   __shared__ int tile_work;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
+  zero_share(args, TILE * TILE);
   const int block = static_cast<int>(blockIdx.x), owned = args.order.n_tiles;
   const std::int64_t index = block < owned                          ? args.order.tile(block)
                              : block - owned < args.grid.tile_begin ? block - owned
@@ -210,9 +224,14 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
 }
 
 template <int TILE>
-void launch_forward(const ForwardArguments& args, CudaStream stream) {
+void launch_forward(ForwardArguments args, CudaStream stream) {
   const auto tiles = static_cast<unsigned>(args.out.clear_rest ? args.grid.count() : args.order.n_tiles);
+  if (args.quads > tiles * std::int64_t{kMostZeros * TILE * TILE}) {
+    check(cudaMemsetAsync(args.out.row_gradients, 0, args.quads * sizeof(float4), stream), "rasterize_fwd");
+    args.quads = 0;
+  }
   if (tiles == 0) return;
+  args.quads_per_block = (args.quads + tiles - 1) / tiles;
   const auto kernel = args.chunk.count == 4 ? forward_kernel<TILE, 4> : forward_kernel<TILE, 3>;
   constexpr int kBytes = sizeof(EntryBatch<TILE, kForwardBatch<TILE>>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_fwd");
@@ -222,16 +241,27 @@ void launch_forward(const ForwardArguments& args, CudaStream stream) {
 
 }  // namespace
 
-std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, std::int64_t, int n_channels) {
-  return n_rows * static_cast<std::int64_t>(sizeof(PackedRow) + (n_channels <= 4 ? sizeof(float4) : 0));
+std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, int n_channels) {
+  return aux_order_begin(n_rows, n_channels) + TileOrder::bytes(grid);
+}
+
+bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes) {
+  const std::int64_t begin = aux_order_begin(n_rows, n_channels);
+  return bytes >= begin && TileOrder::covers(bytes - begin, grid);
 }
 
 template <>
-void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out, std::int64_t,
-                          void* aux, Workspace& workspace, CudaStream stream) {
-  if (in.grid.count() == 0) return;
+void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out, void* aux,
+                          Workspace&, CudaStream stream) {
+  const std::int64_t quads = out.row_gradients ? in.n_rows * (kPackedGradient / 4) : 0;
+  if (in.grid.count() == 0) {
+    if (quads) check(cudaMemsetAsync(out.row_gradients, 0, quads * sizeof(float4), stream), "rasterize_fwd");
+    return;
+  }
   float4* colors = in.n_channels <= 4 ? const_cast<float4*>(aux_colors(aux, in.n_rows)) : nullptr;
-  const TileOrder order(in.grid, workspace, stream);
+  const TileOrder order(in.grid, static_cast<char*>(aux) + aux_order_begin(in.n_rows, in.n_channels),
+                        TileOrder::bytes(in.grid));
+  order.clear(stream);
   const unsigned blocks = blocks_for(in.n_rows, kPackThreads) + blocks_for(order.unordered(), kPackThreads);
   if (blocks > 0) {
     prepare_kernel<<<blocks, kPackThreads, 0, stream>>>(in, static_cast<PackedRow*>(aux), colors, order);
@@ -242,7 +272,8 @@ void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput
         aux_rows(aux),   {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},
         in.backgrounds,  in.isect_rows,
         in.tile_offsets, in.grid,
-        order,           out};
+        order,           out,
+        quads,           0};
     if (in.grid.tile_size == 8) {
       launch_forward<8>(args, stream);
     } else if (in.grid.tile_size == 16) {

@@ -10,6 +10,13 @@
 namespace blitzgs {
 namespace {
 
+// Whether gradients of rows can be left packed.
+#ifdef BLITZGS_BACKEND_CUDA
+constexpr bool kPacked = true;
+#else
+constexpr bool kPacked = false;
+#endif
+
 // The arguments that forward and backward share, checked and contiguous.
 struct Splats {
   Splats(const char* op, const Tensor& means2d_in, const Tensor& conics_in, const Tensor& opacities_in,
@@ -67,34 +74,35 @@ struct Splats {
   std::optional<Tensor> backgrounds;
 };
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
     std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t tile_begin, std::int64_t tile_end, const std::optional<Tensor>&, bool clear_rest) {
+    std::int64_t tile_begin, std::int64_t tile_end, const std::optional<Tensor>&, bool clear_rest,
+    bool backward_follows) {
   constexpr const char* kOp = "rasterize_fwd";
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid);
-  const std::int64_t n_isects = splats.isect_rows.size(0);
   Tensor renders = make_empty(splats.means2d, {n_cameras, height, width, splats.n_channels});
   Tensor transmittances = make_empty(splats.means2d, {n_cameras, height, width});
   Tensor last_ids = make_empty(splats.means2d, {n_cameras, height, width}, ScalarType::Int);
   Tensor tile_work = make_empty(splats.means2d, {grid.count()}, ScalarType::Int);
   Tensor aux = make_empty(
       splats.means2d,
-      {backend::rasterize_aux_bytes(grid, splats.n_rows, n_isects, static_cast<int>(splats.n_channels))},
+      {backend::rasterize_aux_bytes(grid, splats.n_rows, static_cast<int>(splats.n_channels))},
       ScalarType::Byte);
+  const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
+  Tensor row_gradients = make_empty(splats.means2d, {packed ? splats.n_rows : 0, kPackedGradient});
   DeviceScope scope(splats.means2d);
   dispatch_floating(splats.means2d, [&](auto zero) {
     using T = decltype(zero);
     const RasterizeOutput<T> out{mutable_data<T>(renders), mutable_data<T>(transmittances),
                                  mutable_data<std::int32_t>(last_ids), mutable_data<std::int32_t>(tile_work),
-                                 clear_rest};
-    backend::rasterize_fwd(splats.input<T>(), out, n_isects, mutable_data<void>(aux), scope.workspace,
-                           scope.stream);
+                                 packed ? mutable_data<T>(row_gradients) : nullptr, clear_rest};
+    backend::rasterize_fwd(splats.input<T>(), out, mutable_data<void>(aux), scope.workspace, scope.stream);
   });
-  return {renders, transmittances, last_ids, tile_work, aux};
+  return {renders, transmittances, last_ids, tile_work, aux, row_gradients};
 }
 
 // The arguments that the backward ops share, checked and contiguous.
@@ -122,12 +130,15 @@ struct Composited {
       check_dtype(op, "v_alphas", *v_alphas_in, dtype);
       v_alphas = as_contiguous(*v_alphas_in);
     }
-    check_shape(op, "aux", aux,
-                {backend::rasterize_aux_bytes(splats.grid, splats.n_rows, splats.isect_rows.size(0),
-                                              static_cast<int>(splats.n_channels))});
-    STD_TORCH_CHECK(reinterpret_cast<std::uintptr_t>(aux.const_data_ptr()) % 64 == 0, "blitzgs::", op,
-                    ": aux must be 64-byte aligned, as rasterize_fwd returned it");
+    check_shape(op, "aux", aux, {-1});
+    STD_TORCH_CHECK(backend::rasterize_aux_fits(splats.grid, splats.n_rows,
+                                                static_cast<int>(splats.n_channels), aux.size(0)) &&
+                        reinterpret_cast<std::uintptr_t>(aux.const_data_ptr()) % 64 == 0,
+                    "blitzgs::", op, ": aux must be as rasterize_fwd returned it for these tiles or more, got ",
+                    aux.size(0), " bytes");
   }
+
+  RasterizeAux own() const { return {data<void>(aux), aux.size(0)}; }
 
   template <class T>
   RasterizeSaved<T> saved() const {
@@ -165,21 +176,20 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
                                           mutable_data<T>(v_opacities), mutable_data<T>(v_colors),
                                           absgrad ? mutable_data<T>(v_means2d_abs) : nullptr};
     backend::rasterize_bwd(splats.input<T>(), composited.saved<T>(), splats.isect_rows.size(0),
-                           data<void>(composited.aux), deterministic, gradients, scope.workspace,
-                           scope.stream);
+                           composited.own(), deterministic, gradients, scope.workspace, scope.stream);
   });
   return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
 }
 
 #ifdef BLITZGS_BACKEND_CUDA
-Tensor rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
-                            const Tensor& colors, const std::optional<Tensor>& backgrounds,
-                            const Tensor& isect_rows, const Tensor& tile_offsets, const Tensor& renders,
-                            const Tensor& transmittances, const Tensor& last_ids, const Tensor& aux,
-                            const Tensor& v_renders, std::int64_t n_cameras, std::int64_t width,
-                            std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
-                            std::int64_t tile_end, bool deterministic) {
-  constexpr const char* kOp = "rasterize_bwd_packed";
+void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
+                          const Tensor& colors, const std::optional<Tensor>& backgrounds,
+                          const Tensor& isect_rows, const Tensor& tile_offsets, const Tensor& renders,
+                          const Tensor& transmittances, const Tensor& last_ids, const Tensor& aux,
+                          const Tensor& v_renders, std::int64_t n_cameras, std::int64_t width,
+                          std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
+                          std::int64_t tile_end, bool deterministic, Tensor packed) {
+  constexpr const char* kOp = "rasterize_bwd_packed_";
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid);
@@ -187,12 +197,13 @@ Tensor rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const T
                   splats.n_channels);
   const Composited composited(kOp, splats, renders, transmittances, last_ids, aux, v_renders, std::nullopt,
                               width, height);
-  Tensor packed = make_empty(splats.means2d, {splats.n_rows, kPackedGradient});
+  check_shape(kOp, "packed", packed, {splats.n_rows, kPackedGradient});
+  check_dtype(kOp, "packed", packed, ScalarType::Float);
+  STD_TORCH_CHECK(packed.is_contiguous(), "blitzgs::", kOp, ": packed must be contiguous");
   DeviceScope scope(splats.means2d);
   cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_rows.size(0),
-                             data<void>(composited.aux), deterministic, mutable_data<float>(packed),
-                             scope.workspace, scope.stream);
-  return packed;
+                             composited.own(), deterministic, mutable_data<float>(packed), scope.workspace,
+                             scope.stream);
 }
 #endif
 
@@ -203,6 +214,6 @@ BLITZGS_REGISTER(m) {
   m.impl("rasterize_fwd", TORCH_BOX(&blitzgs::rasterize_fwd));
   m.impl("rasterize_bwd", TORCH_BOX(&blitzgs::rasterize_bwd));
 #ifdef BLITZGS_BACKEND_CUDA
-  m.impl("rasterize_bwd_packed", TORCH_BOX(&blitzgs::rasterize_bwd_packed));
+  m.impl("rasterize_bwd_packed_", TORCH_BOX(&blitzgs::rasterize_bwd_packed));
 #endif
 }

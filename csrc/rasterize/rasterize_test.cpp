@@ -58,8 +58,8 @@ struct Scene {
 
   // The sum of all colours of the image.
   double render() {
-    cpu::rasterize_fwd(input(), {renders.data(), rest.data(), last.data(), work.data()},
-                       static_cast<std::int64_t>(rows.size()), nullptr, workspace, nullptr);
+    cpu::rasterize_fwd(input(), {renders.data(), rest.data(), last.data(), work.data()}, nullptr, workspace,
+                       nullptr);
     double sum = 0;
     for (const T value : renders) sum += value;
     return sum;
@@ -97,7 +97,7 @@ TEST_CASE("the gradient predicts a small step") {
   std::vector<double> v_means(4), v_conics(6), v_opacities(2), v_colors(6), v_abs(4);
   cpu::rasterize_bwd<double>(
       scene.input(), {scene.renders.data(), scene.rest.data(), scene.last.data(), ones.data(), nullptr},
-      static_cast<std::int64_t>(scene.rows.size()), nullptr, true,
+      static_cast<std::int64_t>(scene.rows.size()), {}, true,
       {v_means.data(), v_conics.data(), v_opacities.data(), v_colors.data(), v_abs.data()}, scene.workspace,
       nullptr);
   const auto slope = [&scene](double& value) {

@@ -2,7 +2,8 @@
 // In which order a launch takes its tiles. Blocks start in the order of their numbers, and the last to start
 // should be short, so that no multiprocessor is left with a long list when the others are done. Images end
 // with their near, sparse rows; but a rank's share of the tiles may end with the far rows of a view, so there
-// long lists come first. Which tile comes when changes no pixel.
+// long lists come first. Which tile comes when changes no pixel. The order is made once: forward leaves it for
+// backward, which may differentiate fewer tiles than were composited.
 #pragma once
 #include <cstdint>
 
@@ -12,25 +13,41 @@
 
 namespace blitzgs::cuda {
 
-inline constexpr int kOrderThreads = 256;
 // By the power of two below their length; the first class has the longest lists, the last the empty ones.
 inline constexpr int kLengthClasses = 16;
 
-// The owned tiles by class: how many each class has, and which, in any order, n_tiles places for each. Null
-// where all tiles are owned, which come one after the other.
+// The composited tiles by class: how many each class has, and which, in any order, n_tiles places for each.
+// Null where all tiles are composited, which come one after the other.
 struct TileOrder {
   std::int32_t* counts = nullptr;  // [kLengthClasses], 16-byte aligned
   std::int32_t* tiles = nullptr;   // [kLengthClasses, n_tiles]
   std::int64_t first;
   int n_tiles;
 
-  // Before any tile was noted.
-  TileOrder(const TileGrid& grid, Workspace& workspace, CudaStream stream)
+  // Memory for the order of a grid's tiles.
+  static std::int64_t bytes(const TileGrid& grid) {
+    const std::int64_t n = grid.tile_end - grid.tile_begin;
+    return n == grid.count() ? 0 : (1 + n) * kBytesPerTile;
+  }
+
+  // Whether `bytes` of memory can be the order of a grid that has all the tiles of this one.
+  static bool covers(std::int64_t bytes, const TileGrid& grid) {
+    return bytes == 0 ||
+           (bytes % kBytesPerTile == 0 && bytes >= (1 + grid.tile_end - grid.tile_begin) * kBytesPerTile);
+  }
+
+  // In memory of so many bytes: of the tiles of `grid`, or of a grid that has them all.
+  TileOrder(const TileGrid& grid, void* memory, std::int64_t bytes)
       : first(grid.tile_begin), n_tiles(static_cast<int>(grid.tile_end - grid.tile_begin)) {
-    if (n_tiles == grid.count()) return;
-    counts = workspace.allocate<std::int32_t>(kLengthClasses * (std::int64_t{1} + n_tiles));
+    if (bytes == 0) return;
+    counts = static_cast<std::int32_t*>(memory);
     tiles = counts + kLengthClasses;
-    check(cudaMemsetAsync(counts, 0, kLengthClasses * sizeof(*counts), stream), "tile_order");
+    n_tiles = static_cast<int>(bytes / kBytesPerTile - 1);
+  }
+
+  // Before any tile is noted.
+  void clear(CudaStream stream) const {
+    if (counts) check(cudaMemsetAsync(counts, 0, kLengthClasses * sizeof(*counts), stream), "tile_order");
   }
 
   // Notes tile number `local` of the owned ones; the whole warp takes part. Counts are zero at first.
@@ -72,6 +89,9 @@ struct TileOrder {
     }
     return 0;  // not reached: the counts add up to n_tiles
   }
+
+ private:
+  static constexpr std::int64_t kBytesPerTile = kLengthClasses * sizeof(std::int32_t);
 };
 
 }  // namespace blitzgs::cuda

@@ -25,11 +25,11 @@ class Job:
         moved = [t.to(device, dtype) for t in (*self.splats, self.backgrounds)]
         return [*moved, *(t.to(device) for t in self.lists)]
 
-    def forward(self, device, dtype=torch.float32):
-        return ops.rasterize_fwd(*self.inputs(device, dtype), *self.grid)
+    def forward(self, device, dtype=torch.float32, backward_follows=False):
+        return ops.rasterize_fwd(*self.inputs(device, dtype), *self.grid, None, True, backward_follows)
 
     def backward(self, device, dtype, saved, v_renders, v_alphas, absgrad, deterministic):
-        renders, rest, last, _, aux = saved
+        renders, rest, last, _, aux, _ = saved
         v = [t.to(device, dtype) for t in (v_renders, v_alphas)]
         return ops.rasterize_bwd(
             *self.inputs(device, dtype), renders, rest, last, aux, *v, *self.grid, absgrad, deterministic
@@ -78,21 +78,39 @@ def test_gradients_match_float64(scene, channels, tile_size, deterministic, absg
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_packed_gradients_are_the_same(scene, channels):
     job = Job(scene, channels)
-    renders, rest, last, _, aux = saved = job.forward("cuda")
+    renders, rest, last, _, aux, room = saved = job.forward("cuda", backward_follows=True)
+    assert room.shape == (len(job.splats[0]), 12) and not room.any()
     v_renders = torch.randn(renders.shape, generator=torch.Generator().manual_seed(7)).cuda()
     none = torch.zeros_like(rest)
     *columns, _ = job.backward("cuda", torch.float32, saved, v_renders, none, False, True)
     arguments = *job.inputs("cuda", torch.float32), renders, rest, last, aux, v_renders, *job.grid
-    packed = ops.rasterize_bwd_packed(*arguments, True)
-    assert torch.equal(packed[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
+    ops.rasterize_bwd_packed_(*arguments, True, room)
+    assert torch.equal(room[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
+
+
+@pytest.mark.parametrize("rows", [0, 1, 1000, 300_000])
+@pytest.mark.parametrize("begin,end", [(0, -1), (3, 9), (5, 5)])
+def test_backward_finds_zeros(rows, begin, end):
+    """For few rows and many, some tiles and none: whoever writes them."""
+    job = Job(Scene(4, views=1, width=90, height=50), 3, 16, begin, end)
+    job.splats = [torch.zeros(rows, 2), torch.ones(rows, 3), torch.ones(rows), torch.ones(rows, 3)]
+    job.lists = [torch.zeros(0, dtype=torch.int32), torch.zeros(25, dtype=torch.int64)]
+    torch.full((rows, 12), float("nan"), device="cuda")  # what the room would hold otherwise
+    assert len(job.forward("cuda")[5]) == 0
+    room = job.forward("cuda", backward_follows=True)[5]
+    assert room.shape == (rows, 12) and not room.any()
+
+
+def test_rows_of_many_channels_get_no_room(scene):
+    assert len(Job(scene, 9).forward("cuda", backward_follows=True)[5]) == 0
 
 
 def test_packed_gradients_have_four_channels_at_most(scene):
     job = Job(scene, 9)
-    renders, rest, last, _, aux = job.forward("cuda")
+    renders, rest, last, _, aux, room = job.forward("cuda")
     arguments = *job.inputs("cuda", torch.float32), renders, rest, last, aux, renders, *job.grid
     with pytest.raises(RuntimeError, match="1 to 4 channels, got 9"):
-        ops.rasterize_bwd_packed(*arguments, True)
+        ops.rasterize_bwd_packed_(*arguments, True, room)
 
 
 @pytest.mark.parametrize("tile_size", [8, 16, 32])
