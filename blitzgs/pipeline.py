@@ -245,7 +245,7 @@ def _forward(
         isect_rows,
         tile_offsets,
         *composited,
-        GradientRoom(splats.means2d, row_gradients),
+        GradientRoom(row_gradients),
     )
 
 
@@ -276,7 +276,7 @@ def backward_rows(
     grid = (len(views), views.width, views.height, options.tile_size, *tiles)
     returns, second = OWN_VALUES, None
     if v_renders.is_cuda:
-        packed = frame.room.take()
+        packed = frame.room.take(splats.means2d)
         torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, *grid, options.deterministic, packed)
         mark("raster back")
         if frame.route is not None and in_parts and frame.route.pays_in_parts:

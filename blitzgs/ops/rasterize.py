@@ -22,20 +22,16 @@ class GradientRoom:
     They are good for one backward pass; later ones get zeros of their own.
     """
 
-    def __init__(self, means2d: Tensor, zeros: Tensor) -> None:
-        """Keep the zeros.
+    def __init__(self, zeros: Tensor) -> None:
+        """Keep the zeros: [P, 12], the last output of `rasterize_fwd`, or none, [0, 12]."""
+        self._zeros: Tensor | None = zeros
 
-        Args:
-            means2d: of the P rows.
-            zeros: the last output of `rasterize_fwd`: [P, 12], or [0, 12] where no backward pass was foreseen.
-        """
-        self._means2d = means2d
-        self._zeros = zeros if len(zeros) == len(means2d) else None
-
-    def take(self) -> Tensor:
-        """Return zeros [P, 12]."""
+    def take(self, means2d: Tensor) -> Tensor:
+        """Return zeros [P, 12] for the P rows."""
         zeros, self._zeros = self._zeros, None
-        return self._means2d.new_zeros(len(self._means2d), _PACKED) if zeros is None else zeros
+        if zeros is None or len(zeros) < len(means2d):
+            return means2d.new_zeros(len(means2d), _PACKED)
+        return zeros
 
 
 def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -202,7 +198,7 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
 def _save(ctx: Any, splats: Any, grid: Any, means2d_abs: Tensor | None, output: tuple[Tensor, ...]) -> None:
     renders, transmittances, last_ids, _, aux, row_gradients = output
     ctx.set_materialize_grads(False)
-    ctx.room = GradientRoom(splats[0], row_gradients)
+    ctx.room = GradientRoom(row_gradients)
     ctx.save_for_backward(*splats, renders, transmittances, last_ids, aux)
     ctx.grid = grid
     ctx.absgrad = means2d_abs is not None and means2d_abs.requires_grad
@@ -233,7 +229,7 @@ def _gradients(
     v_abs = v_backgrounds = None
     v_splats: Sequence[Tensor]
     if may_pack and renders.is_cuda and renders.shape[-1] == 3 and v_alphas is None and not ctx.absgrad:
-        packed = ctx.room.take()
+        packed = ctx.room.take(splats[0])
         torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, *ctx.grid, deterministic, packed)
         v_splats = gradient_columns(packed)
     else:

@@ -32,7 +32,7 @@ def forward(splats, n_cameras=1, tile_size=16, backgrounds=None, tile_begin=0, t
 def backward(
     splats, outputs, v_renders, v_alphas=None, n_cameras=1, backgrounds=None, absgrad=True, tiles=(0, -1)
 ):
-    renders, transmittances, last_ids, _, aux = outputs
+    renders, transmittances, last_ids, _, aux, _ = outputs
     return torch.ops.blitzgs.rasterize_bwd(
         *splats.values(), backgrounds, *lists(splats, n_cameras), renders, transmittances, last_ids, aux,
         v_renders, v_alphas, n_cameras, WIDTH, HEIGHT, 16, *tiles, absgrad, True,
@@ -319,7 +319,7 @@ def test_a_row_that_is_not_finite_leaves_the_others_alone():
 
 
 def backward_with(splats, tile_lists, outputs):
-    renders, transmittances, last_ids, _, aux = outputs
+    renders, transmittances, last_ids, _, aux, _ = outputs
     return torch.ops.blitzgs.rasterize_bwd(
         *splats.values(), None, *tile_lists, renders, transmittances, last_ids, aux, torch.ones_like(renders),
         None, 1, WIDTH, HEIGHT, 16, 0, -1, True, True,
@@ -349,7 +349,7 @@ def test_opcheck(absgrad):
     torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, arguments)
     with torch.no_grad():
         outputs = forward(splats)
-        renders, transmittances, last_ids, _, aux = outputs
+        renders, transmittances, last_ids, _, aux, _ = outputs
         torch.library.opcheck(
             torch.ops.blitzgs.rasterize_bwd,
             (*(t.detach() for t in values), None, *tile_lists, renders, transmittances, last_ids, aux,
