@@ -139,7 +139,7 @@ class GsplatStep:
         """Take one step."""
         image = self.render.forward()
         mark("render")
-        v_image = photometric_fwd_bwd(image.detach(), self.batch.targets, None, *self.weights)[2]
+        v_image = photometric_fwd_bwd(image.detach(), self.batch.targets, None, *self.weights)[1]
         mark("loss")
         self.optimiser.zero_grad(set_to_none=True)
         image.backward(v_image)

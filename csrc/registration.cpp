@@ -118,9 +118,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int tile_size, int tile_begin, int tile_end) -> Tensor v_renders");
   m.def(
       "photometric_fwd_bwd(Tensor renders, Tensor targets, Tensor? masks, Tensor l1_weights, "
-      "Tensor ssim_weights, int tile_size, int tile_begin, int tile_end) -> (Tensor l1_sums, Tensor "
-      "ssim_sums, "
-      "Tensor v_renders)");
+      "Tensor ssim_weights, int tile_size, int tile_begin, int tile_end, Tensor? samples=None, "
+      "Tensor? visible=None, float scale_weight=0.0) -> (Tensor parts, Tensor v_renders, Tensor scale_reg)");
+  m.def(
+      "report_(Tensor? parts, Tensor? tile_work, int tile_begin, int tile_end, int rank, int n_ranks, "
+      "Tensor(a!)[] targets) -> ()");
 
   // The optimiser: dense Adam over an index list, and its statistics for density control.
   m.def(

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileRanges
+from blitzgs.distributed.peers import SECOND
 from blitzgs.distributed.rows import PeerSpace, Splats, Traffic
 from blitzgs.ops.route import route_count
 from blitzgs.ops.scatter import (
@@ -230,7 +231,7 @@ def send_back_in_parts(packed: Tensor, route: Route) -> tuple[Tensor, Returns, S
     met = main.record_event()
     with torch.cuda.stream(second):
         space.write_back(packed, route.fronts, back=True)
-        peers.meet_apart()
+        peers.meet_apart(SECOND)
         second.wait_event(met)  # some rows that are read there came with the first part
     first = int(FIRST_PART * int(route.traffic.counts[0]))
     return returned, _returns(route), SecondPart(first, second, packed)

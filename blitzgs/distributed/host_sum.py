@@ -1,51 +1,85 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers that only the host reads, later: added up over the ranks without holding up the step."""
+"""Numbers that only the host reads, later: gathered from the ranks without holding up the step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.peers import BESIDE
+from blitzgs.ops.report import report_
 
 
 class HostSum:
-    """The sum of a tensor over all ranks, on its way to the host. Collective.
+    """The loss's sums over all ranks and what every rank's tiles cost, on their way to the host. Collective.
 
     On CUDA everything happens on a stream beside the step's, after what was queued so far; only `read`
-    waits. On the CPU the sum is there at once.
+    waits. Ranks that share memory write to one another, others add up by a collective. On the CPU the sum is
+    there at once.
     """
 
-    def __init__(self, make: Callable[[], Tensor], inputs: Sequence[Tensor], ranks: Ranks) -> None:
-        """Start to add up.
+    def __init__(
+        self,
+        ranks: Ranks,
+        parts: Tensor | None = None,
+        tile_work: Tensor | None = None,
+        tiles: tuple[int, int] = (0, 0),
+    ) -> None:
+        """Start to gather.
 
         Args:
-            make: computes this rank's summand, a new tensor on `ranks.device`, from `inputs`.
-            inputs: what it reads; kept from being overwritten until then.
             ranks: the job.
+            parts: float64 [B, K, 2], sums of this rank's loss in parts (`photometric_fwd_bwd`); None: none.
+            tile_work: int32 [T], list entries each tile went through; None: none.
+            tiles: those of this rank, [first, one past last).
         """
         self._ranks = ranks
+        self._sums = 0 if parts is None else 2 * len(parts)
         self._copied: torch.cuda.Event | None = None
+        words = ranks.world_size * self._sums + (0 if tile_work is None else len(tile_work))
         stream = ranks.side_stream()
         if stream is None:
-            self._value = ranks.all_reduce(make())
+            value = torch.zeros(words)
+            report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [value])
+            self._value = self._folded(ranks.all_reduce(value))
             return
         stream.wait_stream(torch.cuda.current_stream(ranks.device))
         with torch.cuda.stream(stream):
-            total = ranks.all_reduce(make())
-            self._value = torch.empty(total.shape, dtype=total.dtype, pin_memory=True)
+            if ranks.peers is not None:
+                boards = ranks.reading(partial(ranks.peers.boards, words))
+                report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, boards)
+                ranks.peers.meet_apart(BESIDE)
+                total = boards[ranks.rank]
+            else:
+                new = torch.empty if ranks.world_size == 1 else torch.zeros
+                total = new(words, device=ranks.device)
+                report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [total])
+                ranks.all_reduce(total)
+            self._value = torch.empty(words, pin_memory=True)
             self._value.copy_(total, non_blocking=True)
             self._copied = torch.cuda.Event()
             self._copied.record(stream)
-        for tensor in inputs:
-            tensor.record_stream(stream)
+        for tensor in (parts, tile_work):
+            if tensor is not None:
+                tensor.record_stream(stream)
 
     def read(self) -> Tensor:
-        """Return the sum, on the CPU, the same bits on every rank; waits for it the first time."""
+        """Return the sums, float32 on the CPU, the same bits on every rank; waits for them the first time.
+
+        The B views' sums of |render - photograph|, those of the SSIM map, the T tiles' work.
+        """
         if self._copied is not None:
             self._ranks.wait(self._copied)
             self._copied = None
-            self._value = self._value.clone()  # the pinned memory serves the next one
+            self._value = self._folded(self._value)  # the pinned memory serves the next one
         return self._value
+
+    def _folded(self, value: Tensor) -> Tensor:
+        """Add up the sums of the ranks, in their order; a copy."""
+        numbers, end = value.numpy(), self._ranks.world_size * self._sums
+        total = numbers[:end].reshape(self._ranks.world_size, self._sums).sum(0)
+        return torch.from_numpy(np.concatenate((total, numbers[end:])))

@@ -156,7 +156,7 @@ class TileOwners:
         keys: Sequence[Hashable],
         tile_work: Tensor,
         ranges: TileRanges,
-        values: Sequence[Tensor] = (),
+        parts: Tensor | None = None,
     ) -> HostSum:
         """Remember what the tiles of a batch cost. Collective; waits for nothing.
 
@@ -164,23 +164,13 @@ class TileOwners:
             keys: the B views.
             tile_work: int32 [B * T], list entries each composited tile went through.
             ranges: who owns which tiles; each tile counts at its owner.
-            values: float32 [n] each, more to add up over the ranks on this occasion.
+            parts: float64 [B, K, 2], sums of this rank's loss, to be gathered on this occasion.
 
         Returns:
-            The sums, float32: those of all `values`, one after the other, then the tiles' work.
+            The sums; see `HostSum.read`.
         """
-        begin, end = ranges.of(self.ranks.rank)
-        first = sum(len(value) for value in values)
-
-        def summand() -> Tensor:
-            flat = torch.zeros(first + len(tile_work), device=tile_work.device)
-            if values:
-                torch.cat(tuple(values), out=flat[:first])
-            flat[first + begin : first + end] = tile_work[begin:end]
-            return flat
-
-        sums = HostSum(summand, (*values, tile_work), self.ranks)
-        tiles = ranges.tiles_per_view
+        sums = HostSum(self.ranks, parts, tile_work, ranges.of(self.ranks.rank))
+        tiles, first = ranges.tiles_per_view, 0 if parts is None else 2 * len(parts)
         for view, key in enumerate(keys):
             self._costs[key] = (sums, first + view * tiles, first + (view + 1) * tiles)
         return sums

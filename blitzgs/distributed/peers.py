@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory that the ranks of one host share: a rank writes rows straight to where another needs them.
 
-Each rank owns two buffers that all others have mapped (NVLink or PCIe peer access). `mail` is small: the
+Each rank owns buffers that all others have mapped (NVLink or PCIe peer access). `mail` is small: the
 number of the last meeting each rank came to, and the numbers it brought. `rows` is large and grows: first the
 rows that arrive for this rank's tiles, column by column, so that intersection and compositing read them where
-they lie; behind them the gradients that come back for the rows this rank sent.
+they lie; behind them the gradients that come back for the rows this rank sent. `board` is for what ranks tell
+each other's hosts, and has a stream and meetings of its own beside the step.
 
 A step is, in stream order on every rank: meeting A with the counts, rows written to the others, meeting B
 with where their groups are cut, compositing and its gradient, gradients written to the others, meeting C,
@@ -19,7 +20,8 @@ streams: work queued behind it, on any rank, finds done what any rank queued bef
   before its own A;
 - returning gradients are written after A and B, and those of the step before were read before A;
 - the numbers that ranks bring to a meeting are read before the next that has numbers, and overwritten at the
-  one after that: there are two places for them, used in turn.
+  one after that: there are two places for them, used in turn. So it is with the board and the meetings beside
+  the step: what a rank copies from it behind one of them it has copied before it comes to the next.
 
 Rows are queued for writing behind A while the counts are on their way to the host. Where they do not fit into
 somebody's buffer no rank writes any, which each finds from the same counts; then all wait for the counts, so
@@ -49,6 +51,9 @@ MAX_VALUES = 256
 # Buffers grow to this many times what is needed, so that they seldom do.
 HEADROOM = 1.25
 _LEAST_WORDS = 1 << 20
+_LEAST_BOARD = 1 << 16
+# Streams whose meetings count by themselves: that of the second part of gradients, that of what hosts tell.
+SECOND, BESIDE = 0, 1
 
 
 class Shared(NamedTuple):
@@ -66,8 +71,8 @@ class Shared(NamedTuple):
 
 
 def mail_words(world_size: int) -> int:
-    """Length of a rank's mail, int64."""
-    return 2 * world_size + 2 * MAX_VALUES * (world_size + 1)
+    """Length of a rank's mail, int64: last meetings, numbers and their sums, last meetings of two streams."""
+    return world_size + 2 * MAX_VALUES * (world_size + 1) + 2 * world_size
 
 
 class Peers:
@@ -96,8 +101,14 @@ class Peers:
         self._shared = 0  # how many of them had numbers
         self._handles: dict[str, Any] = {}  # the mappings live as long as these
         self._mail = self._map("mail", mail)
-        self._apart, self._meetings_apart = [letters[-self.world_size :] for letters in self._mail], 0
+        first = len(mail) - 2 * self.world_size
+        self._apart = [
+            [letters[begin : begin + self.world_size] for letters in self._mail]
+            for begin in (first, first + self.world_size)
+        ]
+        self._meetings_apart = [0, 0]
         self._known = torch.empty(2, MAX_VALUES * self.world_size, dtype=torch.int64, pin_memory=mail.is_cuda)
+        self._boards: list[Tensor] = []
 
     def _map(self, name: str, mine: Tensor) -> list[Tensor]:
         """Map every rank's counterpart of a symmetric tensor; collective."""
@@ -111,11 +122,12 @@ class Peers:
         """Meet the other ranks, in stream order."""
         self._meet(None, self.world_size, None)
 
-    def meet_apart(self) -> None:
-        """Meet the other ranks on the second stream, whatever meetings the first one is at."""
-        self._meetings_apart += 1
+    def meet_apart(self, stream: int) -> None:
+        """Meet the other ranks on a stream `SECOND` or `BESIDE`, whatever meetings others are at."""
+        self._meetings_apart[stream] += 1
+        number = self._meetings_apart[stream]
         torch.ops.blitzgs.meet_peers_(
-            self._apart, self.rank, self._meetings_apart, None, self.world_size, self.timeout_seconds
+            self._apart[stream], self.rank, number, None, self.world_size, self.timeout_seconds
         )
 
     def share(self, values: Tensor) -> Shared:
@@ -133,6 +145,21 @@ class Peers:
         self._meet(values, first, known)
         brought = self._mail[self.rank][first : first + (count + 1) * numbers].view(count + 1, numbers)
         return Shared(brought[:count], brought[count], known)
+
+    def boards(self, words: int) -> list[Tensor]:
+        """Return every rank's board, float32 [words], for the next meeting beside the step. Collective.
+
+        What is written there before that meeting is to be copied, on the same stream, before the one after.
+        """
+        if not self._boards or len(self._boards[0]) < 2 * words:
+            # Behind its last meeting nobody writes to this rank's board any more.
+            torch.cuda.current_stream(self.device).synchronize()
+            self._boards = []
+            mine = symmetric.empty(2 * max(words, _LEAST_BOARD), dtype=torch.float32, device=self.device)
+            torch.cuda.current_stream(self.device).synchronize()
+            self._boards = self._map("board", mine)
+        begin = self._meetings_apart[BESIDE] % 2 * (len(self._boards[0]) // 2)
+        return [board[begin : begin + words] for board in self._boards]
 
     def _meet(self, values: Tensor | None, first: int, known: Tensor | None) -> None:
         self._meetings += 1

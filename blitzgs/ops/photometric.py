@@ -97,13 +97,18 @@ def photometric_fwd_bwd(
     tile_size: int = 16,
     tile_begin: int = 0,
     tile_end: int = -1,
+    *,
+    samples: Tensor | None = None,
+    visible: Tensor | None = None,
+    scale_weight: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return `photometric_sums` and the gradient of their weighted total in one go, without autograd.
 
-    The gradient is that of `photometric_sums`, but only the owned pixels of it are defined.
+    The sums come in parts, which `blitzgs.ops.report` adds up: nothing in a step waits for that. The gradient
+    is that of `photometric_sums`, but only the owned pixels of it are defined.
 
-    For the loss of `photometric_loss`, summed over views: ``l1_weights = (1 - w) / counts`` and
-    ``ssim_weights = -w / counts`` with ``counts = pixel_counts(renders, masks)``.
+    For the loss of `photometric_loss`, summed over views: ``l1_weights = 1 - w``, ``ssim_weights = -w`` and
+    ``samples = pixel_counts(renders, masks)``.
 
     Args:
         renders: as in `photometric_sums`.
@@ -114,16 +119,21 @@ def photometric_fwd_bwd(
         tile_size: as in `photometric_sums`.
         tile_begin: as in `photometric_sums`.
         tile_end: as in `photometric_sums`.
+        samples: [B], what the weights are divided by, dtype of `renders`; None: 1.
+        visible: int64 [B], Gaussians that each view shows.
+        scale_weight: of the smallest axis of a Gaussian that a view shows, summed over those, in the mean.
 
     Returns:
-        (l1 sums [B], SSIM sums [B], v_renders [B, H, W, 3], undefined beyond the owned pixels).
+        (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,
+        ``scale_weight / max(visible, 1)`` [B], or [0] without `visible`).
 
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
     return torch.ops.blitzgs.photometric_fwd_bwd(
-        renders, targets, _as_bytes(masks), l1_weights, ssim_weights, tile_size, tile_begin, tile_end
-    )
+        renders, targets, _as_bytes(masks), l1_weights, ssim_weights, tile_size, tile_begin, tile_end,
+        samples, visible, scale_weight,
+    )  # fmt: skip
 
 
 def _as_bytes(masks: Tensor | None) -> Tensor | None:
@@ -141,9 +151,25 @@ def _(renders: Tensor, *_others: Any) -> Tensor:
 
 
 @torch.library.register_fake("blitzgs::photometric_fwd_bwd")
-def _(renders: Tensor, *_others: Any) -> tuple[Tensor, Tensor, Tensor]:
-    sums = renders.new_empty(renders.shape[0]), renders.new_empty(renders.shape[0])
-    return *sums, torch.empty_like(renders, memory_format=torch.contiguous_format)
+def _(
+    renders: Tensor,
+    targets: Tensor,
+    masks: Tensor | None,
+    l1_weights: Tensor,
+    ssim_weights: Tensor,
+    tile_size: int,
+    tile_begin: int,
+    tile_end: int,
+    samples: Tensor | None = None,
+    visible: Tensor | None = None,
+    scale_weight: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor]:
+    views, n_parts = renders.shape[0], torch.library.get_ctx().new_dynamic_size()
+    return (
+        renders.new_empty(views, n_parts, 2, dtype=torch.float64),
+        torch.empty_like(renders, memory_format=torch.contiguous_format),
+        renders.new_empty(0 if visible is None else views),
+    )
 
 
 def _save_inputs(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:

@@ -38,7 +38,7 @@ class LossGuard:
         Args:
             step: number of the step.
             names: of its views.
-            sums: their `LossTerms.sums` over all ranks; [2 B], and more that is not looked at.
+            sums: their `LossTerms.parts` over all ranks; [2 B], and more that is not looked at.
             table: this rank's Gaussians.
             frame: what was rendered.
 

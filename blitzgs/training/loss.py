@@ -21,14 +21,14 @@ class LossTerms(NamedTuple):
     """A batch's loss and where its gradients enter.
 
     Attributes:
-        sums: of |render - photograph| and of the SSIM map over this rank's pixels and the channels, float32
-            [B] each; see `photometric`.
+        parts: sums of |render - photograph| and of the SSIM map over this rank's pixels and the channels,
+            float64 [B, K, 2], in K parts; see `photometric`.
         v_renders: gradient of the batch's mean loss by the images, [B, H, W, 3].
         scale_reg: weight of the smallest axis of each visible Gaussian, per view [B]; None when the term is
             off.
     """
 
-    sums: tuple[Tensor, Tensor]
+    parts: Tensor
     v_renders: Tensor
     scale_reg: Tensor | None
 
@@ -50,35 +50,33 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: floa
     count, share = len(frame.views), frame.share
     if share is not None and share.ranges.reach < LOSS_REACH:
         raise ValueError(f"the loss reads {LOSS_REACH} px beyond a rank's tiles: divide them with that reach")
-    weights = _constant(((1.0 - config.ssim) / count,), (-config.ssim / count,), device=batch.samples.device)
-    l1_weights, ssim_weights = weights / batch.samples
-    l1_sums, ssim_sums, v_renders = photometric_fwd_bwd(
+    parts, v_renders, scale_reg = photometric_fwd_bwd(
         frame.renders,
         batch.targets,
         batch.masks,
-        l1_weights,
-        ssim_weights,
+        *_weights(config.ssim, count, batch.samples.device),
         frame.options.tile_size,
         *((0, -1) if share is None else share.tiles),
+        samples=batch.samples,
+        visible=frame.visible if config.scale > 0 else None,
+        scale_weight=config.scale / (length_unit * count),
     )
-    scale_reg = None
-    if config.scale > 0:
-        scale = _constant(config.scale / (length_unit * count), device=batch.samples.device)
-        scale_reg = scale / frame.visible.clamp(min=1)
-    return LossTerms((l1_sums, ssim_sums), v_renders, scale_reg)
+    return LossTerms(parts, v_renders, scale_reg if config.scale > 0 else None)
 
 
 @lru_cache(maxsize=64)
-def _constant(*values: float | tuple[float, ...], device: torch.device) -> Tensor:
-    """Numbers of a run on the device, uploaded once, float32."""
-    return torch.tensor(values if len(values) > 1 else values[0], dtype=torch.float32, device=device)
+def _weights(ssim: float, count: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Weights of each view's sums, [B] each, uploaded once."""
+    weights = torch.tensor([[(1.0 - ssim) / count], [-ssim / count]], dtype=torch.float32, device=device)
+    l1_weights, ssim_weights = weights.repeat(1, count)
+    return l1_weights, ssim_weights
 
 
 def photometric(sums: Tensor, samples: Tensor, config: LossConfig) -> Tensor:
     """Return (1 - lambda) L1 + lambda (1 - SSIM) of each view, float32 [B].
 
     Args:
-        sums: `LossTerms.sums` added up over all ranks, [2 B].
+        sums: `LossTerms.parts` added up over all ranks, [2 B]; see `HostSum.read`.
         samples: `Batch.samples`, on the device of the sums.
         config: weights.
     """

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import torch
-
 from blitzgs import pipeline
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import Share, TileOwners
@@ -61,7 +59,7 @@ class Stepper:
             mark: called with its name at the end of each stage.
 
         Returns:
-            The frame, the loss's terms, and the sums of its `LossTerms.sums` over all ranks, which
+            The frame, the loss's terms, and the sums of its `LossTerms.parts` over all ranks, which
             begin with [2 B].
         """
         table, ranks, views = self._table, self._owners.ranks, batch.views
@@ -77,10 +75,10 @@ class Stepper:
         terms = loss_terms(frame, batch, self._loss, self._length_unit)
         mark("loss")
         if batch.ranges is None:
-            sums = HostSum(lambda: torch.cat(terms.sums), terms.sums, ranks)
+            sums = HostSum(ranks, terms.parts)
         else:
             # Costs of tiles and losses travel together.
-            sums = self._owners.record(batch.indices, frame.tile_work, batch.ranges, terms.sums)
+            sums = self._owners.record(batch.indices, frame.tile_work, batch.ranges, terms.parts)
         mark("other")
         return frame, terms, sums
 

@@ -13,14 +13,16 @@
 // v_renders = d(sum_b l1_weights[b] l1[b] + ssim_weights[b] ssim[b]) / dx for the sums over ALL tiles,
 // written for the owned pixels: the owners' gradients add up to the whole. Elsewhere v_renders is zero with
 // clear_rest, otherwise zero or not written. It reads x up to 10 pixels beyond the owned tiles. The
-// derivative of |x - y| at 0 is 0.
+// derivative of |x - y| at 0 is 0. With samples [B], the weights of view b are divided by samples[b]. In
+// passing, scale_reg[b] = scale_weight / max(visible[b], 1): the weight of the training loss's other term.
 //
 // With e = mean(x) - mean(y), P = E[x^2 + y^2], Q = E[(x - y)^2] under the window, SSIM is computed as
 //   (1 - e^2 / A) (1 - V / S),  A = mean(x)^2 + mean(y)^2 + C1,
 //   V = Q - e^2 (variance of x - y),  S = P - mean(x)^2 - mean(y)^2 + C2,
 // the textbook quotient rearranged: it needs four windowed quantities rather than five and stays accurate in
 // flat regions, where var(x) + var(y) cancels. Separable windows: O(22 B H W) multiply-adds a quantity.
-// Sums are taken in double over fixed blocks in a fixed order: repeatable for any number of threads.
+// Sums are left in parts, double [B, K, 2], each a sum over a fixed block of pixels in a fixed order, zero
+// where a part has no pixel; report/report.h adds them up. Repeatable for any number of threads.
 #pragma once
 #include <cstdint>
 
@@ -40,9 +42,12 @@ struct PhotometricArgs {
   const std::uint8_t* masks;  // null: all pixels count
   const T* l1_weights;        // [B]; null: no gradient
   const T* ssim_weights;      // [B]
-  T* l1_sums;                 // [B]; null: no sums
-  T* ssim_sums;               // [B]
-  T* v_renders;               // with l1_weights
+  const T* samples;           // [B]; null: 1
+  const std::int64_t* visible;  // [B]; null: no scale_reg
+  T scale_weight;
+  T* scale_reg;   // [B]
+  double* parts;  // [B, K, 2], K of photometric_parts(); null: no sums
+  T* v_renders;   // with l1_weights
   bool clear_rest;
   std::int64_t views;
   int width, height, tile_size, tiles_x, tiles_y;
@@ -65,6 +70,18 @@ BLITZGS_HD OwnedColumns owned_columns(const PhotometricArgs<T>& args, std::int64
   const std::int64_t from = b * args.tile_size, to = e * args.tile_size;
   return {static_cast<int>(from < args.width ? from : args.width),
           static_cast<int>(to < args.width ? to : args.width)};
+}
+
+// Of a view, from l1_weights or ssim_weights.
+template <class T>
+BLITZGS_HD T weight_of(const PhotometricArgs<T>& args, const T* weights, std::int64_t view) {
+  return args.samples ? weights[view] / args.samples[view] : weights[view];
+}
+
+template <class T>
+BLITZGS_HD T scale_reg_of(const PhotometricArgs<T>& args, std::int64_t view) {
+  const std::int64_t visible = args.visible[view];
+  return args.scale_weight / static_cast<T>(visible > 1 ? visible : 1);
 }
 
 // One window: its SSIM and the derivatives by mean(x), P and Q.
@@ -104,9 +121,13 @@ BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {
 
 namespace cpu {
 template <class T>
+std::int64_t photometric_parts(const PhotometricArgs<T>& args);
+template <class T>
 void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
 }
 namespace cuda {
+template <class T>
+std::int64_t photometric_parts(const PhotometricArgs<T>& args);
 template <class T>
 void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
 }

@@ -26,12 +26,17 @@ void run_strips(const PhotometricArgs<T>& args, const std::int64_t* strips, std:
 }  // namespace
 
 template <class T>
+std::int64_t photometric_parts(const PhotometricArgs<T>& args) {
+  return (args.height + kStripRows - 1) / kStripRows;
+}
+
+template <class T>
 void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStream) {
-  const std::int64_t per_view = (args.height + kStripRows - 1) / kStripRows;
+  const std::int64_t per_view = photometric_parts(args);
   const std::int64_t total = args.views * per_view;
   const std::int64_t view_tiles = std::int64_t{args.tiles_x} * args.tiles_y;
   std::int64_t* strips = workspace.allocate<std::int64_t>(total);
-  double* sums = workspace.allocate<double>(2 * total);
+  double* sums = args.parts ? args.parts : workspace.allocate<double>(2 * total);
   std::fill_n(sums, 2 * total, 0.0);
   std::int64_t count = 0;
   for (std::int64_t strip = 0; strip < total; ++strip) {
@@ -51,18 +56,12 @@ void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStrea
   }
   parallel_for(0, count, 1,
                [&](std::int64_t begin, std::int64_t end) { run_strips(args, strips, begin, end, sums); });
-  if (!args.l1_sums) return;
-  for (std::int64_t view = 0; view < args.views; ++view) {
-    double l1 = 0, ssim = 0;
-    for (std::int64_t strip = view * per_view; strip < (view + 1) * per_view; ++strip) {
-      l1 += sums[2 * strip];
-      ssim += sums[2 * strip + 1];
-    }
-    args.l1_sums[view] = static_cast<T>(l1);
-    args.ssim_sums[view] = static_cast<T>(ssim);
-  }
+  if (!args.visible) return;
+  for (std::int64_t view = 0; view < args.views; ++view) args.scale_reg[view] = scale_reg_of(args, view);
 }
 
+template std::int64_t photometric_parts<float>(const PhotometricArgs<float>&);
+template std::int64_t photometric_parts<double>(const PhotometricArgs<double>&);
 template void photometric<float>(const PhotometricArgs<float>&, Workspace&, CudaStream);
 template void photometric<double>(const PhotometricArgs<double>&, Workspace&, CudaStream);
 

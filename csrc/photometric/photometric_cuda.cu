@@ -14,6 +14,7 @@
 #include <algorithm>
 #include <climits>
 
+#include "common/block_sum.cuh"
 #include "common/cuda_check.h"
 #include "common/multiprocessors.h"
 #include "photometric/photometric.h"
@@ -63,8 +64,8 @@ class StripWalk {
     next_ = 3 * (image_ + std::int64_t{first_row_} * args.width + pixel) + channel_;
     out_ = 3 * (image_ + std::int64_t{strip_.begin} * args.width + first_pixel_ + local_) + channel_;
     if constexpr (kGradient) {
-      ssim_weight_ = args.ssim_weights[strip_.view];
-      l1_weight_ = args.l1_weights[strip_.view];
+      ssim_weight_ = weight_of(args, args.ssim_weights, strip_.view);
+      l1_weight_ = weight_of(args, args.l1_weights, strip_.view);
       // Windows centred outside the image have no derivative.
       for (int i = threadIdx.x; i < 3 * kRows * 3 * kMidPitch; i += kThreads) {
         (&shared[0].columns[0][0][0][0])[i] = (&shared[1].columns[0][0][0][0])[i] = 0;
@@ -105,6 +106,11 @@ class StripWalk {
       }
       __syncthreads();
     }
+  }
+
+  // Where the sums go: part [blockIdx.x] of the strip's.
+  __device__ __forceinline__ std::int64_t part(const Launch& launch) const {
+    return (std::int64_t{strip_.view} * launch.view_strips + strip_.index) * gridDim.x + blockIdx.x;
   }
 
   float l1_sum = 0, ssim_sum = 0;
@@ -261,43 +267,51 @@ class StripWalk {
   float map_pending_[3][kPending] = {};
 };
 
+// Zeros the parts of the strips that there are not.
+__device__ void clear_parts(const PhotometricArgs<float>& args, const Launch& launch) {
+  const int rows = static_cast<int>(args.views) * launch.view_strips;
+  for (int i = blockIdx.y; i < rows; i += gridDim.y) {
+    if (i % launch.view_strips < strips_of(launch, i / launch.view_strips)) continue;
+    double* part = args.parts + 2 * (std::int64_t{i} * gridDim.x + blockIdx.x);
+    part[0] = part[1] = 0;
+  }
+}
+
 template <bool kBytes, bool kGradient, bool kSums>
 __global__ void __launch_bounds__(kThreads, 2)
     photometric_kernel(const __grid_constant__ PhotometricArgs<float> args,
                        const __grid_constant__ Launch launch) {
+  if (kSums && threadIdx.x == 0) clear_parts(args, launch);
+  if (kGradient && args.visible && blockIdx.x == 0 && blockIdx.y == 0) {
+    for (int view = threadIdx.x; view < args.views; view += kThreads) {
+      args.scale_reg[view] = scale_reg_of(args, view);
+    }
+  }
+  if (launch.strips == 0) return;
   extern __shared__ __align__(16) unsigned char shared[];
   StripWalk<kBytes, kGradient, kSums> walk(args, launch, reinterpret_cast<Shared*>(shared));
   walk.run();
   if constexpr (kSums) {
-    const double l1 = block_sum(walk.l1_sum), ssim = block_sum(walk.ssim_sum);
+    const double l1 = block_sum<kThreads>(walk.l1_sum), ssim = block_sum<kThreads>(walk.ssim_sum);
     if (threadIdx.x == 0) {
-      double* out = launch.partials + 2 * (std::int64_t{blockIdx.y} * gridDim.x + blockIdx.x);
+      double* out = args.parts + 2 * walk.part(launch);
       out[0] = l1, out[1] = ssim;
     }
   }
 }
 
-// One block per view adds its partial sums in order.
-__global__ void finish_sums(const Launch launch, int strips, int blocks_per_strip, float* l1_sums,
-                            float* ssim_sums) {
-  const int view = blockIdx.x, place = view - launch.first_view;
-  double l1 = 0, ssim = 0;
-  if (place >= 0 && view <= launch.last_view) {
-    const int begin = place == 0 ? 0 : launch.first_strips + (place - 1) * launch.view_strips;
-    const int end = view == launch.last_view ? strips : launch.first_strips + place * launch.view_strips;
-    const double* mine = launch.partials + 2 * std::int64_t{begin} * blocks_per_strip;
-    for (int i = threadIdx.x; i < (end - begin) * blocks_per_strip; i += kThreads) {
-      l1 += mine[2 * i], ssim += mine[2 * i + 1];
-    }
-  }
-  l1 = block_sum(l1), ssim = block_sum(ssim);
-  if (threadIdx.x == 0) l1_sums[view] = static_cast<float>(l1), ssim_sums[view] = static_cast<float>(ssim);
-}
-
 int cut(int rows, int rows_per_strip) { return (rows + rows_per_strip - 1) / rows_per_strip; }
 
-// Cuts the owned rows into strips: whole waves of blocks, with few rows read twice. Returns how many.
-int cut_strips(const PhotometricArgs<float>& args, int columns, int slots, Launch* launch) {
+// Blocks side by side.
+int block_columns(const PhotometricArgs<float>& args) { return (args.width + kOut - 1) / kOut; }
+
+// Cuts the owned rows into strips: whole waves of blocks, with few rows read twice.
+Launch cut_strips(const PhotometricArgs<float>& args) {
+  Launch result{};
+  result.view_strips = 1;
+  if (args.tile_begin == args.tile_end) return result;
+  const int columns = block_columns(args), slots = 2 * multiprocessors();
+  Launch* launch = &result;
   const std::int64_t tiles = std::int64_t{args.tiles_x} * args.tiles_y;
   const std::int64_t last = args.tile_end - 1;
   launch->first_view = static_cast<int>(args.tile_begin / tiles);
@@ -309,7 +323,6 @@ int cut_strips(const PhotometricArgs<float>& args, int columns, int slots, Launc
   const int first_rows = (views ? args.height : launch->end_row) - launch->begin_row;
   constexpr int kLeadCost = 24;  // rows of work before the first output
   std::int64_t best_cost = LLONG_MAX;
-  int best_strips = 0;
   for (int pieces = 1; pieces <= cut(args.height, 16); ++pieces) {
     const int rows = cut(cut(args.height, pieces), kRows) * kRows;
     int strips = cut(first_rows, rows);
@@ -317,12 +330,13 @@ int cut_strips(const PhotometricArgs<float>& args, int columns, int slots, Launc
     const std::int64_t waves = (std::int64_t{columns} * strips + slots - 1) / slots;
     const std::int64_t cost = waves * (rows + kLeadCost);
     if (cost >= best_cost) continue;
-    best_cost = cost, best_strips = strips;
+    best_cost = cost;
+    launch->strips = strips;
     launch->rows_per_strip = rows;
     launch->first_strips = cut(first_rows, rows);
     launch->view_strips = cut(args.height, rows);
   }
-  return best_strips;
+  return result;
 }
 
 template <bool kBytes, bool kGradient, bool kSums>
@@ -337,7 +351,7 @@ void launch_kernel(dim3 grid, const PhotometricArgs<float>& args, const Launch& 
 
 template <bool kBytes>
 void launch_strips(dim3 grid, const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
-  if (args.v_renders && args.l1_sums) {
+  if (args.v_renders && args.parts) {
     launch_kernel<kBytes, true, true>(grid, args, launch, stream);
   } else if (args.v_renders) {
     launch_kernel<kBytes, true, false>(grid, args, launch, stream);
@@ -359,24 +373,20 @@ void clear_rest(const PhotometricArgs<float>& args, const Launch& launch, cudaSt
 }  // namespace
 
 template <class T>
-void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStream stream) {
-  Launch launch{};
-  int strips = 0;
-  const int columns = (args.width + kOut - 1) / kOut;
-  if (args.tile_begin < args.tile_end) {
-    strips = cut_strips(args, columns, 2 * multiprocessors(), &launch);
-    if (args.l1_sums) launch.partials = workspace.allocate<double>(std::int64_t{2} * strips * columns);
-    const dim3 grid(columns, strips);
-    args.targets_u8 ? launch_strips<true>(grid, args, launch, stream)
-                    : launch_strips<false>(grid, args, launch, stream);
-  }
-  if (args.v_renders && args.clear_rest) clear_rest(args, launch, stream);
-  if (!args.l1_sums) return;
-  finish_sums<<<static_cast<unsigned>(args.views), kThreads, 0, stream>>>(launch, strips, columns,
-                                                                          args.l1_sums, args.ssim_sums);
-  check_launch("photometric sums");
+std::int64_t photometric_parts(const PhotometricArgs<T>& args) {
+  return std::int64_t{cut_strips(args).view_strips} * block_columns(args);
 }
 
+template <class T>
+void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream stream) {
+  const Launch launch = cut_strips(args);
+  const dim3 grid(block_columns(args), std::max(launch.strips, 1));
+  args.targets_u8 ? launch_strips<true>(grid, args, launch, stream)
+                  : launch_strips<false>(grid, args, launch, stream);
+  if (args.v_renders && args.clear_rest) clear_rest(args, launch, stream);
+}
+
+template std::int64_t photometric_parts<float>(const PhotometricArgs<float>&);
 template void photometric<float>(const PhotometricArgs<float>&, Workspace&, CudaStream);
 
 }  // namespace blitzgs::cuda

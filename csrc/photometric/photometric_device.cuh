@@ -27,26 +27,34 @@ struct Launch {
   int first_view, last_view;
   int begin_row, end_row;  // of the first view; one past the last of the last view
   int rows_per_strip, first_strips, view_strips;
-  double* partials;  // [strips, columns of blocks, 2]
+  int strips;  // of all views
 };
 
-// Rows [begin, end) of a view.
+// Rows [begin, end) of a view; the index-th of the view's strips.
 struct Strip {
-  int view, begin, end;
+  int view, index, begin, end;
 };
 
 __device__ inline Strip strip_of(const Launch& launch, int height, int index) {
-  Strip strip{launch.first_view, launch.begin_row, 0};
+  Strip strip{launch.first_view, index, launch.begin_row, 0};
   if (index >= launch.first_strips) {
     index -= launch.first_strips;
     strip.view += 1 + index / launch.view_strips;
-    index %= launch.view_strips;
+    strip.index = index % launch.view_strips;
     strip.begin = 0;
   }
-  strip.begin += index * launch.rows_per_strip;
+  strip.begin += strip.index * launch.rows_per_strip;
   strip.end =
       min(strip.begin + launch.rows_per_strip, strip.view == launch.last_view ? launch.end_row : height);
   return strip;
+}
+
+// Strips of a view; none of one without owned pixels.
+__device__ inline int strips_of(const Launch& launch, int view) {
+  const int place = view - launch.first_view;
+  if (place < 0 || view > launch.last_view) return 0;
+  const int before = place == 0 ? 0 : launch.first_strips + (place - 1) * launch.view_strips;
+  return min(place == 0 ? launch.first_strips : launch.view_strips, launch.strips - before);
 }
 
 // The strip's rows whose pixels are all owned.
@@ -56,7 +64,7 @@ __device__ inline Strip whole_rows(const PhotometricArgs<float>& args, const Str
   const std::int64_t end = max(args.tile_end - first, std::int64_t{0});
   const std::int64_t top = (begin + args.tiles_x - 1) / args.tiles_x * args.tile_size;
   const std::int64_t bottom = end / args.tiles_x * args.tile_size;
-  return {strip.view, static_cast<int>(min(max(top, std::int64_t{strip.begin}), std::int64_t{strip.end})),
+  return {strip.view, strip.index, static_cast<int>(min(max(top, std::int64_t{strip.begin}), std::int64_t{strip.end})),
           static_cast<int>(min(bottom, std::int64_t{strip.end}))};
 }
 
@@ -112,20 +120,6 @@ __device__ __forceinline__ void convolve4(const float (&window)[kSsimTaps], cons
       }
     }
   }
-}
-
-// Sum over the block, on thread 0.
-__device__ double block_sum(double value) {
-  __shared__ double warps[kThreads / 32];
-  for (int offset = 16; offset > 0; offset /= 2) value += __shfl_down_sync(~0u, value, offset);
-  __syncthreads();
-  if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = value;
-  __syncthreads();
-  double total = 0;
-  if (threadIdx.x == 0) {
-    for (const double part : warps) total += part;
-  }
-  return total;
 }
 
 // Where a horizontal item of a round lies; `pixel` is the first of its four.

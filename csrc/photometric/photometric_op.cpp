@@ -5,6 +5,7 @@
 #include <tuple>
 
 #include "common/op.h"
+#include "report/report.h"
 
 namespace blitzgs {
 namespace {
@@ -20,7 +21,15 @@ void fill_window(T (&window)[kSsimTaps]) {
 }
 
 struct PhotometricOutputs {
-  std::optional<Tensor> l1_sums, ssim_sums, v_renders;
+  std::optional<Tensor> parts, v_renders, scale_reg;
+};
+
+// The weights of what is differentiated.
+struct PhotometricWeights {
+  const Tensor& l1;
+  const Tensor& ssim;
+  std::optional<Tensor> samples, visible;
+  double scale = 0;
 };
 
 void check_weights(const char* op, const char* name, const Tensor& weights, const Tensor& renders) {
@@ -29,9 +38,9 @@ void check_weights(const char* op, const char* name, const Tensor& weights, cons
 }
 
 PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, const Tensor& targets_in,
-                                   const std::optional<Tensor>& masks_in, const Tensor* l1_weights_in,
-                                   const Tensor* ssim_weights_in, bool sums, std::int64_t tile_size,
-                                   std::int64_t tile_begin, std::int64_t tile_end) {
+                                   const std::optional<Tensor>& masks_in, const PhotometricWeights* weights,
+                                   bool sums, std::int64_t tile_size, std::int64_t tile_begin,
+                                   std::int64_t tile_end) {
   check_floating(op, "renders", renders_in);
   check_shape(op, "renders", renders_in, {-1, -1, -1, 3});
   const std::int64_t views = renders_in.size(0), height = renders_in.size(1), width = renders_in.size(2);
@@ -49,21 +58,27 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     check_shape(op, "masks", *masks_in, {views, height, width});
     masks = as_contiguous(*masks_in);
   }
-  std::optional<Tensor> l1_weights, ssim_weights;
+  std::optional<Tensor> l1_weights, ssim_weights, samples, visible;
   PhotometricOutputs outputs;
-  if (l1_weights_in) {
-    check_weights(op, "l1_weights", *l1_weights_in, renders);
-    check_weights(op, "ssim_weights", *ssim_weights_in, renders);
-    l1_weights = as_contiguous(*l1_weights_in);
-    ssim_weights = as_contiguous(*ssim_weights_in);
+  if (weights) {
+    check_weights(op, "l1_weights", weights->l1, renders);
+    check_weights(op, "ssim_weights", weights->ssim, renders);
+    l1_weights = as_contiguous(weights->l1);
+    ssim_weights = as_contiguous(weights->ssim);
+    if (weights->samples) {
+      check_weights(op, "samples", *weights->samples, renders);
+      samples = as_contiguous(*weights->samples);
+    }
+    if (weights->visible) {
+      check_dtype(op, "visible", *weights->visible, ScalarType::Long);
+      check_shape(op, "visible", *weights->visible, {views});
+      visible = as_contiguous(*weights->visible);
+    }
     outputs.v_renders = make_empty(renders, {views, height, width, 3});
-  }
-  if (sums) {
-    outputs.l1_sums = make_empty(renders, {views});
-    outputs.ssim_sums = make_empty(renders, {views});
+    outputs.scale_reg = make_empty(renders, {visible ? views : 0});
   }
   if (renders.numel() == 0) {
-    if (sums) torch::stable::zero_(*outputs.l1_sums), torch::stable::zero_(*outputs.ssim_sums);
+    if (sums) outputs.parts = make_empty(renders, {views, 0, 2}, ScalarType::Double);
     return outputs;
   }
 
@@ -77,8 +92,12 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     args.masks = data_or_null<std::uint8_t>(masks);
     args.l1_weights = data_or_null<T>(l1_weights);
     args.ssim_weights = data_or_null<T>(ssim_weights);
-    args.l1_sums = sums ? mutable_data<T>(*outputs.l1_sums) : nullptr;
-    args.ssim_sums = sums ? mutable_data<T>(*outputs.ssim_sums) : nullptr;
+    args.samples = data_or_null<T>(samples);
+    if (visible) {
+      args.visible = data<std::int64_t>(*visible);
+      args.scale_weight = static_cast<T>(weights->scale);
+      args.scale_reg = mutable_data<T>(*outputs.scale_reg);
+    }
     args.v_renders = outputs.v_renders ? mutable_data<T>(*outputs.v_renders) : nullptr;
     args.clear_rest = !sums;
     args.views = views;
@@ -94,6 +113,10 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
                     ": tile_begin and tile_end must be a range of the ", tiles, " tiles, got [", tile_begin,
                     ", ", tile_end, ")");
     fill_window(args.window);
+    if (sums) {
+      outputs.parts = make_empty(renders, {views, backend::photometric_parts(args), 2}, ScalarType::Double);
+      args.parts = mutable_data<double>(*outputs.parts);
+    }
     backend::photometric(args, scope.workspace, scope.stream);
   });
   return outputs;
@@ -102,27 +125,39 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
 std::tuple<Tensor, Tensor> photometric_fwd(const Tensor& renders, const Tensor& targets,
                                            const std::optional<Tensor>& masks, std::int64_t tile_size,
                                            std::int64_t tile_begin, std::int64_t tile_end) {
-  PhotometricOutputs out = run_photometric("photometric_fwd", renders, targets, masks, nullptr, nullptr, true,
-                                           tile_size, tile_begin, tile_end);
-  return {*out.l1_sums, *out.ssim_sums};
+  const Tensor parts = *run_photometric("photometric_fwd", renders, targets, masks, nullptr, true, tile_size,
+                                        tile_begin, tile_end)
+                            .parts;
+  const std::int64_t views = parts.size(0);
+  Tensor l1_sums = make_empty(renders, {views}), ssim_sums = make_empty(renders, {views});
+  DeviceScope scope(renders);
+  dispatch_floating(renders, [&](auto zero) {
+    using T = decltype(zero);
+    Report<T> report{data<double>(parts), views, parts.size(1), nullptr, 0, 0, {}, 1};
+    report.targets[0] = {mutable_data<T>(l1_sums), mutable_data<T>(ssim_sums), nullptr};
+    backend::report(report, scope.workspace, scope.stream);
+  });
+  return {l1_sums, ssim_sums};
 }
 
 Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
                        const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size,
                        std::int64_t tile_begin, std::int64_t tile_end) {
-  return *run_photometric("photometric_bwd", renders, targets, masks, &l1_weights, &ssim_weights, false,
-                          tile_size, tile_begin, tile_end)
+  const PhotometricWeights weights{l1_weights, ssim_weights, {}, {}};
+  return *run_photometric("photometric_bwd", renders, targets, masks, &weights, false, tile_size, tile_begin,
+                          tile_end)
               .v_renders;
 }
 
-std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(const Tensor& renders, const Tensor& targets,
-                                                       const std::optional<Tensor>& masks,
-                                                       const Tensor& l1_weights, const Tensor& ssim_weights,
-                                                       std::int64_t tile_size, std::int64_t tile_begin,
-                                                       std::int64_t tile_end) {
-  PhotometricOutputs out = run_photometric("photometric_fwd_bwd", renders, targets, masks, &l1_weights,
-                                           &ssim_weights, true, tile_size, tile_begin, tile_end);
-  return {*out.l1_sums, *out.ssim_sums, *out.v_renders};
+std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(
+    const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
+    const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size, std::int64_t tile_begin,
+    std::int64_t tile_end, const std::optional<Tensor>& samples, const std::optional<Tensor>& visible,
+    double scale_weight) {
+  const PhotometricWeights weights{l1_weights, ssim_weights, samples, visible, scale_weight};
+  PhotometricOutputs out = run_photometric("photometric_fwd_bwd", renders, targets, masks, &weights, true,
+                                           tile_size, tile_begin, tile_end);
+  return {*out.parts, *out.v_renders, *out.scale_reg};
 }
 
 }  // namespace

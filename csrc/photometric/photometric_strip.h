@@ -64,7 +64,7 @@ class PhotometricStrip {
       if (centre < begin - reach) continue;
       const bool inside = centre >= 0 && centre < args_.height;
       if (inside) compute_windows(view, centre);
-      if (inside && args_.l1_sums && centre >= begin && centre < end) add_sums(view, centre, l1, ssim);
+      if (inside && args_.parts && centre >= begin && centre < end) add_sums(view, centre, l1, ssim);
       if (!gradient) continue;
       absorb_derivatives(centre, inside);
       if (centre - kSsimRadius >= begin) write_gradient(view, centre - kSsimRadius);
@@ -132,7 +132,7 @@ class PhotometricStrip {
       return;
     }
     T *m = padded_rows_[4] + kPad, *p = padded_rows_[5] + kPad, *q = padded_rows_[6] + kPad;
-    const T weight = args_.ssim_weights[view];
+    const T weight = weight_of(args_, args_.ssim_weights, view);
 #pragma GCC ivdep
     for (std::int64_t i = 0; i < count_; ++i) {
       const SsimTerms<T> terms = ssim_terms(w0[i], w1[i], w2[i], w3[i]);
@@ -190,7 +190,7 @@ class PhotometricStrip {
     const T* x = args_.renders + start;
     T* out = args_.v_renders + start;
     const T *m = windows_[0], *p = windows_[1], *q = windows_[2];
-    const T weight = args_.l1_weights[view];
+    const T weight = weight_of(args_, args_.l1_weights, view);
     const std::uint8_t* mask = mask_row(view, row);
     const std::int64_t first = 3 * std::int64_t{owned.begin}, last = 3 * std::int64_t{owned.end};
     std::fill_n(out, first, T(0));

@@ -6,14 +6,24 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from tests.distributed.rank_harness import on_each_device, run_ranks
 
+VIEWS = 3
+
+
+def _share(tiles, ranks):
+    cuts = [tiles * m // ranks.world_size for m in range(ranks.world_size + 1)]
+    return cuts[ranks.rank], cuts[ranks.rank + 1]
+
 
 def _sums(ranks):
     out = []
-    for step in range(6):
-        values = torch.arange(1000, device=ranks.device) * (ranks.rank + 1) + step
-        total = HostSum(lambda x=values: x.float(), [values], ranks)
-        del values  # its memory must not be handed on before it was read
-        torch.full((1000,), -1, device=ranks.device)
+    # One that needs more memory than those before it, and one without a loss.
+    for step, tiles in enumerate((1000, 1000, 999, 300_000, 5, 1000)):
+        parts = torch.arange(VIEWS * 8.0, dtype=torch.float64).view(VIEWS, 4, 2) * (ranks.rank + 1)
+        parts = None if step == 4 else parts.to(ranks.device)
+        work = torch.arange(tiles, dtype=torch.int32, device=ranks.device) + step
+        total = HostSum(ranks, parts, work, _share(tiles, ranks))
+        del parts, work  # their memory must not be handed on before it was read
+        torch.full((tiles,), -1, device=ranks.device)
         out.append(total)
     first = out[0].read()
     assert first is out[0].read()  # waits and copies once
@@ -23,11 +33,16 @@ def _sums(ranks):
 @pytest.mark.parametrize(("world_size", "device"), on_each_device(1, 2))
 def test_sums_reach_the_host_of_every_rank(world_size, device):
     factor = sum(range(1, world_size + 1))
+    parts = torch.arange(VIEWS * 8.0).view(VIEWS, 4, 2)
     for answer in run_ranks(_sums, world_size, device=device):
         for step, total in enumerate(answer):
             assert total.device.type == "cpu" and not total.is_pinned()
-            assert torch.equal(total, torch.arange(1000) * float(factor) + world_size * step)
+            sums = parts.sum(1).T.flatten() * factor if step != 4 else torch.zeros(0)
+            work = torch.arange(len(total) - len(sums)) + step
+            assert torch.equal(total, torch.cat((sums, work.float())))
 
 
-def test_one_rank_needs_no_group():
-    assert HostSum(lambda: torch.ones(3), [], Ranks()).read().tolist() == [1.0, 1.0, 1.0]
+def test_sums_of_one_process_are_there_at_once():
+    parts = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]], dtype=torch.float64)
+    assert HostSum(Ranks(), parts).read().tolist() == [4.0, 6.0]
+    assert HostSum(Ranks(), None, torch.tensor([5, 6], dtype=torch.int32), (0, 2)).read().tolist() == [5, 6]

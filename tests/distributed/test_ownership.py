@@ -43,15 +43,16 @@ def test_costs_are_those_of_the_last_visit():
             "rank": 0,
             "all_reduce": staticmethod(lambda t: t),
             "side_stream": lambda _: None,
+            "peers": None,
         },
     )()
     # 64 x 48: 4 x 3 tiles a view.
     assert owners.divide(["a", "b"], 64, 48).bounds == (0, 12, 24)
     work = torch.zeros(24, dtype=torch.int32)
     work[:12] = 1000  # all in view a
-    values = torch.tensor([2.0, 3.0]), torch.tensor([4.0])
-    sums = owners.record(["a", "b"], work, TileRanges((0, 24, 24), 2, 64, 48), values)
-    assert sums.read()[:4].tolist() == [2, 3, 4, 1000]
+    parts = torch.tensor([[[1.0, 4.0], [1.0, 1.0]]], dtype=torch.float64)
+    sums = owners.record(["a", "b"], work, TileRanges((0, 24, 24), 2, 64, 48), parts)
+    assert sums.read()[:3].tolist() == [2, 5, 1000]
     assert owners.divide(["a", "b"], 64, 48).bounds == (0, 6, 24)
     assert owners.divide(["b", "a"], 64, 48).bounds == (0, 18, 24)
     # A view never seen is expected to cost what the others do on average.

@@ -15,6 +15,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
+from blitzgs.ops.report import sum_parts
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training.tiny import look_at_origin, random_gaussians
@@ -94,9 +95,9 @@ def _render(ranks):
         on_device = [tensor.to(ranks.device) for tensor in (targets, masks, samples)]
         batch = Batch(list(range(n_views)), views, *on_device, ranges)
         terms = loss_terms(frame, batch, LossConfig(), 3.0)
-        sums = torch.cat(terms.sums).cpu()
+        sums = torch.cat(sum_parts(terms.parts)).cpu()
         if ranges is not None:
-            sums = owners.record(keys, frame.tile_work, ranges, terms.sums).read()[: 2 * n_views]
+            sums = owners.record(keys, frame.tile_work, ranges, terms.parts).read()[: 2 * n_views]
         gradients = pipeline.backward(table, frame, terms.v_renders, terms.scale_reg)
         dense = [torch.zeros_like(column) for column in table.parameters]
         for column, gradient in zip(dense, gradients, strict=True):

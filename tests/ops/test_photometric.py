@@ -15,6 +15,7 @@ from blitzgs.ops.photometric import (
     pixel_counts,
     ssim,
 )
+from blitzgs.ops.report import sum_parts
 from tests.helpers import DEVICES
 
 ROOT = Path(__file__).parents[2]
@@ -60,6 +61,11 @@ def test_reference_is_one_for_equal_images_and_low_for_noise():
     assert reference_ssim_map(x, torch.rand_like(x)).mean() < 0.3
 
 
+def sums_and_gradient(*arguments):
+    parts, v_renders, _ = photometric_fwd_bwd(*arguments)
+    return *sum_parts(parts), v_renders
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("shape", [(2, 53, 70), (1, 1, 1), (3, 7, 200), (1, 130, 3), (1, 200, 400)])
@@ -71,7 +77,7 @@ def test_float32_matches_the_definition(device, masked, shape):
     l1, ssims = reference_sums(exact_x, targets.double() / 255, masks)
     (expected,) = torch.autograd.grad((weights * l1 - 0.7 * weights * ssims).sum(), exact_x)
 
-    got_l1, got_ssim, v_renders = photometric_fwd_bwd(x, targets, masks, weights, -0.7 * weights)
+    got_l1, got_ssim, v_renders = sums_and_gradient(x, targets, masks, weights, -0.7 * weights)
     torch.testing.assert_close(got_l1.double(), l1.detach(), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(got_ssim.double(), ssims.detach(), rtol=1e-6, atol=1e-6)
     assert (v_renders - expected).norm() <= 3e-5 * expected.norm()
@@ -79,6 +85,22 @@ def test_float32_matches_the_definition(device, masked, shape):
     assert torch.equal(separate[0], got_l1) and torch.equal(separate[1], got_ssim)
     bwd = torch.ops.blitzgs.photometric_bwd(x, targets, masks, weights, -0.7 * weights, 16, 0, -1)
     assert torch.equal(bwd, v_renders)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("tiles", [(0, -1), (3, 9), (4, 4)])
+def test_weights_are_divided_by_samples_and_visible_gaussians(device, tiles):
+    x, targets, masks = images(device=device)
+    weights, samples = torch.tensor([0.4, 0.3], device=device), torch.tensor([111.0, 7.0], device=device)
+    visible = torch.tensor([0, 1_000_001], device=device)
+    parts, v_renders, scale_reg = photometric_fwd_bwd(
+        x, targets, masks, weights, -weights, 16, *tiles, samples=samples, visible=visible, scale_weight=0.7
+    )
+    expected = photometric_fwd_bwd(x, targets, masks, weights / samples, -weights / samples, 16, *tiles)
+    assert torch.equal(parts, expected[0])
+    if tiles == (0, -1):
+        assert torch.equal(v_renders, expected[1])
+    assert torch.equal(scale_reg, 0.7 / visible.clamp(min=1)) and len(expected[2]) == 0
 
 
 def test_float64_matches_to_rounding():
@@ -103,7 +125,7 @@ def test_gradcheck(masked):
 def test_a_partition_of_the_tiles_adds_up_to_the_whole(device, tile_size):
     x, targets, masks = images((3, 75, 61), device=device)
     weights = torch.tensor([1.0, 0.5, 2.0], device=device)
-    whole = photometric_fwd_bwd(x, targets, masks, weights, -weights, tile_size)
+    whole = sums_and_gradient(x, targets, masks, weights, -weights, tile_size)
     tiles_x, tiles_y = -(-61 // tile_size), -(-75 // tile_size)
     total = 3 * tiles_x * tiles_y
     cuts = [0, 1, tiles_x + 2, tiles_x + 2, total // 3 + 1, total - 3, total]
@@ -117,7 +139,7 @@ def test_a_partition_of_the_tiles_adds_up_to_the_whole(device, tile_size):
         # A rank knows its own tiles and a ring of 10 pixels around them; the rest must not matter.
         known = F.max_pool2d(owned[:, None].float(), 21, 1, 10)[:, 0, :, :, None] > 0
         known_x = torch.where(known, x, torch.full_like(x, 7.0))
-        part = photometric_fwd_bwd(
+        part = sums_and_gradient(
             known_x,
             targets,
             masks,
@@ -198,7 +220,7 @@ def test_vector_width_does_not_change_the_result(tmp_path):
 def test_empty_batch(device):
     x = torch.zeros(0, 8, 8, 3, device=device)
     outputs = photometric_fwd_bwd(x, x, None, x.new_zeros(0), x.new_zeros(0))
-    assert [tuple(t.shape) for t in outputs] == [(0,), (0,), (0, 8, 8, 3)]
+    assert [tuple(t.shape) for t in outputs] == [(0, 0, 2), (0, 8, 8, 3), (0,)]
 
 
 def test_errors_name_the_value():
@@ -222,5 +244,6 @@ def test_opcheck(device):
     )
     torch.library.opcheck(torch.ops.blitzgs.photometric_bwd, (x, targets, masks, weights, weights, 16, 0, -1))
     torch.library.opcheck(
-        torch.ops.blitzgs.photometric_fwd_bwd, (x, targets, None, weights, weights, 16, 0, -1)
+        torch.ops.blitzgs.photometric_fwd_bwd,
+        (x, targets, None, weights, weights, 16, 0, -1, weights, weights.long(), 0.5),
     )

@@ -159,7 +159,7 @@ def test_thousands_of_layers_stay_accurate():
 def test_last_ids_and_tile_work():
     splats = random_splats(400, WIDTH, HEIGHT, smallest=3, opacity=(0.5, 1.0))
     rows, offsets = lists(splats)
-    _, transmittances, last_ids, tile_work, _ = forward(splats)
+    _, transmittances, last_ids, tile_work, *_ = forward(splats)
     tiles_x, _ = tile_counts(WIDTH, HEIGHT, 16)
     lengths = offsets.diff()
     assert (tile_work <= lengths).all()

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a step tells the host, put together in one launch: the loss's sums, and what tiles cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+
+def report_(
+    parts: Tensor | None,
+    tile_work: Tensor | None,
+    tiles: tuple[int, int],
+    rank: int,
+    n_ranks: int,
+    targets: Sequence[Tensor],
+) -> None:
+    """Write one rank's report into all targets: the sums of all ranks [M, 2, B], then the tiles' work.
+
+    Of a target only what is this rank's is written.
+
+    Args:
+        parts: float64 [B, K, 2], of `blitzgs.ops.photometric.photometric_fwd_bwd`; None: no views.
+        tile_work: int32 [T], of `rasterize_fwd`; None: no tiles.
+        tiles: this rank's [first, one past last).
+        rank: whose report it is.
+        n_ranks: M.
+        targets: float32 [2 M B + T] each, on this device or memory of others that it can reach.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    torch.ops.blitzgs.report_(parts, tile_work, *tiles, rank, n_ranks, targets)
+
+
+def sum_parts(parts: Tensor) -> tuple[Tensor, Tensor]:
+    """Add up a loss's parts, float64 [B, K, 2], to the sums of |x - y| and of SSIM, float32 [B] each."""
+    target = parts.new_empty(2 * len(parts), dtype=torch.float32)
+    report_(parts, None, (0, 0), 0, 1, [target])
+    l1, ssim = target.view(2, -1)
+    return l1, ssim

@@ -1,0 +1,45 @@
+// SPDX-License-Identifier: Apache-2.0
+// What a step tells the host, put together in one launch beside the step and written where it is wanted: the
+// loss's sums, added up from the parts that the loss's kernel left, and what the rank's tiles cost.
+//
+//   parts double [B, K, 2], sums of |x - y| and of SSIM of each view in K parts -> l1 [B], ssim [B]
+//   tile_work int32 [tiles], of which [tile_begin, tile_end) are this rank's  -> tiles [tiles], only those
+//
+// Parts are added in a fixed order; the same on the CPU and on CUDA to rounding of doubles.
+#pragma once
+#include <cstdint>
+
+#include "common/stream.h"
+
+namespace blitzgs {
+
+constexpr int kMaxReportTargets = 16;
+
+// One for each rank that gets the report: memory of peers, or this rank's own.
+template <class T>
+struct ReportTarget {
+  T* l1;
+  T* ssim;
+  T* tiles;
+};
+
+template <class T>
+struct Report {
+  const double* parts;
+  std::int64_t views, n_parts;
+  const std::int32_t* tile_work;
+  std::int64_t tile_begin, tile_end;
+  ReportTarget<T> targets[kMaxReportTargets];
+  int n_targets;
+};
+
+namespace cpu {
+template <class T>
+void report(const Report<T>& report, Workspace&, CudaStream);
+}
+namespace cuda {
+template <class T>
+void report(const Report<T>& report, Workspace&, CudaStream);
+}
+
+}  // namespace blitzgs
