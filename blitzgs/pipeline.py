@@ -227,7 +227,7 @@ def _forward(
     )  # fmt: skip
     mark("sort")
     backgrounds = _backgrounds(options.background, count, table.device)
-    *composited, row_gradients = torch.ops.blitzgs.rasterize_fwd(
+    renders, transmittances, last_ids, tile_work, aux, row_gradients = torch.ops.blitzgs.rasterize_fwd(
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
         count, views.width, views.height, options.tile_size, *tiles, None, False, backward_follows,
     )  # fmt: skip
@@ -244,7 +244,11 @@ def _forward(
         backgrounds,
         isect_rows,
         tile_offsets,
-        *composited,
+        renders,
+        transmittances,
+        last_ids,
+        tile_work,
+        aux,
         GradientRoom(row_gradients),
     )
 

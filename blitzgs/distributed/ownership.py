@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from blitzgs.distributed.host_sum import HostSum
 TILE_COST = 8
 # Windows of the loss reach this far: 5 px from an owned pixel, and 5 more for its gradient.
 LOSS_REACH = 10
+_STRETCH = 128
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,7 @@ class TileOwners:
         """
         unit = TileRanges((0,), len(keys), width, height, tile_size)
         cost = np.concatenate([self._cost(key, unit.tiles_per_view) for key in keys])
+        cost += TILE_COST
         bounds = divide(cost, self.ranks.world_size)
         return TileRanges(bounds, len(keys), width, height, tile_size, reach)
 
@@ -175,26 +178,28 @@ class TileOwners:
             self._costs[key] = (sums, first + view * tiles, first + (view + 1) * tiles)
         return sums
 
-    def _cost(self, key: Hashable, tiles: int) -> NDArray[np.float64]:
-        """Cost of each tile of a view: measured at its last visit, else the mean of the views visited."""
+    def _cost(self, key: Hashable, tiles: int) -> NDArray[np.float32]:
+        """Work of each tile of a view: measured at its last visit, else the mean of the views visited."""
         if key in self._costs and self._tiles(key) == tiles:
-            return self._read(key) + TILE_COST
+            return self._read(key)
         # What views share: the far (upper) tiles of oblique ones cost more than the near ones.
         similar = [other for other in self._costs if self._tiles(other) == tiles][-16:]
-        return (
-            np.mean([self._read(other) for other in similar], 0) if similar else np.zeros(tiles)
-        ) + TILE_COST
+        if not similar:
+            return np.zeros(tiles, np.float32)
+        mean: NDArray[np.float32] = np.mean([self._read(other) for other in similar], 0)
+        return mean
 
     def _tiles(self, key: Hashable) -> int:
         _, begin, end = self._costs[key]
         return end - begin
 
-    def _read(self, key: Hashable) -> NDArray[np.float64]:
+    def _read(self, key: Hashable) -> NDArray[np.float32]:
         sums, begin, end = self._costs[key]
-        return sums.read().numpy()[begin:end].astype(np.float64)
+        values: NDArray[np.float32] = sums.read().numpy()
+        return values[begin:end]
 
 
-def divide(cost: NDArray[np.float64], parts: int) -> tuple[int, ...]:
+def divide(cost: NDArray[Any], parts: int) -> tuple[int, ...]:
     """Cut a sequence of costs into contiguous parts of nearly equal sums.
 
     Args:
@@ -204,12 +209,20 @@ def divide(cost: NDArray[np.float64], parts: int) -> tuple[int, ...]:
     Returns:
         M + 1 ascending bounds, 0 and n included; each is the one nearest to its share of the total.
     """
-    ends = np.concatenate(([0.0], np.cumsum(cost)))
-    targets = ends[-1] * np.arange(1, parts) / parts
-    after = np.searchsorted(ends, targets)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(targets - ends[before] < ends[after] - targets, before, after)
-    return (0, *(int(cut) for cut in nearest), len(cost))
+    # Stretch by stretch, then within those that are cut: a running sum of all takes four times as long, and
+    # every step waits for it.
+    stretches = np.add.reduceat(cost, np.arange(0, len(cost), _STRETCH), dtype=np.float64)
+    ends = np.concatenate(([0.0], stretches.cumsum()))
+    bounds = [0]
+    for part in range(1, parts):
+        target = ends[-1] * part / parts
+        stretch = max(int(np.searchsorted(ends, target)) - 1, 0)
+        first = stretch * _STRETCH
+        within = cost[first : first + _STRETCH].cumsum(dtype=np.float64) + ends[stretch]
+        after = min(int(np.searchsorted(within, target)), len(within) - 1)  # sums are rounded
+        start = within[after - 1] if after > 0 else ends[stretch]
+        bounds.append(first + after + int(target - start >= within[after] - target))
+    return (*bounds, len(cost))
 
 
 def cost_balance(cost: NDArray[np.float64], bounds: Sequence[int]) -> float:

@@ -25,7 +25,7 @@ _COLUMNS = (
     (torch.int64, 2, ()),
 )
 _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
-# Gradients of means2d, conics, opacities and colors as they return, `rasterize_bwd_packed_` has them in front.
+# Gradients of means2d, conics, opacities and colors as they return; `rasterize_bwd_packed_` has them first.
 _GRADIENT_WORDS = 9
 # Writes rows to the peers: see `PeerSpace.fill`.
 Projection = Callable[[Tensor, Tensor, list[Tensor], int], Any]

@@ -39,10 +39,10 @@ struct PhotometricArgs {
   const T* renders;
   const T* targets;  // or
   const std::uint8_t* targets_u8;
-  const std::uint8_t* masks;  // null: all pixels count
-  const T* l1_weights;        // [B]; null: no gradient
-  const T* ssim_weights;      // [B]
-  const T* samples;           // [B]; null: 1
+  const std::uint8_t* masks;    // null: all pixels count
+  const T* l1_weights;          // [B]; null: no gradient
+  const T* ssim_weights;        // [B]
+  const T* samples;             // [B]; null: 1
   const std::int64_t* visible;  // [B]; null: no scale_reg
   T scale_weight;
   T* scale_reg;   // [B]
@@ -124,12 +124,12 @@ template <class T>
 std::int64_t photometric_parts(const PhotometricArgs<T>& args);
 template <class T>
 void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
-}
+}  // namespace cpu
 namespace cuda {
 template <class T>
 std::int64_t photometric_parts(const PhotometricArgs<T>& args);
 template <class T>
 void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
-}
+}  // namespace cuda
 
 }  // namespace blitzgs

@@ -64,7 +64,8 @@ __device__ inline Strip whole_rows(const PhotometricArgs<float>& args, const Str
   const std::int64_t end = max(args.tile_end - first, std::int64_t{0});
   const std::int64_t top = (begin + args.tiles_x - 1) / args.tiles_x * args.tile_size;
   const std::int64_t bottom = end / args.tiles_x * args.tile_size;
-  return {strip.view, strip.index, static_cast<int>(min(max(top, std::int64_t{strip.begin}), std::int64_t{strip.end})),
+  return {strip.view, strip.index,
+          static_cast<int>(min(max(top, std::int64_t{strip.begin}), std::int64_t{strip.end})),
           static_cast<int>(min(bottom, std::int64_t{strip.end}))};
 }
 

@@ -283,8 +283,8 @@ class PackedRows {
     if (entries_) {
       check(cudaMemsetAsync(entries_, 0, n_isects_ * sizeof(PackedGradient), stream_), "rasterize_bwd");
     }
-    const BackwardArguments args{aux_rows(aux_), chunk,   in_.backgrounds, in_.isect_rows, in_.tile_offsets,
-                                 in_.grid,       order_,  saved_,          packed,         entries_};
+    const BackwardArguments args{aux_rows(aux_), chunk,  in_.backgrounds, in_.isect_rows, in_.tile_offsets,
+                                 in_.grid,       order_, saved_,          packed,         entries_};
     if (in_.grid.tile_size == 8) {
       dispatch_backward<8>(args, absolute, stream_);
     } else if (in_.grid.tile_size == 16) {

@@ -264,11 +264,11 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   write_gradients(in, sums, width, gradients);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                             \
-  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, void*, Workspace&,   \
-                                 CudaStream);                                                              \
-  template void rasterize_bwd<T>(const RasterizeInput<T>&, const RasterizeSaved<T>&, std::int64_t,         \
-                                 const RasterizeAux&, bool, const RasterizeGradients<T>&, Workspace&,      \
+#define BLITZGS_INSTANTIATE(T)                                                                           \
+  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, void*, Workspace&, \
+                                 CudaStream);                                                            \
+  template void rasterize_bwd<T>(const RasterizeInput<T>&, const RasterizeSaved<T>&, std::int64_t,       \
+                                 const RasterizeAux&, bool, const RasterizeGradients<T>&, Workspace&,    \
                                  CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)

@@ -88,18 +88,21 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
   Tensor transmittances = make_empty(splats.means2d, {n_cameras, height, width});
   Tensor last_ids = make_empty(splats.means2d, {n_cameras, height, width}, ScalarType::Int);
   Tensor tile_work = make_empty(splats.means2d, {grid.count()}, ScalarType::Int);
-  Tensor aux = make_empty(
-      splats.means2d,
-      {backend::rasterize_aux_bytes(grid, splats.n_rows, static_cast<int>(splats.n_channels))},
-      ScalarType::Byte);
+  Tensor aux =
+      make_empty(splats.means2d,
+                 {backend::rasterize_aux_bytes(grid, splats.n_rows, static_cast<int>(splats.n_channels))},
+                 ScalarType::Byte);
   const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
   Tensor row_gradients = make_empty(splats.means2d, {packed ? splats.n_rows : 0, kPackedGradient});
   DeviceScope scope(splats.means2d);
   dispatch_floating(splats.means2d, [&](auto zero) {
     using T = decltype(zero);
-    const RasterizeOutput<T> out{mutable_data<T>(renders), mutable_data<T>(transmittances),
-                                 mutable_data<std::int32_t>(last_ids), mutable_data<std::int32_t>(tile_work),
-                                 packed ? mutable_data<T>(row_gradients) : nullptr, clear_rest};
+    const RasterizeOutput<T> out{mutable_data<T>(renders),
+                                 mutable_data<T>(transmittances),
+                                 mutable_data<std::int32_t>(last_ids),
+                                 mutable_data<std::int32_t>(tile_work),
+                                 packed ? mutable_data<T>(row_gradients) : nullptr,
+                                 clear_rest};
     backend::rasterize_fwd(splats.input<T>(), out, mutable_data<void>(aux), scope.workspace, scope.stream);
   });
   return {renders, transmittances, last_ids, tile_work, aux, row_gradients};
@@ -134,8 +137,9 @@ struct Composited {
     STD_TORCH_CHECK(backend::rasterize_aux_fits(splats.grid, splats.n_rows,
                                                 static_cast<int>(splats.n_channels), aux.size(0)) &&
                         reinterpret_cast<std::uintptr_t>(aux.const_data_ptr()) % 64 == 0,
-                    "blitzgs::", op, ": aux must be as rasterize_fwd returned it for these tiles or more, got ",
-                    aux.size(0), " bytes");
+                    "blitzgs::", op,
+                    ": aux must be as rasterize_fwd returned it for these tiles or more, got ", aux.size(0),
+                    " bytes");
   }
 
   RasterizeAux own() const { return {data<void>(aux), aux.size(0)}; }

@@ -2,8 +2,8 @@
 // In which order a launch takes its tiles. Blocks start in the order of their numbers, and the last to start
 // should be short, so that no multiprocessor is left with a long list when the others are done. Images end
 // with their near, sparse rows; but a rank's share of the tiles may end with the far rows of a view, so there
-// long lists come first. Which tile comes when changes no pixel. The order is made once: forward leaves it for
-// backward, which may differentiate fewer tiles than were composited.
+// long lists come first. Which tile comes when changes no pixel. The order is made once: forward leaves it
+// for backward, which may differentiate fewer tiles than were composited.
 #pragma once
 #include <cstdint>
 

@@ -37,8 +37,8 @@ __global__ void __launch_bounds__(kReportThreads)
 
 template <>
 void report<float>(const Report<float>& report, Workspace&, CudaStream stream) {
-  const auto blocks = static_cast<unsigned>(report.views) +
-                      blocks_for(report.tile_end - report.tile_begin, kReportThreads);
+  const auto blocks =
+      static_cast<unsigned>(report.views) + blocks_for(report.tile_end - report.tile_begin, kReportThreads);
   if (blocks == 0) return;
   report_kernel<<<blocks, kReportThreads, 0, stream>>>(report);
   check_launch("report");

@@ -12,10 +12,10 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import LOSS_REACH, Share, TileOwners, TileRanges
 from blitzgs.distributed.pixels import collect_images
 from blitzgs.model import GaussianTable
+from blitzgs.ops.report import sum_parts
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
-from blitzgs.ops.report import sum_parts
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training.tiny import look_at_origin, random_gaussians

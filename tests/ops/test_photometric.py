@@ -100,7 +100,8 @@ def test_weights_are_divided_by_samples_and_visible_gaussians(device, tiles):
     assert torch.equal(parts, expected[0])
     if tiles == (0, -1):
         assert torch.equal(v_renders, expected[1])
-    assert torch.equal(scale_reg, 0.7 / visible.clamp(min=1)) and len(expected[2]) == 0
+    assert torch.equal(scale_reg, torch.tensor(0.7, device=device) / visible.clamp(min=1))
+    assert len(expected[2]) == 0
 
 
 def test_float64_matches_to_rounding():
