@@ -42,3 +42,18 @@ def test_gradients_are_those_from_columns(degree):
     gradients = pipeline.backward(table, frame, v_renders, scale_reg)
     for x, y in zip(gradients, expected, strict=True):
         assert relative_error(x, y) < 1e-6
+
+
+def test_a_second_backward_pass_starts_from_zeros_too():
+    small = random_gaussians(2000)
+    table = GaussianTable({name: small[name].cuda() for name in small})
+    options, views = dataclasses.replace(OPTIONS, deterministic=True), cameras(2, device="cuda")
+    plain = pipeline.forward(table, views, options)
+    frame = pipeline.forward(table, views, options, backward_follows=True)
+    assert torch.equal(frame.renders, plain.renders)
+    v_renders = torch.randn_like(frame.renders)
+    expected = pipeline.backward_rows(plain, v_renders)
+    assert expected.colors.any()
+    for _ in range(2):
+        for x, y in zip(pipeline.backward_rows(frame, v_renders)[:4], expected[:4], strict=True):
+            assert torch.equal(x, y)
