@@ -109,6 +109,7 @@ class Peers:
         self._meetings_apart = [0, 0]
         self._known = torch.empty(2, MAX_VALUES * self.world_size, dtype=torch.int64, pin_memory=mail.is_cuda)
         self._boards: list[Tensor] = []
+        self._places: dict[tuple[int, int], list[Tensor]] = {}  # on the boards; made once
 
     def _map(self, name: str, mine: Tensor) -> list[Tensor]:
         """Map every rank's counterpart of a symmetric tensor; collective."""
@@ -155,11 +156,15 @@ class Peers:
             # Behind its last meeting nobody writes to this rank's board any more.
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = []
+            self._places.clear()
             mine = symmetric.empty(2 * max(words, _LEAST_BOARD), dtype=torch.float32, device=self.device)
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = self._map("board", mine)
-        begin = self._meetings_apart[BESIDE] % 2 * (len(self._boards[0]) // 2)
-        return [board[begin : begin + words] for board in self._boards]
+        key = words, self._meetings_apart[BESIDE] % 2
+        if key not in self._places:
+            begin = key[1] * (len(self._boards[0]) // 2)
+            self._places[key] = [board[begin : begin + words] for board in self._boards]
+        return self._places[key]
 
     def _meet(self, values: Tensor | None, first: int, known: Tensor | None) -> None:
         self._meetings += 1
