@@ -71,7 +71,7 @@ class Shared(NamedTuple):
 
 
 def mail_words(world_size: int) -> int:
-    """Length of a rank's mail, int64: last meetings, numbers and their sums, last meetings of two streams."""
+    """Length of a rank's mail, int64: last meetings, numbers and their sums, and meetings apart."""
     return world_size + 2 * MAX_VALUES * (world_size + 1) + 2 * world_size
 
 
