@@ -21,6 +21,8 @@ TESTS = [
     *(INTERSECT + test for test in (
         "lists_match_the_cpu[False-8]", "lists_match_the_cpu[True-16]", "more_tiles_than_16_bits_hold",
         "tile_ranges_cut_the_whole", "capacity_beyond_the_count", "a_long_run_of_equal_depths", "no_rows",
+        "depths_of_every_kind[60000-3-True-18 decades]",
+        "depths_of_every_kind[5000-1-True-four neighbouring numbers]",
     )),
     *(PROJECT + test for test in (
         "rows_match_the_cpu[0-False]", "rows_match_the_cpu[1-True]", "rows_match_the_cpu[2-False]",

@@ -58,8 +58,8 @@ def intersect(
         past ``tile_offsets[-1]`` mean nothing.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, a tile range outside the image, 2^31 rows or more, or (CPU) more
-            intersections than ``n_isects``.
+        RuntimeError: wrong shapes or dtypes, a tile range outside the image, 2^31 rows or tiles or more, or
+            (CPU) more intersections than ``n_isects``.
     """
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         means2d, conics, row_opacities, depths, camera_ids, ids, n_cameras, width, height, tile_size,

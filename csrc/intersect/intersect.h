@@ -15,7 +15,8 @@
 // (the op then fails with both numbers); the CUDA kernel may trust the capacity.
 //
 // Deterministic: the lists depend on the rows alone, never on threads. Row order need not follow depth.
-// O(P) for the radix sort, O(tile rows) for the tests, O(I) to write. Counts are 64-bit, P < 2^31.
+// O(P) for the radix sort, O(tile rows) for the tests, O(I) to write. Counts are 64-bit; P and
+// B*T < 2^31.
 #pragma once
 #include <cstdint>
 

@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows are sorted by depth once (32-bit keys, P of them); their entries are written in that order with the
-// tile as a key, 16 bits where the tiles of the launch fit, and a stable radix sort over just the bits in use
-// brings each tile's entries together without disturbing their order. Which tiles a row touches is found
-// once, in row order, and kept in 16 bytes: those of all rows fit into the L2 cache, where depth order
-// gathers them. Compiled without FMA contraction (cmake/cuda.cmake), as the projection is: both count the
-// same tiles.
-#include <cub/device/device_radix_sort.cuh>
+// Rows are sorted by depth once (depth_order.cuh); their entries are written in that order with the tile as
+// a key, 16 bits where the tiles of the launch fit, and a stable radix sort over just the bits in use brings
+// each tile's entries together without disturbing their order. Which tiles a row touches is found once, in
+// row order, and kept in 16 bytes: those of all rows fit into the L2 cache, where depth order gathers them.
+// Compiled without FMA contraction (cmake/cuda.cmake), as the projection is: both count the same tiles.
 #include <cub/device/device_reduce.cuh>
 
 #include <cuda/std/functional>
 
 #include "common/arrays.h"
+#include "intersect/depth_order.cuh"
+#include "intersect/radix_sweep.cuh"
 #include "intersect/running_sum.cuh"
 #include "intersect/touched_tiles.cuh"
 
@@ -20,68 +20,38 @@ namespace {
 
 using Input = IntersectInput<float>;
 constexpr int kThreads = 256;
-constexpr int kEmitItems = 2, kEmitRows = kThreads * kEmitItems;  // rows of a thread and of a block
+constexpr int kEmitItems = 4, kEmitRows = kThreads * kEmitItems;  // rows of a thread and of a block
+
+// The digits that tiles are sorted by, as many and as narrow as hold the number of tiles.
+struct TileDigits {
+  static constexpr int kBits = 8, kBins = 1 << kBits, kMost = 4;
+  int passes = 1, width = 1;
+
+  explicit TileDigits(std::int64_t n_tiles) {
+    int bits = 1;
+    while ((std::int64_t{1} << bits) < n_tiles) ++bits;
+    passes = (bits + kBits - 1) / kBits;
+    width = (bits + passes - 1) / passes;
+  }
+  // Counts a tile's digits in [passes, kBins] shared counters.
+  __device__ void count(std::uint32_t tile, std::uint32_t* counts) const {
+    for (int pass = 0; pass < passes; ++pass) {
+      atomicAdd(&counts[pass * kBins + (tile >> pass * width & ((1u << width) - 1))], 1u);
+    }
+  }
+};
 
 __global__ void count_kernel(const Input in, std::int32_t* counts) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
-  if (i < in.n_rows) counts[i] = find_touched(in, i).count();
-}
-
-// Depths as unsigned integers in the same order, the rows' indices and what they touch.
-__global__ void depth_keys_kernel(const Input in, std::uint32_t* keys, std::int32_t* rows, Touched* touched) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
-  if (i >= in.n_rows) return;
-  const std::uint32_t bits = __float_as_uint(in.depths[i]);
-  keys[i] = bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
-  rows[i] = static_cast<std::int32_t>(i);
-  touched[i] = find_touched(in, i);
-}
-
-__device__ void sift_down(std::int32_t* rows, const std::int64_t* ids, std::int64_t root, std::int64_t n) {
-  for (std::int64_t child; (child = 2 * root + 1) < n; root = child) {
-    if (child + 1 < n && ids[rows[child]] < ids[rows[child + 1]]) ++child;
-    if (ids[rows[root]] >= ids[rows[child]]) return;
-    const std::int32_t row = rows[root];
-    rows[root] = rows[child];
-    rows[child] = row;
-  }
-}
-
-// Orders each run of equal depths by id: insertion for the usual handful, heapsort for the freak.
-__global__ void order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows, const std::int64_t* ids,
-                                  std::int64_t n) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
-  if (i + 1 >= n || keys[i] != keys[i + 1] || (i > 0 && keys[i - 1] == keys[i])) return;
-  std::int64_t end = i + 2;
-  while (end < n && keys[end] == keys[i]) ++end;
-  std::int32_t* run = rows + i;
-  const std::int64_t length = end - i;
-  bool ordered = true;
-  for (std::int64_t k = 1; k < length && ordered; ++k) ordered = ids[run[k - 1]] < ids[run[k]];
-  if (ordered) return;
-  if (length <= 32) {
-    for (std::int64_t k = 1; k < length; ++k) {
-      const std::int32_t row = run[k];
-      std::int64_t at = k;
-      for (; at > 0 && ids[run[at - 1]] > ids[row]; --at) run[at] = run[at - 1];
-      run[at] = row;
-    }
-    return;
-  }
-  for (std::int64_t root = length / 2; root-- > 0;) sift_down(run, ids, root, length);
-  for (std::int64_t left = length - 1; left > 0; --left) {
-    const std::int32_t row = run[0];
-    run[0] = run[left];
-    run[left] = row;
-    sift_down(run, ids, 0, left);
-  }
+  if (i < in.n_rows) counts[i] = find_touched(in.grid, load_splat(in, i)).count();
 }
 
 // Writes the entries of a warp's rows, a row a lane, from `turn` on; start: of the lane's row behind `turn`.
 template <class Key>
 __device__ __forceinline__ void write_entries(const Input& in, std::int32_t row, const Touched& touched,
                                               std::int32_t start, std::int64_t turn, std::int64_t capacity,
-                                              Key* keys, std::int32_t* entries) {
+                                              Key* keys, std::int32_t* entries, const TileDigits& digits,
+                                              std::uint32_t* counts) {
   const int lane = threadIdx.x % 32;
   // Of compact rows each lane writes every 32nd entry, whosever it is.
   const std::int32_t count = touched.compact() ? touched.count() : 0;
@@ -99,8 +69,10 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t row,
     const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
     const Touched its = touched.of_lane(source);
     if (entry < total && at < capacity) {
-      keys[at] = static_cast<Key>(its.tile(k, in.grid.tiles_x));
+      const std::uint32_t tile = its.tile(k, in.grid.tiles_x);
+      keys[at] = static_cast<Key>(tile);
       entries[at] = of_row;
+      digits.count(tile, counts);
     }
   }
   // The other rows are walked by all lanes together.
@@ -108,23 +80,28 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t row,
     const int source = __ffs(left) - 1;
     const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
     std::int64_t at = turn + __shfl_sync(kFullWarp, start, source);
-    for_each_owned(in, of_row, [&](const Owned& owned) {
-      const std::int64_t n = owned.last - owned.first, tile = owned.first - in.grid.tile_begin;
-      for (std::int64_t k = lane; k < n && at + k < capacity; k += 32) {
-        keys[at + k] = static_cast<Key>(tile + k);
+    for_each_owned(in.grid, load_splat(in, of_row), [&](const Owned& owned) {
+      const int n = owned.last - owned.first;
+      for (int k = lane; k < n && at + k < capacity; k += 32) {
+        keys[at + k] = static_cast<Key>(owned.first + k);
         entries[at + k] = of_row;
+        digits.count(owned.first + k, counts);
       }
       at += n;
     });
   }
 }
 
-// Entries in depth order. Blocks take kEmitRows rows each, a warp 32 times kEmitItems of them in a row.
+// Entries in depth order, their number and the histograms of their tiles' digits. Blocks take kEmitRows rows
+// each, a warp 32 times kEmitItems of them in a row.
 template <class Key>
 __global__ void __launch_bounds__(kThreads)
     emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows, RunningSum running,
-                std::int64_t capacity, Key* keys, std::int32_t* entries) {
-  __shared__ std::int64_t warp_sums[kThreads / 32], entries_before;
+                std::int64_t capacity, TileDigits digits, Key* keys, std::int32_t* entries,
+                std::uint64_t* histograms, std::int64_t* n_entries) {
+  __shared__ std::int64_t warp_sums[kThreads / 32];
+  __shared__ std::uint32_t counts[TileDigits::kMost * TileDigits::kBins];
+  for (int bin = threadIdx.x; bin < digits.passes * TileDigits::kBins; bin += kThreads) counts[bin] = 0;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const int block = running.take_turn();
   const std::int64_t first = static_cast<std::int64_t>(block) * kEmitRows + warp * (32 * kEmitItems) + lane;
@@ -151,102 +128,146 @@ __global__ void __launch_bounds__(kThreads)
     if (i == warp) before = sum;
     sum += warp_sums[i];
   }
-  if (warp == 0) {
-    const std::int64_t earlier = running.sum_before(block, sum);
-    if (lane == 0) entries_before = earlier;
-  }
-  __syncthreads();
-  before += entries_before;
+  const std::int64_t earlier = running.sum_before<kThreads>(block, sum);
+  if (threadIdx.x == 0 && block == static_cast<int>(gridDim.x) - 1) *n_entries = min(earlier + sum, capacity);
+  before += earlier;
 
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
-    write_entries(in, row[k], touched[k], start[k], before + turn[k], capacity, keys, entries);
+    write_entries(in, row[k], touched[k], start[k], before + turn[k], capacity, keys, entries, digits,
+                  counts);
   }
+  __syncthreads();
+  add_counts(counts, digits.passes * TileDigits::kBins, histograms);
 }
 
-// Slots beyond the true count sort behind every tile.
+// tile_offsets[t] = first entry whose tile is >= t, a tile a warp.
 template <class Key>
-__global__ void fill_tail_kernel(RunningSum running, unsigned n_blocks, std::int64_t capacity, Key sentinel,
-                                 Key* keys, std::int32_t* entries) {
-  const std::int64_t step = static_cast<std::int64_t>(gridDim.x) * kThreads;
-  for (std::int64_t i =
-           running.total(n_blocks) + blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
-       i < capacity; i += step) {
-    keys[i] = sentinel;
-    entries[i] = 0;
-  }
-}
-
-// tile_offsets[t] = first entry whose tile is >= t.
-template <class Key>
-__global__ void tile_offsets_kernel(const Key* keys, std::int64_t n, TileGrid grid,
+__global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entries, TileGrid grid,
                                     std::int64_t* tile_offsets) {
-  const std::int64_t tile = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
+  const std::int64_t tile = (blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x) / 32;
+  const int lane = threadIdx.x % 32;
   if (tile > grid.count()) return;
-  std::int64_t wanted = tile < grid.tile_end ? tile : grid.tile_end;
-  wanted -= grid.tile_begin;
-  std::int64_t low = 0, high = wanted <= 0 ? 0 : n;
-  while (low < high) {
-    const std::int64_t middle = (low + high) / 2;
-    if (static_cast<std::int64_t>(keys[middle]) < wanted) {
-      low = middle + 1;
-    } else {
-      high = middle;
-    }
+  const std::int64_t wanted = (tile < grid.tile_end ? tile : grid.tile_end) - grid.tile_begin;
+  std::int64_t low = 0, high = wanted <= 0 ? 0 : *n_entries;
+  while (low < high) {  // the lanes look at the ends of 32 parts
+    const std::int64_t part = (high - low + 31) / 32, at = low + (lane + 1) * part - 1;
+    const bool less = at < high && static_cast<std::int64_t>(keys[at]) < wanted;
+    low += __popc(__ballot_sync(kFullWarp, less)) * part;
+    high = min(high, low + part - 1);
   }
-  tile_offsets[tile] = low;
+  if (lane == 0) tile_offsets[tile] = low;
 }
 
-template <class Key, class Value>
-void sort_pairs(const Key* keys, Key* sorted_keys, const Value* values, Value* sorted_values, std::int64_t n,
-                int bits, Workspace& workspace, CudaStream stream) {
-  std::size_t bytes = 0;
-  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, sorted_keys, values, sorted_values, n, 0, bits,
-                                        stream),
-        "intersect");
-  void* scratch = workspace.allocate_bytes(bytes);
-  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys, sorted_keys, values, sorted_values, n, 0, bits,
-                                        stream),
-        "intersect");
-}
+// What a call needs besides the arrays of its rows and entries.
+template <class State>
+struct Counters {
+  unsigned depth_blocks, tile_blocks, emit_blocks;
+  // All zero when the first kernel has run, but for the ranges, which it writes.
+  std::uint64_t *depth_histograms, *tile_histograms, *running, *turns;
+  std::int64_t *n_rows, *n_entries;
+  int *dropped_bits, *width;
+  State *depth_states, *tile_states;
+  DepthRange* ranges;
+  uint4* begin;
+  std::int64_t n_zeros;  // of 16 bytes
+
+  Counters(const Input& in, std::int64_t capacity, const TileDigits& digits, Workspace& workspace)
+      : depth_blocks(blocks_for(in.n_rows, kSweepTile)),
+        tile_blocks(blocks_for(capacity, kSweepTile)),
+        emit_blocks(blocks_for(in.n_rows, kEmitRows)) {
+    const std::int64_t bytes = lay_out(nullptr, digits);
+    begin = reinterpret_cast<uint4*>(workspace.allocate<std::byte>(bytes));
+    lay_out(reinterpret_cast<std::byte*>(begin), digits);
+  }
+
+ private:
+  // Returns the number of bytes.
+  std::int64_t lay_out(std::byte* memory, const TileDigits& digits) {
+    std::int64_t bytes = 0;
+    const auto take = [&]<class T>(T*& array, std::int64_t length) {
+      array = memory ? reinterpret_cast<T*>(memory + bytes) : nullptr;
+      bytes += (length * static_cast<std::int64_t>(sizeof(T)) + 15) / 16 * 16;
+    };
+    take(depth_histograms, kDepthPasses * kDepthBins);
+    take(tile_histograms, digits.passes * TileDigits::kBins);
+    take(running, std::int64_t{emit_blocks} + 1);
+    take(turns, kDepthPasses + digits.passes);
+    take(n_rows, 1);
+    take(n_entries, 1);
+    take(dropped_bits, 1);
+    take(width, 1);
+    take(depth_states, std::int64_t{depth_blocks} * kDepthPasses * kDepthBins);
+    take(tile_states, std::int64_t{tile_blocks} * digits.passes * TileDigits::kBins);
+    n_zeros = bytes / 16;
+    take(ranges, kRangeBlocks);
+    return bytes;
+  }
+};
 
 struct DepthOrder {
   Touched* touched;    // [P] of each row
   std::int32_t* rows;  // [P] by (depth, id)
 };
 
-DepthOrder order_by_depth(const Input& in, Workspace& workspace, CudaStream stream) {
+template <class State>
+DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Workspace& workspace,
+                          CudaStream stream) {
   const std::int64_t n = in.n_rows;
-  auto [touched, keys, sorted_keys, unsorted, rows] =
+  auto [touched, keys_0, keys_1, rows_0, rows_1] =
       allocate_arrays<Touched, std::uint32_t, std::uint32_t, std::int32_t, std::int32_t>(n, workspace);
-  depth_keys_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(in, keys, unsorted, touched);
+  std::uint32_t* const keys[] = {keys_0, keys_1};
+  std::int32_t* const rows[] = {rows_0, rows_1};
+  range_kernel<<<kRangeBlocks, kRangeThreads, 0, stream>>>(in.depths, n, counters.ranges, counters.begin,
+                                                           counters.n_zeros);
   check_launch("intersect");
-  sort_pairs(keys, sorted_keys, unsorted, rows, n, 32, workspace, stream);
-  if (in.ids) {
-    order_ties_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(sorted_keys, rows, in.ids, n);
+  const unsigned blocks = blocks_for(n, kDepthRows);
+  depth_keys_kernel<<<blocks, kDepthThreads, 0, stream>>>(in, counters.ranges, keys[0], touched,
+                                                          counters.depth_histograms, counters.dropped_bits,
+                                                          counters.width, counters.n_rows);
+  check_launch("intersect");
+  int from = 0;
+  for (int pass = 0; pass < kDepthPasses; ++pass, from = 1 - from) {
+    const std::int64_t bins = pass * kDepthBins;
+    sweep_kernel<kDepthBits>
+        <<<counters.depth_blocks, kSweepThreads, 0, stream>>>(SweepPass<std::uint32_t, State>{
+            keys[from], pass ? rows[from] : nullptr, keys[1 - from], rows[1 - from], counters.n_rows,
+            counters.depth_histograms + bins, counters.turns + pass,
+            counters.depth_states + bins * counters.depth_blocks, pass, 0, counters.width});
     check_launch("intersect");
   }
-  return {touched, rows};
+  order_ties_kernel<<<blocks, kDepthThreads, 0, stream>>>(keys[from], rows[from], n, {in.depths, in.ids},
+                                                          counters.dropped_bits);
+  check_launch("intersect");
+  return {touched, rows[from]};
 }
 
-template <class Key>
-void list_entries(const Input& in, const DepthOrder& order, std::int64_t capacity, std::int32_t* isect_rows,
-                  std::int64_t* tile_offsets, Workspace& workspace, CudaStream stream) {
-  const std::int64_t n_tiles = in.grid.tile_end - in.grid.tile_begin;
-  auto [keys, sorted_keys, entries] = allocate_arrays<Key, Key, std::int32_t>(capacity, workspace);
-  const unsigned blocks = blocks_for(in.n_rows, kEmitRows);
-  const RunningSum running(blocks, workspace, stream);
-  emit_kernel<<<blocks, kThreads, 0, stream>>>(in, order.touched, order.rows, running, capacity, keys,
-                                               entries);
+template <class Key, class State>
+void list_rows(const Input& in, std::int64_t capacity, std::int32_t* isect_rows, std::int64_t* tile_offsets,
+               Workspace& workspace, CudaStream stream) {
+  const TileDigits digits(in.grid.tile_end - in.grid.tile_begin);
+  const Counters<State> counters(in, capacity, digits, workspace);
+  const DepthOrder order = order_by_depth(in, counters, workspace, stream);
+  auto [keys_0, keys_1, unsorted] = allocate_arrays<Key, Key, std::int32_t>(capacity, workspace);
+  Key* const keys[] = {keys_0, keys_1};
+  // The last pass writes isect_rows.
+  const bool even = digits.passes % 2 == 0;
+  std::int32_t* const entries[] = {even ? isect_rows : unsorted, even ? unsorted : isect_rows};
+  emit_kernel<<<counters.emit_blocks, kThreads, 0, stream>>>(
+      in, order.touched, order.rows, RunningSum(counters.running), capacity, digits, keys[0], entries[0],
+      counters.tile_histograms, counters.n_entries);
   check_launch("intersect");
-  fill_tail_kernel<<<64, kThreads, 0, stream>>>(running, blocks, capacity, static_cast<Key>(n_tiles), keys,
-                                                entries);
-  check_launch("intersect");
-  int bits = 1;
-  while ((std::int64_t{1} << bits) <= n_tiles) ++bits;
-  sort_pairs(keys, sorted_keys, entries, isect_rows, capacity, bits, workspace, stream);
-  tile_offsets_kernel<<<blocks_for(in.grid.count() + 1, kThreads), kThreads, 0, stream>>>(
-      sorted_keys, capacity, in.grid, tile_offsets);
+  int from = 0;
+  for (int pass = 0; pass < digits.passes; ++pass, from = 1 - from) {
+    const std::int64_t bins = pass * TileDigits::kBins;
+    sweep_kernel<TileDigits::kBits><<<counters.tile_blocks, kSweepThreads, 0, stream>>>(SweepPass<Key, State>{
+        keys[from], entries[from], keys[1 - from], entries[1 - from], counters.n_entries,
+        counters.tile_histograms + bins, counters.turns + kDepthPasses + pass,
+        counters.tile_states + bins * counters.tile_blocks, pass, digits.width, nullptr});
+    check_launch("intersect");
+  }
+  tile_offsets_kernel<<<blocks_for((in.grid.count() + 1) * 32, kThreads), kThreads, 0, stream>>>(
+      keys[from], counters.n_entries, in.grid, tile_offsets);
   check_launch("intersect");
 }
 
@@ -281,11 +302,16 @@ std::int64_t intersect<float>(const Input& in, std::int64_t capacity, std::int32
           "intersect");
     return capacity;
   }
-  const DepthOrder order = order_by_depth(in, workspace, stream);
-  if (n_tiles < 65536) {
-    list_entries<std::uint16_t>(in, order, capacity, isect_rows, tile_offsets, workspace, stream);
+  // 30 bits count what a call with 32-bit states has.
+  const bool small = in.n_rows < (1 << 30) && capacity < (1 << 30);
+  const auto list = [&](auto key, auto state) {
+    list_rows<decltype(key), decltype(state)>(in, capacity, isect_rows, tile_offsets, workspace, stream);
+  };
+  using std::uint16_t, std::uint32_t, std::uint64_t;
+  if (n_tiles <= 65536) {
+    small ? list(uint16_t{}, uint32_t{}) : list(uint16_t{}, uint64_t{});
   } else {
-    list_entries<std::uint32_t>(in, order, capacity, isect_rows, tile_offsets, workspace, stream);
+    small ? list(uint32_t{}, uint32_t{}) : list(uint32_t{}, uint64_t{});
   }
   return capacity;
 }

@@ -34,6 +34,9 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
     check_dtype(kOp, "ids", *ids, ScalarType::Long);
   }
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  STD_TORCH_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(),
+                  "blitzgs::intersect: tile numbers are 32-bit, got ", grid.count(),
+                  " tiles; use larger tiles or render fewer views at once");
   STD_TORCH_CHECK(n_rows <= std::numeric_limits<std::int32_t>::max(),
                   "blitzgs::intersect: row indices are 32-bit, got ", n_rows,
                   " rows; render fewer views at once");

@@ -1,20 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sums of 32-bit counts over lanes, and of block sums over the blocks of one launch while they run.
+// Sums over lanes, and of block sums over the blocks of one launch while they run.
 #pragma once
 #include <cstdint>
 #include <cuda/atomic>
-
-#include "common/cuda_check.h"
-#include "common/stream.h"
 
 namespace blitzgs::cuda {
 
 inline constexpr unsigned kFullWarp = 0xffffffffu;
 
-__device__ __forceinline__ std::int32_t sum_of_lanes_until(std::int32_t value, int lane) {
+template <class T>
+__device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
 #pragma unroll
   for (int step = 1; step < 32; step *= 2) {
-    const std::int32_t before = __shfl_up_sync(kFullWarp, value, step);
+    const T before = __shfl_up_sync(kFullWarp, value, step);
     if (lane >= step) value += before;
   }
   return value;
@@ -26,10 +24,8 @@ __device__ __forceinline__ std::int32_t sum_of_lanes_until(std::int32_t value, i
 // all predecessors of one that waits run or have run.
 class RunningSum {
  public:
-  RunningSum(unsigned n_blocks, Workspace& workspace, CudaStream stream)
-      : turn_(workspace.allocate<std::uint64_t>(n_blocks + 1)), states_(turn_ + 1) {
-    check(cudaMemsetAsync(turn_, 0, (n_blocks + 1) * sizeof(std::uint64_t), stream), "running sum");
-  }
+  // zeros: one for each block and one more.
+  explicit RunningSum(std::uint64_t* zeros) : turn_(zeros), states_(zeros + 1) {}
 
   // The block's number; called once by all its threads, and a barrier for them.
   __device__ int take_turn() const {
@@ -39,13 +35,16 @@ class RunningSum {
     return turn;
   }
 
-  // Called by one whole warp of the block.
+  // Called by all threads of a block, each looking at one predecessor at a time; a barrier for them.
+  template <int kThreads>
   __device__ std::int64_t sum_before(int block, std::int64_t own) const {
-    const int lane = threadIdx.x % 32;
-    if (lane == 0) publish(block, kOwn, own);
+    __shared__ std::int64_t parts[kThreads / 32];
+    __shared__ bool ends[kThreads / 32];
+    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    if (threadIdx.x == 0) publish(block, kOwn, own);
     std::int64_t sum = 0;
-    for (int end = block; end > 0; end -= 32) {
-      const int at = end - 1 - lane;
+    for (int end = block; end > 0; end -= kThreads) {
+      const int at = end - 1 - static_cast<int>(threadIdx.x);
       std::uint64_t state = kThrough;  // in front of the first block there is nothing
       do {
         if (at >= 0) state = Word(states_[at]).load(::cuda::memory_order_relaxed);
@@ -53,15 +52,22 @@ class RunningSum {
       const unsigned through = __ballot_sync(kFullWarp, state >= kThrough);
       std::int64_t part = lane <= __ffs(through) - 1 || !through ? value(state) : 0;
       for (int step = 16; step > 0; step /= 2) part += __shfl_xor_sync(kFullWarp, part, step);
-      sum += part;
-      if (through) break;
+      __syncthreads();
+      if (lane == 0) {
+        parts[warp] = part;
+        ends[warp] = through != 0;
+      }
+      __syncthreads();
+      bool ended = false;
+      for (int w = 0; w < kThreads / 32 && !ended; ++w) {
+        sum += parts[w];
+        ended = ends[w];
+      }
+      if (ended) break;
     }
-    if (lane == 0) publish(block, kThrough, sum + own);
+    if (threadIdx.x == 0) publish(block, kThrough, sum + own);
     return sum;
   }
-
-  // In a later launch: of all blocks.
-  __device__ std::int64_t total(unsigned n_blocks) const { return value(states_[n_blocks - 1]); }
 
  private:
   using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;

@@ -7,26 +7,36 @@
 
 namespace blitzgs::cuda {
 
+// Tiles are counted from tile_begin on and fit 32 bits (intersect_op.cpp).
 struct Owned {
-  std::int64_t first, last;  // tiles [first, last)
-  int ty;                    // the tile row in its image
+  int first, last;  // tiles [first, last)
+  int ty;           // the tile row in its image
 };
+
+struct Splat {
+  float mean[2], conic[3], opacity;
+  int camera;
+};
+
+__device__ __forceinline__ Splat load_splat(const IntersectInput<float>& in, std::int64_t row) {
+  const float2 mean = reinterpret_cast<const float2*>(in.means2d)[row];
+  const float* const conic = in.conics + 3 * row;
+  const Splat s{{mean.x, mean.y}, {conic[0], conic[1], conic[2]}, in.opacities[row], in.camera_ids[row]};
+  // All are waited for together here: left to itself the compiler puts each load behind the tests before it.
+  asm volatile("" ::"f"(s.mean[0]), "f"(s.mean[1]), "f"(s.conic[0]), "f"(s.conic[1]), "f"(s.conic[2]),
+               "f"(s.opacity), "r"(s.camera));
+  return s;
+}
 
 // Calls f(owned tiles) for each tile row the splat touches.
 template <class F>
-__device__ __forceinline__ void for_each_owned(const IntersectInput<float>& in, std::int64_t row,
-                                               const F& f) {
-  const TileGrid& grid = in.grid;
-  const std::int64_t image = in.camera_ids[row] * grid.per_image();
-  const float2 mean2d = reinterpret_cast<const float2*>(in.means2d)[row];
-  const float conic[3] = {in.conics[3 * row], in.conics[3 * row + 1], in.conics[3 * row + 2]};
-  const float center[2] = {mean2d.x, mean2d.y};
-  for_each_tile_row(center, conic, in.opacities[row], grid.width, grid.height, grid.tile_size,
+__device__ __forceinline__ void for_each_owned(const TileGrid& grid, const Splat& splat, const F& f) {
+  const int n_owned = static_cast<int>(grid.tile_end - grid.tile_begin);
+  const int image = splat.camera * static_cast<int>(grid.per_image()) - static_cast<int>(grid.tile_begin);
+  for_each_tile_row(splat.mean, splat.conic, splat.opacity, grid.width, grid.height, grid.tile_size,
                     [&](int ty, int begin, int end) {
-                      const std::int64_t base = image + static_cast<std::int64_t>(ty) * grid.tiles_x;
-                      Owned owned{base + begin, base + end, ty};
-                      if (owned.first < grid.tile_begin) owned.first = grid.tile_begin;
-                      if (owned.last > grid.tile_end) owned.last = grid.tile_end;
+                      const int base = image + ty * grid.tiles_x;
+                      const Owned owned{max(base + begin, 0), min(base + end, n_owned), ty};
                       if (owned.first < owned.last) f(owned);
                     });
 }
@@ -39,28 +49,32 @@ struct alignas(16) Touched {
   static constexpr int kWords = 3;
   std::uint32_t first, rows[kWords];
 
+  static constexpr std::uint32_t kCounts = 0x0f0f0f0fu, kOnes = 0x01010101u, kHighBits = 0x80808080u;
+
   __device__ std::int32_t count() const {
     if (first == kWalk) return static_cast<std::int32_t>(rows[0]);
-    constexpr std::uint32_t kCounts = 0x0f0f0f0fu;
     const std::uint32_t sums = (rows[0] & kCounts) + (rows[1] & kCounts) + (rows[2] & kCounts);
-    return static_cast<std::int32_t>(sums * 0x01010101u >> 24);
+    return static_cast<std::int32_t>(sums * kOnes >> 24);
   }
 
   __device__ bool compact() const { return first != kWalk; }
 
   // Tile k < count() of a compact row, from tile_begin on.
-  __device__ std::int64_t tile(int k, int tiles_x) const {
-    std::int64_t start = static_cast<std::int64_t>(first) - 8;
+  __device__ std::uint32_t tile(std::uint32_t k, std::uint32_t tiles_x) const {
+    std::uint32_t start = first, word = rows[0];
+    std::uint32_t through = (word & kCounts) * kOnes;  // byte j: the tiles in rows 0 to j of the word
 #pragma unroll
-    for (int i = 0; i < kWords; ++i) {
-#pragma unroll
-      for (int bit = 0; bit < 32; bit += 8, start += tiles_x) {
-        const int n = rows[i] >> bit & 15u;
-        if (k < n) return start + (rows[i] >> bit + 4 & 15u) + k;
-        k -= n;
-      }
+    for (int i = 1; i < kWords; ++i) {
+      if (k < through >> 24) break;
+      k -= through >> 24;
+      start += 4 * tiles_x;
+      word = rows[i];
+      through = (word & kCounts) * kOnes;
     }
-    return start;
+    // The first byte that counts more than k; no byte borrows from the next, as they are at most 60.
+    const std::uint32_t reached = ((through | kHighBits) - (k + 1) * kOnes) & kHighBits;
+    const int bit = (__ffs(reached) - 1) & 24;
+    return start + (bit >> 3) * tiles_x + (word >> (bit + 4) & 15u) - 8 + k - (through << 8 >> bit & 255u);
   }
 
   // That of another lane; called by whole warps.
@@ -71,28 +85,25 @@ struct alignas(16) Touched {
   }
 };
 
-__device__ __forceinline__ Touched find_touched(const IntersectInput<float>& in, std::int64_t row) {
-  std::int64_t count = 0, first = in.grid.tile_begin;
-  int top = 0;
+__device__ __forceinline__ Touched find_touched(const TileGrid& grid, const Splat& splat) {
+  int count = 0, first = 0, top = 0;
   bool compact = true;
   Touched touched{};
-  for_each_owned(in, row, [&](const Owned& owned) {
+  for_each_owned(grid, splat, [&](const Owned& owned) {
     if (count == 0) {
       first = owned.first;
       top = owned.ty;
     }
-    const std::int64_t n = owned.last - owned.first;
-    const int down = owned.ty - top;
-    const std::int64_t shift = owned.first - first - static_cast<std::int64_t>(down) * in.grid.tiles_x + 8;
-    compact &= down < 4 * Touched::kWords && n < 16 && shift >= 0 && shift < 16;
-    const std::uint32_t bits = static_cast<std::uint32_t>(shift << 4 | n) << 8 * (down & 3);
+    const int n = owned.last - owned.first, down = owned.ty - top;
+    const unsigned shift = static_cast<unsigned>(owned.first - first - down * grid.tiles_x + 8);
+    compact &= down < 4 * Touched::kWords && n < 16 && shift < 16;
+    const std::uint32_t bits = (shift << 4 | n) << 8 * (down & 3);
 #pragma unroll
     for (int i = 0; i < Touched::kWords; ++i) touched.rows[i] |= down >> 2 == i ? bits : 0u;
     count += n;
   });
-  first -= in.grid.tile_begin;
   touched.first = static_cast<std::uint32_t>(first);
-  if (!compact || first >= Touched::kWalk) {
+  if (!compact) {
     touched.first = Touched::kWalk;
     touched.rows[0] = static_cast<std::uint32_t>(count);
   }

@@ -61,6 +61,49 @@ def test_splats_of_every_shape(tiles):
     require_same_lists(rows, (views, width, height, 16, *tiles), None)
 
 
+def small_splats(n, depths, views=1):
+    """Rows of splats some pixels wide, all over images of 200 x 150 pixels."""
+    g = torch.Generator().manual_seed(6)
+    rows = [None] * 8
+    rows[1] = torch.randint(0, views, (n,), generator=g, dtype=torch.int32)
+    rows[4] = torch.rand(n, 2, generator=g) * torch.tensor([220.0, 170.0]) - 10
+    rows[5] = torch.tensor([0.3, 0.1, 0.2]).repeat(n, 1)
+    rows[6] = depths[torch.randperm(n, generator=g)]
+    rows[7] = torch.rand(n, generator=g)
+    return rows, torch.randperm(n, generator=g)
+
+
+DEPTHS = {
+    "18 decades": lambda n: 10 ** torch.linspace(-8, 10, n),
+    "18 decades and many rows a few roundings apart": lambda n: torch.cat(
+        [torch.tensor([1e-8, 1e10]), 1 + torch.arange(n - 2) % 200 * 2.0**-23]
+    ),
+    "four neighbouring numbers": lambda n: 1 + torch.arange(n) % 4 * 2.0**-23,
+    "one number": lambda n: torch.full((n,), 3.0),
+    "both signs and both zeros": lambda n: torch.cat(
+        [torch.tensor([0.0, -0.0]).repeat(n // 4), torch.linspace(-1e5, 1e5, n - n // 4 * 2)]
+    ),
+    "all of a factor of four": lambda n: torch.linspace(100, 400, n),
+}
+
+
+@pytest.mark.parametrize("depths", DEPTHS)
+@pytest.mark.parametrize("with_ids", [False, True])
+@pytest.mark.parametrize(("n", "views"), [(1, 1), (5000, 1), (60_000, 3)])
+def test_depths_of_every_kind(depths, with_ids, n, views):
+    n_depths = max(n, 8)
+    rows, ids = small_splats(n, DEPTHS[depths](n_depths)[:n], views)
+    require_same_lists(rows, (views, 200, 150, 16, 0, -1), ids if with_ids else None)
+
+
+@pytest.mark.parametrize("tile_size", [8, 16, 64])
+def test_many_rows_and_entries(tile_size):
+    """Hundreds of blocks in every pass of the sorts."""
+    g = torch.Generator().manual_seed(2)
+    rows, ids = small_splats(1_000_000, torch.rand(1_000_000, generator=g), 2)
+    require_same_lists(rows, (2, 200, 150, tile_size, 0, -1), ids)
+
+
 def test_more_tiles_than_16_bits_hold():
     scene = Scene(500, views=2, width=4600, height=4100)
     rows = scene.project("cpu")

@@ -1,0 +1,193 @@
+// SPDX-License-Identifier: Apache-2.0
+// Rows by (depth, id): a radix sort of keys of up to 24 bits in three passes. A key is the depth's place
+// among all floats, counted from the smallest depth there is. Where 24 bits hold more than that, the view
+// goes in front: rows of different views need no order among them, and have fewer equal keys then. Where they
+// hold less (more than a factor of four between the nearest and the farthest) the low bits are left out, and
+// rows whose keys are equal are compared by depth as well as by id.
+#pragma once
+#include <cstdint>
+
+#include "intersect/radix_sweep.cuh"
+#include "intersect/touched_tiles.cuh"
+
+namespace blitzgs::cuda {
+
+inline constexpr int kDepthThreads = 256, kDepthItems = 4, kDepthRows = kDepthThreads * kDepthItems;
+inline constexpr int kDepthPasses = 3, kDepthBits = 8, kDepthBins = 1 << kDepthBits;
+inline constexpr int kRangeBlocks = kDepthThreads, kRangeThreads = 512;
+inline constexpr int kShortRun = 16;  // rows of equal keys that one thread orders
+
+// Floats in the order of unsigned integers.
+__device__ __forceinline__ std::uint32_t ordered_bits(float depth) {
+  const std::uint32_t bits = __float_as_uint(depth);
+  return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
+}
+
+struct DepthRange {
+  std::uint32_t low, high;
+
+  // Called by a whole block: the union of its threads' ranges, to all of them.
+  template <int kThreads>
+  __device__ DepthRange of_block() const {
+    __shared__ DepthRange warps[kThreads / 32];
+    const int lane = threadIdx.x % 32;
+    DepthRange range{__reduce_min_sync(kFullWarp, low), __reduce_max_sync(kFullWarp, high)};
+    if (lane == 0) warps[threadIdx.x / 32] = range;
+    __syncthreads();
+    range = warps[lane % (kThreads / 32)];
+    return {__reduce_min_sync(kFullWarp, range.low), __reduce_max_sync(kFullWarp, range.high)};
+  }
+};
+
+// How keys are made of depths, once for all kernels.
+struct DepthDigits {
+  int dropped, view_shift, width;  // bits left out of the depth, below the view, and of a digit
+  std::uint32_t view_mask;
+
+  __device__ DepthDigits(const DepthRange& range, int n_views) {
+    constexpr int kMost = kDepthPasses * kDepthBits;
+    const int depth_bits = 32 - __clz(range.high - range.low);
+    view_shift = min(depth_bits, kMost);
+    dropped = depth_bits - view_shift;
+    const int view_bits = min(kMost - view_shift, 32 - __clz(n_views - 1));
+    view_mask = (1u << view_bits) - 1;
+    width = max(1, (view_shift + view_bits + kDepthPasses - 1) / kDepthPasses);
+  }
+
+  // offset: a depth's place from the smallest one on.
+  __device__ std::uint32_t key(std::uint32_t offset, std::int32_t view) const {
+    return (view & view_mask) << view_shift | offset >> dropped;
+  }
+};
+
+// The range of the depths by block, and zeros for the kernels that follow: one launch before all others.
+__global__ void __launch_bounds__(kRangeThreads)
+    range_kernel(const float* depths, std::int64_t n, DepthRange* ranges, uint4* zeros,
+                 std::int64_t n_zeros) {
+  constexpr std::int64_t kStep = kRangeBlocks * kRangeThreads;
+  const std::int64_t thread = blockIdx.x * static_cast<std::int64_t>(kRangeThreads) + threadIdx.x;
+  DepthRange range{0xffffffffu, 0u};
+#pragma unroll 8
+  for (std::int64_t i = thread; i < n; i += kStep) {
+    const std::uint32_t bits = ordered_bits(depths[i]);
+    range = {min(range.low, bits), max(range.high, bits)};
+  }
+  for (std::int64_t i = thread; i < n_zeros; i += kStep) zeros[i] = uint4{};
+  range = range.of_block<kRangeThreads>();
+  if (threadIdx.x == 0) ranges[blockIdx.x] = range;
+}
+
+// Sort keys, their digits' histograms, and what the rows touch.
+__global__ void __launch_bounds__(kDepthThreads)
+    depth_keys_kernel(const IntersectInput<float> in, const DepthRange* ranges, std::uint32_t* keys,
+                      Touched* touched, std::uint64_t* histograms, int* dropped_bits, int* width,
+                      std::int64_t* n_rows) {
+  __shared__ std::uint32_t counts[kDepthPasses][kDepthBins];
+  for (int bin = threadIdx.x; bin < kDepthPasses * kDepthBins; bin += kDepthThreads) counts[0][bin] = 0;
+  const DepthRange range = ranges[threadIdx.x].of_block<kDepthThreads>();  // and a barrier
+  const DepthDigits digits(range, in.grid.n_cameras);
+  if (blockIdx.x == 0 && threadIdx.x == 0) {
+    *dropped_bits = digits.dropped;
+    *width = digits.width;
+    *n_rows = in.n_rows;
+  }
+  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kDepthRows) + threadIdx.x;
+#pragma unroll 1
+  for (int k = 0; k < kDepthItems; ++k) {
+    const std::int64_t i = first + k * kDepthThreads;
+    if (i >= in.n_rows) break;
+    const float depth = in.depths[i];
+    const Splat splat = load_splat(in, i);
+    const std::uint32_t key = digits.key(ordered_bits(depth) - range.low, splat.camera);
+    keys[i] = key;
+#pragma unroll
+    for (int pass = 0; pass < kDepthPasses; ++pass) {
+      atomicAdd(&counts[pass][key >> pass * digits.width & ((1u << digits.width) - 1)], 1u);
+    }
+    touched[i] = find_touched(in.grid, splat);
+  }
+  __syncthreads();
+  add_counts(counts[0], kDepthPasses * kDepthBins, histograms);
+}
+
+struct RowOrder {
+  const float* depths;      // null: not compared
+  const std::int64_t* ids;  // null: the row index
+
+  __device__ bool before(std::int32_t a, std::int32_t b) const {
+    if (depths) {
+      const std::uint32_t depth_a = ordered_bits(depths[a]), depth_b = ordered_bits(depths[b]);
+      if (depth_a != depth_b) return depth_a < depth_b;
+    }
+    return ids ? ids[a] < ids[b] : a < b;
+  }
+
+  // By a whole block: bitonic, with every comparison upwards, so that rows behind the last need not exist.
+  __device__ void sort(std::int32_t* rows, std::int64_t n) const {
+    for (std::int64_t size = 2; size < 2 * n; size *= 2) {
+      for (std::int64_t step = size / 2; step > 0; step /= 2) {
+        __syncthreads();
+        for (std::int64_t i = threadIdx.x; i < (n + 2 * step - 1) / (2 * step) * step; i += blockDim.x) {
+          const std::int64_t at = i & (step - 1), group = 2 * (i - at), low = group + at;
+          // The first step of a size mirrors its upper half.
+          const std::int64_t high = 2 * step == size ? group + size - 1 - at : low + step;
+          if (high < n && before(rows[high], rows[low])) {
+            const std::int32_t row = rows[low];
+            rows[low] = rows[high];
+            rows[high] = row;
+          }
+        }
+      }
+    }
+    __syncthreads();
+  }
+};
+
+// Orders each run of equal keys: a thread the usual handful, its block the others, one by one.
+__global__ void __launch_bounds__(kDepthThreads)
+    order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows, std::int64_t n, RowOrder order,
+                      const int* dropped_bits) {
+  __shared__ std::int64_t long_runs[kDepthRows / kShortRun + 1];
+  __shared__ int n_long;
+  if (*dropped_bits == 0) {
+    if (!order.ids) return;  // the passes kept equal depths in the order of rows
+    order.depths = nullptr;
+  }
+  if (threadIdx.x == 0) n_long = 0;
+  __syncthreads();
+  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kDepthRows) + threadIdx.x;
+  unsigned begins = 0;
+#pragma unroll
+  for (int k = 0; k < kDepthItems; ++k) {
+    const std::int64_t i = first + k * kDepthThreads;
+    if (i + 1 < n && keys[i] == keys[i + 1] && (i == 0 || keys[i - 1] != keys[i])) begins |= 1u << k;
+  }
+  for (; begins; begins &= begins - 1) {
+    const std::int64_t i = first + (__ffs(begins) - 1) * kDepthThreads;
+    std::int32_t* const run = rows + i;
+    int length = 2;
+    while (length <= kShortRun && i + length < n && keys[i + length] == keys[i]) ++length;
+    if (length > kShortRun) {
+      long_runs[atomicAdd(&n_long, 1)] = i;
+      continue;
+    }
+    for (int at = 1; at < length; ++at) {
+      const std::int32_t row = run[at];
+      int to = at;
+      for (; to > 0 && order.before(row, run[to - 1]); --to) run[to] = run[to - 1];
+      if (to < at) run[to] = row;
+    }
+  }
+  __syncthreads();
+  for (int k = 0; k < n_long; ++k) {
+    const std::int64_t begin = long_runs[k];
+    std::int64_t length = 0;
+    for (int same = kDepthThreads; same == kDepthThreads; length += same) {
+      const std::int64_t i = begin + length + threadIdx.x;
+      same = __syncthreads_count(i < n && keys[i] == keys[begin]);
+    }
+    order.sort(rows + begin, length);
+  }
+}
+
+}  // namespace blitzgs::cuda
