@@ -186,6 +186,8 @@ def test_errors_name_the_value():
         intersect(*splats.rows(), tile_begin=5, tile_end=31, **options)
     with pytest.raises(RuntimeError, match=r"tile_size must be in \[1, 64\], got 0"):
         torch.ops.blitzgs.intersect(*splats.rows(), None, 1, WIDTH, HEIGHT, 0, 0, -1, -1)
+    with pytest.raises(RuntimeError, match="tile numbers are 32-bit, got 4294967296 tiles"):
+        intersect(*splats.rows(), n_cameras=1, width=2**20, height=2**20)
 
 
 @pytest.mark.parametrize("known", [False, True])
