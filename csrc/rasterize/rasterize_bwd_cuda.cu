@@ -293,8 +293,8 @@ class PackedRows {
       dispatch_backward<32>(args, absolute, stream_);
     }
     if (!entries_) return;
-    sum_entries_kernel<<<blocks_for(3 * n_isects_, 256), 256, 0, stream_>>>(sorted_.rows, sorted_.entries,
-                                                                            n_isects_, entries_, packed);
+    sum_entries_kernel<<<blocks_for(3 * n_isects_, 256), 256, 0, stream_>>>(
+        sorted_.rows, sorted_.entries, n_isects_, in_.tile_offsets + in_.grid.count(), entries_, packed);
     check_launch("rasterize_bwd");
   }
 

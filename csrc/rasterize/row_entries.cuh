@@ -17,18 +17,21 @@ inline __global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
   if (i < n) values[i] = static_cast<std::int32_t>(i);
 }
 
-// Adds each row's entries in the order of the list of all tiles.
+// Adds each row's entries in the order of the list of all tiles. Of the n entries those from *n_listed on are
+// of no tile, and name any row: sorted by the low bits of it, they come behind the listed ones of a row.
 inline __global__ void sum_entries_kernel(const std::int32_t* sorted_rows, const std::int32_t* entries,
-                                          std::int64_t n, const PackedGradient* entry_gradients,
+                                          std::int64_t n, const std::int64_t* n_listed,
+                                          const PackedGradient* entry_gradients,
                                           PackedGradient* row_gradients) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
   if (i >= 3 * n) return;
   const int quad = static_cast<int>(i % 3);
   std::int64_t at = i / 3;
+  const std::int64_t end = *n_listed;
   const std::int32_t row = sorted_rows[at];
-  if (at > 0 && sorted_rows[at - 1] == row) return;
+  if (entries[at] >= end || (at > 0 && sorted_rows[at - 1] == row)) return;
   float4 sum{0.f, 0.f, 0.f, 0.f};
-  for (; at < n && sorted_rows[at] == row; ++at) {
+  for (; at < n && sorted_rows[at] == row && entries[at] < end; ++at) {
     const float4 part = entry_gradients[entries[at]].quads[quad];
     sum = {sum.x + part.x, sum.y + part.y, sum.z + part.z, sum.w + part.w};
   }

@@ -154,6 +154,23 @@ def test_gradients_of_some_of_the_composited_tiles(scene, deterministic):
         assert target.any() and relative_error(value, target) < 1e-4
 
 
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_entries_of_no_tile_name_any_row(scene, deterministic):
+    """Lists may be longer than what the tiles have."""
+    job = Job(scene, 3)
+    saved = job.forward("cuda")
+    v = torch.randn_like(saved[0]), torch.randn_like(saved[1])
+    expected = job.backward("cuda", torch.float32, saved, *v, False, deterministic)
+    rows, offsets = job.lists
+    g = torch.Generator().manual_seed(9)
+    anything = torch.randint(-(2**31), 2**31, (5000,), generator=g).int()
+    anything[::2] = rows[torch.randint(len(rows), (2500,), generator=g)]
+    job.lists = torch.cat((rows, anything)), offsets
+    gradients = job.backward("cuda", torch.float32, saved, *v, False, deterministic)
+    for value, target in zip(gradients, expected, strict=True):
+        assert relative_error(value, target) <= (0 if deterministic else 1e-5)
+
+
 def test_empty_lists_give_the_background(scene):
     scene.means[:, 2] = -100.0
     job = Job(scene, 3)
