@@ -293,8 +293,12 @@ def _meta(
         with torch.set_grad_enabled(with_gradient):  # as when meta was made
             return seen.of_all(values)
 
+    def listed() -> Tensor:
+        """Leave out the entries of no tile, of which there are some where rows are hidden."""
+        return isect_rows[: int(tile_offsets[-1])]
+
     def isect_ids() -> Tensor:
-        depths = rows.depths.detach().index_select(0, isect_rows)
+        depths = rows.depths.detach().index_select(0, listed())
         return _isect_ids(depths, tile_offsets, n_cameras, tile_width * tile_height)
 
     per_row = {
@@ -312,7 +316,7 @@ def _meta(
         tile_width=tile_width,
         tile_height=tile_height,
         isect_ids=Later(isect_ids),
-        flatten_ids=isect_rows if packed else Later(lambda: seen.places.index_select(0, isect_rows).int()),
+        flatten_ids=Later(listed if packed else lambda: seen.places.index_select(0, listed()).int()),
         isect_offsets=Later(lambda: tile_offsets[:-1].reshape(n_cameras, tile_height, tile_width)),
         width=width,
         height=height,

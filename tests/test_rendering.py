@@ -202,6 +202,20 @@ def test_meta_read_late_is_differentiable_as_the_call_was():
 
 
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("packed", [False, True])
+def test_meta_lists_only_what_touches_a_tile(device, packed):
+    """Not Gaussians whose colour is not finite, for which there is room in the lists."""
+    scene = random_scene(n=90, cameras=2, width=50, height=37, device=device)
+    scene.colors[::3, 0] = float("nan")
+    _, _, meta = rasterize_scene(scene, packed=packed)
+    listed = int(meta["tiles_per_gauss"].sum())
+    assert 0 < listed == len(meta["flatten_ids"]) == len(meta["isect_ids"])
+    rows = meta["flatten_ids"].long()
+    gaussians = meta["gaussian_ids"][rows] if packed else rows % 90
+    assert (gaussians % 3 != 0).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_meta_lists_are_sorted_and_consistent(device):
     scene = random_scene(n=90, cameras=2, width=50, height=37, device=device)
     _, _, meta = rasterize_scene(scene, tile_size=8)
