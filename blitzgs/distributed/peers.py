@@ -19,9 +19,11 @@ streams: work queued behind it, on any rank, finds done what any rank queued bef
 - arriving rows of a step overwrite those of the step before after A; whoever read those had queued that
   before its own A;
 - returning gradients are written after A and B, and those of the step before were read before A;
-- the numbers that ranks bring to a meeting are read before the next that has numbers, and overwritten at the
-  one after that: there are two places for them, used in turn. So it is with the board and the meetings beside
-  the step: what a rank copies from it behind one of them it has copied before it comes to the next.
+- the numbers that ranks bring to a meeting are read before the next that has numbers, as there are two places
+  for them, used in turn: whoever has been at the next may overwrite the first. So it is with the board and
+  the meetings beside the step: what a rank copies from it behind one of them it has copied before it comes to
+  the next. Sums of the numbers lie where no other rank ever writes: a rank's own second meeting after
+  overwrites them.
 
 Rows are queued for writing behind A while the counts are on their way to the host. Where they do not fit into
 somebody's buffer no rank writes any, which each finds from the same counts; then all wait for the counts, so
@@ -57,12 +59,13 @@ SECOND, BESIDE = 0, 1
 
 
 class Shared(NamedTuple):
-    """Numbers that all ranks brought to a meeting; valid until the second such meeting after this.
+    """Numbers that all ranks brought to a meeting.
 
     Attributes:
-        everyone: int64 [M, n], those of each rank.
-        sums: int64 [n], over the ranks.
-        known: `everyone` on the CPU, once what was queued on the current stream was waited for.
+        everyone: int64 [M, n], those of each rank; valid until the next such meeting.
+        sums: int64 [n], over the ranks; valid until this rank queues the second such meeting after this.
+        known: `everyone` on the CPU, once what was queued on the current stream was waited for; as long as
+            the sums.
     """
 
     everyone: Tensor
@@ -141,7 +144,8 @@ class Peers:
         place = self._shared % 2
         self._shared += 1
         count, numbers = self.world_size, len(values)
-        first = count + place * MAX_VALUES * (count + 1)
+        # The sums come behind the numbers: always in the same words, where no other rank ever writes.
+        first = count + place * MAX_VALUES * (count + 1) + count * (MAX_VALUES - numbers)
         known = self._known[place, : count * numbers].view(count, numbers)
         self._meet(values, first, known)
         brought = self._mail[self.rank][first : first + (count + 1) * numbers].view(count + 1, numbers)

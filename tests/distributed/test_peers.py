@@ -4,12 +4,14 @@
 import dataclasses
 import os
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed import exchange
+from blitzgs.distributed import peers as peers_module
 from blitzgs.distributed.exchange import send_back, send_back_packed
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
@@ -166,28 +168,67 @@ def test_a_rank_that_leaves_a_meeting_is_named(how):
     assert "waited 3 s in read: rank 1 has not" in failure.value.blame
 
 
-def test_numbers_are_not_overwritten_before_all_have_read_them(monkeypatch):
-    """Two calls of `share` in turn use different places."""
+@pytest.fixture
+def alone(monkeypatch):
+    """Shared memory of one rank without a GPU: its mail, the peers, and what meetings it queued."""
     met = []
     monkeypatch.setattr(Peers, "_map", lambda self, name, mine: [mine])
-    monkeypatch.setattr(
-        torch.ops.blitzgs,
-        "meet_peers_",
-        lambda mail, rank, number, values, first, timeout, known: met.append(
-            (number, values is not None, first, known is not None)
-        ),
-    )
+
+    def meet(mail, rank, number, values, first, timeout, known=None):
+        met.append((number, values is not None, first, known is not None))
+
+    monkeypatch.setattr(torch.ops.blitzgs, "meet_peers_", meet)
     mail = torch.arange(mail_words(1))
-    peers = Peers(Ranks(), mail, 1.0)
-    numbers, second = torch.arange(3), 1 + 2 * MAX_VALUES
+    return mail, Peers(Ranks(), mail, 1.0), met
+
+
+def test_numbers_are_not_overwritten_before_all_have_read_them(alone):
+    """Two calls of `share` in turn use different places."""
+    mail, peers, met = alone
+    numbers, second = torch.arange(3), 2 * MAX_VALUES
+    first = MAX_VALUES - 2
     got = peers.share(numbers)
-    assert got.everyone.tolist() == [[1, 2, 3]] and got.sums.tolist() == [4, 5, 6]
+    assert got.everyone.tolist() == [[first, first + 1, first + 2]]
+    assert got.sums.tolist() == [first + 3, first + 4, first + 5]
     peers.meet()
     later = peers.share(numbers)
-    assert later.everyone.tolist() == [[second, second + 1, second + 2]]
+    assert later.everyone.tolist() == [[first + second, first + second + 1, first + second + 2]]
     assert later.known.data_ptr() != got.known.data_ptr() == peers.share(numbers).known.data_ptr()
-    assert met == [(1, True, 1, True), (2, False, 1, False), (3, True, second, True), (4, True, 1, True)]
-    assert second + 2 * MAX_VALUES + 2 == len(mail)
+    assert met == [
+        (1, True, first, True),
+        (2, False, 1, False),
+        (3, True, first + second, True),
+        (4, True, first, True),
+    ]
+    assert 1 + 2 * second + 2 == len(mail)
+
+
+def test_sums_are_where_no_rank_writes_numbers(alone):
+    _, peers, _ = alone
+    calls = [peers.share(torch.zeros(n, dtype=torch.int64)) for n in (1, 7, MAX_VALUES, 3, 20, MAX_VALUES)]
+    numbers = [{*call.everyone.flatten().tolist()} for call in calls]
+    sums = [{*call.sums.tolist()} for call in calls]
+    words = [set.union(*numbers[place::2], *sums[place::2]) for place in (0, 1)]
+    assert words[0].isdisjoint(words[1])
+    for place in (0, 1):
+        assert set.union(*numbers[place::2]).isdisjoint(set.union(*sums[place::2]))
+    with pytest.raises(RuntimeError, match="invalid for input of size"):
+        peers.share(torch.zeros(MAX_VALUES + 1, dtype=torch.int64))
+
+
+def test_boards_have_two_places_and_grow(alone, monkeypatch):
+    _, peers, met = alone
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: SimpleNamespace(synchronize=lambda: None))
+    monkeypatch.setattr(
+        peers_module.symmetric, "empty", lambda words, dtype, device: torch.arange(words, dtype=dtype)
+    )
+    half = peers_module._LEAST_BOARD
+    for words, begin in ((5, 0), (5, half), (half, 0), (7, half), (half + 1, 0), (5, half + 1), (5, 0)):
+        (board,) = peers.boards(words)
+        assert len(board) == words and board[0] == begin
+        peers.meet_apart(peers_module.SECOND)  # counts by itself
+        peers.meet_apart(peers_module.BESIDE)
+    assert [number for number, *_ in met] == [n for meeting in range(1, 8) for n in (meeting, meeting)]
 
 
 def _refused(rank):
