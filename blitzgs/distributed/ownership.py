@@ -20,6 +20,7 @@ from blitzgs.distributed.host_sum import HostSum
 TILE_COST = 8
 # Windows of the loss reach this far: 5 px from an owned pixel, and 5 more for its gradient.
 LOSS_REACH = 10
+# Costs that `divide` first adds up together.
 _STRETCH = 128
 
 
@@ -203,7 +204,7 @@ def divide(cost: NDArray[Any], parts: int) -> tuple[int, ...]:
     """Cut a sequence of costs into contiguous parts of nearly equal sums.
 
     Args:
-        cost: [n], >= 0.
+        cost: [n], n >= 1, >= 0.
         parts: how many, M.
 
     Returns:

@@ -29,7 +29,7 @@ class GradientRoom:
     def take(self, means2d: Tensor) -> Tensor:
         """Return zeros [P, 12] for the P rows."""
         zeros, self._zeros = self._zeros, None
-        if zeros is None or len(zeros) < len(means2d):
+        if zeros is None or len(zeros) != len(means2d):
             return means2d.new_zeros(len(means2d), _PACKED)
         return zeros
 

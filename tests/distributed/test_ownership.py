@@ -33,6 +33,20 @@ def test_extreme_costs():
     assert list(bounds) == sorted(bounds)
 
 
+@pytest.mark.parametrize("n", [1, 127, 128, 129, 257, 1000])
+@pytest.mark.parametrize("share_of_zeros", [0.0, 0.5, 0.99])
+def test_each_bound_is_the_nearest_to_its_share(n, share_of_zeros):
+    """However the stretches that are summed first lie."""
+    rng = np.random.default_rng(n)
+    for parts in range(1, 17):
+        cost = (rng.integers(1, 9, n) * (rng.random(n) >= share_of_zeros)).astype(np.float32)
+        bounds, ends = divide(cost, parts), np.concatenate(([0.0], np.cumsum(cost, dtype=np.float64)))
+        assert bounds[0] == 0 and bounds[-1] == n and list(bounds) == sorted(bounds)
+        for part in range(1, parts):
+            distances = abs(ends - ends[-1] * part / parts)
+            assert distances[bounds[part]] == distances.min()
+
+
 def test_costs_are_those_of_the_last_visit():
     owners = TileOwners(Ranks(world_size=1))
     owners.ranks = type(

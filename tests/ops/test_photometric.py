@@ -234,6 +234,13 @@ def test_errors_name_the_value():
         photometric_sums(x, targets, torch.ones(2, 53, 70))
     with pytest.raises(RuntimeError, match=r"targets \(if not uint8\) must be Float, got Double"):
         photometric_sums(x, targets.double())
+    weights = torch.ones(2)
+    with pytest.raises(RuntimeError, match=r"samples must have shape \[2\], got \[3\]"):
+        photometric_fwd_bwd(x, targets, None, weights, weights, samples=torch.ones(3))
+    with pytest.raises(RuntimeError, match="samples must be Float, got Long"):
+        photometric_fwd_bwd(x, targets, None, weights, weights, samples=torch.ones(2).long())
+    with pytest.raises(RuntimeError, match="visible must be Long, got Int"):
+        photometric_fwd_bwd(x, targets, None, weights, weights, visible=torch.ones(2).int())
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
-from blitzgs.ops.rasterize import rasterize
+from blitzgs.ops.rasterize import GradientRoom, rasterize
 from tests.ops.splats import Splats, dense_composite, near_a_cut, random_splats
 
 WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
@@ -338,6 +338,28 @@ def test_errors_name_the_value():
         rasterize(*splats.values(), tile_lists[0], tile_lists[1][:-1], **options)
 
 
+def test_zeros_for_gradients_serve_once():
+    means2d, zeros = torch.ones(5, 2), torch.zeros(5, 12)
+    room = GradientRoom(zeros)
+    assert room.take(means2d) is zeros
+    for others in (room, GradientRoom(torch.zeros(0, 12))):  # taken, or never written
+        taken = others.take(means2d)
+        assert taken is not zeros and taken.shape == (5, 12) and not taken.any()
+    assert GradientRoom(torch.zeros(0, 12)).take(means2d[:0]).shape == (0, 12)
+
+
+def test_the_images_do_not_depend_on_a_backward_pass_to_follow():
+    splats = random_splats(100, WIDTH, HEIGHT)
+    grid = (1, WIDTH, HEIGHT, 16, 0, -1, None, True)
+    plain, prepared = (
+        torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *lists(splats), *grid, follows)
+        for follows in (False, True)
+    )
+    for x, y in zip(plain[:4], prepared[:4], strict=True):
+        assert torch.equal(x, y)
+    assert plain[5].shape == prepared[5].shape == (0, 12)  # on the CPU nothing is left packed
+
+
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_opcheck(absgrad):
     splats = random_splats(6, WIDTH, HEIGHT)
@@ -347,6 +369,7 @@ def test_opcheck(absgrad):
     tile_lists = lists(splats)
     arguments = (*values, backgrounds, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1, probe)
     torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, arguments)
+    torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, (*arguments, False, True))
     with torch.no_grad():
         outputs = forward(splats)
         renders, transmittances, last_ids, _, aux, _ = outputs
