@@ -39,6 +39,7 @@ TESTS = [
         "gradients_match_float64[True-False-3-16]", "gradients_match_float64[True-False-9-16]",
         "gradients_match_float64[True-True-9-32]", "packed_gradients_are_the_same[3]",
         "gradients_of_some_of_the_composited_tiles[False]", "empty_lists_give_the_background",
+        "entries_of_no_tile_name_any_row[True]",
     )),
     *(PEERS + test for test in (
         "rows_arrive_and_their_gradients_return", "parts_of_rows_return",
