@@ -63,13 +63,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status: int = args.run(args)
     except USER_ERRORS as error:
         Console(stderr=True, highlight=False).print(
-            f"blitzgs {args.command}: {error}", style="red", markup=False
+            f"blitzgs {args.command}: {_message(error)}", style="red", markup=False, soft_wrap=True
         )
         return 1
     except KeyboardInterrupt:
         print(f"blitzgs {args.command}: interrupted", file=sys.stderr)
         return 130
     return status
+
+
+def _message(error: Exception) -> str:
+    """The error's text; for one of the operating system, the file and what is wrong with it."""
+    if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
+        return str(error)
+    if isinstance(error, FileExistsError):
+        return f"{error.filename} is a file where a folder is needed: choose another name"
+    return f"{error.filename}: {error.strerror}"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -184,6 +193,9 @@ def _eval(args: argparse.Namespace) -> int:
     with Ranks.from_environment(args.device) as ranks:
         model = run.open_model(args.folder, ranks, args.data)
         capture, images = run.open_capture(model.config, ranks)
+        run.check_capture(model.space, capture, args.folder)
+        if not getattr(capture, args.split):
+            raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
         result = evaluate(
             model.table,
             ViewSet(list(capture.cameras), model.space, ranks.device),
@@ -205,6 +217,7 @@ def _render(args: argparse.Namespace) -> int:
     with Ranks.from_environment(args.device) as ranks:
         model = run.open_model(args.folder, ranks, args.data)
         capture, _ = run.open_capture(model.config, ranks)
+        run.check_capture(model.space, capture, args.folder)
         views = ViewSet(list(capture.cameras), model.space, ranks.device)
         options = render_options(model.config, model.space, model.progress.sh_degree)
         indices = range(len(capture.cameras)) if args.split == "all" else getattr(capture, args.split)
@@ -221,6 +234,8 @@ def _render(args: argparse.Namespace) -> int:
                 np.save(path, render.cpu().numpy())
             else:
                 save_image(path, render)
+        if ranks.rank == 0:
+            print(f"{args.out}: {len(indices)} images")
     return 0
 
 

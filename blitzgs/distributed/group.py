@@ -190,7 +190,9 @@ class Ranks:
         if self.peers is not None:
             return self.peers.share(values).everyone
         everyone = values.new_empty(self.world_size * len(values))
-        self._collective("share", lambda: dist.all_gather_into_tensor(everyone, values))
+        # Newer versions of torch have it under another name, and warn about this one.
+        gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
+        self._collective("share", lambda: gather(everyone, values))
         return everyone.view(self.world_size, -1)
 
     def exchange_counts(self, counts: Tensor) -> Tensor:
@@ -331,7 +333,12 @@ def _shorten(text: str, limit: int = 200) -> str:
 def _resolve_device(device: str, local_rank: int) -> torch.device:
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    place = torch.device(device)
+    try:
+        place = torch.device(device)
+    except RuntimeError:
+        place = torch.device("meta")
+    if place.type not in ("cpu", "cuda"):
+        raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {device!r}")
     if place.type == "cuda" and place.index is None:
         place = torch.device("cuda", local_rank)
     if place.type == "cuda" and place.index >= torch.cuda.device_count():

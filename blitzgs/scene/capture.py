@@ -25,6 +25,8 @@ from blitzgs.scene.ply import read_points
 from blitzgs.scene.splits import split_views
 from blitzgs.scene.undistort import Rectification, rectify
 
+# Pixels: SSIM looks at windows of 11, and what is much smaller shows nothing to train on.
+_LEAST_SIDE = 8
 _HEADER_THREADS = 16
 _SAMPLED_POINTS = 2000
 
@@ -244,7 +246,8 @@ def _existing(views: list[_View], root: Path, images: str, allow_missing: bool) 
     message = f"{len(missing)} of {len(views)} images are not in {root / images}: {shown}"
     if not allow_missing or len(missing) == len(views):
         raise FileNotFoundError(
-            f"{message}; check the images folder, or load with allow_missing=True to drop them"
+            f"{message}; check the images folder, or load with allow_missing=True "
+            "(--data.allow_missing=true) to drop them"
         )
     warnings.warn(f"{message}; dropped", stacklevel=3)
     return [view for view, there in zip(views, exists, strict=True) if there]
@@ -286,6 +289,11 @@ def _camera(
     already = max(1.0, view.lens.width / width) if downscale > 1 else 1.0
     left = downscale / already if downscale / already > 1.01 else 1.0
     size = downscaled_size(plan.width, plan.height, left)
+    if downscale > 1 and min(size) < _LEAST_SIDE:
+        raise ValueError(
+            f"downscale {downscale} leaves {size[0]} x {size[1]} pixels of {view.path}, which is {width} x "
+            f"{height}: choose a smaller one"
+        )
     pose = view.world_to_camera.copy()
     pose[:3, 3] += pose[:3, :3] @ offset
     mask = view.mask_path

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import platform
 import resource
 from dataclasses import dataclass
@@ -98,6 +99,16 @@ def open_capture(config: Config, ranks: Ranks) -> tuple[Capture, ImageStore]:
     return capture, ImageStore(capture, budget, data.threads, background=config.model.background)
 
 
+def check_capture(space: Space, capture: Capture, folder: Path) -> None:
+    """Check that a capture is the one that the run in `folder` was trained on.
+
+    Raises:
+        ValueError: its cameras lie elsewhere.
+    """
+    if Space.of(capture.offset, capture.extent) != space:
+        raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
+
+
 def check_alike(config: Config, capture: Capture, ranks: Ranks) -> None:
     """Check that all ranks run the same code with the same configuration on the same capture.
 
@@ -183,7 +194,7 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
     if restored is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
     table, progress, space, _ = restored
-    config = load_config(folder / CONFIG, [] if data is None else [f"data.path={data}"])
+    config = load_config(folder / CONFIG, [] if data is None else [f"data.path={json.dumps(data)}"])
     optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), space.extent, ranks.device)
     optimiser.catch_up(table, None, progress.step)
     return TrainedModel(config, progress, space, table)

@@ -90,10 +90,7 @@ class Trainer:
         else:
             self.table, self.progress, space, saved = restored
             run.check_resumable(saved, config)
-            if space != self.space:
-                raise ValueError(
-                    f"{config.data.path} is not the capture of the run in {folder}: its cameras differ"
-                )
+            run.check_capture(space, capture, folder)
         if ranks.rank == 0:
             folder.mkdir(parents=True, exist_ok=True)
             save_config(config, folder / run.CONFIG)

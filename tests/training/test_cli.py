@@ -3,6 +3,8 @@
 
 import json
 import math
+import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -88,6 +90,8 @@ def test_torchrun_entry(trained, tmp_path):
         (["train", "--config", "missing.yaml", "--out", "x"], 1, "missing.yaml: cannot read"),
         (["eval", "/nowhere"], 1, "/nowhere is not a run"),
         (["export", "/nowhere", "--ply", "x.ply"], 1, "/nowhere is not a run"),
+        (["train", "--data", "d", "--out", "x", "--device", "tpu"], 1, "cuda or cuda:N, got 'tpu'"),
+        (["train", "--data", "d", "--out", "x", "--device", "cuda:x"], 1, "cuda or cuda:N, got 'cuda:x'"),
         (["eval", "/nowhere", "--fast"], 2, "unrecognized arguments: --fast"),
     ],
 )
@@ -101,6 +105,41 @@ def test_mistakes_get_a_message(arguments, status, message, capsys, tmp_path, mo
     assert result == status
     printed = capsys.readouterr().err
     assert message in printed and "Traceback" not in printed
+
+
+def fails(capsys, *arguments):
+    assert main([str(argument) for argument in arguments]) == 1
+    return capsys.readouterr().err
+
+
+def test_another_capture_is_refused(trained, tmp_path, capsys):
+    shutil.copytree(trained[0], tmp_path / "other: one")
+    for name in ("eval", "render"):
+        flags = ["--out", tmp_path / name, "--data", tmp_path / "other: one"]
+        assert main([str(argument) for argument in (name, trained[1], *flags)]) == 0
+    poses = tmp_path / "other: one" / "sparse" / "0" / "images.bin"
+    content = bytearray(poses.read_bytes())
+    struct.pack_into("<d", content, 8 + 4 + 4 * 8, 9.0)  # the first camera's translation along x
+    poses.write_bytes(content)
+    for name in ("eval", "render"):
+        message = fails(capsys, name, trained[1], *flags[2:], "--out", tmp_path / "no")
+        assert "is not the capture of the run" in message and not (tmp_path / "no").exists()
+
+
+def test_mistakes_with_files_name_them(trained, tmp_path, capsys):
+    file = tmp_path / "binary"
+    file.write_bytes(b"\xff\xfe")
+    data = ["--data", trained[0]]
+    assert f"{file}: not valid YAML" in fails(capsys, "train", "--config", file, *data, "--out", tmp_path / "x")
+    assert f"{file} is a file" in fails(capsys, "render", trained[1], "--out", file)
+    small = fails(capsys, "train", *data, "--out", tmp_path / "x", "--data.downscale=100")
+    assert "downscale 100 leaves 1 x 1 pixels" in small
+
+
+def test_eval_without_held_out_views_says_so(trained, tmp_path, capsys):
+    flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.02", "--data.split=0"]
+    assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "run"), *flags]) == 0
+    assert "no test views: choose another --split" in fails(capsys, "eval", tmp_path / "run")
 
 
 def test_show_config_and_help(capsys):
