@@ -129,10 +129,10 @@ def test_another_capture_is_refused(trained, tmp_path, capsys):
 def test_mistakes_with_files_name_them(trained, tmp_path, capsys):
     file = tmp_path / "binary"
     file.write_bytes(b"\xff\xfe")
-    data = ["--data", trained[0]]
-    assert f"{file}: not valid YAML" in fails(capsys, "train", "--config", file, *data, "--out", tmp_path / "x")
+    data = ["--data", trained[0], "--out", tmp_path / "x"]
+    assert f"{file}: not valid YAML" in fails(capsys, "train", "--config", file, *data)
     assert f"{file} is a file" in fails(capsys, "render", trained[1], "--out", file)
-    small = fails(capsys, "train", *data, "--out", tmp_path / "x", "--data.downscale=100")
+    small = fails(capsys, "train", *data, "--data.downscale=100")
     assert "downscale 100 leaves 1 x 1 pixels" in small
 
 
