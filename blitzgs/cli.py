@@ -19,6 +19,7 @@ from rich.table import Table
 from blitzgs import __version__
 from blitzgs.distributed.group import MismatchError, Ranks, Transport
 from blitzgs.distributed.ownership import TileOwners
+from blitzgs.progress import image_progress
 from blitzgs.scene import ply
 from blitzgs.scene.pictures import save_image
 from blitzgs.scene.synth import command as synth
@@ -196,18 +197,20 @@ def _eval(args: argparse.Namespace) -> int:
         run.check_capture(model.space, capture, args.folder)
         if not getattr(capture, args.split):
             raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
-        result = evaluate(
-            model.table,
-            ViewSet(list(capture.cameras), model.space, ranks.device),
-            capture.cameras,
-            images,
-            getattr(capture, args.split),
-            render_options(model.config, model.space, model.progress.sh_degree),
-            args.out or args.folder / run.EVALUATION / args.split,
-            TileOwners(ranks),
-            pictures=args.pictures,
-            lpips=load_lpips(args.lpips),
-        )
+        with image_progress("Comparing", ranks.rank == 0) as report:
+            result = evaluate(
+                model.table,
+                ViewSet(list(capture.cameras), model.space, ranks.device),
+                capture.cameras,
+                images,
+                getattr(capture, args.split),
+                render_options(model.config, model.space, model.progress.sh_degree),
+                args.out or args.folder / run.EVALUATION / args.split,
+                TileOwners(ranks),
+                pictures=args.pictures,
+                lpips=load_lpips(args.lpips),
+                report=report,
+            )
         if ranks.rank == 0:
             print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
     return 0
@@ -223,17 +226,19 @@ def _render(args: argparse.Namespace) -> int:
         indices = range(len(capture.cameras)) if args.split == "all" else getattr(capture, args.split)
         owners = TileOwners(ranks)
         args.out.mkdir(parents=True, exist_ok=True)
-        for position, index in enumerate(indices):
-            # The ranks take turns at writing.
-            render = render_view(model.table, views, index, options, owners, position % ranks.world_size)
-            if render is None:
-                continue
-            path = (args.out / capture.cameras[index].name).with_suffix(".npy" if args.raw else ".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if args.raw:
-                np.save(path, render.cpu().numpy())
-            else:
-                save_image(path, render)
+        with image_progress("Rendering", ranks.rank == 0) as report:
+            for position, index in enumerate(indices):
+                # The ranks take turns at writing.
+                render = render_view(model.table, views, index, options, owners, position % ranks.world_size)
+                report(position + 1, len(indices))
+                if render is None:
+                    continue
+                path = (args.out / capture.cameras[index].name).with_suffix(".npy" if args.raw else ".png")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if args.raw:
+                    np.save(path, render.cpu().numpy())
+                else:
+                    save_image(path, render)
         if ranks.rank == 0:
             print(f"{args.out}: {len(indices)} images")
     return 0

@@ -95,6 +95,7 @@ def rasterization(
         is worked out when it is first read.
 
     Raises:
+        TypeError: an array of another library where a tensor is needed.
         ValueError: an argument that is not supported or does not fit, by name.
         RuntimeError: a wrong shape or dtype that a kernel found.
     """
@@ -104,6 +105,17 @@ def rasterization(
             "covars": covars,
             "camera_model": camera_model,
             **unsupported,
+        }
+    )
+    _require_tensors(
+        {
+            "means": means,
+            "quats": quats,
+            "scales": scales,
+            "opacities": opacities,
+            "colors": colors,
+            "viewmats": viewmats,
+            "Ks": Ks,
         }
     )
     _check(means, opacities, colors, viewmats, sh_degree, render_mode, rasterize_mode, backgrounds)
@@ -195,6 +207,12 @@ def _reject_unsupported(arguments: dict[str, Any]) -> None:
     for name, value in arguments.items():
         if value is not None and value is not False and value != "pinhole":
             raise ValueError(f"blitzgs.rasterization does not support {name}={value!r}; leave it out")
+
+
+def _require_tensors(arguments: dict[str, Any]) -> None:
+    for name, value in arguments.items():
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
 
 
 def _check(

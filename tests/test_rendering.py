@@ -281,6 +281,12 @@ def test_what_is_not_supported_is_refused_by_name(options, message):
         blitzgs.rasterization(**arguments)
 
 
+def test_an_array_of_another_library_is_refused_by_name():
+    means, quats, *rest = random_scene(n=4, cameras=1).arguments()
+    with pytest.raises(TypeError, match=r"quats must be a torch\.Tensor, got ndarray"):
+        blitzgs.rasterization(means, quats.numpy(), *rest, sh_degree=3)
+
+
 def test_arguments_without_effect_are_accepted():
     scene = random_scene(n=10, cameras=1)
     plain, _, _ = rasterize_scene(scene)

@@ -175,6 +175,9 @@ def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View],
     if "train" in parts:
         found = [_read_colmap(root / p, _model_in(root / p), images, downscale, part=p) for p in parts]
         return [view for views, _ in found for view in views], found[0][1]
+    incomplete = colmap.find_incomplete_model(root)
+    if incomplete is not None:
+        return _read_colmap(root, incomplete, images, downscale)  # says which file is missing
     raise FileNotFoundError(
         f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
         ".bin or .txt), or transforms.json"

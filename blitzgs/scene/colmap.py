@@ -8,6 +8,7 @@ Poses map world to camera: x_camera = R(q) x_world + t with q = (w, x, y, z); pi
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -114,9 +115,18 @@ def camera_models() -> dict[str, list[str]]:
 
 def find_model(path: Path) -> Path | None:
     """The folder of a sparse model below `path` (sparse/0, sparse, `path` itself, colmap/...), or None."""
+    return _find(path, all)
+
+
+def find_incomplete_model(path: Path) -> Path | None:
+    """The folder that `find_model` would find if all of its files were there, or None."""
+    return _find(path, any)
+
+
+def _find(path: Path, enough: Callable[[Iterable[bool]], bool]) -> Path | None:
     for folder in ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse"):
         for suffix in (".bin", ".txt"):
-            if all((path / folder / (name + suffix)).is_file() for name in FILES):
+            if enough((path / folder / (name + suffix)).is_file() for name in FILES):
                 return path / folder
     return None
 

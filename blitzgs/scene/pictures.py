@@ -14,7 +14,9 @@ from torch import Tensor
 
 UInt8 = npt.NDArray[np.uint8]
 
-_LABELS = ("render", "photograph", "error")
+# Shown in the last colour of an error map.
+_FULL_ERROR = 0.25
+_LABELS = ("render", "photograph", f"error (red: {_FULL_ERROR} or more)")
 _BAR = 24
 _GAP = 4
 
@@ -43,7 +45,9 @@ def save_image(path: Path | str, image: Tensor) -> None:
         raise OSError(f"cannot write the picture {path}")
 
 
-def error_map(render: Tensor, target: Tensor, mask: Tensor | None = None, full: float = 0.25) -> Tensor:
+def error_map(
+    render: Tensor, target: Tensor, mask: Tensor | None = None, full: float = _FULL_ERROR
+) -> Tensor:
     """Mean absolute error over the channels as colours from dark blue (0) to red (`full` and more).
 
     Args:

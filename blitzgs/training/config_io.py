@@ -7,6 +7,7 @@ import dataclasses
 import difflib
 import hashlib
 import json
+import math
 import types
 import typing
 from collections.abc import Iterable
@@ -205,6 +206,12 @@ def _check(config: Config) -> None:
         (config.log.every >= 1, "log.every", config.log.every, "1 or more"),
         (config.log.keep_checkpoints >= 1, "log.keep_checkpoints", config.log.keep_checkpoints, "1 or more"),
     ]
+    for name in ("position", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation", "eps"):
+        rate = getattr(config.optimiser, name)
+        rules.append((0 <= rate < math.inf, f"optimiser.{name}", rate, "0 or more, and finite"))
+    for name in ("beta1", "beta2"):
+        beta = getattr(config.optimiser, name)
+        rules.append((0 <= beta < 1, f"optimiser.{name}", beta, "in [0, 1)"))
     for fine, name, value, wanted in rules:
         if not fine:
             raise ConfigError(f"{name}: must be {wanted}, got {value}")

@@ -17,6 +17,7 @@ from blitzgs.distributed.pixels import collect_images
 from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import ssim
 from blitzgs.pipeline import RenderOptions
+from blitzgs.progress import Report
 from blitzgs.scene.pictures import save_comparison
 from blitzgs.training.batches import Images
 from blitzgs.training.views import CameraLike, ViewSet
@@ -102,6 +103,7 @@ def evaluate(
     *,
     pictures: int = 0,
     lpips: Lpips | None = None,
+    report: Report | None = None,
 ) -> dict[str, Any]:
     """Render views and compare them with their photographs; the ranks take turns at comparing.
 
@@ -116,6 +118,7 @@ def evaluate(
         owners: divides the tiles among the ranks; all of them call this.
         pictures: evenly spaced views of which to write render | photograph | error side by side.
         lpips: from `load_lpips`.
+        report: is told (views rendered, all of them) after each.
 
     Returns:
         {"psnr": mean, "ssim": mean, ("lpips": mean,) "views": {name: {...}}}; the means are absent without
@@ -134,6 +137,8 @@ def evaluate(
         if destination == 0:
             images.prefetch(own[turn : turn + 4])
         render = render_view(table, views, index, options, owners, destination)
+        if report is not None:
+            report(position + 1, len(indices))
         if render is None:
             continue
         target = images.get(index).to(table.device)

@@ -243,6 +243,10 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
     edit_model(tmp_path, lambda m: m.images.camera_ids.fill(7))
     with pytest.raises(ValueError, match=f"the cameras of 2 images .first: {NAMES[0]}. are not there"):
         load_capture(tmp_path)
+    points = next((tmp_path / "sparse" / "0").glob("points3D.*"))
+    points.unlink()
+    with pytest.raises(FileNotFoundError, match=f"{points.name} is missing: .* not a complete COLMAP"):
+        load_capture(tmp_path)
 
 
 def test_a_model_without_points_starts_from_random_ones_where_the_cameras_look(tmp_path):

@@ -8,9 +8,7 @@ import time
 from dataclasses import fields
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
+from blitzgs.progress import image_progress
 from blitzgs.scene.synth.generate import generate_city
 from blitzgs.scene.synth.options import PRESETS, CityOptions
 
@@ -53,23 +51,14 @@ def run(args: argparse.Namespace) -> int:
     for field in fields(CityOptions):
         value = getattr(args, field.name)
         chosen[field.name] = getattr(preset, field.name) if value is None else value
-    console = Console(stderr=True)
     started = time.monotonic()
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("images"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("Photographing the city", total=None)
+    with image_progress("Photographing the city") as report:
         out = generate_city(
             args.out,
             **chosen,
             threads=args.threads,
             overwrite=args.overwrite,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=report,
         )
     size = f"{chosen['views']} images of {chosen['width']} x {chosen['height']}"
     print(f"{out}: {size}, {time.monotonic() - started:.1f} s")
