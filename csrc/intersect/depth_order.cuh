@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows by (depth, id): a radix sort of keys of up to 24 bits in three passes. A key is the depth's place
-// among all floats, counted from the smallest depth there is. Where 24 bits hold more than that, the view
+// Rows by (depth, id): a radix sort of keys of up to 27 bits in three passes. A key is the depth's place
+// among all floats, counted from the smallest depth there is. Where 27 bits hold more than that, the view
 // goes in front: rows of different views need no order among them, and have fewer equal keys then. Where they
-// hold less (more than a factor of four between the nearest and the farthest) the low bits are left out, and
+// hold less (more than a factor of 65536 between the nearest and the farthest) the low bits are left out, and
 // rows whose keys are equal are compared by depth as well as by id.
 #pragma once
 #include <cstdint>
@@ -12,9 +12,10 @@
 
 namespace blitzgs::cuda {
 
-inline constexpr int kDepthThreads = 256, kDepthItems = 4, kDepthRows = kDepthThreads * kDepthItems;
-inline constexpr int kDepthPasses = 3, kDepthBits = 8, kDepthBins = 1 << kDepthBits;
+inline constexpr int kDepthThreads = 256, kDepthBlocks = 5;  // blocks of a multiprocessor
+inline constexpr int kDepthPasses = 3, kDepthBits = 9, kDepthBins = 1 << kDepthBits;
 inline constexpr int kRangeBlocks = kDepthThreads, kRangeThreads = 512;
+inline constexpr int kTieItems = 4, kTieRows = kDepthThreads * kTieItems;
 inline constexpr int kShortRun = 16;  // rows of equal keys that one thread orders
 
 // Floats in the order of unsigned integers.
@@ -77,8 +78,8 @@ __global__ void __launch_bounds__(kRangeThreads)
   if (threadIdx.x == 0) ranges[blockIdx.x] = range;
 }
 
-// Sort keys, their digits' histograms, and what the rows touch.
-__global__ void __launch_bounds__(kDepthThreads)
+// Sort keys, their digits' histograms, and what the rows touch. As many blocks as run at a time.
+__global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
     depth_keys_kernel(const IntersectInput<float> in, const DepthRange* ranges, std::uint32_t* keys,
                       Touched* touched, std::uint64_t* histograms, int* dropped_bits, int* width,
                       std::int64_t* n_rows) {
@@ -91,11 +92,10 @@ __global__ void __launch_bounds__(kDepthThreads)
     *width = digits.width;
     *n_rows = in.n_rows;
   }
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kDepthRows) + threadIdx.x;
+  const std::int64_t step = static_cast<std::int64_t>(gridDim.x) * kDepthThreads;
 #pragma unroll 1
-  for (int k = 0; k < kDepthItems; ++k) {
-    const std::int64_t i = first + k * kDepthThreads;
-    if (i >= in.n_rows) break;
+  for (std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kDepthThreads) + threadIdx.x; i < in.n_rows;
+       i += step) {
     const float depth = in.depths[i];
     const Splat splat = load_splat(in, i);
     const std::uint32_t key = digits.key(ordered_bits(depth) - range.low, splat.camera);
@@ -147,7 +147,7 @@ struct RowOrder {
 __global__ void __launch_bounds__(kDepthThreads)
     order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows, std::int64_t n, RowOrder order,
                       const int* dropped_bits) {
-  __shared__ std::int64_t long_runs[kDepthRows / kShortRun + 1];
+  __shared__ std::int64_t long_runs[kTieRows / kShortRun + 1];
   __shared__ int n_long;
   if (*dropped_bits == 0) {
     if (!order.ids) return;  // the passes kept equal depths in the order of rows
@@ -155,10 +155,10 @@ __global__ void __launch_bounds__(kDepthThreads)
   }
   if (threadIdx.x == 0) n_long = 0;
   __syncthreads();
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kDepthRows) + threadIdx.x;
+  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kTieRows) + threadIdx.x;
   unsigned begins = 0;
 #pragma unroll
-  for (int k = 0; k < kDepthItems; ++k) {
+  for (int k = 0; k < kTieItems; ++k) {
     const std::int64_t i = first + k * kDepthThreads;
     if (i + 1 < n && keys[i] == keys[i + 1] && (i == 0 || keys[i - 1] != keys[i])) begins |= 1u << k;
   }

@@ -6,9 +6,11 @@
 // Compiled without FMA contraction (cmake/cuda.cmake), as the projection is: both count the same tiles.
 #include <cub/device/device_reduce.cuh>
 
+#include <algorithm>
 #include <cuda/std/functional>
 
 #include "common/arrays.h"
+#include "common/multiprocessors.h"
 #include "intersect/depth_order.cuh"
 #include "intersect/radix_sweep.cuh"
 #include "intersect/running_sum.cuh"
@@ -95,7 +97,7 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t row,
 // Entries in depth order, their number and the histograms of their tiles' digits. Blocks take kEmitRows rows
 // each, a warp 32 times kEmitItems of them in a row.
 template <class Key>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, 4)
     emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows, RunningSum running,
                 std::int64_t capacity, TileDigits digits, Key* keys, std::int32_t* entries,
                 std::uint64_t* histograms, std::int64_t* n_entries) {
@@ -221,7 +223,8 @@ DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Work
   range_kernel<<<kRangeBlocks, kRangeThreads, 0, stream>>>(in.depths, n, counters.ranges, counters.begin,
                                                            counters.n_zeros);
   check_launch("intersect");
-  const unsigned blocks = blocks_for(n, kDepthRows);
+  const unsigned blocks =
+      std::min(blocks_for(n, kDepthThreads), static_cast<unsigned>(kDepthBlocks * multiprocessors()));
   depth_keys_kernel<<<blocks, kDepthThreads, 0, stream>>>(in, counters.ranges, keys[0], touched,
                                                           counters.depth_histograms, counters.dropped_bits,
                                                           counters.width, counters.n_rows);
@@ -229,15 +232,15 @@ DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Work
   int from = 0;
   for (int pass = 0; pass < kDepthPasses; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * kDepthBins;
-    sweep_kernel<kDepthBits>
-        <<<counters.depth_blocks, kSweepThreads, 0, stream>>>(SweepPass<std::uint32_t, State>{
-            keys[from], pass ? rows[from] : nullptr, keys[1 - from], rows[1 - from], counters.n_rows,
-            counters.depth_histograms + bins, counters.turns + pass,
-            counters.depth_states + bins * counters.depth_blocks, pass, 0, counters.width});
-    check_launch("intersect");
+    sweep<kDepthBits>(SweepPass<std::uint32_t, State>{keys[from], pass ? rows[from] : nullptr, keys[1 - from],
+                                                      rows[1 - from], counters.n_rows,
+                                                      counters.depth_histograms + bins, counters.turns + pass,
+                                                      counters.depth_states + bins * counters.depth_blocks,
+                                                      pass, 0, counters.width},
+                      counters.depth_blocks, stream);
   }
-  order_ties_kernel<<<blocks, kDepthThreads, 0, stream>>>(keys[from], rows[from], n, {in.depths, in.ids},
-                                                          counters.dropped_bits);
+  order_ties_kernel<<<blocks_for(n, kTieRows), kDepthThreads, 0, stream>>>(
+      keys[from], rows[from], n, {in.depths, in.ids}, counters.dropped_bits);
   check_launch("intersect");
   return {touched, rows[from]};
 }
@@ -260,11 +263,12 @@ void list_rows(const Input& in, std::int64_t capacity, std::int32_t* isect_rows,
   int from = 0;
   for (int pass = 0; pass < digits.passes; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * TileDigits::kBins;
-    sweep_kernel<TileDigits::kBits><<<counters.tile_blocks, kSweepThreads, 0, stream>>>(SweepPass<Key, State>{
-        keys[from], entries[from], keys[1 - from], entries[1 - from], counters.n_entries,
-        counters.tile_histograms + bins, counters.turns + kDepthPasses + pass,
-        counters.tile_states + bins * counters.tile_blocks, pass, digits.width, nullptr});
-    check_launch("intersect");
+    sweep<TileDigits::kBits>(
+        SweepPass<Key, State>{
+            keys[from], entries[from], keys[1 - from], entries[1 - from], counters.n_entries,
+            counters.tile_histograms + bins, counters.turns + kDepthPasses + pass,
+            counters.tile_states + bins * counters.tile_blocks, pass, digits.width, nullptr},
+        counters.tile_blocks, stream);
   }
   tile_offsets_kernel<<<blocks_for((in.grid.count() + 1) * 32, kThreads), kThreads, 0, stream>>>(
       keys[from], counters.n_entries, in.grid, tile_offsets);

@@ -5,16 +5,18 @@
 // predecessors at a time: with a few hundred blocks, all of them running at once, the look-back is what a
 // pass would otherwise wait for. The number of pairs is read on the device.
 #pragma once
+#include <algorithm>
 #include <cstdint>
 #include <cuda/atomic>
 
 #include "common/cuda_check.h"
+#include "common/stream.h"
 #include "intersect/running_sum.cuh"
 
 namespace blitzgs::cuda {
 
-inline constexpr int kSweepThreads = 256, kSweepItems = 16, kSweepTile = kSweepThreads * kSweepItems;
-inline constexpr int kSweepWindow = 8;  // predecessors looked at together
+inline constexpr int kSweepThreads = 512, kSweepItems = 16, kSweepTile = kSweepThreads * kSweepItems;
+inline constexpr int kSweepWindow = 4;  // predecessors looked at together
 
 // State: an unsigned integer whose two high bits say what the rest counts, so n_items < 2^30 for 32 bits.
 template <class Key, class State>
@@ -40,67 +42,73 @@ __device__ __forceinline__ void add_counts(const std::uint32_t* counts, int bins
   }
 }
 
-// What the blocks before `block` hold of each of a thread's bins, which begin at states[0] in block 0.
-template <int kBins, int kOwned, class State>
-__device__ __forceinline__ void count_before(const State* states, unsigned block, State (&sums)[kOwned]) {
+// What the blocks before `block` hold of one bin, whose state in block 0 is states[0].
+template <int kBins, class State>
+__device__ __forceinline__ State count_before(const State* states, unsigned block) {
   using Word = ::cuda::atomic_ref<const State, ::cuda::thread_scope_device>;
   constexpr int kBits = 8 * sizeof(State);
-  bool through[kOwned] = {}, all = block == 0;
-  for (std::int64_t end = block; !all; end -= kSweepWindow) {
-    State seen[kSweepWindow][kOwned];
+  State sum = 0;
+  for (std::int64_t end = block; end > 0; end -= kSweepWindow) {
+    State seen[kSweepWindow];
 #pragma unroll
     for (int k = 0; k < kSweepWindow; ++k) {
-#pragma unroll
-      for (int j = 0; j < kOwned; ++j) {
-        seen[k][j] = State{2} << (kBits - 2);  // in front of the first block there is nothing
-        if (end > k) seen[k][j] = Word(states[(end - 1 - k) * kBins + j]).load(::cuda::memory_order_relaxed);
-      }
+      seen[k] = State{2} << (kBits - 2);  // in front of the first block there is nothing
+      if (end > k) seen[k] = Word(states[(end - 1 - k) * kBins]).load(::cuda::memory_order_relaxed);
     }
-    all = true;
 #pragma unroll
-    for (int j = 0; j < kOwned; ++j) {
-#pragma unroll
-      for (int k = 0; k < kSweepWindow; ++k) {
-        if (through[j]) continue;
-        while (seen[k][j] >> (kBits - 2) == 0) {
-          seen[k][j] = Word(states[(end - 1 - k) * kBins + j]).load(::cuda::memory_order_relaxed);
-        }
-        sums[j] += seen[k][j] & ((State{1} << (kBits - 2)) - 1);
-        through[j] = seen[k][j] >> (kBits - 1) != 0;
+    for (int k = 0; k < kSweepWindow; ++k) {
+      while (seen[k] >> (kBits - 2) == 0) {
+        seen[k] = Word(states[(end - 1 - k) * kBins]).load(::cuda::memory_order_relaxed);
       }
-      all &= through[j];
+      sum += seen[k] & ((State{1} << (kBits - 2)) - 1);
+      if (seen[k] >> (kBits - 1)) return sum;
     }
   }
+  return sum;
+}
+
+// The lanes whose low bits are those of this lane. In PTX, as the compiler spends 7 instructions a bit.
+template <int kBits>
+__device__ __forceinline__ unsigned lanes_with_same(unsigned value) {
+  unsigned lanes = kFullWarp;
+#pragma unroll
+  for (int bit = 0; bit < kBits; ++bit) {
+    unsigned with;
+    asm volatile(
+        "{ .reg .pred set; .reg .b32 masked;\n"
+        "and.b32 masked, %1, %2; setp.ne.u32 set, masked, 0;\n"
+        "vote.sync.ballot.b32 %0, set, 0xffffffff; @!set not.b32 %0, %0; }"
+        : "=r"(with)
+        : "r"(value), "r"(1u << bit));
+    lanes &= with;
+  }
+  return lanes;
 }
 
 template <int kBits, class Key, class State>
-__global__ void __launch_bounds__(kSweepThreads, 4) sweep_kernel(const SweepPass<Key, State> pass) {
-  constexpr int kBins = 1 << kBits, kWarps = kSweepThreads / 32, kOwned = kBins / kSweepThreads;
-  static_assert(kOwned >= 1);
+__global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass<Key, State> pass) {
+  constexpr int kBins = 1 << kBits, kWarps = kSweepThreads / 32;
+  static_assert(kBins <= kSweepThreads);
   // The flags of a state: this block's own count, or that of all blocks through this one.
   constexpr State kOwn = State{1} << (8 * sizeof(State) - 2), kThrough = kOwn << 1;
-  __shared__ union {
-    std::uint32_t counts[kWarps][kBins];
-    struct {
-      Key keys[kSweepTile];
-      std::int32_t values[kSweepTile];
-    } staged;
-  } shared;
-  __shared__ std::uint64_t targets[kBins], sums_everywhere[kWarps];
+  extern __shared__ std::int32_t staged_values[];
+  auto* const staged_keys = reinterpret_cast<Key*>(staged_values + kSweepTile);
+  // [warps, bins] of each warp; the keys take their place.
+  auto* const counts = reinterpret_cast<std::uint32_t*>(staged_values + kSweepTile);
+  __shared__ State targets[kBins], sums_everywhere[kWarps];
   __shared__ std::uint32_t sums_here[kWarps];
   __shared__ unsigned turn;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const int bin = threadIdx.x;  // of threads that have one
   if (threadIdx.x == 0) {
     using Turn = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;  // predecessors have started
     turn = static_cast<unsigned>(Turn(*pass.turn).fetch_add(1, ::cuda::memory_order_relaxed));
   }
-  std::uint64_t everywhere[kOwned];
-#pragma unroll
-  for (int j = 0; j < kOwned; ++j) everywhere[j] = pass.histogram[threadIdx.x * kOwned + j];
+  const State everywhere = bin < kBins ? static_cast<State>(pass.histogram[bin]) : 0;
   const std::int64_t n = *pass.n_items;
   const int width = pass.known_width ? *pass.known_width : pass.width, shift = pass.index * width;
   const auto digit_of = [&](Key key) { return static_cast<unsigned>(key) >> shift & ((1u << width) - 1); };
-  for (int bin = lane; bin < kBins; bin += 32) shared.counts[warp][bin] = 0;
+  for (int i = lane; i < kBins; i += 32) counts[warp * kBins + i] = 0;
   __syncthreads();
   const unsigned block = turn;
   const std::int64_t first = block * static_cast<std::int64_t>(kSweepTile);
@@ -120,64 +128,53 @@ __global__ void __launch_bounds__(kSweepThreads, 4) sweep_kernel(const SweepPass
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) {
     const unsigned digit = digit_of(keys[k]);
-    unsigned peers = kFullWarp;
-#pragma unroll
-    for (int bit = 0; bit < kBits; ++bit) {
-      const bool set = digit >> bit & 1u;
-      const unsigned with = __ballot_sync(kFullWarp, set);
-      peers &= set ? with : ~with;
-    }
+    const unsigned peers = lanes_with_same<kBits>(digit);
     const unsigned earlier = peers & ((1u << lane) - 1);
-    const std::uint32_t count = shared.counts[warp][digit];
+    const std::uint32_t count = counts[warp * kBins + digit];
     places[k] = count + __popc(earlier);
     __syncwarp();
-    if (!earlier) shared.counts[warp][digit] = count + __popc(peers);
+    if (!earlier) counts[warp * kBins + digit] = count + __popc(peers);
     __syncwarp();
   }
   __syncthreads();
 
   using Word = ::cuda::atomic_ref<State, ::cuda::thread_scope_device>;
-  State* const states = pass.states + threadIdx.x * kOwned;
-  State* const own_states = states + block * static_cast<std::int64_t>(kBins);
-  std::uint32_t counts[kOwned] = {}, here = 0;
-  std::uint64_t of_all = 0;
+  State* const states = pass.states + bin;
+  State* const own_state = states + block * static_cast<std::int64_t>(kBins);
+  std::uint32_t here = 0;
+  if (bin < kBins) {
 #pragma unroll
-  for (int j = 0; j < kOwned; ++j) {
-    for (int w = 0; w < kWarps; ++w) counts[j] += shared.counts[w][threadIdx.x * kOwned + j];
-    Word(own_states[j]).store((block ? kOwn : kThrough) | counts[j], ::cuda::memory_order_relaxed);
-    here += counts[j];
-    of_all += everywhere[j];
+    for (int w = 0; w < kWarps; ++w) here += counts[w * kBins + bin];
+    Word(*own_state).store((block ? kOwn : kThrough) | here, ::cuda::memory_order_relaxed);
   }
   const std::uint32_t until_here = sum_of_lanes_until(here, lane);
-  const std::uint64_t until_everywhere = sum_of_lanes_until(of_all, lane);
+  const State until_everywhere = sum_of_lanes_until(everywhere, lane);
   if (lane == 31) {
     sums_here[warp] = until_here;
     sums_everywhere[warp] = until_everywhere;
   }
   __syncthreads();
-  std::uint32_t start = until_here - here;           // of the thread's first bin in this block
-  std::uint64_t target = until_everywhere - of_all;  // and of all pairs
-  for (int w = 0; w < warp; ++w) {
-    start += sums_here[w];
-    target += sums_everywhere[w];
-  }
+  State target = until_everywhere - everywhere;
+  if (bin < kBins) {
+    std::uint32_t start = until_here - here;  // of the bin in this block
+    for (int w = 0; w < warp; ++w) {
+      start += sums_here[w];
+      target += sums_everywhere[w];
+    }
+    target -= start;
 #pragma unroll
-  for (int j = 0; j < kOwned; ++j) {
-    const int bin = threadIdx.x * kOwned + j;
-    targets[bin] = target - start;
-    target += everywhere[j];
     for (int w = 0; w < kWarps; ++w) {
-      const std::uint32_t count = shared.counts[w][bin];
-      shared.counts[w][bin] = start;
+      const std::uint32_t count = counts[w * kBins + bin];
+      counts[w * kBins + bin] = start;
       start += count;
     }
   }
   __syncthreads();
 #pragma unroll
-  for (int k = 0; k < kSweepItems; ++k) places[k] += shared.counts[warp][digit_of(keys[k])];
+  for (int k = 0; k < kSweepItems; ++k) places[k] += counts[warp * kBins + digit_of(keys[k])];
   __syncthreads();
 #pragma unroll
-  for (int k = 0; k < kSweepItems; ++k) shared.staged.keys[places[k]] = keys[k];
+  for (int k = 0; k < kSweepItems; ++k) staged_keys[places[k]] = keys[k];
   std::int32_t values[kSweepItems];
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) {
@@ -185,28 +182,34 @@ __global__ void __launch_bounds__(kSweepThreads, 4) sweep_kernel(const SweepPass
     values[k] = static_cast<std::int32_t>(first + at);
     if (pass.values && at < n_here) values[k] = pass.values[first + at];
   }
-
-  State before[kOwned] = {};
-  count_before<kBins>(states, block, before);
-#pragma unroll
-  for (int j = 0; j < kOwned; ++j) {
-    if (block) {
-      Word(own_states[j]).store(kThrough | (before[j] + counts[j]), ::cuda::memory_order_relaxed);
-    }
-    targets[threadIdx.x * kOwned + j] += before[j];
+  if (bin < kBins) {
+    const State before = count_before<kBins>(states, block);
+    if (block) Word(*own_state).store(kThrough | (before + here), ::cuda::memory_order_relaxed);
+    targets[bin] = target + before;
   }
 #pragma unroll
-  for (int k = 0; k < kSweepItems; ++k) shared.staged.values[places[k]] = values[k];
+  for (int k = 0; k < kSweepItems; ++k) staged_values[places[k]] = values[k];
   __syncthreads();
 #pragma unroll
-  for (int k = 0; k < kSweepItems; ++k) {
+  for (int k = 0; k < kSweepItems; ++k) {  // neighbouring threads write a digit's pairs
     const int at = threadIdx.x + k * kSweepThreads;
     if (at >= n_here) break;
-    const Key key = shared.staged.keys[at];
-    const std::uint64_t target_at = targets[digit_of(key)] + at;
-    pass.sorted_keys[target_at] = key;
-    pass.sorted_values[target_at] = shared.staged.values[at];
+    const Key key = staged_keys[at];
+    const State to = targets[digit_of(key)] + at;
+    pass.sorted_keys[to] = key;
+    pass.sorted_values[to] = staged_values[at];
   }
+}
+
+template <int kBits, class Key, class State>
+void sweep(const SweepPass<Key, State>& pass, unsigned blocks, CudaStream stream) {
+  constexpr std::size_t kCounts = kSweepThreads / 32 * sizeof(std::uint32_t) << kBits;
+  constexpr std::size_t kBytes =
+      kSweepTile * sizeof(std::int32_t) + std::max(kSweepTile * sizeof(Key), kCounts);
+  const auto kernel = sweep_kernel<kBits, Key, State>;
+  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "radix sweep");
+  kernel<<<blocks, kSweepThreads, kBytes, stream>>>(pass);
+  check_launch("radix sweep");
 }
 
 }  // namespace blitzgs::cuda
