@@ -2,8 +2,9 @@
 #include <algorithm>
 
 #include "blocks/blocks.h"
-#include "common/cuda_check.h"
+#include "common/launch.cuh"
 #include "common/multiprocessors.h"
+#include "common/zeros.cuh"
 #include "math/morton_cuda.cuh"
 
 namespace blitzgs::cuda {
@@ -35,6 +36,7 @@ __device__ void append(bool present, std::int32_t item, std::int32_t* list, std:
 // costs time alone.
 __global__ void list_blocks(const std::int32_t* ids, std::int64_t n, std::int32_t* list,
                             std::int32_t* length) {
+  wait_for_earlier_kernels();
   const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
   const std::int32_t block = i < n ? ids[i] / kBlockRows : 0;
   append(i < n && (i == 0 || ids[i - 1] / kBlockRows != block), block, list, length);
@@ -60,6 +62,7 @@ __device__ __forceinline__ SweptBox box_around(SweptBox box) {
 __global__ void __launch_bounds__(kBlockRows, kResident)
     update_bounds(const BlockRows rows, const std::int32_t* list, const std::int32_t* length, float* bounds) {
   __shared__ SweptBox warps[2][kWarps];  // they take turns, so that one barrier is enough
+  wait_for_earlier_kernels();
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const std::int64_t count = list ? *length : blocks_of(rows.n);
   const auto block_at = [&](std::int64_t i) { return i >= count ? 0 : list ? list[i] : i; };
@@ -85,6 +88,7 @@ __global__ void test_blocks(const float* bounds, CullCamera camera, int views, c
                             std::int32_t* list, std::int32_t* length, std::int32_t* groups,
                             CullView* planes_out) {
   __shared__ CullView planes[kMaxViews];
+  wait_for_earlier_kernels();
   const int thread = threadIdx.x;
   if (thread < views) {
     planes[thread] = make_cull_view(camera, thread);
@@ -108,6 +112,7 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
     test_rows(const BlockRows rows, const CullView* planes, int views, const CullPlan plan,
               const std::int32_t* list, const std::int32_t* length, std::int32_t* groups) {
   __shared__ CullView shared[kMaxViews];
+  wait_for_earlier_kernels();
   const std::int32_t count = *length;
   if (static_cast<std::int32_t>(blockIdx.x) >= count) return;
   if (threadIdx.x < views) shared[threadIdx.x] = planes[threadIdx.x];
@@ -144,6 +149,7 @@ __device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* gr
 // A warp a block.
 __global__ void __launch_bounds__(kBlockRows)
     emit_rows(const CullPlan plan, const std::int32_t* groups, const ActiveList out) {
+  wait_for_earlier_kernels();
   const std::int64_t blocks = blocks_of(plan.n), first = blockIdx.x * std::int64_t{kWarps};
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const std::int64_t block = first + warp;
@@ -195,11 +201,12 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
   if (ids) {
     length = workspace.allocate<std::int32_t>(1 + n_ids);
     list = length + 1;
-    check(cudaMemsetAsync(length, 0, sizeof(*length), stream), "update_block_bounds");
-    list_blocks<<<blocks_for(n_ids, 256), 256, 0, stream>>>(ids, n_ids, list, length);
+    zero("update_block_bounds", length, 1, stream);
+    launch_early("update_block_bounds", list_blocks, {blocks_for(n_ids, 256), 256, stream}, ids, n_ids, list,
+                 length);
   }
-  update_bounds<<<persistent_blocks(blocks), kBlockRows, 0, stream>>>(rows, list, length, bounds);
-  check_launch("update_block_bounds");
+  launch_early("update_block_bounds", update_bounds, {persistent_blocks(blocks), kBlockRows, stream}, rows,
+               list, length, bounds);
 }
 
 void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
@@ -214,12 +221,12 @@ void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& c
   CullView* planes = workspace.allocate<CullView>(views);
   const unsigned n_groups = blocks_for(blocks, kGroup);
   std::int32_t *groups = workspace.allocate<std::int32_t>(n_groups + 1), *length = groups + n_groups;
-  check(cudaMemsetAsync(groups, 0, (n_groups + 1) * sizeof(*groups), stream), "cull_blocks");
-  test_blocks<<<n_groups, kGroup, 0, stream>>>(bounds, camera, views, plan, list, length, groups, planes);
-  test_rows<<<persistent_blocks(blocks), kBlockRows, 0, stream>>>(rows, planes, views, plan, list, length,
-                                                                  groups);
-  emit_rows<<<blocks_for(blocks, kWarps), kBlockRows, 0, stream>>>(plan, groups, out);
-  check_launch("cull_blocks");
+  zero("cull_blocks", groups, n_groups + 1, stream);
+  launch_early("cull_blocks", test_blocks, {n_groups, kGroup, stream}, bounds, camera, views, plan, list,
+               length, groups, planes);
+  launch_early("cull_blocks", test_rows, {persistent_blocks(blocks), kBlockRows, stream}, rows, planes, views,
+               plan, list, length, groups);
+  launch_early("cull_blocks", emit_rows, {blocks_for(blocks, kWarps), kBlockRows, stream}, plan, groups, out);
 }
 
 }  // namespace blitzgs::cuda

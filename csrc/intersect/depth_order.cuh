@@ -65,6 +65,7 @@ struct DepthDigits {
 __global__ void __launch_bounds__(kRangeThreads)
     range_kernel(const float* depths, std::int64_t n, DepthRange* ranges, uint4* zeros,
                  std::int64_t n_zeros) {
+  wait_for_earlier_kernels();
   constexpr std::int64_t kStep = kRangeBlocks * kRangeThreads;
   const std::int64_t thread = blockIdx.x * static_cast<std::int64_t>(kRangeThreads) + threadIdx.x;
   DepthRange range{0xffffffffu, 0u};
@@ -85,6 +86,7 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
                       std::int64_t* n_rows) {
   __shared__ std::uint32_t counts[kDepthPasses][kDepthBins];
   for (int bin = threadIdx.x; bin < kDepthPasses * kDepthBins; bin += kDepthThreads) counts[0][bin] = 0;
+  wait_for_earlier_kernels();
   const DepthRange range = ranges[threadIdx.x].of_block<kDepthThreads>();  // and a barrier
   const DepthDigits digits(range, in.grid.n_cameras);
   if (blockIdx.x == 0 && threadIdx.x == 0) {
@@ -149,6 +151,7 @@ __global__ void __launch_bounds__(kDepthThreads)
                       const int* dropped_bits) {
   __shared__ std::int64_t long_runs[kTieRows / kShortRun + 1];
   __shared__ int n_long;
+  wait_for_earlier_kernels();
   if (*dropped_bits == 0) {
     if (!order.ids) return;  // the passes kept equal depths in the order of rows
     order.depths = nullptr;

@@ -10,6 +10,7 @@
 #include <cuda/std/functional>
 
 #include "common/arrays.h"
+#include "common/launch.cuh"
 #include "common/multiprocessors.h"
 #include "intersect/depth_order.cuh"
 #include "intersect/radix_sweep.cuh"
@@ -104,6 +105,7 @@ __global__ void __launch_bounds__(kThreads, 4)
   __shared__ std::int64_t warp_sums[kThreads / 32];
   __shared__ std::uint32_t counts[TileDigits::kMost * TileDigits::kBins];
   for (int bin = threadIdx.x; bin < digits.passes * TileDigits::kBins; bin += kThreads) counts[bin] = 0;
+  wait_for_earlier_kernels();
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const int block = running.take_turn();
   const std::int64_t first = static_cast<std::int64_t>(block) * kEmitRows + warp * (32 * kEmitItems) + lane;
@@ -147,6 +149,7 @@ __global__ void __launch_bounds__(kThreads, 4)
 template <class Key>
 __global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entries, TileGrid grid,
                                     std::int64_t* tile_offsets) {
+  wait_for_earlier_kernels();
   const std::int64_t tile = (blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x) / 32;
   const int lane = threadIdx.x % 32;
   if (tile > grid.count()) return;
@@ -220,15 +223,12 @@ DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Work
       allocate_arrays<Touched, std::uint32_t, std::uint32_t, std::int32_t, std::int32_t>(n, workspace);
   std::uint32_t* const keys[] = {keys_0, keys_1};
   std::int32_t* const rows[] = {rows_0, rows_1};
-  range_kernel<<<kRangeBlocks, kRangeThreads, 0, stream>>>(in.depths, n, counters.ranges, counters.begin,
-                                                           counters.n_zeros);
-  check_launch("intersect");
+  launch_early("intersect", range_kernel, {kRangeBlocks, kRangeThreads, stream}, in.depths, n,
+               counters.ranges, counters.begin, counters.n_zeros);
   const unsigned blocks =
       std::min(blocks_for(n, kDepthThreads), static_cast<unsigned>(kDepthBlocks * multiprocessors()));
-  depth_keys_kernel<<<blocks, kDepthThreads, 0, stream>>>(in, counters.ranges, keys[0], touched,
-                                                          counters.depth_histograms, counters.dropped_bits,
-                                                          counters.width, counters.n_rows);
-  check_launch("intersect");
+  launch_early("intersect", depth_keys_kernel, {blocks, kDepthThreads, stream}, in, counters.ranges, keys[0],
+               touched, counters.depth_histograms, counters.dropped_bits, counters.width, counters.n_rows);
   int from = 0;
   for (int pass = 0; pass < kDepthPasses; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * kDepthBins;
@@ -239,9 +239,8 @@ DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Work
                                                       pass, 0, counters.width},
                       counters.depth_blocks, stream);
   }
-  order_ties_kernel<<<blocks_for(n, kTieRows), kDepthThreads, 0, stream>>>(
-      keys[from], rows[from], n, {in.depths, in.ids}, counters.dropped_bits);
-  check_launch("intersect");
+  launch_early("intersect", order_ties_kernel, {blocks_for(n, kTieRows), kDepthThreads, stream}, keys[from],
+               rows[from], n, {in.depths, in.ids}, counters.dropped_bits);
   return {touched, rows[from]};
 }
 
@@ -256,10 +255,9 @@ void list_rows(const Input& in, std::int64_t capacity, std::int32_t* isect_rows,
   // The last pass writes isect_rows.
   const bool even = digits.passes % 2 == 0;
   std::int32_t* const entries[] = {even ? isect_rows : unsorted, even ? unsorted : isect_rows};
-  emit_kernel<<<counters.emit_blocks, kThreads, 0, stream>>>(
-      in, order.touched, order.rows, RunningSum(counters.running), capacity, digits, keys[0], entries[0],
-      counters.tile_histograms, counters.n_entries);
-  check_launch("intersect");
+  launch_early("intersect", emit_kernel<Key>, {counters.emit_blocks, kThreads, stream}, in, order.touched,
+               order.rows, RunningSum(counters.running), capacity, digits, keys[0], entries[0],
+               counters.tile_histograms, counters.n_entries);
   int from = 0;
   for (int pass = 0; pass < digits.passes; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * TileDigits::kBins;
@@ -270,9 +268,9 @@ void list_rows(const Input& in, std::int64_t capacity, std::int32_t* isect_rows,
             counters.tile_states + bins * counters.tile_blocks, pass, digits.width, nullptr},
         counters.tile_blocks, stream);
   }
-  tile_offsets_kernel<<<blocks_for((in.grid.count() + 1) * 32, kThreads), kThreads, 0, stream>>>(
-      keys[from], counters.n_entries, in.grid, tile_offsets);
-  check_launch("intersect");
+  launch_early("intersect", tile_offsets_kernel<Key>,
+               {blocks_for((in.grid.count() + 1) * 32, kThreads), kThreads, stream}, keys[from],
+               counters.n_entries, in.grid, tile_offsets);
 }
 
 }  // namespace

@@ -9,7 +9,7 @@
 #include <cstdint>
 #include <cuda/atomic>
 
-#include "common/cuda_check.h"
+#include "common/launch.cuh"
 #include "common/stream.h"
 #include "intersect/running_sum.cuh"
 
@@ -100,6 +100,8 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   __shared__ unsigned turn;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const int bin = threadIdx.x;  // of threads that have one
+  for (int i = lane; i < kBins; i += 32) counts[warp * kBins + i] = 0;
+  wait_for_earlier_kernels();
   if (threadIdx.x == 0) {
     using Turn = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;  // predecessors have started
     turn = static_cast<unsigned>(Turn(*pass.turn).fetch_add(1, ::cuda::memory_order_relaxed));
@@ -108,7 +110,6 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   const std::int64_t n = *pass.n_items;
   const int width = pass.known_width ? *pass.known_width : pass.width, shift = pass.index * width;
   const auto digit_of = [&](Key key) { return static_cast<unsigned>(key) >> shift & ((1u << width) - 1); };
-  for (int i = lane; i < kBins; i += 32) counts[warp * kBins + i] = 0;
   __syncthreads();
   const unsigned block = turn;
   const std::int64_t first = block * static_cast<std::int64_t>(kSweepTile);
@@ -208,8 +209,7 @@ void sweep(const SweepPass<Key, State>& pass, unsigned blocks, CudaStream stream
       kSweepTile * sizeof(std::int32_t) + std::max(kSweepTile * sizeof(Key), kCounts);
   const auto kernel = sweep_kernel<kBits, Key, State>;
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "radix sweep");
-  kernel<<<blocks, kSweepThreads, kBytes, stream>>>(pass);
-  check_launch("radix sweep");
+  launch_early("radix sweep", kernel, {blocks, kSweepThreads, stream, kBytes}, pass);
 }
 
 }  // namespace blitzgs::cuda

@@ -3,7 +3,7 @@
 #include <stdexcept>
 #include <type_traits>
 
-#include "common/cuda_check.h"
+#include "common/launch.cuh"
 #include "common/multiprocessors.h"
 #include "lazy_adam/lazy_adam_device.cuh"
 
@@ -29,6 +29,7 @@ struct Prepared {
 // kPrepareLanes lanes a step, one for each rule: it is a chain of divisions that this kernel takes.
 __global__ void __launch_bounds__(kPrepareThreads)
     prepare(const __grid_constant__ AdamArgs<float> args, const Prepared prepared) {
+  wait_for_earlier_kernels();
   const auto thread = static_cast<std::int32_t>(blockIdx.x * kPrepareThreads + threadIdx.x);
   const std::int32_t t = thread / kPrepareLanes, target = args.target();
   const int group = thread % kPrepareLanes;
@@ -73,6 +74,7 @@ __device__ std::int64_t listed(const AdamArgs<float>& args) { return args.count 
 // early in a schedule have, pay at once, each by a whole warp.
 __global__ void __launch_bounds__(kListThreads)
     list_debtors(const __grid_constant__ AdamArgs<float> args, const Prepared prepared, Debtor* debtors) {
+  wait_for_earlier_kernels();
   const std::int64_t n = listed(args);
   for (std::int64_t first = blockIdx.x * std::int64_t{kListThreads}; first < n;
        first += gridDim.x * std::int64_t{kListThreads}) {
@@ -152,6 +154,7 @@ template <int ShWidth, int ShPacks>
 __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
     catch_up_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
                     const Debtor* debtors) {
+  wait_for_earlier_kernels();
   if (!*prepared.owing) return;
   const std::int64_t n = listed(args);
   const auto pay = [&]<int Column, int Width>(int local, int pack) {
@@ -183,6 +186,7 @@ __device__ __forceinline__ void step_pack(const AdamArgs<float>& args, const Ada
 template <int ShWidth, int ShPacks>
 __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ AdamArgs<float> args) {
   __shared__ AdamStep<float> step;
+  wait_for_earlier_kernels();
   if (threadIdx.x == 0) step = adam_step_scalars(args);
   __syncthreads();
   const std::int64_t first = blockIdx.x * std::int64_t{kRows};
@@ -205,16 +209,18 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
   const Prepared prepared{workspace.allocate<AdamDebt<float>>(args.step),
                           workspace.allocate<Decay>(args.step + 1), workspace.allocate<bool>(1)};
   auto* debtors = workspace.allocate<Debtor>(args.n);
-  prepare<<<blocks_for(args.step + 1, kPrepareThreads / kPrepareLanes), kPrepareThreads, 0, stream>>>(
-      args, prepared);
+  launch_early("lazy_adam catch-up", prepare,
+               {blocks_for(args.step + 1, kPrepareThreads / kPrepareLanes), kPrepareThreads, stream}, args,
+               prepared);
   // The device is filled once, as n may be far more than there are.
   const auto filled = [&](int items, int per_multiprocessor) {
     return std::min(blocks_for(args.n, items), unsigned(per_multiprocessor * multiprocessors()));
   };
-  list_debtors<<<filled(kListThreads, kListBlocks), kListThreads, 0, stream>>>(args, prepared, debtors);
+  launch_early("lazy_adam catch-up", list_debtors, {filled(kListThreads, kListBlocks), kListThreads, stream},
+               args, prepared, debtors);
   const auto kernel = args.columns[4].width == 48 ? catch_up_kernel<4, 12> : catch_up_kernel<1, 0>;
-  kernel<<<filled(kRows, kCatchUpBlocks), kThreads, 0, stream>>>(args, prepared, debtors);
-  check_launch("lazy_adam catch-up");
+  launch_early("lazy_adam catch-up", kernel, {filled(kRows, kCatchUpBlocks), kThreads, stream}, args,
+               prepared, debtors);
 }
 
 // Quaternions, and SH of degree 3, are moved 16 bytes at a time.
@@ -245,8 +251,7 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
   if (!args.sparse) catch_up(behind, workspace, stream);
   if (!args.with_gradient()) return;
   const auto kernel = args.columns[4].width == 48 ? step_kernel<4, 12> : step_kernel<1, 0>;
-  kernel<<<blocks_for(args.n, kRows), kThreads, 0, stream>>>(args);
-  check_launch("lazy_adam step");
+  launch_early("lazy_adam step", kernel, {blocks_for(args.n, kRows), kThreads, stream}, args);
 }
 
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);

@@ -15,7 +15,7 @@
 #include <climits>
 
 #include "common/block_sum.cuh"
-#include "common/cuda_check.h"
+#include "common/launch.cuh"
 #include "common/multiprocessors.h"
 #include "photometric/photometric.h"
 #include "photometric/photometric_device.cuh"
@@ -281,6 +281,7 @@ template <bool kBytes, bool kGradient, bool kSums>
 __global__ void __launch_bounds__(kThreads, 2)
     photometric_kernel(const __grid_constant__ PhotometricArgs<float> args,
                        const __grid_constant__ Launch launch) {
+  wait_for_earlier_kernels();
   if (kSums && threadIdx.x == 0) clear_parts(args, launch);
   if (kGradient && args.visible && blockIdx.x == 0 && blockIdx.y == 0) {
     for (int view = threadIdx.x; view < args.views; view += kThreads) {
@@ -345,8 +346,7 @@ void launch_kernel(dim3 grid, const PhotometricArgs<float>& args, const Launch& 
   constexpr int kSharedBytes = 2 * sizeof(Shared);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kSharedBytes),
         "photometric");
-  kernel<<<grid, kThreads, kSharedBytes, stream>>>(args, launch);
-  check_launch("photometric");
+  launch_early("photometric", kernel, {grid, kThreads, stream, kSharedBytes}, args, launch);
 }
 
 template <bool kBytes>

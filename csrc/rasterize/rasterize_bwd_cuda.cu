@@ -9,6 +9,7 @@
 #include <stdexcept>
 #include <string>
 
+#include "common/launch.cuh"
 #include "rasterize/backward_pixel.cuh"
 #include "rasterize/row_entries.cuh"
 #include "rasterize/unpack_gradients.cuh"
@@ -136,6 +137,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) :
   constexpr int kBatch = Shared::kBatch;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
   Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);
+  wait_for_earlier_kernels();
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   const std::int64_t index = args.order.tile(static_cast<int>(blockIdx.x));
   if (index < args.grid.tile_begin || index >= args.grid.tile_end) return;  // composited, but not owned
@@ -225,8 +227,8 @@ void launch_backward(const BackwardArguments& args, CudaStream stream) {
   const auto kernel = backward_kernel<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>;
   constexpr int kBytes = sizeof(BackwardShared<TILE, CHANNELS, DETERMINISTIC>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_bwd");
-  kernel<<<static_cast<unsigned>(args.order.n_tiles), TILE * TILE, kBytes, stream>>>(args);
-  check_launch("rasterize_bwd");
+  launch_early("rasterize_bwd", kernel,
+               {static_cast<unsigned>(args.order.n_tiles), TILE * TILE, stream, kBytes}, args);
 }
 
 template <int TILE>
@@ -330,9 +332,9 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
     const ChannelChunk chunk = rows.chunk(first);
     check(cudaMemsetAsync(packed, 0, in.n_rows * sizeof(PackedGradient), stream), "rasterize_bwd");
     rows.add(chunk, absolute, packed);
-    unpack_kernel<<<blocks_for(in.n_rows, kUnpackThreads), kUnpackThreads, 0, stream>>>(
-        packed, in.n_rows, chunk, absolute && first > 0, gradients);
-    check_launch("rasterize_bwd");
+    launch_early("rasterize_bwd", unpack_kernel,
+                 {blocks_for(in.n_rows, kUnpackThreads), kUnpackThreads, stream}, packed, in.n_rows, chunk,
+                 absolute && first > 0, gradients);
   }
 }
 

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <string>
 
+#include "common/launch.cuh"
 #include "rasterize/tile_batch.cuh"
 
 namespace blitzgs::cuda {
@@ -41,6 +42,7 @@ __device__ __forceinline__ PackedRow pack_row(const RasterizeInput<float>& in, s
 // The last blocks order the tiles; the others pack rows. A warp's rows go through shared memory, so that each
 // store fills whole sectors.
 __global__ void prepare_kernel(RasterizeInput<float> in, PackedRow* rows, float4* colors, TileOrder order) {
+  wait_for_earlier_kernels();
   const auto pack_blocks = static_cast<unsigned>((in.n_rows + kPackThreads - 1) / kPackThreads);
   if (blockIdx.x >= pack_blocks) {
     order.add(in.tile_offsets, static_cast<int>((blockIdx.x - pack_blocks) * kPackThreads + threadIdx.x));
@@ -167,6 +169,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
   auto& batch = *reinterpret_cast<EntryBatch<TILE, kBatch>*>(shared_bytes);
   __shared__ int tile_work;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
+  wait_for_earlier_kernels();
   zero_share(args, TILE * TILE);
   const int block = static_cast<int>(blockIdx.x), owned = args.order.n_tiles;
   const std::int64_t index = block < owned                          ? args.order.tile(block)
@@ -235,8 +238,7 @@ void launch_forward(ForwardArguments args, CudaStream stream) {
   const auto kernel = args.chunk.count == 4 ? forward_kernel<TILE, 4> : forward_kernel<TILE, 3>;
   constexpr int kBytes = sizeof(EntryBatch<TILE, kForwardBatch<TILE>>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_fwd");
-  kernel<<<tiles, TILE * TILE, kBytes, stream>>>(args);
-  check_launch("rasterize_fwd");
+  launch_early("rasterize_fwd", kernel, {tiles, TILE * TILE, stream, kBytes}, args);
 }
 
 }  // namespace
@@ -264,8 +266,8 @@ void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput
   order.clear(stream);
   const unsigned blocks = blocks_for(in.n_rows, kPackThreads) + blocks_for(order.unordered(), kPackThreads);
   if (blocks > 0) {
-    prepare_kernel<<<blocks, kPackThreads, 0, stream>>>(in, static_cast<PackedRow*>(aux), colors, order);
-    check_launch("rasterize_fwd");
+    launch_early("rasterize_fwd", prepare_kernel, {blocks, kPackThreads, stream}, in,
+                 static_cast<PackedRow*>(aux), colors, order);
   }
   for (int first = 0; first < in.n_channels; first += 4) {
     const ForwardArguments args{

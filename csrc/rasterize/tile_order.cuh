@@ -7,8 +7,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/cuda_check.h"
-#include "common/stream.h"
+#include "common/zeros.cuh"
 #include "math/tiles.h"
 
 namespace blitzgs::cuda {
@@ -47,7 +46,7 @@ struct TileOrder {
 
   // Before any tile is noted.
   void clear(CudaStream stream) const {
-    if (counts) check(cudaMemsetAsync(counts, 0, kLengthClasses * sizeof(*counts), stream), "tile_order");
+    if (counts) zero("tile_order", counts, kLengthClasses, stream);
   }
 
   // Notes tile number `local` of the owned ones; the whole warp takes part. Counts are zero at first.

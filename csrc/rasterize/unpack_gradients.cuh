@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // From gradients packed by row to one array for each input.
 #pragma once
+#include "common/launch.cuh"
 #include "rasterize/tile_batch.cuh"
 
 namespace blitzgs::cuda {
@@ -28,6 +29,7 @@ __device__ __forceinline__ void store_rows(float* stage, const float (&mine)[WID
 inline __global__ void unpack_kernel(const PackedGradient* packed, std::int64_t n, ChannelChunk chunk,
                                      bool colors_only, RasterizeGradients<float> out) {
   __shared__ float4 stages[kUnpackThreads / 32][3 * 32];
+  wait_for_earlier_kernels();
   float4* stage = stages[threadIdx.x / 32];
   const int lane = threadIdx.x % 32;
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kUnpackThreads) + threadIdx.x;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/cuda_check.h"
+#include "common/launch.cuh"
 #include "tell_host/tell_host.h"
 
 namespace blitzgs::cuda {
@@ -9,6 +9,7 @@ namespace {
 constexpr int kThreads = 128;
 
 __global__ void tell_kernel(const std::int64_t* values, std::int64_t n, std::int64_t* known) {
+  wait_for_earlier_kernels();
   const std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
   if (i < n) known[i] = values[i];
 }
@@ -26,8 +27,8 @@ std::int64_t* device_address(std::int64_t* pinned) {
 
 void tell_host(const std::int64_t* values, std::int64_t n, std::int64_t* known, CudaStream stream) {
   if (n == 0) return;
-  tell_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream>>>(values, n, device_address(known));
-  check_launch("tell_host");
+  launch_early("tell_host", tell_kernel, {blocks_for(n, kThreads), kThreads, stream}, values, n,
+               device_address(known));
 }
 
 }  // namespace blitzgs::cuda

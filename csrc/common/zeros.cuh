@@ -1,0 +1,20 @@
+// SPDX-License-Identifier: Apache-2.0
+// Zeros for a few counters, between kernels that are launched early: a memset there brings both gaps back.
+#pragma once
+#include <cstdint>
+
+#include "common/launch.cuh"
+
+namespace blitzgs::cuda {
+
+static __global__ void zero_kernel(std::int32_t* counters, std::int64_t n) {
+  wait_for_earlier_kernels();
+  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
+  if (i < n) counters[i] = 0;
+}
+
+inline void zero(const char* what, std::int32_t* counters, std::int64_t n, CudaStream stream) {
+  launch_early(what, zero_kernel, {blocks_for(n, 256), 256, stream}, counters, n);
+}
+
+}  // namespace blitzgs::cuda
