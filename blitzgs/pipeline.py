@@ -34,9 +34,9 @@ from blitzgs.distributed.rows import PeerSpace, Splats
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.host import tell_host
-from blitzgs.ops.project import RowRoom, Rows
+from blitzgs.ops.project import RowRoom, Rows, rows_of
 from blitzgs.ops.rasterize import GradientRoom, gradient_columns
-from blitzgs.ops.scatter import OWN_VALUES, Returns
+from blitzgs.ops.scatter import OWN_VALUES, Returns, runs_of
 
 Mark = Callable[[str], None]
 
@@ -164,7 +164,7 @@ class RowGradients(NamedTuple):
         if self.second is None:
             yield rows
             return
-        first, stream, _ = self.second
+        first, stream = self.second
         ids, offsets = rows.visible_ids, rows.row_offsets
         yield rows._replace(visible_ids=ids[:first], row_offsets=offsets[: first + 1])
         with torch.cuda.stream(stream):
@@ -227,6 +227,8 @@ def _forward(
     )  # fmt: skip
     mark("sort")
     backgrounds = _backgrounds(options.background, count, table.device)
+    if route is not None and route.space is not None and route.kept is not None:
+        route.space.meet_colors()
     renders, transmittances, last_ids, tile_work, aux, row_gradients = torch.ops.blitzgs.rasterize_fwd(
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
         count, views.width, views.height, options.tile_size, *tiles, None, False, backward_follows,
@@ -353,37 +355,47 @@ def _project(
         options.tile_size, options.sh_degree, options.near_plane, options.far_plane, options.eps2d, 0.0,
         options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted], length,
     )  # fmt: skip
-    plan, carry, totals = torch.ops.blitzgs.project_count(*arguments)
+    persistent, traffic, sizes = table["id"], None, room.sizes
     if asking is not None and asking.ranks.peers is not None:
-        rank, persistent = asking.ranks.rank, table["id"]
+        rank, peers = asking.ranks.rank, asking.ranks.peers
+        apart = peers.second if peers.apart else None
 
-        def project(everyone: Tensor, known: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
-            return torch.ops.blitzgs.project_emit_to_peers_(
-                *arguments,
-                plan,
-                everyone,
-                known,
-                rank,
-                persistent,
-                buffers,
-                capacity,
-                *room.sizes,
-                FIRST_PART,
-            )
+        def count(space: int) -> tuple[Tensor, list[Tensor]]:
+            return torch.ops.blitzgs.project_count(*arguments, space, space, persistent)[2:]
 
-        (*written, places, filled), space = PeerSpace.fill(totals, len(views), asking.ranks, project)
-        rows = Rows._make((*written, space.traffic.counts))
-        route = Route(space.traffic, rows.rank_masks, places=places, space=space, filled=filled)
+        def send_rows(
+            rows: list[Tensor], everyone: Tensor, buffers: list[Tensor], capacity: int
+        ) -> list[Tensor]:
+            return torch.ops.blitzgs.project_rows_to_peers_(
+                *arguments[:7], views.width, views.height, options.sh_degree, everyone, rank, rows, buffers,
+                capacity, FIRST_PART, apart.cuda_stream if apart is not None else 0,
+            )  # fmt: skip
+
+        columns, sent, fronts, space = PeerSpace.fill(len(views), asking.ranks, count, send_rows)
+        rows = rows_of(columns, space.traffic.counts)
+        route = Route(
+            space.traffic, rows.rank_masks, places=sent[0][: runs_of(len(rows.camera_ids))], space=space,
+            filled=sent[1], fronts=fronts, kept=sent[2] if apart is not None else None,
+        )  # fmt: skip
+        peers.apart = route.pays_in_parts
         return rows, space.arrived(), route, space.traffic.n_isects, space.traffic.visible
-    traffic = None if asking is None else read_traffic(totals, len(views), asking.ranks)
-    counts = tell_host(totals)[:3] if traffic is None else traffic.counts
-    sizes = room.sizes if traffic is None else (0, 0)  # known already
-    emitted = torch.ops.blitzgs.project_emit(*arguments, plan, carry, totals, counts, *sizes)
-    rows = Rows._make((*emitted, counts))
+    plan, carry, totals, written = torch.ops.blitzgs.project_count(*arguments, *sizes, persistent)
+
+    def finish(counts: Tensor) -> list[Tensor]:
+        return torch.ops.blitzgs.project_finish_(*arguments, plan, carry, totals, counts, written, persistent)
+
+    if asking is None:
+        with tell_host(totals) as known:
+            *columns, row_ids = finish(known)
+        counts = known[:3]
+    else:
+        traffic = read_traffic(totals, len(views), asking.ranks)
+        counts = traffic.counts
+        *columns, row_ids = finish(counts)
+    rows = Rows._make((*columns, counts))
     splats = Splats(
-        rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids,
-        table["id"].index_select(0, rows.gaussian_ids),
-    )  # fmt: skip
+        rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids, row_ids
+    )
     if traffic is not None:
         route = Route(traffic, rows.rank_masks)
     elif share is not None:

@@ -41,11 +41,12 @@ target_compile_options(
     -diag-suppress=20012>
 )
 
-# Counting and emitting compute the same rows and tiles in different kernels: no contraction, so that they
-# get the same bits. These kernels wait for memory, not for arithmetic.
+# Rows, colours and tiles are worked out in different kernels, and by some twice: no contraction, so that they
+# get the same bits.
 set_source_files_properties(
-  ${CMAKE_SOURCE_DIR}/csrc/project/project_count_cuda.cu
-  ${CMAKE_SOURCE_DIR}/csrc/project/project_emit_cuda.cu
+  ${CMAKE_SOURCE_DIR}/csrc/project/project_survey_cuda.cu
+  ${CMAKE_SOURCE_DIR}/csrc/project/project_rows_cuda.cu
+  ${CMAKE_SOURCE_DIR}/csrc/project/project_colors_cuda.cu
   ${CMAKE_SOURCE_DIR}/csrc/intersect/intersect_cuda.cu
   PROPERTIES COMPILE_OPTIONS "-fmad=false"
 )

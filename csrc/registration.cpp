@@ -22,33 +22,39 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "project_count(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
       "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
-      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count=None) -> "
-      "(Tensor plan, Tensor carry, Tensor totals)");
+      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count=None, "
+      "int visible_room=0, int row_room=0, Tensor? ids=None) -> (Tensor plan, Tensor carry, Tensor totals, "
+      "Tensor[] rows)");
   m.def(
       "project_emit(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
       "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
       "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count, Tensor plan, "
-      "Tensor carry, Tensor totals, Tensor counts, int visible_room, int row_room) -> (Tensor gaussian_ids, "
+      "Tensor carry, Tensor counts) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, "
       "Tensor means2d, Tensor conics, Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, "
       "Tensor tiles_touched, Tensor rank_masks)");
+  // Instead, for rows that project_count had room for: these, or others.
   m.def(
-      "project_emit_to_peers_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh, "
+      "project_finish_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
       "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
       "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count, Tensor plan, "
-      "Tensor everyone, Tensor counts, int rank, Tensor ids, Tensor(a!)[] buffers, int capacity, "
-      "int visible_room, int row_room, float first_part) -> (Tensor gaussian_ids, "
-      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, "
-      "Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
-      "Tensor rank_masks, Tensor places, Tensor filled)");
+      "Tensor carry, Tensor totals, Tensor counts, Tensor(a!)[] rows, Tensor? ids) -> Tensor(a!)[]");
+  // Colours, unless colors_stream is 0, in that stream: they are valid, here and there, once it was waited
+  // for.
+  m.def(
+      "project_rows_to_peers_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
+      "Tensor viewmats, Tensor Ks, int width, int height, int sh_degree, Tensor everyone, int rank, "
+      "Tensor(a!)[] rows, Tensor(b!)[] buffers, int capacity, float first_part, int colors_stream) -> "
+      "Tensor[]");
   m.def(
       "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
       "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "
       "int sh_degree, float eps2d, bool antialiased, bool raw, Tensor v_means2d, Tensor v_conics, "
       "Tensor? v_depths, Tensor v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats, "
-      "Tensor? places=None, int[] group_sizes=[], bool dense=False) -> (Tensor v_means, Tensor v_quats, "
+      "Tensor? places=None, int[] group_sizes=[], int own_rank=-1, Tensor? own=None, bool dense=False) -> ("
+      "Tensor v_means, Tensor v_quats, "
       "Tensor v_scales, Tensor v_opacities, Tensor v_sh, Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible rows.
   m.def(
@@ -57,7 +63,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int explicit_steps, float beta1, float beta2, float eps, bool sparse, Tensor viewmats, Tensor Ks, "
       "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, int sh_degree, "
       "float eps2d, bool antialiased, Tensor v_means2d, Tensor v_conics, Tensor v_row_opacities, "
-      "Tensor v_colors, Tensor? scale_reg, Tensor? places=None, int[] group_sizes=[]) "
+      "Tensor v_colors, Tensor? scale_reg, Tensor? places=None, int[] group_sizes=[], int own_rank=-1, "
+      "Tensor? own=None) "
       "-> ()");
 
   // Which rows each tile composites, front to back by (depth, id).
@@ -75,8 +82,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
   m.def("gather_rows(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
   m.def(
-      "sum_rows(Tensor values, Tensor places, int[] group_sizes, int rows, int[] widths) -> Tensor[] "
-      "columns");
+      "sum_rows(Tensor values, Tensor places, int[] group_sizes, int own_rank, Tensor? own, int rows, "
+      "int[] widths) -> Tensor[] columns");
   m.def(
       "return_to_peers_(Tensor values, int width, int[] group_sizes, Tensor(a!)[] buffers, int offset, "
       "int[] starts, int rank, Tensor? fronts, bool back) -> ()");
@@ -138,7 +145,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
-      "weight, Tensor? places=None, int[] group_sizes=[]) -> ()");
+      "weight, Tensor? places=None, int[] group_sizes=[], int own_rank=-1, Tensor? own=None) -> ()");
 
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");

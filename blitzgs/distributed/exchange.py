@@ -7,9 +7,9 @@ there; `send_back` or `send_back_packed` returns their gradients along the same 
 owner, by rank, so that the sum does not depend on who was faster (paper §3.1). `exchange` is the
 differentiable form for use with autograd, `plan_route` for rows that are there already.
 
-Rows travel in one of two ways. Where the ranks share memory (`blitzgs.distributed.peers`), the projection
-itself writes each row into the columns that other ranks composite from, so that the links work while it
-computes; `PeerSpace` tells it where. Otherwise rows are packed, carried by one all-to-all and taken apart.
+Rows travel in one of two ways. Where the ranks share memory (`blitzgs.distributed.peers`), each writes its
+rows into the columns that the others composite from, and the host waits for the numbers when all of that is
+queued: `PeerSpace` does so. Otherwise rows are packed, carried by one all-to-all and taken apart.
 Either way the places of rows among those of a rank are kept in 8 bytes per 32 rows, and serve the way back
 too. Over shared memory gradients may return in two parts, so that the second travels while the optimiser
 works on the first: the projection writes the rows of the first Gaussians to the front of each group and the
@@ -62,6 +62,8 @@ class Route:
         filled: where peers write, int64 [2, M]: how many of the rows for each rank are of the first part of
             the Gaussians (`FIRST_PART`), and lie in front of the others, whose number follows.
         fronts: int64 [M], how many that is of the rows from each rank; None: not known yet.
+        kept: what has to live until the rows' colours, which travel on their own, are there; None: they
+            travel with them.
     """
 
     traffic: Traffic
@@ -71,10 +73,11 @@ class Route:
     space: PeerSpace | None = None
     filled: Tensor | None = None
     fronts: Tensor | None = None
+    kept: Tensor | None = None
 
     @property
     def pays_in_parts(self) -> bool:
-        """Whether gradients had better return in two parts; the same on all ranks."""
+        """Whether gradients had better return in two parts and colours travel apart; as all ranks see it."""
         return self.space is not None and self.traffic.most >= LEAST_ROWS
 
 
@@ -84,12 +87,10 @@ class SecondPart(NamedTuple):
     Attributes:
         first: the gradients of the rows of this many visible Gaussians, from the first on, are there.
         stream: those of the others are, for what is queued on this stream.
-        sent: what has to live until then.
     """
 
     first: int
     stream: torch.cuda.Stream
-    sent: Tensor
 
 
 def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
@@ -150,11 +151,9 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
 
     Returns:
         The rows that touch the tiles this rank composites, grouped by source rank. Where peers write them,
-        they are valid until the next exchange.
+        they are valid until the next exchange; colours that travel apart, after `PeerSpace.meet_colors`.
     """
     if route.space is not None:
-        assert route.filled is not None
-        route.fronts = route.space.peers.share(route.filled[0]).everyone[:, ranks.rank]
         return splats
     columns = [splats.means2d, splats.depths, splats.camera_ids, splats.ids]
     if route.halves is None:
@@ -204,7 +203,8 @@ def send_back_packed(packed: Tensor, route: Route) -> tuple[Tensor, Returns]:
         route: of these rows.
 
     Returns:
-        What came back for the rows this rank sent, [S, 9], valid until the next exchange; how it adds up.
+        What came back for the rows this rank sent to others, [S, 9], valid until the next exchange; how it
+        adds up, with those that it sent to itself.
 
     Raises:
         RuntimeError: another exchange has taken the place of this one.
@@ -212,14 +212,14 @@ def send_back_packed(packed: Tensor, route: Route) -> tuple[Tensor, Returns]:
     assert route.space is not None
     returned = route.space.write_back(packed)
     route.space.peers.meet()
-    return returned, _returns(route)
+    return returned, _returns(route, packed)
 
 
 def send_back_in_parts(packed: Tensor, route: Route) -> tuple[Tensor, Returns, SecondPart]:
     """As `send_back_packed`, but wait only for the gradients of the first Gaussians.
 
     Returns:
-        As `send_back_packed`; what to know of the rest.
+        As `send_back_packed`; what to know of the rest. `packed` has to live until then, as it does in these.
     """
     assert route.space is not None and route.fronts is not None
     space, peers, main = route.space, route.space.peers, torch.cuda.current_stream()
@@ -234,14 +234,18 @@ def send_back_in_parts(packed: Tensor, route: Route) -> tuple[Tensor, Returns, S
         peers.meet_apart(SECOND)
         second.wait_event(met)  # some rows that are read there came with the first part
     first = int(FIRST_PART * int(route.traffic.counts[0]))
-    return returned, _returns(route), SecondPart(first, second, packed)
+    return returned, _returns(route, packed), SecondPart(first, second)
 
 
-def _returns(route: Route) -> Returns:
-    """Tell how what returned along a route adds up."""
+def _returns(route: Route, packed: Tensor | None = None) -> Returns:
+    """Tell how what returned along a route adds up; rows from this rank to itself stay in `packed`."""
+    traffic = route.traffic
     if route.places is None:
         raise RuntimeError("send_back: the route's rows have not been sent")
-    return Returns(route.places, route.traffic.sent)
+    if packed is None:
+        return Returns(route.places, traffic.sent)
+    own = packed.split(traffic.received)[traffic.rank]
+    return Returns(route.places, traffic.sent, traffic.rank, own)
 
 
 def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> tuple[Splats, Route]:

@@ -8,14 +8,16 @@ they lie; behind them the gradients that come back for the rows this rank sent. 
 each other's hosts, and has a stream and meetings of its own beside the step.
 
 A step is, in stream order on every rank: meeting A with the counts, rows written to the others, meeting B
-with where their groups are cut, compositing and its gradient, gradients written to the others, meeting C,
-reading those. With the gradients in two parts, the second is written and meets (D) on a stream of its own
-while the first meets C and is read; the main stream then waits for it. D counts by itself and does not wait
-for C: behind that it would find the GPU filled by what reads the first part. A meeting is a barrier between
-streams: work queued behind it, on any rank, finds done what any rank queued before it. Hence
+with where their groups are cut, sorting, compositing and its gradient, gradients written to the others,
+meeting C, reading those. Where many rows travel, their colours are computed meanwhile on a stream of their
+own, written there while the rows are sorted, and met for (B') before compositing. With the gradients in two
+parts, the second is written and meets (D) on that stream while the first meets C and is read; the main stream
+then waits for it. D counts by itself and does not wait for C: behind that it would find the GPU filled by
+what reads the first part. A meeting is a barrier between streams: work queued behind it, on any rank, finds
+done what any rank queued before it. Hence
 
-- rows and gradients are read after the meeting that follows their writing: B, C, and the second part after D
-  as well;
+- rows and gradients are read after the meeting that follows their writing: B, B' for colours, C, and the
+  second part after D as well;
 - arriving rows of a step overwrite those of the step before after A; whoever read those had queued that
   before its own A;
 - returning gradients are written after A and B, and those of the step before were read before A;
@@ -90,7 +92,8 @@ class Peers:
         buffers: int32 [words] of each rank, mapped here.
         columns: of the rows in this rank's buffer, as `PeerSpace.arrived` has them; empty: not made yet.
         exchanges: how often rows were written: tells whose rows are in the buffers.
-        second: stream for the second part of returning gradients.
+        second: stream for the second part of returning gradients, and for colours.
+        apart: whether the next exchange's colours travel apart from their rows; the same on all ranks.
     """
 
     def __init__(self, ranks: Ranks, mail: Tensor, timeout_seconds: float) -> None:
@@ -99,6 +102,7 @@ class Peers:
         self.buffers: list[Tensor] = []
         self.columns: list[Tensor] = []
         self.exchanges = 0
+        self.apart = False
         self.second = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._meetings = 0
         self._shared = 0  # how many of them had numbers

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,8 +27,9 @@ _COLUMNS = (
 _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
 # Gradients of means2d, conics, opacities and colors as they return; `rasterize_bwd_packed_` has them first.
 _GRADIENT_WORDS = 9
-# Writes rows to the peers: see `PeerSpace.fill`.
-Projection = Callable[[Tensor, Tensor, list[Tensor], int], Any]
+# Projects, and sends rows to the peers: see `PeerSpace.fill`.
+Projection = Callable[[int], tuple[Tensor, list[Tensor]]]
+Sending = Callable[[list[Tensor], Tensor, list[Tensor], int], list[Tensor]]
 # A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
 _ALIGNMENT = 32
 
@@ -63,6 +64,7 @@ class Traffic:
         counts: int64 [3] on the CPU: this rank's visible Gaussians, rows and tiles they touch.
         rows: rows[s][d] that rank s sends to rank d.
         rank: this rank.
+        most: most rows that any rank has, sends or gets.
         n_isects: row-tile intersections among the rows received, or a few more.
         visible: int64 [B], rows of each view before the exchange, over all ranks; over shared memory valid
             until the next exchange.
@@ -71,6 +73,7 @@ class Traffic:
     counts: Tensor
     rows: list[list[int]]
     rank: int
+    most: int
     n_isects: int
     visible: Tensor
 
@@ -78,10 +81,13 @@ class Traffic:
     def of(cls, known: Sequence[Sequence[int]], visible: Tensor, rank: int) -> Traffic:
         """Read it from every rank's totals."""
         first = 3 + len(visible)
+        rows = [list(numbers[first::2]) for numbers in known]
+        most = max(*(n[1] for n in known), *map(sum, rows), *map(sum, zip(*rows, strict=True)))
         return cls(
             counts=torch.tensor(known[rank][:3]),
-            rows=[list(numbers[first::2]) for numbers in known],
+            rows=rows,
             rank=rank,
+            most=most,
             n_isects=sum(numbers[first + 2 * rank + 1] for numbers in known),
             visible=visible,
         )
@@ -95,11 +101,6 @@ class Traffic:
     def received(self) -> list[int]:
         """Rows from each rank."""
         return [row[self.rank] for row in self.rows]
-
-    @property
-    def most(self) -> int:
-        """Most rows that any rank sends or gets."""
-        return max(*map(sum, self.rows), *map(sum, zip(*self.rows, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -119,34 +120,45 @@ class PeerSpace:
     exchange: int
 
     @classmethod
-    def fill(cls, totals: Tensor, n_views: int, ranks: Ranks, project: Projection) -> tuple[Any, PeerSpace]:
-        """Begin an exchange: have the rows of all ranks written, and agree on how many. Collective.
+    def fill(
+        cls, n_views: int, ranks: Ranks, project: Projection, send: Sending
+    ) -> tuple[list[Tensor], list[Tensor], Tensor, PeerSpace]:
+        """Have the rows of all ranks written to each other, and agree on how many. Collective.
+
+        All is queued, up to the meeting that ends it, before the host waits for the numbers: they come while
+        rows travel. Each rank has room for as many rows of its own as the buffers have for those that arrive,
+        so that all ranks know, on the device too, whether everything fits.
 
         Args:
-            totals: of `project_count`, with the tiles of each rank; int64 [3 + B + 2 M].
             n_views: B.
             ranks: the job, with peers.
-            project: given all ranks' totals, the same on their way to the CPU, the buffers and how many rows
-                each has room for: writes this rank's rows if there is room for everyone's, and waits for the
-                totals.
+            project: `project_count` with room for so many rows: returns its totals, with the tiles of each
+                rank, int64 [3 + B + 2 M], and its rows.
+            send: `project_rows_to_peers_`: given the rows, all ranks' totals, the buffers and how many rows
+                each has room for; returns, as that, places, filled and what has to live.
 
         Returns:
-            What `project` returned, and where the rows are.
+            This rank's rows, with room behind them; what `send` returned; int64 [M], how many of the rows
+            from each rank are of the first part of its Gaussians; and where the rows are.
         """
         peers = ranks.peers
-        assert peers is not None
-        everyone, sums, known = peers.share(totals)
-        visible = sums[3 : 3 + n_views]
-        needed = 0
+        assert peers is not None and peers.second is not None
         while True:
-            ranks.reading(partial(peers.reserve, (_ROW_WORDS + _GRADIENT_WORDS) * needed))
             room = len(peers.buffers[0]) // (_ROW_WORDS + _GRADIENT_WORDS) // _ALIGNMENT * _ALIGNMENT
-            result = ranks.reading(partial(project, everyone, known, peers.buffers, room))
-            traffic = Traffic.of(known.tolist(), visible, ranks.rank)
+            totals, rows = project(room)
+            everyone, sums, known = peers.share(totals)
+            told = torch.cuda.Event()
+            told.record()
+            sent = send(rows, everyone, peers.buffers, room)
+            fronts = peers.share(sent[1][0]).everyone[:, ranks.rank]
+            ranks.reading(told.synchronize)
+            traffic = Traffic.of(known.tolist(), sums[3 : 3 + n_views], ranks.rank)
             if traffic.most <= room:
                 peers.exchanges += 1
-                return result, cls(peers, traffic, room, peers.exchanges)
+                return rows, sent, fronts, cls(peers, traffic, room, peers.exchanges)
+            torch.cuda.current_stream().wait_stream(peers.second)
             needed = -(-traffic.most // _ALIGNMENT) * _ALIGNMENT
+            ranks.reading(partial(peers.reserve, (_ROW_WORDS + _GRADIENT_WORDS) * needed))
 
     def arrived(self) -> Splats:
         """Return the rows that arrive here; they may be read after the next meeting."""
@@ -155,16 +167,23 @@ class PeerSpace:
             peers.columns = _columns(peers.buffers[peers.rank], self.capacity)
         return Splats(*(column[:count] for column in peers.columns))
 
+    def meet_colors(self) -> None:
+        """Wait, in stream order, for the colours of all ranks."""
+        assert self.peers.second is not None
+        torch.cuda.current_stream().wait_stream(self.peers.second)
+        self.peers.meet()
+
     def write_back(self, packed: Tensor, fronts: Tensor | None = None, back: bool = False) -> Tensor:
-        """Write the gradients of the rows that arrived to their owners.
+        """Write the gradients of the rows that arrived from other ranks to these.
 
         Args:
             packed: [R, 9 or more], of `rasterize_bwd_packed_`.
-            fronts: int64 [M], only of so many rows from each other rank, from the first on; None: of all.
-            back: instead, only of the rest of those.
+            fronts: int64 [M], only of so many rows from each, from the first on; None: of all.
+            back: instead, only of the rest.
 
         Returns:
-            [S, 9], those of the rows this rank sent; they may be read after the next meeting.
+            [S, 9], those of the rows this rank sent, undefined where it sent them to itself; they may be read
+            after the next meeting.
 
         Raises:
             RuntimeError: a later exchange has begun.

@@ -3,25 +3,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
 
-def tell_host(values: Tensor) -> Tensor:
-    """Return a tensor on the CPU that holds a few numbers once the current stream was waited for.
+@contextmanager
+def tell_host(values: Tensor) -> Iterator[Tensor]:
+    """Give a tensor on the CPU that holds a few numbers once the current stream was waited for.
 
-    On CUDA a kernel writes them there: a copy would make the stream wait for the copying engine, 15 us.
+    On CUDA a kernel writes them there: a copy would make the stream wait for the copying engine, 15 us. So
+    the memory has to live until then: whoever uses this waits within it, and an exception does so too.
 
     Args:
-        values: int64 [n]. Who asked keeps what is returned until then.
+        values: int64 [n].
     """
     if not values.is_cuda:
-        return values
+        yield values
+        return
     known = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
     torch.ops.blitzgs.tell_host_(known, values)
-    return known
+    try:
+        yield known
+    except BaseException:
+        torch.cuda.current_stream(values.device).synchronize()
+        raise
 
 
 @torch.library.register_fake("blitzgs::tell_host_")

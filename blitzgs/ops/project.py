@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from blitzgs._library import without_autograd
+import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.ops.host import tell_host
-
-project_emit = without_autograd(torch.ops.blitzgs.project_emit)
 
 
 class Rows(NamedTuple):
@@ -30,6 +30,18 @@ class Rows(NamedTuple):
     tiles_touched: Tensor  # int32 [P]
     rank_masks: Tensor  # int64 [P]: bit m set where rank m wants the row; [0] where no rank asked
     counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
+
+
+def rows_of(columns: Sequence[Tensor], counts: Tensor) -> Rows:
+    """Return the rows that lie in columns with room behind them.
+
+    Args:
+        columns: those of `Rows` but the last, and perhaps more.
+        counts: `Rows.counts`.
+    """
+    visible, rows = counts[:2].tolist()
+    lengths = (rows, rows, visible, visible + 1, *(rows,) * 8)
+    return Rows._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
 
 
 class RowRoom:
@@ -119,25 +131,35 @@ def project(
         means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width, height, tile_size,
         sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
     )  # fmt: skip
-    plan, counts = _counted(arguments)
     if not torch.compiler.is_compiling():
-        return Rows._make((*_ProjectEmit.apply(*arguments[:6], plan, sparse_grad), counts))  # type: ignore[no-untyped-call]
+        return Rows._make(_Project.apply(*arguments[:6], arguments[6:], sparse_grad))  # type: ignore[no-untyped-call]
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
-    return Rows._make((*torch.ops.blitzgs.project_emit(*arguments[:6], *plan), counts))
+    plan, carry, totals, _ = torch.ops.blitzgs.project_count(*arguments, [], [])
+    counts = totals.cpu()[:3]
+    emitted = torch.ops.blitzgs.project_emit(*arguments, [], [], None, plan, carry, counts)
+    return Rows._make((*emitted, counts))
 
 
 def project_rows(*arguments: Any) -> Rows:
     """`project` without gradients, with the positional arguments of its ops, from means to raw."""
-    plan, counts = _counted(arguments)
-    return Rows._make((*project_emit(*arguments[:6], *plan), counts))
+    means, viewmats = arguments[0], arguments[5]
+    room = _room(means.device, len(means), len(viewmats))
+    with torch._C._AutoDispatchBelowAutograd():
+        plan, carry, totals, rows = torch.ops.blitzgs.project_count(*arguments, [], [], None, *room.sizes)
+        with tell_host(totals) as known:
+            *columns, _ = torch.ops.blitzgs.project_finish_(
+                *arguments, [], [], None, plan, carry, totals, known, rows, None
+            )
+    counts = known[:3]
+    room.learn(counts)
+    return Rows._make((*columns, counts))
 
 
-def _counted(arguments: tuple[Any, ...]) -> tuple[tuple[Any, ...], Tensor]:
-    """Count the rows: returns what `project_emit` takes after viewmats, and counts, for which it waits."""
-    plan, carry, totals = torch.ops.blitzgs.project_count(*arguments, [], [])
-    counts = (totals.cpu() if torch.compiler.is_compiling() else tell_host(totals))[:3]
-    return (*arguments[6:], [], [], None, plan, carry, totals, counts, 0, 0), counts
+@lru_cache(maxsize=16)
+def _room(_device: torch.device, _gaussians: int, _views: int) -> RowRoom:
+    """Return the room that is kept for calls of a size."""
+    return RowRoom()
 
 
 @torch.library.register_fake("blitzgs::project_count")
@@ -148,6 +170,7 @@ def _(means: Tensor, *rest: Any) -> Any:
         means.new_empty(context.new_dynamic_size(), dtype=torch.int64),
         means.new_empty(context.new_dynamic_size(), dtype=torch.uint8),
         means.new_empty(3 + viewmats.shape[0] + 2 * len(tile_begins), dtype=torch.int64),
+        [],
     )
 
 
@@ -189,7 +212,7 @@ def _(
     visible_ids: Tensor,
     *rest: Any,
 ) -> Any:
-    dense = any(rest[16:])
+    dense = any(rest[18:])
     length = (means if dense else visible_ids).shape[0]
     return (
         means.new_empty(length, 3),
@@ -215,7 +238,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
-    return (*_gradients(ctx, v_output), *(None,) * 22)
+    return (*_gradients(ctx, v_output), *(None,) * 19)
 
 
 def _gradients(ctx: Any, v_output: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
@@ -265,25 +288,26 @@ def _row_gradients(
     return v.means2d, v.conics, v.depths, v.opacities, v.colors
 
 
-class _ProjectEmit(torch.autograd.Function):
-    """`project_emit` and the argument `sparse_grad`, outside of `torch.compile`.
+class _Project(torch.autograd.Function):
+    """`project_rows` with the formula registered below, outside of `torch.compile`.
 
-    The formula is the one registered below, whose way through torch takes 0.2 ms of the host's time. Each
-    argument takes time: those without a gradient are one.
+    The way through torch to a registered formula takes 0.2 ms of the host's time, and each argument some:
+    those without a gradient are one. Counts are no output of the op.
     """
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        *parameters, plan, sparse_grad = arguments
-        inputs = (*parameters, *plan)
-        rows = project_emit(*inputs)
-        _setup_context(ctx, inputs, rows)
+        *parameters, options, sparse_grad = arguments
+        inputs = (*parameters, *options)
+        rows = project_rows(*inputs)
+        _setup_context(ctx, inputs, rows[:-1])
+        ctx.mark_non_differentiable(rows.counts)
         ctx.sparse_grad = sparse_grad
-        return rows
+        return tuple(rows)
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
-        return (*_gradients(ctx, v_output), None, None)
+        return (*_gradients(ctx, v_output[:-1]), None, None)
 
 
 torch.library.register_autograd("blitzgs::project_emit", _backward, setup_context=_setup_context)

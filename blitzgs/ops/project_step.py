@@ -77,7 +77,8 @@ def project_bwd_step_(
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
         returns: how to add up the gradients of the rows, which are then those that came back from the ranks,
-            [S, ...]. They are the sums that `blitzgs.ops.scatter.sum_rows` makes.
+            [S, ...]. They are the sums that `blitzgs.ops.scatter.sum_rows` makes, which has the four
+            gradients in this order as the values of a row.
 
     The four gradients may be views of one table, [.., 9 or more] in this order: on CUDA, one of 12 floats a
     row, or any that came back, is read where it lies.

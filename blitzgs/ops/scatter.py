@@ -22,10 +22,15 @@ class Returns(NamedTuple):
     Attributes:
         places: from `scatter_rows`.
         group_sizes: as for `scatter_rows`.
+        own_rank: the group whose values never left, and are not read from among the others; -1: none.
+        own: that group's values, [group_sizes[own_rank], W]: as many as came back, or more behind them. Ops
+            that take only some of the columns of a row still take whole rows here.
     """
 
     places: Tensor | None = None
     group_sizes: Sequence[int] = ()
+    own_rank: int = -1
+    own: Tensor | None = None
 
 
 OWN_VALUES = Returns()
@@ -91,6 +96,11 @@ def sum_rows(values: Tensor, returns: Returns, rows: int, widths: Sequence[int])
     return torch.ops.blitzgs.sum_rows(values, *returns, rows, list(widths))
 
 
+def runs_of(rows: int) -> int:
+    """Entries of `places` for each rank."""
+    return -(-rows // RUN)
+
+
 def words_per_row(column: Tensor) -> int:
     """32-bit words that a row of a column takes."""
     return -(-math.prod(column.shape[1:]) * column.element_size() // 4)
@@ -116,7 +126,7 @@ def as_column(words: Tensor, like: Tensor) -> Tensor:
 @torch.library.register_fake("blitzgs::scatter_rows")
 def _(columns: Sequence[Tensor], masks: Tensor, group_sizes: Sequence[int]) -> tuple[Tensor, Tensor]:
     words = sum(column.shape[1] for column in columns) * sum(group_sizes)
-    runs = -(-masks.shape[0] // RUN)
+    runs = runs_of(masks.shape[0])
     packed = masks.new_empty(words, dtype=torch.int32)
     return packed, masks.new_empty((runs, len(group_sizes)))
 
@@ -128,6 +138,12 @@ def _(packed: Tensor, widths: Sequence[int], group_sizes: Sequence[int]) -> list
 
 @torch.library.register_fake("blitzgs::sum_rows")
 def _(
-    values: Tensor, places: Tensor, group_sizes: Sequence[int], rows: int, widths: Sequence[int]
+    values: Tensor,
+    places: Tensor,
+    group_sizes: Sequence[int],
+    own_rank: int,
+    own: Tensor | None,
+    rows: int,
+    widths: Sequence[int],
 ) -> list[Tensor]:
     return [values.new_empty((rows, width)) for width in widths]

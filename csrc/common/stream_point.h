@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// CUDA only: a point in a stream that the host waits for while it goes on queueing work behind it.
+// CUDA only: a point in a stream that the host, or another stream, waits for while work is queued behind it.
 #pragma once
 #include "common/stream.h"
 
@@ -16,6 +16,8 @@ class StreamPoint {
   StreamPoint& operator=(const StreamPoint&) = delete;
 
   void wait() const;
+  // What is queued in another stream from now on waits for it.
+  void hold(CudaStream other) const;
 
  private:
   CUevent_st* event_ = nullptr;

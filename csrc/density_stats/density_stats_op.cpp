@@ -20,7 +20,8 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
                     const Tensor& row_offsets_in, const Tensor& v_means2d_in, const Tensor& conics_in,
                     const std::optional<Tensor>& phi_in, std::int64_t width, std::int64_t height,
                     double weight, const std::optional<Tensor>& places,
-                    const std::vector<std::int64_t>& group_sizes) {
+                    const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank,
+                    const std::optional<Tensor>& own) {
   check_floating(kOp, "grad_sum", grad_sum);
   const ScalarType dtype = grad_sum.scalar_type();
   const std::int64_t rows = grad_sum.numel();
@@ -37,7 +38,7 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   check_shape(kOp, "conics", conics_in, {-1, 3});
   const std::int64_t n_rows = conics_in.size(0);
   std::optional<HeldReturns> returns;
-  if (places) returns.emplace(kOp, n_rows, *places, group_sizes);
+  if (places) returns.emplace(kOp, n_rows, *places, group_sizes, own_rank, own, dtype);
   check_shape(kOp, "v_means2d", v_means2d_in, {returns ? total_rows(returns->groups) : n_rows, 2});
   std::optional<Tensor> phi;
   if (phi_in) {
@@ -61,7 +62,7 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
                                    mutable_data<T>(max_radii),
                                    data<std::int32_t>(visible_ids),
                                    data<std::int32_t>(row_offsets),
-                                   returns ? returns->values(v, row) : own_values(v, row, n_rows),
+                                   returns ? returns->values(kOp, v, row, 0, 2) : own_values(v, row, n_rows),
                                    data<T>(conics),
                                    data_or_null<T>(phi),
                                    visible,

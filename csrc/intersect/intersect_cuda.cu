@@ -12,9 +12,9 @@
 #include "common/arrays.h"
 #include "common/launch.cuh"
 #include "common/multiprocessors.h"
+#include "common/running_sum.cuh"
 #include "intersect/depth_order.cuh"
 #include "intersect/radix_sweep.cuh"
-#include "intersect/running_sum.cuh"
 #include "intersect/touched_tiles.cuh"
 
 namespace blitzgs::cuda {

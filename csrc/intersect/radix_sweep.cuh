@@ -10,8 +10,8 @@
 #include <cuda/atomic>
 
 #include "common/launch.cuh"
+#include "common/running_sum.cuh"
 #include "common/stream.h"
-#include "intersect/running_sum.cuh"
 
 namespace blitzgs::cuda {
 

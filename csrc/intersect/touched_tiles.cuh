@@ -2,8 +2,8 @@
 // Which tiles a row touches, found once and kept in 16 bytes. Include it only where contraction is off
 // (cmake/cuda.cmake): the projection counts the same tiles.
 #pragma once
+#include "common/running_sum.cuh"
 #include "intersect/intersect.h"
-#include "intersect/running_sum.cuh"
 
 namespace blitzgs::cuda {
 

@@ -2,14 +2,13 @@
 // Ranks that reach each other's memory: rows written where they are needed, and a meeting of all ranks on the
 // device. CUDA only. Every rank holds the same kind of buffers; `buffers[m]` is rank m's, mapped here.
 //
-// Rows for other ranks are written by the projection (project_emit_to_peers_): each group goes into its
-// rank's buffer behind the groups of the ranks before this one, column c from word capacity * begin[c] on.
+// Rows for other ranks are written by project_rows_to_peers_: each group goes into its rank's buffer behind
+// the groups of the ranks before this one, column c from word capacity * begin[c] on.
 //
 // return_to_peers_, the way back: the first `width` values of each received row of values [R, W], group m of
-// them from rank m, go to rank m's buffer, from row starts[m] of those there, which begin at word `offset`.
-// With fronts [M], on the device: of the groups of ranks other than `rank`, this one, only the first
-// fronts[m] rows or, with `back`, only the rest, which leaves most of the GPU to kernels of other streams; of
-// this rank's own all or, with `back`, none.
+// them from rank m, go to rank m's buffer, from row starts[m] of those there, which begin at word `offset`;
+// but for this rank's own group. With fronts [M], on the device: only the first fronts[m] rows of each or,
+// with `back`, only the rest, which leaves most of the GPU to kernels of other streams.
 //
 // meet_peers_, a barrier in stream order: what any rank queued before it is done, and visible, when what any
 // rank queues behind it runs. Each rank also leaves its `values` with every other. mail[m], int64: [M] the

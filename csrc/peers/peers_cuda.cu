@@ -67,20 +67,17 @@ __global__ void __launch_bounds__(kMeetThreads)
   }
 }
 
-// Groups that a launch writes.
-BLITZGS_HD int return_groups(const PeerReturn& job) { return job.groups.count - job.back; }
-
-// Block x: kReturnWords words at a time of the x-th group, from the first again after the last. Neighbouring
-// blocks write to different ranks, so that no link waits for another.
+// Block x: kReturnWords words at a time of the x-th of the other ranks' groups, from the first again after
+// the last. Neighbouring blocks write to different ranks, so that no link waits for another.
 template <int WIDTH>
 __global__ void __launch_bounds__(kReturnThreads, 3) return_kernel(const __grid_constant__ PeerReturn job) {
-  const int n_groups = return_groups(job), width = WIDTH > 0 ? WIDTH : job.width;
+  const int n_groups = job.groups.count - 1, width = WIDTH > 0 ? WIDTH : job.width;
   int m = static_cast<int>(blockIdx.x) % n_groups;
-  if (job.back && m >= job.rank) ++m;
+  if (m >= job.rank) ++m;
   const float* from = job.values + job.groups.start[m] * job.stride;
   float* to = job.targets[m];
   std::int64_t begin = 0, end = job.groups.size[m];
-  if (job.fronts && m != job.rank) {
+  if (job.fronts) {
     const std::int64_t front = min(max(job.fronts[m * job.fronts_stride], std::int64_t{0}), end);
     (job.back ? begin : end) = front;
   }
@@ -118,7 +115,7 @@ void meet(const PeerMail& mail, std::int64_t meeting, const std::int64_t* values
 
 void return_rows(const PeerReturn& job, Workspace&, CudaStream stream) {
   const std::int64_t most = *std::max_element(job.groups.size, job.groups.size + job.groups.count);
-  const unsigned groups = return_groups(job), limit = job.back ? kReturnBlocksBack : kReturnBlocks;
+  const unsigned groups = job.groups.count - 1, limit = job.back ? kReturnBlocksBack : kReturnBlocks;
   if (most == 0 || groups == 0) return;
   const unsigned blocks =
       groups * std::min(blocks_for(most * job.width, kReturnWords) + 1, blocks_for(limit, groups));

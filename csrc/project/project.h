@@ -7,14 +7,17 @@
 // its geometry is finite: a NaN or infinite parameter hides its Gaussian and spreads nowhere. With
 // radius_clip = 0 no dropped row could have changed a pixel. A row whose colour is not finite is there but
 // hidden: opacity, colour, radii and tiles_touched are 0, so nothing composites it (SH rows are by far the
-// most bytes, and are read once: by project_emit).
+// most bytes, and are read once, for rows alone).
 //
 // Rows are ordered by (Gaussian, view). Every value of a row depends on its Gaussian and view alone, so rows
-// are bit-identical however Gaussians are divided among calls. Counting comes first: project_count finds, in
-// few bytes per candidate, which views see it, and sums up what there will be. Given room for that much,
-// project_list writes which Gaussian and view each row is of, and project_emit the rows; SH is evaluated for
-// them alone. Nobody waits for the device: on CUDA these two find the sums there, and where the room was a
-// guess that is too small they write nothing. O(candidates * B + rows); no output of size N.
+// are bit-identical however Gaussians are divided among calls. O(candidates * B + rows); no output of size N.
+//
+// On the CPU project_count projects and sums up what there will be, project_list writes which Gaussian and
+// view each row is of, and project_emit the rows. On CUDA project_survey lists, from few bytes per candidate,
+// the views that may see it; project_rows projects those pairs, counts what are rows and, as far as it was
+// given room for them, writes each behind those before it, in one launch: where the room turns out to be too
+// small, it runs again. project_colors adds the colours. Nobody waits for the device: kernels find the sums
+// there.
 //
 // On several ranks, rank_tiles says which tiles each composites. The walk over a row's tiles that counts them
 // then also finds the ranks that the row has to reach.
@@ -65,7 +68,8 @@ struct ProjectSizes {
   std::int64_t visible, rows;
 };
 
-// How many there is room for, and what project_count summed up. On the CPU the room is what is needed.
+// How many there is room for, and what there is, as project_totals where the inputs are; null: the room is
+// what is needed, as always on the CPU.
 struct ProjectRoom {
   ProjectSizes sizes;
   const std::int64_t* totals;
@@ -77,34 +81,44 @@ struct ProjectIds {
   std::int32_t *gaussian_ids, *camera_ids, *visible_ids, *row_offsets;
 };
 
-// colors is null without sh, rank_masks (bit m: rank m composites tiles of the row) without ranks.
+// colors is null without sh, rank_masks (bit m: rank m composites tiles of the row) without ranks. row_ids:
+// the persistent ids of the rows' Gaussians, from those of all, ids [N]; null: not wanted.
 template <class T>
 struct ProjectOutputs {
   T *means2d, *conics, *depths, *opacities, *colors;
   std::int32_t *radii, *tiles_touched;
-  std::int64_t* rank_masks;
+  std::int64_t *rank_masks, *row_ids;
+  const std::int64_t* ids;
 };
 
 // What other ranks need of a row: means2d, conics, opacities, colors, depths, camera_ids and the Gaussian's
 // persistent id, in words.
 inline constexpr RowColumns<const std::int32_t> kEmittedColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
+inline constexpr int kOpacityColumn = 2, kColorColumn = 3;
 
-// Where emitted rows go besides (CUDA): each to the ranks of its rank mask, as `scatter` does
-// (scatter/scatter.h), in every target behind the rows of the ranks before this one, unless some rank has
-// more than `capacity` rows to send or to get: then nothing is written, here and, as all ranks know of it, at
-// no other. everyone: project_totals of each rank, on the device. targets: where the columns of each rank's
-// rows begin. ids [N]; row_ids [P], places and filled [2, M] are written too. In each group the rows of the
-// first `first_part` of the visible Gaussians come first: those within its first filled[0][m].
+// What this rank writes to the others, as its device works it out.
+struct ProjectAdmitted {
+  ProjectSizes sizes;
+  RowGroups groups;    // rows for each rank, and the row of its target that they begin at
+  std::int32_t split;  // rows of the first part
+};
+
+// Where rows go besides (CUDA): each to the ranks of its rank mask, as `scatter` does (scatter/scatter.h), in
+// every target behind the rows of the ranks before this one, unless some rank has more than `capacity` rows,
+// of its own, to send or to get: then nothing is written, here and, as all ranks know of it, at no other.
+// everyone: project_totals of each rank, on the device. targets: where the columns of each rank's rows begin.
+// admitted, places and filled [2, M] are written too. In each group the rows of the first `first_part` of the
+// visible Gaussians come first: those within its first filled[0][m].
 struct ProjectScatter {
-  const std::int64_t* ids;
+  ProjectAdmitted* admitted;
   double first_part;
-  std::int64_t* row_ids;
   std::int64_t* filled;
   RowPlace* places;
   const std::int64_t* everyone;
   int n_ranks, rank;
   std::int64_t capacity;
   ScatterTargets targets;
+  bool with_colors;  // else they follow: project_colors_to_ranks
 };
 
 // Gradients by visible Gaussian, [U, ...] (sh [U, K, 3], null without sh), or, where `dense`, by Gaussian:
@@ -141,19 +155,23 @@ void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGr
                  const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
+// plan [project_plan_bytes]: from the survey to the rows.
 std::size_t project_plan_bytes(std::int64_t candidates);
-template <class T>
-void project_count(const ProjectInputs<T>&, const RankTiles& rank_tiles, void* plan, Workspace& carry,
-                   std::int64_t* totals, Workspace&, CudaStream);
-template <class T>
-void project_list(const ProjectInputs<T>&, const void* plan, const ProjectRoom&, const ProjectIds&,
-                  Workspace&, CudaStream);
-template <class T>
-void project_emit(const ProjectInputs<T>&, const RankTiles&, const void* carry, const ProjectIds&,
-                  const ProjectRoom&, const ProjectOutputs<T>&, Workspace&, CudaStream);
-void project_emit_to_ranks(const ProjectInputs<float>&, const RankTiles&, const ProjectIds&,
-                           const ProjectRoom&, const ProjectOutputs<float>&, const ProjectScatter&,
-                           Workspace&, CudaStream);
+void project_survey(const ProjectInputs<float>&, void* plan, Workspace&, CudaStream);
+// totals: null, where they are known. With no room rows are counted only.
+void project_rows(const ProjectInputs<float>&, const RankTiles&, const void* plan, const ProjectSizes& room,
+                  const ProjectIds&, const ProjectOutputs<float>&, std::int64_t* totals, Workspace&,
+                  CudaStream);
+// Of the rows that project_rows wrote; none without sh. beside: leaves a place to kernels of other streams.
+void project_colors(const ProjectInputs<float>&, const ProjectIds&, const ProjectRoom&,
+                    const ProjectOutputs<float>&, CudaStream, bool beside = false);
+// Into the room for `capacity` rows that this rank has too.
+void project_rows_to_ranks(const ProjectIds&, const ProjectOutputs<float>&, int n_views,
+                           const ProjectScatter&, CudaStream);
+// The colours of rows that were sent without: nobody needs them to sort the rows, so they are worked out
+// while the rows travel, and travel while these are sorted. A row whose colour is not finite is hidden only
+// now: its opacity becomes zero where it went too, which may list it, but composites nothing of it.
+void project_colors_to_ranks(const ProjectOutputs<float>&, const ProjectScatter&, CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const RowGradientSource&, const T* scale_reg,
                  const ProjectGradients<T>&, Workspace&, CudaStream);

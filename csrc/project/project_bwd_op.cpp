@@ -75,13 +75,14 @@ BackwardTensors project_bwd(const Tensor& means, const Tensor& quats, const Tens
                             const Tensor& v_means2d, const Tensor& v_conics, const OptionalTensor& v_depths,
                             const Tensor& v_row_opacities, const OptionalTensor& v_colors,
                             const OptionalTensor& scale_reg, bool need_viewmats, const OptionalTensor& places,
-                            const std::vector<std::int64_t>& group_sizes, bool dense) {
+                            const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank,
+                            const std::optional<Tensor>& own, bool dense) {
   constexpr const char* kOp = "project_bwd";
   const Parameters p(kOp, means, quats, scales, opacities, sh, viewmats, Ks, sh_degree);
   const Backward b(kOp, p, camera_ids, visible_ids, row_offsets, width, height, sh_degree, eps2d, antialiased,
                    raw, scale_reg);
   HeldRowGradients v(kOp, p.means.scalar_type(), camera_ids.numel(), v_means2d, v_conics, v_depths,
-                     v_row_opacities, v_colors, places, group_sizes);
+                     v_row_opacities, v_colors, places, group_sizes, own_rank, own);
   const std::int64_t length = dense ? p.count : b.visible();
   const auto rows_of = [&](std::vector<std::int64_t> shape) {
     Tensor rows = make_empty(p.means, shape);
@@ -113,7 +114,8 @@ void project_bwd_step_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
                        std::int64_t height, std::int64_t sh_degree, double eps2d, bool antialiased,
                        const Tensor& v_means2d, const Tensor& v_conics, const Tensor& v_row_opacities,
                        const Tensor& v_colors, const OptionalTensor& scale_reg, const OptionalTensor& places,
-                       const std::vector<std::int64_t>& group_sizes) {
+                       const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank,
+                       const std::optional<Tensor>& own) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state{kOp,      params, exp_avgs,       exp_avg_sqs, last_step, moment_step, table,
                     lr_table, step,   explicit_steps, beta1,       beta2,     eps,         sparse};
@@ -123,7 +125,7 @@ void project_bwd_step_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
   const Backward b(kOp, p, camera_ids, visible_ids, row_offsets, width, height, sh_degree, eps2d, antialiased,
                    true, scale_reg);
   HeldRowGradients v(kOp, p.means.scalar_type(), camera_ids.numel(), v_means2d, v_conics, std::nullopt,
-                     v_row_opacities, v_colors, places, group_sizes);
+                     v_row_opacities, v_colors, places, group_sizes, own_rank, own);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {

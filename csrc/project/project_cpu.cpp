@@ -118,6 +118,7 @@ void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t 
   out.radii[2 * index + 1] = shown ? pixel_radius(row.extent[1]) : 0;
   out.tiles_touched[index] = shown ? kept.tiles : 0;
   if (out.rank_masks) out.rank_masks[index] = kept.ranks;
+  if (out.row_ids) out.row_ids[index] = out.ids[id];
 }
 
 // Gradients of visible Gaussian u; poses [B] or null.

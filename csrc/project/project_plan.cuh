@@ -1,30 +1,43 @@
 // SPDX-License-Identifier: Apache-2.0
-// What counting hands to emitting: for each segment of candidates, which of them are visible.
+// What the survey of the candidates hands to the kernel that projects them.
 #pragma once
+#include "common/turn_sums.cuh"
 #include "project/project_device.cuh"
 
 namespace blitzgs::cuda {
 
-// Candidates that a warp takes together: as many as leave enough of them to fill the device.
-inline constexpr int kMostSegment = 512, kLeastSegment = 128;
-inline constexpr std::int64_t kSegmentsWanted = 1 << 14;
+// Candidates that a block of the survey takes at a time: as many as leave enough of them to fill the device.
+inline constexpr int kSurveyThreads = 128, kSurveyBatch = 4;
+inline constexpr int kLeastSurveyed = kSurveyThreads * kSurveyBatch, kMostSurveyed = 4 * kLeastSurveyed;
+inline constexpr std::int64_t kTurnsWanted = 1 << 12;
 
-__host__ __device__ inline int segment_of(std::int64_t candidates) {
-  int segment = kMostSegment;
-  while (segment > kLeastSegment && candidates < kSegmentsWanted * segment) segment /= 2;
-  return segment;
+__host__ __device__ inline int surveyed_at_once(std::int64_t candidates) {
+  int count = kMostSurveyed;
+  while (count > kLeastSurveyed && candidates < kTurnsWanted * count) count /= 2;
+  return count;
 }
 
-__host__ __device__ inline std::int64_t segments_of(std::int64_t candidates) {
-  return (candidates + segment_of(candidates) - 1) / segment_of(candidates);
+// The most turns that so many candidates, or fewer, can take.
+inline std::int64_t most_survey_turns(std::int64_t candidates) {
+  const std::int64_t in_small = (candidates + kLeastSurveyed - 1) / kLeastSurveyed,
+                     in_large = (candidates + kMostSurveyed - 1) / kMostSurveyed;
+  return in_small < 2 * kTurnsWanted ? in_small : in_large > 2 * kTurnsWanted ? in_large : 2 * kTurnsWanted;
 }
 
-// The most segments that so many candidates, or fewer, can have.
-__host__ __device__ inline std::int64_t most_segments(std::int64_t candidates) {
-  const std::int64_t in_small = (candidates + kLeastSegment - 1) / kLeastSegment,
-                     in_large = (candidates + kMostSegment - 1) / kMostSegment,
-                     wanted = 2 * kSegmentsWanted;  // beyond, segments double
-  return in_small < wanted ? in_small : in_large > wanted ? in_large : wanted;
+// Gaussians that a block projects at a time, a thread each at first, and the most pairs of one and a view
+// that these make.
+inline constexpr int kRowThreads = 128, kMostPairs = 512;
+
+__host__ __device__ inline int projected_at_once(int n_views) {
+  return n_views > kMostPairs / kRowThreads ? kMostPairs / n_views : kRowThreads;
+}
+
+// For TurnSums of so many turns.
+inline std::uint64_t* turn_zeros(std::int64_t turns, Workspace& workspace, CudaStream stream) {
+  const std::int64_t count = turns + 1;
+  auto* zeros = workspace.allocate<std::uint64_t>(count);
+  check(cudaMemsetAsync(zeros, 0, count * sizeof(*zeros), stream), "project_count");
+  return zeros;
 }
 
 // How many candidates there are.
@@ -32,37 +45,28 @@ __device__ inline std::int64_t candidates_of(const Inputs& in) {
   return in.n_active ? *in.n_active : in.n_candidates;
 }
 
-// What is to be written: nothing where it does not fit.
-__device__ inline ProjectSizes fitting(const ProjectRoom& room) {
-  const ProjectSizes sizes{room.totals[kTotalVisible], room.totals[kTotalRows]};
-  return sizes.visible <= room.sizes.visible && sizes.rows <= room.sizes.rows ? sizes : ProjectSizes{0, 0};
-}
-
 __device__ inline std::int64_t candidate_id(const Inputs& in, std::int64_t candidate) {
   return in.active_ids ? in.active_ids[candidate] : candidate;
 }
 
-// Visible candidates and rows in one number, so that one scan serves both.
-__device__ inline std::int64_t pack_counts(std::int64_t visible, std::int64_t rows) {
-  return visible << 32 | rows;
+// What is to be read of rows that project_rows had room for: nothing where they did not fit.
+__device__ inline ProjectSizes fitting(const ProjectRoom& room) {
+  if (!room.totals) return room.sizes;
+  const ProjectSizes sizes{room.totals[kTotalVisible], room.totals[kTotalRows]};
+  return sizes.visible <= room.sizes.visible && sizes.rows <= room.sizes.rows ? sizes : ProjectSizes{0, 0};
 }
 
-// before [most_segments + 1]: pack_counts() of the segments before each. The visible candidates of segment s
-// are the first entries from segment_of() * s on, ascending: the views that see each, and where in the
-// segment it is.
-template <class Count, class Views, class Slot>
+// The Gaussians that some views may see, in the order of the candidates, and these views as bits:
+// count [1], ids and views [candidates].
 struct Plan {
-  Count* before;
-  Views* views;
-  Slot* slots;
+  std::int64_t* count;
+  std::uint32_t* views;
+  std::int32_t* ids;
 
-  template <class Memory>
-  Plan(Memory* memory, std::int64_t candidates)
-      : before(static_cast<Count*>(memory)),
-        views(reinterpret_cast<Views*>(before + most_segments(candidates) + 1)),
-        slots(reinterpret_cast<Slot*>(views + candidates)) {}
+  Plan(const void* memory, std::int64_t candidates)
+      : count(static_cast<std::int64_t*>(const_cast<void*>(memory))),
+        views(reinterpret_cast<std::uint32_t*>(count + 1)),
+        ids(reinterpret_cast<std::int32_t*>(views + candidates)) {}
 };
-using NewPlan = Plan<std::int64_t, std::uint32_t, std::uint16_t>;
-using MadePlan = Plan<const std::int64_t, const std::uint32_t, const std::uint16_t>;
 
 }  // namespace blitzgs::cuda

@@ -74,7 +74,8 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
   const ProjectIds ids{p.gaussian_ids.data(), p.camera_ids.data(), p.visible_ids.data(),
                        p.row_offsets.data()};
   const ProjectOutputs<double> out{p.means2d.data(), p.conics.data(), p.depths.data(), p.opacities.data(),
-                                   p.colors.data(),  p.radii.data(),  p.tiles.data(),  p.rank_masks.data()};
+                                   p.colors.data(),  p.radii.data(),  p.tiles.data(),  p.rank_masks.data(),
+                                   nullptr,          nullptr};
   const ProjectRoom room{p.sizes, p.totals.data()};
   cpu::project_list(in, plan, room, ids, workspace, nullptr);
   cpu::project_emit(in, ranks, carry.last(), ids, room, out, workspace, nullptr);

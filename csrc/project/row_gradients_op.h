@@ -26,10 +26,14 @@ class HeldRowGradients {
   HeldRowGradients(const char* op, ScalarType dtype, std::int64_t rows, const Tensor& means2d,
                    const Tensor& conics, const std::optional<Tensor>& depths, const Tensor& opacities,
                    const std::optional<Tensor>& colors, const std::optional<Tensor>& places,
-                   const std::vector<std::int64_t>& group_sizes)
+                   const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank,
+                   const std::optional<Tensor>& own)
       : op_(op), means2d_(means2d), conics_(conics), opacities_(opacities), depths_(depths), colors_(colors) {
     std::int64_t n = rows;
-    if (places) n = total_rows(returns_.emplace(op, rows, *places, group_sizes).groups);
+    if (places) {
+      n = total_rows(returns_.emplace(op, rows, *places, group_sizes, own_rank, own, dtype).groups);
+    }
+    STD_TORCH_CHECK(!own || !depths, "blitzgs::", op, ": own has no gradients of depths");
     check_shape(op, "v_means2d", means2d, {n, 2});
     check_shape(op, "v_conics", conics, {n, 3});
     check_shape(op, "v_row_opacities", opacities, {n});
@@ -44,13 +48,19 @@ class HeldRowGradients {
 #ifdef BLITZGS_BACKEND_CUDA
     const std::int64_t width = table_width();
     const auto* table = data<float>(means2d_);
-    if (width > 0 && returns_) return ReturnedRowGradients{returns_->values(table, width)};
+    if (width > 0 && returns_) {
+      return ReturnedRowGradients{returns_->values(op_, table, width, 0, kRowGradient)};
+    }
     if (width * sizeof(float) == sizeof(PackedRowGradients::Row) && lies_at(table, 16)) {
       return PackedRowGradients{reinterpret_cast<const PackedRowGradients::Row*>(table)};
     }
 #endif
-    each_column(
-        [&](Tensor& column) { column = returns_ ? add_up<T>(column, scope) : as_contiguous(column); });
+    std::int64_t before = 0;  // columns of a table in the order of kRowGradient
+    each_column([&](Tensor& column) {
+      const std::int64_t width = column.dim() == 1 ? 1 : column.size(1);
+      column = returns_ ? add_up<T>(column, before, width, scope) : as_contiguous(column);
+      before += width;
+    });
     return ProjectRowGradients<T>{data<T>(means2d_), data<T>(conics_), data_or_null<T>(depths_),
                                   data<T>(opacities_), data_or_null<T>(colors_)};
   }
@@ -87,13 +97,14 @@ class HeldRowGradients {
 
   // Sums over the ranks, in a column of its own.
   template <class T>
-  Tensor add_up(const Tensor& column, DeviceScope& scope) const {
+  Tensor add_up(const Tensor& column, std::int64_t before, std::int64_t width, DeviceScope& scope) const {
     const Tensor returned = as_contiguous(column);
-    const std::int64_t rows = returns_->rows, width = column.dim() == 1 ? 1 : column.size(1);
+    const std::int64_t rows = returns_->rows;
     Tensor sums = column.dim() == 1 ? make_empty(column, {rows}) : make_empty(column, {rows, width});
     RowColumns<T> columns{};
     add_column(op_, columns, mutable_data<T>(sums), width);
-    backend::sum(returns_->values(data<T>(returned), width), columns, scope.workspace, scope.stream);
+    backend::sum(returns_->values(op_, data<T>(returned), width, before, width), columns, scope.workspace,
+                 scope.stream);
     return sums;
   }
 

@@ -85,6 +85,7 @@ struct ScatterRows {
 };
 
 // Values of rows, `width` apart: each row's own, or, with places, what came back from each rank it went to.
+// Those from rank `own_rank` (-1: none), which never left, may lie elsewhere, `own_width` apart.
 template <class T>
 struct RowValues {
   const T* values;
@@ -92,6 +93,8 @@ struct RowValues {
   std::int64_t count;
   const RowPlace* places;
   RowGroups groups;
+  const T* own = nullptr;
+  int own_width = 0, own_rank = -1;
 
   // Calls f(pointer to a row's values), for each rank in order.
   template <class F>
@@ -108,7 +111,9 @@ struct RowValues {
     for (; ranks != 0; ranks &= ranks - 1) {
       const int m = lowest_bit(ranks);
       const std::int64_t at = run[m].of(in_run);
-      if (at < groups.size[m]) f(values + (groups.start[m] + at) * width);
+      if (at < groups.size[m]) {
+        f(m == own_rank ? own + at * own_width : values + (groups.start[m] + at) * width);
+      }
     }
   }
 };

@@ -110,6 +110,20 @@ __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::ui
   }
 }
 
+__device__ __forceinline__ void copy_run(const std::int32_t* from, const std::uint8_t* list, int n, int width,
+                                         std::int32_t* to) {
+  switch (width) {
+    case 1:
+      return copy_run<1>(from, list, n, width, to);
+    case 2:
+      return copy_run<2>(from, list, n, width, to);
+    case 3:
+      return copy_run<3>(from, list, n, width, to);
+    default:
+      return copy_run<0>(from, list, n, width, to);
+  }
+}
+
 // Scatters rows [kScatterBlock * blockIdx.x, ...) of n_rows, whatever rows.count says. All THREADS threads of
 // the block call this; the rows must be visible to all of them.
 template <int THREADS, int RANKS>
@@ -160,19 +174,7 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
     std::int32_t* to = targets.words[m][c] + shared.target[m] * width;
     const std::uint8_t* list = shared.list[m];
     const int n = shared.count[m];
-    switch (width) {
-      case 1:
-        copy_run<1>(from, list, n, width, to);
-        break;
-      case 2:
-        copy_run<2>(from, list, n, width, to);
-        break;
-      case 3:
-        copy_run<3>(from, list, n, width, to);
-        break;
-      default:
-        copy_run<0>(from, list, n, width, to);
-    }
+    copy_run(from, list, n, width, to);
   }
 }
 

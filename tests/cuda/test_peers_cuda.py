@@ -9,7 +9,8 @@ from cuda_scenes import Scene, ops
 
 from blitzgs.distributed.rows import PeerSpace, Traffic
 from blitzgs.ops.host import tell_host
-from blitzgs.ops.scatter import Returns, sum_rows
+from blitzgs.ops.project import rows_of
+from blitzgs.ops.scatter import Returns, runs_of, sum_rows
 
 VIEWS, WIDTH, HEIGHT, FIRST_PART = 2, 150, 100, 0.4
 TILES = VIEWS * 10 * 7
@@ -22,47 +23,52 @@ class Rank:
 
     def __init__(self, number, n):
         scene = Scene(n, VIEWS, WIDTH, HEIGHT, seed=number)
+        scene.sh[5:n:50] = float("nan")  # such rows are hidden
         self.number = number
         self.ids = (torch.arange(n, device="cuda") * 7919 + number) % 100_003
         self.arguments = (
             *scene.parameters("cuda"), None, None, WIDTH, HEIGHT, 16, scene.degree, 0.1, 1e10, 0.3, 0.0,
             False, True, BEGINS, ENDS, None,
         )  # fmt: skip
-        self.plan, self.carry, self.totals = ops.project_count(*self.arguments)
+        self.plan, self.carry, self.totals, _ = ops.project_count(*self.arguments)
 
     def rows(self):
-        counts = self.totals.cpu()
-        return ops.project_emit(*self.arguments, self.plan, self.carry, self.totals, counts, 0, 0)
+        return ops.project_emit(*self.arguments, self.plan, self.carry, self.totals.cpu())
 
-    def send(self, everyone, buffers, capacity, guessed):
-        """guessed: the room for this rank's own rows, a multiple of what is needed."""
-        room = [int(guessed * n) + 1 * (guessed > 2) for n in self.totals[:2].tolist()]
-        return ops.project_emit_to_peers_(
-            *self.arguments, self.plan, everyone, everyone.cpu(), self.number, self.ids, buffers, capacity,
-            *room, FIRST_PART,
+    def send(self, everyone, buffers, capacity, apart):
+        _, _, totals, rows = ops.project_count(*self.arguments, capacity, capacity, self.ids)
+        assert torch.equal(totals, self.totals)
+        second = torch.cuda.Stream()
+        places, filled, kept = ops.project_rows_to_peers_(
+            *self.arguments[:7], WIDTH, HEIGHT, self.arguments[12], everyone, self.number, rows, buffers,
+            capacity, FIRST_PART, second.cuda_stream if apart else 0,
         )  # fmt: skip
+        torch.cuda.current_stream().wait_stream(second)
+        counts = totals[:3].cpu()
+        del kept
+        return [*rows_of(rows, counts)[:12], places[: runs_of(int(counts[1]))], filled]
 
 
-def exchange(counts, guessed, room=None):
+def exchange(counts, slack=0, room=None, apart=False):
     """All ranks' rows are written; also what each would have to be given."""
     ranks = [Rank(m, n) for m, n in enumerate(counts)]
     everyone = torch.stack([rank.totals for rank in ranks])
     traffic = [Traffic.of(everyone.tolist(), torch.empty(VIEWS), m) for m in range(len(ranks))]
-    capacity = -(-traffic[0].most // 32) * 32 if room is None else room
-    words = 22 * max(capacity, 1)
+    capacity = -(-traffic[0].most // 32) * 32 + slack if room is None else room
+    words = 22 * capacity
     buffers = [torch.full((words,), -1, dtype=torch.int32, device="cuda") for _ in ranks]
     spaces = [
         PeerSpace(SimpleNamespace(rank=m, columns=[], buffers=buffers, exchanges=1), traffic[m], capacity, 1)
         for m in range(len(ranks))
     ]
-    return ranks, spaces, [rank.send(everyone, buffers, capacity, guessed) for rank in ranks]
+    return ranks, spaces, [rank.send(everyone, buffers, capacity, apart) for rank in ranks]
 
 
-@pytest.mark.parametrize("guessed", [0, 0.9, 1, 2.5])
-@pytest.mark.parametrize("counts", [(3000, 900, 0, 40), (1, 0, 0, 2)])
-@pytest.mark.parametrize("in_parts", [False, True])
-def test_rows_arrive_and_their_gradients_return(counts, guessed, in_parts):
-    ranks, spaces, sent = exchange(counts, guessed)
+@pytest.mark.parametrize("slack", [32, 3200])
+@pytest.mark.parametrize("counts", [(3000, 900, 0, 40), (1, 0, 0, 2), (60_000, 0, 3, 90_000)])
+@pytest.mark.parametrize(("in_parts", "apart"), [(False, False), (True, False), (False, True)])
+def test_rows_arrive_and_their_gradients_return(counts, slack, in_parts, apart):
+    ranks, spaces, sent = exchange(counts, slack, apart=apart)
     expected = [rank.rows() for rank in ranks]
     for got, want in zip(sent, expected, strict=True):
         for a, b in zip(got[:12], want, strict=True):
@@ -85,11 +91,12 @@ def test_rows_arrive_and_their_gradients_return(counts, guessed, in_parts):
             begin += len(part[0])
     filled = torch.stack([rows[13] for rows in sent])
     assert filled.sum(1).tolist() == spaces[0].traffic.rows
-    returned = []
+    returned, tables = [], []
     for m, space in enumerate(spaces):
         splats = space.arrived()
         columns = [splats.means2d, splats.conics, splats.opacities[:, None], splats.colors]
         packed = torch.cat([*columns, torch.ones_like(splats.conics)], 1)
+        tables.append(packed)
         if in_parts:
             fronts = filled[:, 0, m]
             space.write_back(packed, fronts)
@@ -98,7 +105,8 @@ def test_rows_arrive_and_their_gradients_return(counts, guessed, in_parts):
             returned.append(space.write_back(packed))
     for m, space in enumerate(spaces):
         rows, masks, places = expected[m], sent[m][11], sent[m][12]
-        sums = sum_rows(returned[m], Returns(places, space.traffic.sent), len(masks), [2, 3, 1, 3])
+        returns = Returns(places, space.traffic.sent, m, tables[m].split(space.traffic.received)[m])
+        sums = sum_rows(returned[m], returns, len(masks), [2, 3, 1, 3])
         times = sum((masks >> k & 1) for k in range(len(ranks)))[:, None]
         for got, column in zip(sums, (rows[4], rows[5], rows[7][:, None], rows[8]), strict=True):
             assert torch.equal(got, times * column)
@@ -106,7 +114,7 @@ def test_rows_arrive_and_their_gradients_return(counts, guessed, in_parts):
 
 @pytest.mark.parametrize("count", [3, 20_000])
 def test_rows_of_the_first_gaussians_lie_in_front(count):
-    ranks, spaces, sent = exchange((count, 10, 10, count), 1.25)
+    ranks, spaces, sent = exchange((count, 10, 10, count))
     for rank, space, rows in zip(ranks, spaces, sent, strict=True):
         first = rows[3][int(FIRST_PART * len(rows[2]))].item()  # rows before are of the first Gaussians
         for m, target in enumerate(spaces):
@@ -121,19 +129,29 @@ def test_rows_of_the_first_gaussians_lie_in_front(count):
             assert front <= len(mine) + 256  # a block's rows stay together
 
 
-@pytest.mark.parametrize("guessed", [0, 2])
-def test_nothing_is_written_where_room_is_too_small(guessed):
-    ranks, spaces, sent = exchange((500, 300, 0, 0), guessed, room=32)
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("counts", [(500, 300, 0, 0), (0, 0, 0, 300)])
+def test_nothing_is_written_where_room_is_too_small(counts, apart):
+    _, spaces, _ = exchange(counts, room=32, apart=apart)
     assert spaces[0].traffic.most > 32
-    for rows in sent:
-        assert len(rows[0]) == len(rows[2]) == 0 and rows[3].tolist() == [0]
+    torch.cuda.synchronize()
     for buffer in spaces[0].peers.buffers:
         assert (buffer == -1).all()
 
 
+def test_rows_need_the_room_that_others_count_on():
+    rank = Rank(0, 100)
+    rows = ops.project_count(*rank.arguments, 64, 63, rank.ids)[3]
+    with pytest.raises(RuntimeError, match="rows must have room for 64 visible Gaussians and rows, got 64"):
+        ops.project_rows_to_peers_(
+            *rank.arguments[:7], WIDTH, HEIGHT, rank.arguments[12], rank.totals[None], 0, rows,
+            [torch.zeros(22 * 64, dtype=torch.int32, device="cuda")], 64, FIRST_PART, 0,
+        )  # fmt: skip
+
+
 @pytest.mark.parametrize("width,in_parts", [(1, False), (4, False), (9, False), (9, True)])
 def test_parts_of_rows_return(width, in_parts):
-    sizes, starts, offset = [700, 0, 5], [3, 0, 900], 17
+    sizes, starts, offset = [700, 40, 5], [3, 0, 900], 17
     values = torch.randn(sum(sizes), 12, device="cuda")
     buffers = [torch.full((10_000,), -1, dtype=torch.int32, device="cuda") for _ in sizes]
     fronts = torch.tensor([[400, 0], [0, 0], [9, 0]], device="cuda")[:, 0]
@@ -142,15 +160,14 @@ def test_parts_of_rows_return(width, in_parts):
         assert (buffers[0][offset + (3 + 400) * width :] == -1).all()
         ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 1, fronts, True)
     else:
-        ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 0, None, False)
-    begin = 0
-    for buffer, size, start in zip(buffers, sizes, starts, strict=True):
-        first = offset + start * width
-        end = first + size * width
-        got = buffer[first:end].view(torch.float32).view(size, width)
-        assert torch.equal(got, values[begin : begin + size, :width])
-        assert (buffer[:first] == -1).all() and (buffer[end:] == -1).all()
-        begin += size
+        ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 1, None, False)
+    assert (buffers[1] == -1).all()  # its own
+    for m, group in ((0, values[:700]), (2, values[740:])):
+        first = offset + starts[m] * width
+        end = first + sizes[m] * width
+        got = buffers[m][first:end].view(torch.float32).view(-1, width)
+        assert torch.equal(got, group[:, :width])
+        assert (buffers[m][:first] == -1).all() and (buffers[m][end:] == -1).all()
 
 
 @pytest.mark.parametrize("n_values", [0, 5, 100])
@@ -191,8 +208,12 @@ def test_ranks_on_two_streams_wait_for_each_other():
 def test_numbers_for_the_host_go_to_pinned_memory():
     for n in (0, 1, 300):
         values = torch.arange(n, device="cuda") + 7
-        known = tell_host(values)
-        torch.cuda.synchronize()
-        assert torch.equal(known, values.cpu())
+        with tell_host(values) as known:
+            torch.cuda.synchronize()
+            assert torch.equal(known, values.cpu())
     with pytest.raises(RuntimeError, match="must be pinned memory"):
         ops.tell_host_(torch.zeros(300, dtype=torch.int64), values)
+    torch.cuda._sleep(20_000_000)
+    with pytest.raises(ValueError), tell_host(values):
+        raise ValueError
+    assert torch.cuda.current_stream().query()  # nobody writes to the memory any more

@@ -114,14 +114,31 @@ def test_ranks_of_rows_match_the_cpu(scene):
         *scene.parameters("cpu"), None, None, scene.width, scene.height, 16, scene.degree, 0.1, 1e10, 0.3,
         0.0, False, True, [0, 30, 30, 50], [40, 30, 90, 140],
     )  # fmt: skip
-    plan, carry, totals = ops.project_count(*arguments)
-    expected = ops.project_emit(*arguments, None, plan, carry, totals, totals, 0, 0)
+    plan, carry, totals, _ = ops.project_count(*arguments)
+    expected = ops.project_emit(*arguments, None, plan, carry, totals)
     on_gpu = [a.cuda() if torch.is_tensor(a) else a for a in arguments]
-    plan, carry, counted = ops.project_count(*on_gpu)
+    plan, carry, counted, _ = ops.project_count(*on_gpu)
     assert torch.equal(counted.cpu(), totals)
-    rows = ops.project_emit(*on_gpu, None, plan, carry, counted, counted.cpu(), 0, 0)
+    rows = ops.project_emit(*on_gpu, None, plan, carry, counted.cpu())
     assert torch.equal(rows[11].cpu(), expected[11])
     assert totals[5::2].tolist() == [(expected[11] >> m & 1).sum().item() for m in range(4)]
+
+
+@pytest.mark.parametrize("views", [1, 4, 9])
+@pytest.mark.parametrize("n", [1, 200, 400_000])
+def test_rows_are_written_in_order(views, n):
+    scene = Scene(n, views, 150, 100)
+    parts = [
+        scene.project("cuda", active_ids=part)
+        for part in torch.arange(n, dtype=torch.int32, device="cuda").chunk(7)
+    ]
+    expected = [torch.cat(columns) for columns in zip(*(part[:11] for part in parts), strict=True)]
+    for _ in range(3):  # the room for the rows is that of the call before
+        rows = scene.project("cuda")
+        for i in (0, 1, 2, *range(4, 11)):
+            assert torch.equal(rows[i], expected[i]), i
+        assert rows[3][0] == 0 and rows[3][-1] == len(rows[0])
+        assert torch.equal(rows[2].repeat_interleave(rows[3].diff()), rows[0])
 
 
 @pytest.mark.parametrize("rows_seen", [True, False])
@@ -132,16 +149,20 @@ def test_rows_do_not_depend_on_the_room_that_was_guessed(scene, rows_seen):
     ]  # fmt: skip
     if not rows_seen:
         arguments[0] = torch.full_like(arguments[0], 1e6)
-    plan, carry, totals = ops.project_count(*arguments)
+    plan, carry, totals, none = ops.project_count(*arguments)
     counts = totals.cpu()
+    assert none == []
     visible, rows = counts[:2].tolist()
     assert (rows > visible > 100) == rows_seen
-    expected = ops.project_emit(*arguments, plan, carry, totals, counts, 0, 0)
+    expected = ops.project_emit(*arguments, plan, carry, counts)
+    ids = 7919 * torch.arange(len(arguments[0]), device="cuda")
     assert len(expected[0]) == rows and len(expected[2]) == visible
     rooms = [(visible, rows), (visible - 1, rows), (visible, rows - 1), (1, 1), (visible + 1, rows + 200)]
     for room in [*rooms, (2 * visible + 3, 3 * rows + 1000)]:
-        told = counts.new_empty(counts.shape, pin_memory=True).copy_(totals, non_blocking=True)
-        for a, b in zip(
-            ops.project_emit(*arguments, plan, carry, totals, told, *room), expected, strict=True
-        ):
+        plan, carry, counted, written = ops.project_count(*arguments, *room, ids)
+        assert torch.equal(counted, totals)
+        told = counts.new_empty(counts.shape, pin_memory=True).copy_(counted, non_blocking=True)
+        *columns, row_ids = ops.project_finish_(*arguments, plan, carry, counted, told, written, ids)
+        for a, b in zip(columns, expected, strict=True):
             assert a.is_contiguous() and torch.equal(a, b)
+        assert torch.equal(row_ids, ids[columns[0].long()])

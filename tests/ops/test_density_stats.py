@@ -96,6 +96,9 @@ def test_gradients_are_read_where_they_are(device):
     returns = Returns(places, sizes)
     total, _ = sum_rows(parts, returns, len(masks), [2, 2])
     torch.testing.assert_close(sums(parts[:, :2], returns), sums(total))
+    own = parts[sizes[0] :].clone()
+    parts[sizes[0] :] = torch.nan
+    torch.testing.assert_close(sums(parts[:, :2], Returns(places, sizes, 1, own)), sums(total))
     with pytest.raises(RuntimeError, match=r"v_means2d must have shape \[\d+, 2\]"):
         sums(gradients[1:].contiguous(), returns)
 

@@ -84,8 +84,11 @@ class Scene:
         table[:, :9] = torch.cat(columns, 1)
         self.v = gradient_columns(table)
 
-    def tear(self, width, ranks=3):
-        """Replace the gradients by parts from ranks, `width` floats a row; return what they add up to."""
+    def tear(self, width, own_rank=-1, ranks=3):
+        """Replace the gradients by parts from ranks, `width` floats a row; return what they add up to.
+
+        Those from `own_rank` are apart from the others.
+        """
         rows = len(self.v[0])
         masks = torch.randint(0, 2**ranks, (rows,), generator=self.seed) & ~2  # rank 1 had nothing
         sizes = [int((masks >> m & 1).sum()) for m in range(ranks)]
@@ -95,7 +98,12 @@ class Scene:
         total = table.new_zeros(rows, 9)
         for part, group in zip(table.split(sizes), sent.long().split(sizes), strict=True):
             total[group] += part[:, :9]
-        self.v, self.returns = gradient_columns(table), Returns(places, sizes)
+        self.returns = Returns(places, sizes)
+        if own_rank >= 0:
+            part = table.split(sizes)[own_rank]
+            self.returns = Returns(places, sizes, own_rank, torch.nn.functional.pad(part, (0, 3)))
+            part.fill_(torch.nan)
+        self.v = gradient_columns(table)
         return [column.contiguous() for column in gradient_columns(total)]
 
 
@@ -138,7 +146,12 @@ def test_equals_backward_and_step(device, sparse, n, k, degree, views):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("source", ["packed", "odd table", "returned", "returned packed", "returned columns"])
+@pytest.mark.parametrize(
+    "source", [
+        "packed", "odd table", "returned", "returned packed", "returned columns", "returned but own",
+        "returned columns but own",
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize(
     "n,k,degree,views", [(1, 16, 3, 1), (3000, 16, 3, 3), (700, 16, 2, 1), (700, 4, 1, 2), (700, 16, 0, 1)]
 )
@@ -149,8 +162,8 @@ def test_gradients_are_read_where_they_are(device, source, n, k, degree, views):
         scene.degree = degree
         scene.render(antialiased=False)
     if source.startswith("returned"):
-        plain.v = other.tear(12 if source == "returned packed" else 9)
-        if source == "returned columns":
+        plain.v = other.tear(12 if source == "returned packed" else 9, 2 if "own" in source else -1)
+        if "columns" in source:
             other.v = [column.contiguous() for column in other.v]
     else:
         other.pack(12 if source == "packed" else 10)

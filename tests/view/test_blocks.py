@@ -172,8 +172,8 @@ def caught_up_and_projected(table, ids, views, count, viewmats, Ks):
         *(after[name] for name in PARAMETERS), viewmats, Ks, ids, views, WIDTH, HEIGHT, 16, 0, NEAR, FAR, 0.3,
         0.0, False, True, [0], [50], count,
     )  # fmt: skip
-    plan, carry, totals = torch.ops.blitzgs.project_count(*arguments)
-    rows = torch.ops.blitzgs.project_emit(*arguments, plan, carry, totals, totals.cpu(), 0, 0)
+    plan, carry, totals, _ = torch.ops.blitzgs.project_count(*arguments)
+    rows = torch.ops.blitzgs.project_emit(*arguments, plan, carry, totals.cpu())
     return [*after.values(), totals, *rows]
 
 

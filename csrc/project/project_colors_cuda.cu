@@ -1,0 +1,56 @@
+// SPDX-License-Identifier: Apache-2.0
+// Compiled without FMA contraction (cmake/cuda.cmake), as project_rows_cuda.cu.
+#include <algorithm>
+
+#include "common/multiprocessors.h"
+#include "project/project_plan.cuh"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+// kColorBlocks fill a multiprocessor; kBlocksBeside leave a place, such as a meeting of ranks needs at once.
+constexpr int kColorThreads = 128, kColorBlocks = 5, kBlocksBeside = 2;
+constexpr int kRowsOfBlock = 2 * kColorThreads;
+
+template <int DEGREE, bool QUADS>
+__global__ void __launch_bounds__(kColorThreads, kColorBlocks)
+    color_kernel(const Inputs in, const ProjectIds ids, const ProjectRoom room,
+                 const ProjectOutputs<float> out) {
+  __shared__ ShStage<DEGREE> stages[QUADS ? kColorThreads / 32 : 1];
+  __shared__ Camera<float> cameras[kMaxViews];
+  __shared__ TripleStage triples[kColorThreads / 32];
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
+  const std::int64_t n_rows = fitting(room).rows, step = gridDim.x * std::int64_t{kColorThreads};
+  std::int64_t begin = blockIdx.x * std::int64_t{kColorThreads};
+  if (begin >= n_rows) return;
+  load_cameras(in, cameras);
+  __syncthreads();
+  for (; begin < n_rows; begin += step) {
+    const std::int64_t i = begin + threadIdx.x;
+    const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
+    int sh_slot = 0;
+    if constexpr (QUADS) sh_slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
+    const int view = id < 0 ? 0 : ids.camera_ids[i];
+    const Vec3<float> mean = triples[warp].gather(in.means, id, lane);
+    emit_color<DEGREE, QUADS>(in, cameras[view], mean, stage, sh_slot, out, i, id);
+    __syncwarp();
+  }
+}
+
+}  // namespace
+
+void project_colors(const Inputs& in, const ProjectIds& ids, const ProjectRoom& room,
+                    const ProjectOutputs<float>& out, CudaStream stream, bool beside) {
+  if (room.sizes.rows == 0 || !in.sh) return;
+  std::int64_t blocks = (room.sizes.rows + kRowsOfBlock - 1) / kRowsOfBlock;
+  if (beside) blocks = std::min<std::int64_t>(blocks, kBlocksBeside * multiprocessors());
+  dispatch_sh(in, [&](auto degree, auto quads) {
+    color_kernel<degree.value, quads.value>
+        <<<static_cast<unsigned>(blocks), kColorThreads, 0, stream>>>(in, ids, room, out);
+  });
+  check_launch("project_colors");
+}
+
+}  // namespace blitzgs::cuda
