@@ -10,7 +10,9 @@ With --data the Gaussians are the octree of the capture's points, seen from its 
 again by their measured cost.
 
 Stages: every step starts together on all ranks, behind a barrier; a stage is the time between its marks on
-the device, the slowest rank's, and the median over the batches and visits. "alone" is their sum.
+the device, the slowest rank's, and the median over the batches and visits. "alone" is their sum. Where ranks
+share memory, rows travel in "project" and "sort", and gradients in "optimiser", whose kernel pulls them from
+the other ranks; "exchange" and "exchange back" are then the meetings before these are read.
 Step: all batches one after the other without a barrier, as in training; the time from the first to the last,
 by the host's clock, over their number; the median over the visits.
 """
@@ -268,7 +270,7 @@ def measure(args: argparse.Namespace) -> None:
             "visible per step": visible,
             "rows per step": rows,
             "rows sent to other ranks": sent,
-            "bytes per step": {"splats": 52 * sent, "gradients": 36 * sent},
+            "bytes per step": {"splats": 52 * sent, "gradients": (36 if ranks.peers is None else 48) * sent},
             "balance": {"estimated": max(estimated), "measured": max(measured)},
             "ms": {s: statistics.median(t[i] for t in times) for i, s in enumerate(STAGES)},
         }

@@ -10,7 +10,7 @@ intersection, and its reverse between their gradients.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -19,15 +19,11 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.exchange import (
-    FIRST_PART,
     Route,
-    SecondPart,
     plan_route,
     read_traffic,
     send,
     send_back,
-    send_back_in_parts,
-    send_back_packed,
 )
 from blitzgs.distributed.ownership import Share
 from blitzgs.distributed.rows import PeerSpace, Splats
@@ -36,7 +32,7 @@ from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.host import tell_host
 from blitzgs.ops.project import RowRoom, Rows, rows_of
 from blitzgs.ops.rasterize import GradientRoom, gradient_columns
-from blitzgs.ops.scatter import OWN_VALUES, Returns, runs_of
+from blitzgs.ops.scatter import NO_TABLES, RowTables, runs_of
 
 Mark = Callable[[str], None]
 
@@ -132,44 +128,21 @@ class Frame(NamedTuple):
 
 
 class RowGradients(NamedTuple):
-    """Gradients of this rank's P rows, maybe views of one table.
+    """Gradients of this rank's P rows: columns, maybe views of one table, or where they lie at the ranks.
 
     Attributes:
-        means2d: [P, 2], per pixel.
+        means2d: [P, 2], per pixel; None, like the next three: in `tables`.
         conics: [P, 3].
         opacities: [P].
         colors: [P, 3].
-        returns: says where they are in parts, [S, ...], from the ranks that composited the rows, and how to
-            add them up (`blitzgs.ops.scatter.sum_rows`); such are valid until the next exchange.
-        second: what is still on its way, until `parts` is exhausted; None: nothing.
+        tables: at the ranks that composited the rows; such are valid until the next exchange.
     """
 
-    means2d: Tensor
-    conics: Tensor
-    opacities: Tensor
-    colors: Tensor
-    returns: Returns = OWN_VALUES
-    second: SecondPart | None = None
-
-    def parts(self, rows: Rows) -> Iterator[Rows]:
-        """Iterate over the visible Gaussians in parts, each once the gradients of its rows are there.
-
-        Args:
-            rows: the frame's.
-
-        Yields:
-            The rows, with `visible_ids` and `row_offsets` of a part. What a loop does with them, it queues on
-            the current stream: another one for the second part.
-        """
-        if self.second is None:
-            yield rows
-            return
-        first, stream = self.second
-        ids, offsets = rows.visible_ids, rows.row_offsets
-        yield rows._replace(visible_ids=ids[:first], row_offsets=offsets[: first + 1])
-        with torch.cuda.stream(stream):
-            yield rows._replace(visible_ids=ids[first:], row_offsets=offsets[first:])
-        torch.cuda.current_stream().wait_stream(stream)
+    means2d: Tensor | None
+    conics: Tensor | None
+    opacities: Tensor | None
+    colors: Tensor | None
+    tables: RowTables = NO_TABLES
 
 
 def forward(
@@ -229,10 +202,21 @@ def _forward(
     backgrounds = _backgrounds(options.background, count, table.device)
     if route is not None and route.space is not None and route.kept is not None:
         route.space.meet_colors()
-    renders, transmittances, last_ids, tile_work, aux, row_gradients = torch.ops.blitzgs.rasterize_fwd(
+    arguments = (
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
-        count, views.width, views.height, options.tile_size, *tiles, None, False, backward_follows,
+        count, views.width, views.height, options.tile_size, *tiles,
     )  # fmt: skip
+    if route is None or route.space is None:
+        *composited, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, None, False, backward_follows)
+        gradients = GradientRoom(zeros)
+    elif backward_follows:
+        zeros = route.space.table()
+        composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, zeros)
+        gradients = GradientRoom(zeros, route.space.clear_table)
+    else:
+        *composited, _ = torch.ops.blitzgs.rasterize_fwd(*arguments, None, False)
+        gradients = GradientRoom(None, route.space.clear_table)
+    renders, transmittances, last_ids, tile_work, aux = composited
     room.learn(rows.counts)
     mark("raster")
     return Frame(
@@ -251,7 +235,7 @@ def _forward(
         last_ids,
         tile_work,
         aux,
-        GradientRoom(row_gradients),
+        gradients,
     )
 
 
@@ -261,43 +245,44 @@ def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.d
     return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
 
 
-def backward_rows(
-    frame: Frame, v_renders: Tensor, mark: Mark = unmarked, in_parts: bool = False
-) -> RowGradients:
+def backward_rows(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> RowGradients:
     """Carry image gradients back to the projected rows.
 
     Args:
         frame: from `forward`.
         v_renders: gradient of the loss by the images, [B, H, W, 3]; this rank's tiles matter.
         mark: called at the end of each stage: "raster back", "exchange back".
-        in_parts: where it pays, leave some on their way: the caller goes through `RowGradients.parts` before
-            anything else.
+
+    Raises:
+        RuntimeError: the ranks share memory, and a later frame has taken the place of this one's rows.
     """
     views, options, splats, share = frame.views, frame.options, frame.splats, frame.share
     tiles = (0, -1) if share is None else share.tiles
+    space = None if frame.route is None else frame.route.space
     arguments = (
         splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
         frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders,
     )  # fmt: skip
     grid = (len(views), views.width, views.height, options.tile_size, *tiles)
-    returns, second = OWN_VALUES, None
     if v_renders.is_cuda:
+        if space is not None:
+            space.check_current()
         packed = frame.room.take(splats.means2d)
         torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, *grid, options.deterministic, packed)
-        mark("raster back")
-        if frame.route is not None and in_parts and frame.route.pays_in_parts:
-            packed, returns, second = send_back_in_parts(packed, frame.route)
-        elif frame.route is not None and frame.route.space is not None:
-            packed, returns = send_back_packed(packed, frame.route)
         columns: Sequence[Tensor] = gradient_columns(packed)
     else:
         *columns, _ = torch.ops.blitzgs.rasterize_bwd(*arguments, None, *grid, False, options.deterministic)
-        mark("raster back")
-    if share is not None and frame.route is not None and frame.route.space is None:
+    mark("raster back")
+    if space is not None:
+        assert frame.route is not None and frame.route.places is not None
+        tables = space.share_table(frame.route.places)
+        mark("exchange back")
+        return RowGradients(None, None, None, None, tables)
+    if share is not None and frame.route is not None:
         columns = send_back(columns, frame.route, share.ranks)
     mark("exchange back")
     means2d, conics, opacities, colors = columns
-    return RowGradients(means2d, conics, opacities, colors, returns, second)
+    return RowGradients(means2d, conics, opacities, colors)
 
 
 def backward(
@@ -326,7 +311,7 @@ def backward(
     *parameters, _ = torch.ops.blitzgs.project_bwd(
         *table.parameters, views.viewmats, views.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
         views.width, views.height, options.sh_degree, options.eps2d, options.antialiased, True, v.means2d,
-        v.conics, None, v.opacities, v.colors, scale_reg, False, *v.returns,
+        v.conics, None, v.opacities, v.colors, scale_reg, False, *v.tables,
     )  # fmt: skip
     mark("project back")
     return tuple(parameters)
@@ -368,16 +353,16 @@ def _project(
         ) -> list[Tensor]:
             return torch.ops.blitzgs.project_rows_to_peers_(
                 *arguments[:7], views.width, views.height, options.sh_degree, everyone, rank, rows, buffers,
-                capacity, FIRST_PART, apart.cuda_stream if apart is not None else 0,
+                capacity, apart.cuda_stream if apart is not None else 0,
             )  # fmt: skip
 
-        columns, sent, fronts, space = PeerSpace.fill(len(views), asking.ranks, count, send_rows)
+        columns, (places, kept), space = PeerSpace.fill(len(views), asking.ranks, count, send_rows)
         rows = rows_of(columns, space.traffic.counts)
         route = Route(
-            space.traffic, rows.rank_masks, places=sent[0][: runs_of(len(rows.camera_ids))], space=space,
-            filled=sent[1], fronts=fronts, kept=sent[2] if apart is not None else None,
+            space.traffic, rows.rank_masks, places=places[: runs_of(len(rows.camera_ids))], space=space,
+            kept=kept if apart is not None else None,
         )  # fmt: skip
-        peers.apart = route.pays_in_parts
+        peers.apart = route.pays_apart
         return rows, space.arrived(), route, space.traffic.n_isects, space.traffic.visible
     plan, carry, totals, written = torch.ops.blitzgs.project_count(*arguments, *sizes, persistent)
 

@@ -46,14 +46,15 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "project_rows_to_peers_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
       "Tensor viewmats, Tensor Ks, int width, int height, int sh_degree, Tensor everyone, int rank, "
-      "Tensor(a!)[] rows, Tensor(b!)[] buffers, int capacity, float first_part, int colors_stream) -> "
+      "Tensor(a!)[] rows, Tensor(b!)[] buffers, int capacity, int colors_stream) -> "
       "Tensor[]");
   m.def(
       "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
       "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "
-      "int sh_degree, float eps2d, bool antialiased, bool raw, Tensor v_means2d, Tensor v_conics, "
-      "Tensor? v_depths, Tensor v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats, "
-      "Tensor? places=None, int[] group_sizes=[], int own_rank=-1, Tensor? own=None, bool dense=False) -> ("
+      "int sh_degree, float eps2d, bool antialiased, bool raw, Tensor? v_means2d, Tensor? v_conics, "
+      "Tensor? v_depths, Tensor? v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats, "
+      "Tensor? places=None, int[] group_sizes=[], int[] starts=[], Tensor[]? buffers=None, int offset=0, "
+      "bool dense=False) -> ("
       "Tensor v_means, Tensor v_quats, "
       "Tensor v_scales, Tensor v_opacities, Tensor v_sh, Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible rows.
@@ -62,10 +63,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor(d!) last_step, Tensor(e!) moment_step, Tensor table, Tensor lr_table, int step, "
       "int explicit_steps, float beta1, float beta2, float eps, bool sparse, Tensor viewmats, Tensor Ks, "
       "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, int sh_degree, "
-      "float eps2d, bool antialiased, Tensor v_means2d, Tensor v_conics, Tensor v_row_opacities, "
-      "Tensor v_colors, Tensor? scale_reg, Tensor? places=None, int[] group_sizes=[], int own_rank=-1, "
-      "Tensor? own=None) "
-      "-> ()");
+      "float eps2d, bool antialiased, Tensor? v_means2d, Tensor? v_conics, Tensor? v_row_opacities, "
+      "Tensor? v_colors, Tensor? scale_reg, Tensor? places=None, int[] group_sizes=[], int[] starts=[], "
+      "Tensor[]? buffers=None, int offset=0, Tensor(f!)? means2d_sums=None) -> ()");
 
   // Which rows each tile composites, front to back by (depth, id).
   m.def(
@@ -82,11 +82,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
   m.def("gather_rows(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
   m.def(
-      "sum_rows(Tensor values, Tensor places, int[] group_sizes, int own_rank, Tensor? own, int rows, "
-      "int[] widths) -> Tensor[] columns");
-  m.def(
-      "return_to_peers_(Tensor values, int width, int[] group_sizes, Tensor(a!)[] buffers, int offset, "
-      "int[] starts, int rank, Tensor? fronts, bool back) -> ()");
+      "sum_rows(Tensor values, Tensor places, int[] group_sizes, int rows, int[] widths) -> "
+      "Tensor[] columns");
   m.def(
       "meet_peers_(Tensor(a!)[] mail, int rank, int meeting, Tensor? values, int first, "
       "float timeout_seconds, Tensor(b!)? known=None) -> ()");
@@ -101,6 +98,13 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "int tile_begin, int tile_end, Tensor? means2d_abs=None, bool clear_rest=True, "
       "bool backward_follows=False) -> (Tensor renders, Tensor transmittances, Tensor last_ids, "
       "Tensor tile_work, Tensor aux, Tensor row_gradients)");
+  // The same for a backward pass that adds up gradients in `packed`, which is zeroed; pixels that nobody owns
+  // are left as they are (CUDA).
+  m.def(
+      "rasterize_fwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
+      "backgrounds, Tensor isect_rows, Tensor tile_offsets, int n_cameras, int width, int height, "
+      "int tile_size, int tile_begin, int tile_end, Tensor(a!) packed) -> (Tensor renders, "
+      "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor aux)");
   m.def(
       "rasterize_bwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
       "backgrounds, "
@@ -145,7 +149,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
-      "weight, Tensor? places=None, int[] group_sizes=[], int own_rank=-1, Tensor? own=None) -> ()");
+      "weight) -> ()");
 
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");

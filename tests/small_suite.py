@@ -42,13 +42,17 @@ TESTS = [
         "entries_of_no_tile_name_any_row[True]",
     )),
     *(PEERS + test for test in (
-        "rows_arrive_and_their_gradients_return", "parts_of_rows_return",
+        "rows_arrive_and_their_gradients_are_found",
         "a_meeting_with_ranks_that_have_come", "numbers_for_the_host_go_to_pinned_memory",
     )),
     # Rows, coefficients, degree, views, sparse.
     *(f"{OPS}project_step.py::test_equals_backward_and_step[{case}-cuda]" for case in (
         "1007-16-3-3-False", "1007-16-2-1-True", "1007-16-1-2-False", "333-16-0-1-False", "333-4-1-2-False",
         "333-25-3-1-False",
+    )),
+    # Rows, coefficients, degree, views.
+    *(f"{OPS}project_step.py::test_gradients_in_tables_of_ranks[{case}]" for case in (
+        "3001-16-3-4", "700-16-2-1", "700-4-1-2", "700-16-0-1", "70-16-3-12",
     )),
     *(OPS + test for test in (
         "lazy_adam.py::test_float32_drift_of_any_second_moment[40-30-cuda]",

@@ -3,17 +3,17 @@
 
 Each rank projects its own Gaussians. The counting pass of the projection finds where each row will have to
 go, and `read_traffic` shows everyone's counts to all, which is all the host waits for; `send` brings the rows
-there; `send_back` or `send_back_packed` returns their gradients along the same routes, to be added up at the
-owner, by rank, so that the sum does not depend on who was faster (paper §3.1). `exchange` is the
-differentiable form for use with autograd, `plan_route` for rows that are there already.
+there; `send_back` returns their gradients along the same routes, to be added up at the owner, by rank, so
+that the sum does not depend on who was faster (paper §3.1). `exchange` is the differentiable form for use
+with autograd, `plan_route` for rows that are there already.
 
 Rows travel in one of two ways. Where the ranks share memory (`blitzgs.distributed.peers`), each writes its
 rows into the columns that the others composite from, and the host waits for the numbers when all of that is
-queued: `PeerSpace` does so. Otherwise rows are packed, carried by one all-to-all and taken apart.
-Either way the places of rows among those of a rank are kept in 8 bytes per 32 rows, and serve the way back
-too. Over shared memory gradients may return in two parts, so that the second travels while the optimiser
-works on the first: the projection writes the rows of the first Gaussians to the front of each group and the
-others to its back.
+queued: `PeerSpace` does so. Nothing is sent back then: the projection's backward pass reads the gradients
+where the ranks that composited the rows added them up (`PeerSpace.share_table`), so that they travel while
+the optimiser works. Otherwise rows are packed, carried by one all-to-all and taken apart, and their gradients
+likewise. Either way the places of rows among those of a rank are kept in 8 bytes per 32 rows, and serve the
+way back too.
 """
 
 from __future__ import annotations
@@ -21,18 +21,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileRanges
-from blitzgs.distributed.peers import SECOND
 from blitzgs.distributed.rows import PeerSpace, Splats, Traffic
 from blitzgs.ops.route import route_count
 from blitzgs.ops.scatter import (
-    Returns,
     as_column,
     gather_rows,
     scatter_rows,
@@ -41,10 +39,8 @@ from blitzgs.ops.scatter import (
     words_per_row,
 )
 
-# Gradients come back in two parts: those of this share of the visible Gaussians, which the optimiser waits
-# for, and the rest, which travels while the optimiser works on the first. About wire / (wire + optimiser).
-FIRST_PART = 0.3125
-# In one part where no rank has this many rows to send or get: too little travels to be worth a meeting more.
+# Colours travel with their rows where no rank has this many to send or get: too little to be worth a meeting
+# more.
 LEAST_ROWS = 1 << 18
 
 
@@ -59,9 +55,6 @@ class Route:
             them as they are.
         places: int64, of the rows sent, see `blitzgs.ops.scatter`; None: not sent yet.
         space: where peers write; None: rows travel by collectives.
-        filled: where peers write, int64 [2, M]: how many of the rows for each rank are of the first part of
-            the Gaussians (`FIRST_PART`), and lie in front of the others, whose number follows.
-        fronts: int64 [M], how many that is of the rows from each rank; None: not known yet.
         kept: what has to live until the rows' colours, which travel on their own, are there; None: they
             travel with them.
     """
@@ -71,26 +64,12 @@ class Route:
     halves: Tensor | None = None
     places: Tensor | None = None
     space: PeerSpace | None = None
-    filled: Tensor | None = None
-    fronts: Tensor | None = None
     kept: Tensor | None = None
 
     @property
-    def pays_in_parts(self) -> bool:
-        """Whether gradients had better return in two parts and colours travel apart; as all ranks see it."""
+    def pays_apart(self) -> bool:
+        """Whether colours had better travel on their own; as all ranks see it."""
         return self.space is not None and self.traffic.most >= LEAST_ROWS
-
-
-class SecondPart(NamedTuple):
-    """The part of returning gradients that is still on its way.
-
-    Attributes:
-        first: the gradients of the rows of this many visible Gaussians, from the first on, are there.
-        stream: those of the others are, for what is queued on this stream.
-    """
-
-    first: int
-    stream: torch.cuda.Stream
 
 
 def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
@@ -189,63 +168,10 @@ def send_back(gradients: Sequence[Tensor], route: Route, ranks: Ranks) -> list[T
         # Gradients span too many magnitudes for float16.
         halves = torch.cat(flat, 1).bfloat16()
         returned = as_column(ranks.all_to_all(words_of(halves), received, sent), halves).to(dtype)
-    sums = sum_rows(returned, _returns(route), len(route.masks), widths)
-    return [part.reshape(-1, *g.shape[1:]) for part, g in zip(sums, gradients, strict=True)]
-
-
-def send_back_packed(packed: Tensor, route: Route) -> tuple[Tensor, Returns]:
-    """Return the gradients of received rows to their owners, for a route whose rows the peers write.
-
-    Nobody adds them up: that is left to who reads them, once.
-
-    Args:
-        packed: [R, 9 or more], of `rasterize_bwd_packed_`.
-        route: of these rows.
-
-    Returns:
-        What came back for the rows this rank sent to others, [S, 9], valid until the next exchange; how it
-        adds up, with those that it sent to itself.
-
-    Raises:
-        RuntimeError: another exchange has taken the place of this one.
-    """
-    assert route.space is not None
-    returned = route.space.write_back(packed)
-    route.space.peers.meet()
-    return returned, _returns(route, packed)
-
-
-def send_back_in_parts(packed: Tensor, route: Route) -> tuple[Tensor, Returns, SecondPart]:
-    """As `send_back_packed`, but wait only for the gradients of the first Gaussians.
-
-    Returns:
-        As `send_back_packed`; what to know of the rest. `packed` has to live until then, as it does in these.
-    """
-    assert route.space is not None and route.fronts is not None
-    space, peers, main = route.space, route.space.peers, torch.cuda.current_stream()
-    second = peers.second
-    assert second is not None
-    returned = space.write_back(packed, route.fronts)
-    second.wait_stream(main)
-    peers.meet()
-    met = main.record_event()
-    with torch.cuda.stream(second):
-        space.write_back(packed, route.fronts, back=True)
-        peers.meet_apart(SECOND)
-        second.wait_event(met)  # some rows that are read there came with the first part
-    first = int(FIRST_PART * int(route.traffic.counts[0]))
-    return returned, _returns(route, packed), SecondPart(first, second)
-
-
-def _returns(route: Route, packed: Tensor | None = None) -> Returns:
-    """Tell how what returned along a route adds up; rows from this rank to itself stay in `packed`."""
-    traffic = route.traffic
     if route.places is None:
         raise RuntimeError("send_back: the route's rows have not been sent")
-    if packed is None:
-        return Returns(route.places, traffic.sent)
-    own = packed.split(traffic.received)[traffic.rank]
-    return Returns(route.places, traffic.sent, traffic.rank, own)
+    sums = sum_rows(returned, route.places, sent, len(route.masks), widths)
+    return [part.reshape(-1, *g.shape[1:]) for part, g in zip(sums, gradients, strict=True)]
 
 
 def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> tuple[Splats, Route]:

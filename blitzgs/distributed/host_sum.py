@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.peers import BESIDE
 from blitzgs.ops.report import report_
 
 
@@ -52,7 +51,7 @@ class HostSum:
             if ranks.peers is not None:
                 boards = ranks.reading(partial(ranks.peers.boards, words))
                 report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, boards)
-                ranks.peers.meet_apart(BESIDE)
+                ranks.peers.meet_beside()
                 total = boards[ranks.rank]
             else:
                 new = torch.empty if ranks.world_size == 1 else torch.zeros

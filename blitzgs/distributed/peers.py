@@ -4,23 +4,20 @@
 Each rank owns buffers that all others have mapped (NVLink or PCIe peer access). `mail` is small: the
 number of the last meeting each rank came to, and the numbers it brought. `rows` is large and grows: first the
 rows that arrive for this rank's tiles, column by column, so that intersection and compositing read them where
-they lie; behind them the gradients that come back for the rows this rank sent. `board` is for what ranks tell
-each other's hosts, and has a stream and meetings of its own beside the step.
+they lie; behind them the table in which compositing's gradient adds up theirs, where their owners read it.
+`board` is for what ranks tell each other's hosts, and has a stream and meetings of its own beside the step.
 
-A step is, in stream order on every rank: meeting A with the counts, rows written to the others, meeting B
-with where their groups are cut, sorting, compositing and its gradient, gradients written to the others,
-meeting C, reading those. Where many rows travel, their colours are computed meanwhile on a stream of their
-own, written there while the rows are sorted, and met for (B') before compositing. With the gradients in two
-parts, the second is written and meets (D) on that stream while the first meets C and is read; the main stream
-then waits for it. D counts by itself and does not wait for C: behind that it would find the GPU filled by
-what reads the first part. A meeting is a barrier between streams: work queued behind it, on any rank, finds
-done what any rank queued before it. Hence
+A step is, in stream order on every rank: meeting A with the counts, rows written to the others, meeting B,
+sorting, compositing, which zeroes the table, and its gradient, meeting C, reading the tables of all ranks.
+Where many rows travel, their colours are computed meanwhile on a stream of their own, written there while the
+rows are sorted, and met for (B') before compositing. A meeting is a barrier between streams: work queued
+behind it, on any rank, finds done what any rank queued before it. Hence
 
-- rows and gradients are read after the meeting that follows their writing: B, B' for colours, C, and the
-  second part after D as well;
+- rows and tables are read after the meeting that follows their writing: B, B' for colours, C;
 - arriving rows of a step overwrite those of the step before after A; whoever read those had queued that
   before its own A;
-- returning gradients are written after A and B, and those of the step before were read before A;
+- a table is zeroed after B; whoever read it in the step before had queued that before its own B. A second
+  gradient of one frame has a meeting of its own before the table is zeroed again;
 - the numbers that ranks bring to a meeting are read before the next that has numbers, as there are two places
   for them, used in turn: whoever has been at the next may overwrite the first. So it is with the board and
   the meetings beside the step: what a rank copies from it behind one of them it has copied before it comes to
@@ -56,8 +53,6 @@ MAX_VALUES = 256
 HEADROOM = 1.25
 _LEAST_WORDS = 1 << 20
 _LEAST_BOARD = 1 << 16
-# Streams whose meetings count by themselves: that of the second part of gradients, that of what hosts tell.
-SECOND, BESIDE = 0, 1
 
 
 class Shared(NamedTuple):
@@ -76,8 +71,8 @@ class Shared(NamedTuple):
 
 
 def mail_words(world_size: int) -> int:
-    """Length of a rank's mail, int64: last meetings, numbers and their sums, and meetings apart."""
-    return world_size + 2 * MAX_VALUES * (world_size + 1) + 2 * world_size
+    """Length of a rank's mail, int64: last meetings, numbers and sums, last meetings beside the step."""
+    return world_size + 2 * MAX_VALUES * (world_size + 1) + world_size
 
 
 class Peers:
@@ -92,7 +87,7 @@ class Peers:
         buffers: int32 [words] of each rank, mapped here.
         columns: of the rows in this rank's buffer, as `PeerSpace.arrived` has them; empty: not made yet.
         exchanges: how often rows were written: tells whose rows are in the buffers.
-        second: stream for the second part of returning gradients, and for colours.
+        second: stream for colours.
         apart: whether the next exchange's colours travel apart from their rows; the same on all ranks.
     """
 
@@ -108,12 +103,8 @@ class Peers:
         self._shared = 0  # how many of them had numbers
         self._handles: dict[str, Any] = {}  # the mappings live as long as these
         self._mail = self._map("mail", mail)
-        first = len(mail) - 2 * self.world_size
-        self._apart = [
-            [letters[begin : begin + self.world_size] for letters in self._mail]
-            for begin in (first, first + self.world_size)
-        ]
-        self._meetings_apart = [0, 0]
+        self._beside = [letters[-self.world_size :] for letters in self._mail]
+        self._meetings_beside = 0
         self._known = torch.empty(2, MAX_VALUES * self.world_size, dtype=torch.int64, pin_memory=mail.is_cuda)
         self._boards: list[Tensor] = []
         self._places: dict[tuple[int, int], list[Tensor]] = {}  # on the boards; made once
@@ -130,12 +121,11 @@ class Peers:
         """Meet the other ranks, in stream order."""
         self._meet(None, self.world_size, None)
 
-    def meet_apart(self, stream: int) -> None:
-        """Meet the other ranks on a stream `SECOND` or `BESIDE`, whatever meetings others are at."""
-        self._meetings_apart[stream] += 1
-        number = self._meetings_apart[stream]
+    def meet_beside(self) -> None:
+        """Meet the other ranks on the stream beside the step, whatever meetings the step is at."""
+        self._meetings_beside += 1
         torch.ops.blitzgs.meet_peers_(
-            self._apart[stream], self.rank, number, None, self.world_size, self.timeout_seconds
+            self._beside, self.rank, self._meetings_beside, None, self.world_size, self.timeout_seconds
         )
 
     def share(self, values: Tensor) -> Shared:
@@ -168,7 +158,7 @@ class Peers:
             mine = symmetric.empty(2 * max(words, _LEAST_BOARD), dtype=torch.float32, device=self.device)
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = self._map("board", mine)
-        key = words, self._meetings_apart[BESIDE] % 2
+        key = words, self._meetings_beside % 2
         if key not in self._places:
             begin = key[1] * (len(self._boards[0]) // 2)
             self._places[key] = [board[begin : begin + words] for board in self._boards]

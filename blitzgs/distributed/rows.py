@@ -13,6 +13,8 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.peers import Peers
+from blitzgs.ops.rasterize import PACKED_GRADIENT
+from blitzgs.ops.scatter import RowTables
 
 # Columns of a row as peers write them: those of `Splats`, with dtype, words and shape of an element.
 _COLUMNS = (
@@ -25,8 +27,6 @@ _COLUMNS = (
     (torch.int64, 2, ()),
 )
 _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
-# Gradients of means2d, conics, opacities and colors as they return; `rasterize_bwd_packed_` has them first.
-_GRADIENT_WORDS = 9
 # Projects, and sends rows to the peers: see `PeerSpace.fill`.
 Projection = Callable[[int], tuple[Tensor, list[Tensor]]]
 Sending = Callable[[list[Tensor], Tensor, list[Tensor], int], list[Tensor]]
@@ -122,7 +122,7 @@ class PeerSpace:
     @classmethod
     def fill(
         cls, n_views: int, ranks: Ranks, project: Projection, send: Sending
-    ) -> tuple[list[Tensor], list[Tensor], Tensor, PeerSpace]:
+    ) -> tuple[list[Tensor], list[Tensor], PeerSpace]:
         """Have the rows of all ranks written to each other, and agree on how many. Collective.
 
         All is queued, up to the meeting that ends it, before the host waits for the numbers: they come while
@@ -135,30 +135,29 @@ class PeerSpace:
             project: `project_count` with room for so many rows: returns its totals, with the tiles of each
                 rank, int64 [3 + B + 2 M], and its rows.
             send: `project_rows_to_peers_`: given the rows, all ranks' totals, the buffers and how many rows
-                each has room for; returns, as that, places, filled and what has to live.
+                each has room for; returns, as that, places and what has to live.
 
         Returns:
-            This rank's rows, with room behind them; what `send` returned; int64 [M], how many of the rows
-            from each rank are of the first part of its Gaussians; and where the rows are.
+            This rank's rows, with room behind them; what `send` returned; and where the rows are.
         """
         peers = ranks.peers
         assert peers is not None and peers.second is not None
         while True:
-            room = len(peers.buffers[0]) // (_ROW_WORDS + _GRADIENT_WORDS) // _ALIGNMENT * _ALIGNMENT
+            room = len(peers.buffers[0]) // (_ROW_WORDS + PACKED_GRADIENT) // _ALIGNMENT * _ALIGNMENT
             totals, rows = project(room)
             everyone, sums, known = peers.share(totals)
             told = torch.cuda.Event()
             told.record()
             sent = send(rows, everyone, peers.buffers, room)
-            fronts = peers.share(sent[1][0]).everyone[:, ranks.rank]
+            peers.meet()
             ranks.reading(told.synchronize)
             traffic = Traffic.of(known.tolist(), sums[3 : 3 + n_views], ranks.rank)
             if traffic.most <= room:
                 peers.exchanges += 1
-                return rows, sent, fronts, cls(peers, traffic, room, peers.exchanges)
+                return rows, sent, cls(peers, traffic, room, peers.exchanges)
             torch.cuda.current_stream().wait_stream(peers.second)
             needed = -(-traffic.most // _ALIGNMENT) * _ALIGNMENT
-            ranks.reading(partial(peers.reserve, (_ROW_WORDS + _GRADIENT_WORDS) * needed))
+            ranks.reading(partial(peers.reserve, (_ROW_WORDS + PACKED_GRADIENT) * needed))
 
     def arrived(self) -> Splats:
         """Return the rows that arrive here; they may be read after the next meeting."""
@@ -173,42 +172,38 @@ class PeerSpace:
         torch.cuda.current_stream().wait_stream(self.peers.second)
         self.peers.meet()
 
-    def write_back(self, packed: Tensor, fronts: Tensor | None = None, back: bool = False) -> Tensor:
-        """Write the gradients of the rows that arrived from other ranks to these.
+    def table(self) -> Tensor:
+        """Return the table for gradients of the rows that arrived here, [R, 12], see `rasterize_bwd_packed_`.
 
-        Args:
-            packed: [R, 9 or more], of `rasterize_bwd_packed_`.
-            fronts: int64 [M], only of so many rows from each, from the first on; None: of all.
-            back: instead, only of the rest.
-
-        Returns:
-            [S, 9], those of the rows this rank sent, undefined where it sent them to itself; they may be read
-            after the next meeting.
-
-        Raises:
-            RuntimeError: a later exchange has begun.
+        It may be written between the meeting for the rows and the one that `share_table` waits for.
         """
+        begin, count = self.capacity * _ROW_WORDS, sum(self.traffic.received)
+        words = self.peers.buffers[self.peers.rank][begin : begin + count * PACKED_GRADIENT]
+        return words.view(torch.float32).view(count, PACKED_GRADIENT)
+
+    def check_current(self) -> None:
+        """Raise a RuntimeError if a later exchange has begun."""
         if self.exchange != self.peers.exchanges:
             raise RuntimeError(
-                "send_back: a later exchange has overwritten this one's rows: run the backward pass of a "
-                "frame before the next forward pass"
+                "a later exchange has overwritten this one's rows: run the backward pass of a frame before "
+                "the next forward pass"
             )
-        offset, me = self.capacity * _ROW_WORDS, self.peers.rank
-        before = [sum(row[:me]) for row in self.traffic.rows]
-        torch.ops.blitzgs.return_to_peers_(
-            packed,
-            _GRADIENT_WORDS,
-            self.traffic.received,
-            self.peers.buffers,
-            offset,
-            before,
-            me,
-            fronts,
-            back,
-        )
-        count = sum(self.traffic.sent)
-        mine = self.peers.buffers[me][offset : offset + count * _GRADIENT_WORDS]
-        return mine.view(torch.float32).view(count, _GRADIENT_WORDS)
+
+    def clear_table(self) -> Tensor:
+        """Return `table`, zeros, once no rank reads it any more. Collective."""
+        self.peers.meet()
+        return self.table().zero_()
+
+    def share_table(self, places: Tensor) -> RowTables:
+        """Let the owners of the rows read the table, and tell where this rank's are in all. Collective.
+
+        Args:
+            places: of the rows that this rank sent.
+        """
+        self.peers.meet()
+        traffic, me = self.traffic, self.peers.rank
+        starts = [sum(column[:me]) for column in zip(*traffic.rows, strict=True)]
+        return RowTables(places, traffic.sent, starts, self.peers.buffers, self.capacity * _ROW_WORDS)
 
 
 def _columns(buffer: Tensor, capacity: int) -> list[Tensor]:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
-from blitzgs.ops.scatter import OWN_VALUES, Returns
 
 
 @torch.no_grad()
@@ -25,7 +24,6 @@ def density_stats_(
     height: int,
     weight: float,
     phi: Tensor | None = None,
-    returns: Returns = OWN_VALUES,
 ) -> None:
     """Add one step's rows to the statistics of the visible Gaussians, in place.
 
@@ -38,14 +36,12 @@ def density_stats_(
         max_radii: [N], pixels, dtype of `grad_sum`.
         visible_ids: int32 [U], Gaussians with rows, each once.
         row_offsets: int32 [U + 1], the rows of each.
-        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel; with `returns`, what
-            came back from the ranks.
+        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel; rows may be apart.
         conics: [P, 3], inverse 2D covariances (a, b, c).
         width: image width in pixels.
         height: image height in pixels.
         weight: turns the gradient of the step's loss into that of one view's: B when it is a mean over B.
         phi: [N], factor of each Gaussian's gradient; None = 1.
-        returns: how to add up `v_means2d`.
 
     Raises:
         RuntimeError: wrong shapes or dtypes.
@@ -62,7 +58,6 @@ def density_stats_(
         width,
         height,
         weight,
-        *returns,
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from blitzgs.ops.lazy_adam import explicit_steps, schedule_table
 from blitzgs.ops.project import Rows
-from blitzgs.ops.scatter import OWN_VALUES, Returns
+from blitzgs.ops.scatter import NO_TABLES, RowTables
 
 
 @torch.no_grad()
@@ -36,12 +36,13 @@ def project_bwd_step_(
     sh_degree: int,
     eps2d: float,
     antialiased: bool,
-    v_means2d: Tensor,
-    v_conics: Tensor,
-    v_opacities: Tensor,
-    v_colors: Tensor,
+    v_means2d: Tensor | None = None,
+    v_conics: Tensor | None = None,
+    v_opacities: Tensor | None = None,
+    v_colors: Tensor | None = None,
     scale_reg: Tensor | None = None,
-    returns: Returns = OWN_VALUES,
+    tables: RowTables = NO_TABLES,
+    means2d_sums: Tensor | None = None,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their rows.
 
@@ -76,12 +77,11 @@ def project_bwd_step_(
         v_colors: gradient of `rows.colors`, [P, 3].
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
-        returns: how to add up the gradients of the rows, which are then those that came back from the ranks,
-            [S, ...]. They are the sums that `blitzgs.ops.scatter.sum_rows` makes, which has the four
-            gradients in this order as the values of a row.
+        tables: instead of the four gradients, where they lie (CUDA).
+        means2d_sums: [P, 2], becomes the gradient of `rows.means2d` from tables.
 
-    The four gradients may be views of one table, [.., 9 or more] in this order: on CUDA, one of 12 floats a
-    row, or any that came back, is read where it lies.
+    The four gradients may be views of one table, in this order: on CUDA, one of 12 floats a row
+    (`blitzgs.ops.rasterize.gradient_columns`) is read where it lies.
 
     Raises:
         ValueError: decay rates outside their range.
@@ -92,7 +92,7 @@ def project_bwd_step_(
         schedule_table(lr_table, beta1, beta2), lr_table, step, explicit_steps(beta1, beta2, params[0].dtype),
         beta1, beta2, eps, sparse, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets, width,
         height, sh_degree, eps2d, antialiased, v_means2d, v_conics, v_opacities, v_colors, scale_reg,
-        *returns,
+        *tables, means2d_sums,
     )  # fmt: skip
 
 

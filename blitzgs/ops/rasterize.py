@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -13,32 +13,37 @@ from blitzgs._library import without_autograd
 from blitzgs.ops.intersect import tile_counts
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
-_PACKED = 12  # kPackedGradient of csrc/rasterize/rasterize.h
+PACKED_GRADIENT = 12  # kPackedGradient of csrc/rasterize/rasterize.h
 
 
 class GradientRoom:
     """Where the backward pass adds up the gradients of rows on CUDA: zeros that the forward pass wrote.
 
-    They are good for one backward pass; later ones get zeros of their own.
+    They are good for one backward pass; later ones get others.
     """
 
-    def __init__(self, zeros: Tensor) -> None:
-        """Keep the zeros: [P, 12], the last output of `rasterize_fwd`, or none, [0, 12]."""
-        self._zeros: Tensor | None = zeros
+    def __init__(self, zeros: Tensor | None, others: Callable[[], Tensor] | None = None) -> None:
+        """Keep the zeros.
+
+        Args:
+            zeros: [P, 12], the last output of `rasterize_fwd`, or none, [0, 12] or None.
+            others: makes others; None: they are allocated.
+        """
+        self._zeros, self._others = zeros, others
 
     def take(self, means2d: Tensor) -> Tensor:
         """Return zeros [P, 12] for the P rows."""
         zeros, self._zeros = self._zeros, None
-        if zeros is None or len(zeros) != len(means2d):
-            return means2d.new_zeros(len(means2d), _PACKED)
-        return zeros
+        if zeros is not None and len(zeros) == len(means2d):
+            return zeros
+        return means2d.new_zeros(len(means2d), PACKED_GRADIENT) if self._others is None else self._others()
 
 
 def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """View a table of the gradients of rows as columns.
 
     Args:
-        packed: [P, 9 or more], of the op `rasterize_bwd_packed_` or the part of it that ranks send back.
+        packed: [P, 12], of the op `rasterize_bwd_packed_`.
 
     Returns:
         Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
@@ -151,7 +156,7 @@ def _(
         means2d.new_empty(pixels, dtype=torch.int32),
         means2d.new_empty(tile_offsets.shape[0] - 1, dtype=torch.int32),
         means2d.new_empty(aux_size, dtype=torch.uint8),
-        means2d.new_empty(n_ready, _PACKED),
+        means2d.new_empty(n_ready, PACKED_GRADIENT),
     )
 
 

@@ -16,24 +16,28 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 RUN = 32
 
 
-class Returns(NamedTuple):
-    """How values that came back from M ranks belong to rows; as it is by default, each row has its own.
+class RowTables(NamedTuple):
+    """Where the gradients of rows lie at the M ranks that composited them, whose memory is shared (CUDA).
+
+    By default nowhere. Where several ranks had a row, its gradient is the sum in their order.
 
     Attributes:
-        places: from `scatter_rows`.
-        group_sizes: as for `scatter_rows`.
-        own_rank: the group whose values never left, and are not read from among the others; -1: none.
-        own: that group's values, [group_sizes[own_rank], W]: as many as came back, or more behind them. Ops
-            that take only some of the columns of a row still take whole rows here.
+        places: where each row is among those that a rank had of this one, as `scatter_rows` returns it.
+        group_sizes: how many those are, for each rank.
+        starts: in which row of each rank's table they begin.
+        buffers: int32 [words] of each rank, all of one length, mapped on this device.
+        offset: the tables begin at this word of the buffers. Their rows are those of `rasterize_bwd_packed_`,
+            float32 [.., 12].
     """
 
     places: Tensor | None = None
     group_sizes: Sequence[int] = ()
-    own_rank: int = -1
-    own: Tensor | None = None
+    starts: Sequence[int] = ()
+    buffers: Sequence[Tensor] | None = None
+    offset: int = 0
 
 
-OWN_VALUES = Returns()
+NO_TABLES = RowTables()
 
 
 def scatter_rows(
@@ -78,12 +82,15 @@ def gather_rows(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[in
     return [as_column(part, column) for part, column in zip(parts, like, strict=True)]
 
 
-def sum_rows(values: Tensor, returns: Returns, rows: int, widths: Sequence[int]) -> list[Tensor]:
+def sum_rows(
+    values: Tensor, places: Tensor, group_sizes: Sequence[int], rows: int, widths: Sequence[int]
+) -> list[Tensor]:
     """Add up what came back for each row, in the order of ranks.
 
     Args:
         values: [sum(group_sizes), F], float32 (CPU also float64): rows where `scatter_rows` put them.
-        returns: how the rows were scattered.
+        places: from `scatter_rows`.
+        group_sizes: as for `scatter_rows`.
         rows: P.
         widths: of the columns that the F values are; they add up to F.
 
@@ -93,7 +100,7 @@ def sum_rows(values: Tensor, returns: Returns, rows: int, widths: Sequence[int])
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
-    return torch.ops.blitzgs.sum_rows(values, *returns, rows, list(widths))
+    return torch.ops.blitzgs.sum_rows(values, places, list(group_sizes), rows, list(widths))
 
 
 def runs_of(rows: int) -> int:
@@ -141,8 +148,6 @@ def _(
     values: Tensor,
     places: Tensor,
     group_sizes: Sequence[int],
-    own_rank: int,
-    own: Tensor | None,
     rows: int,
     widths: Sequence[int],
 ) -> list[Tensor]:

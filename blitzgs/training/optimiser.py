@@ -60,7 +60,13 @@ class LazyAdam:
         )
 
     def step(
-        self, table: GaussianTable, frame: Frame, v: RowGradients, scale_reg: Tensor | None, step: int
+        self,
+        table: GaussianTable,
+        frame: Frame,
+        v: RowGradients,
+        scale_reg: Tensor | None,
+        step: int,
+        means2d_sums: Tensor | None = None,
     ) -> None:
         """Take step number `step` (from 1) for the Gaussians that a frame shows.
 
@@ -70,32 +76,33 @@ class LazyAdam:
             v: gradients of the frame's rows, from `pipeline.backward_rows`.
             scale_reg: as for `pipeline.backward`.
             step: the visible rows stand at the step before.
+            means2d_sums: [P, 2], becomes the gradient of the rows' means2d where `v` has it in tables.
         """
         views, options = frame.views, frame.options
-        for rows in v.parts(frame.rows):
-            project_bwd_step_(
-                table.parameters,
-                table.exp_avgs,
-                table.exp_avg_sqs,
-                table["last_step"],
-                table["moment_step"],
-                self.lr_table,
-                step,
-                *self._betas,
-                self._eps,
-                self._sparse,
-                rows,
-                views.viewmats,
-                views.Ks,
-                views.width,
-                views.height,
-                sh_degree=options.sh_degree,
-                eps2d=options.eps2d,
-                antialiased=options.antialiased,
-                v_means2d=v.means2d,
-                v_conics=v.conics,
-                v_opacities=v.opacities,
-                v_colors=v.colors,
-                scale_reg=scale_reg,
-                returns=v.returns,
-            )
+        project_bwd_step_(
+            table.parameters,
+            table.exp_avgs,
+            table.exp_avg_sqs,
+            table["last_step"],
+            table["moment_step"],
+            self.lr_table,
+            step,
+            *self._betas,
+            self._eps,
+            self._sparse,
+            frame.rows,
+            views.viewmats,
+            views.Ks,
+            views.width,
+            views.height,
+            sh_degree=options.sh_degree,
+            eps2d=options.eps2d,
+            antialiased=options.antialiased,
+            v_means2d=v.means2d,
+            v_conics=v.conics,
+            v_opacities=v.opacities,
+            v_colors=v.colors,
+            scale_reg=scale_reg,
+            tables=v.tables,
+            means2d_sums=means2d_sums,
+        )

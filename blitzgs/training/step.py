@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import torch
+from torch import Tensor
+
 from blitzgs import pipeline
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.ops.project import RowRoom
-from blitzgs.pipeline import Frame, Mark, RenderOptions, RowGradients, unmarked
+from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms
@@ -82,16 +85,28 @@ class Stepper:
         mark("other")
         return frame, terms, sums
 
-    def backward(self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked) -> RowGradients:
+    def backward(
+        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
+    ) -> Tensor | None:
         """Carry the gradients of `forward`'s loss back to the rows, and move the Gaussians by them.
 
+        Args:
+            step: as for `forward`.
+            frame: from `forward`.
+            terms: from `forward`.
+            mark: called with its name at the end of each stage.
+            keep_means2d: whether the caller wants the gradient of the rows' means2d.
+
         Returns:
-            The gradients of the rows, valid until the next `forward`.
+            That gradient, [P, 2] per pixel, or None.
         """
         table = self._table
-        gradients = pipeline.backward_rows(frame, terms.v_renders, mark, in_parts=True)
-        self._optimiser.step(table, frame, gradients, terms.scale_reg, step)
+        gradients = pipeline.backward_rows(frame, terms.v_renders, mark)
+        v_means2d, sums = gradients.means2d, None
+        if v_means2d is None and keep_means2d:
+            v_means2d = sums = torch.empty_like(frame.rows.means2d)
+        self._optimiser.step(table, frame, gradients, terms.scale_reg, step, sums)
         mark("optimiser")
         self._blocks.update(table, frame.rows.visible_ids)
         mark("other")
-        return gradients
+        return v_means2d if keep_means2d else None

@@ -16,7 +16,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.ops.density_stats import density_stats_
-from blitzgs.pipeline import Frame, RowGradients
+from blitzgs.pipeline import Frame
 from blitzgs.population.density import DensityRules, densify
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.redistribution import redistribute
@@ -198,9 +198,10 @@ class Trainer:
         report = None
         if self._crosses(begin, config.log.every):
             report = self._measure(frame, batch)
-        gradients = self._stepper.backward(step, frame, terms)
-        if begin < config.schedule.densify_until * config.schedule.scale:
-            self._gather(frame, gradients)
+        densifies = begin < config.schedule.densify_until * config.schedule.scale
+        v_means2d = self._stepper.backward(step, frame, terms, keep_means2d=densifies)
+        if v_means2d is not None:
+            self._gather(frame, v_means2d)
         self.progress = dataclasses.replace(
             self.progress, step=step, sh_degree=degree, seconds=time.monotonic() - self._clock
         )
@@ -217,7 +218,7 @@ class Trainer:
         """Whether the step at `begin` completes a multiple of `every` images."""
         return (begin + self.schedule.batch_size) // every > begin // every
 
-    def _gather(self, frame: Frame, v: RowGradients) -> None:
+    def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
         rows, views = frame.rows, frame.views
         density_stats_(
             self.table["grad_sum"],
@@ -225,12 +226,11 @@ class Trainer:
             self.table["max_radii"],
             rows.visible_ids,
             rows.row_offsets,
-            v.means2d,
+            v_means2d,
             rows.conics,
             views.width,
             views.height,
             float(len(views)),
-            returns=v.returns,
         )
 
     def _measure(self, frame: Frame, batch: Batch) -> Tensor:

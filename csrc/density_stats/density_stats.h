@@ -8,17 +8,16 @@
 //   the
 //                    eigenvalue's root term clamped at sqrt(0.1) as in the original renderer
 //
-// v_means2d [P, 2] gradient by the pixel position, summed over the ranks it came back from; weight turns the
-// gradient of the batch's loss into that of one view's (B for a mean over B views); phi [N] or null (1);
-// conics [P, 3] inverse covariance (a, b, c); visible_ids int32 [U], row_offsets int32 [U + 1]. In place, one
-// thread a Gaussian, rows in order: deterministic. O(P).
+// v_means2d [P, 2] gradient by the pixel position, rows v_stride apart; weight turns the gradient of the
+// batch's loss into that of one view's (B for a mean over B views); phi [N] or null (1); conics [P, 3]
+// inverse covariance (a, b, c); visible_ids int32 [U], row_offsets int32 [U + 1]. In place, one thread a
+// Gaussian, rows in order: deterministic. O(P).
 #pragma once
 #include <cmath>
 #include <cstdint>
 
 #include "common/host_device.h"
 #include "common/stream.h"
-#include "scatter/scatter.h"
 
 namespace blitzgs {
 
@@ -29,7 +28,8 @@ struct DensityStatsArgs {
   T* max_radii;              // [N]
   const std::int32_t* visible_ids;
   const std::int32_t* row_offsets;
-  RowValues<T> v_means2d;
+  const T* v_means2d;
+  std::int64_t v_stride;
   const T* conics;
   const T* phi;
   std::int64_t visible;
@@ -52,13 +52,8 @@ BLITZGS_HD void density_stats_of(const DensityStatsArgs<T>& args, std::int64_t u
   const std::int32_t begin = args.row_offsets[u], end = args.row_offsets[u + 1];
   T sum = 0, radius = args.max_radii[id];
   for (std::int32_t r = begin; r < end; ++r) {
-    T x = 0, y = 0;
-    args.v_means2d.for_each(r, [&](const T* v) {
-      x += v[0];
-      y += v[1];
-    });
-    x *= args.half_width;
-    y *= args.half_height;
+    const T* v = args.v_means2d + r * args.v_stride;
+    const T x = v[0] * args.half_width, y = v[1] * args.half_height;
     sum += std::sqrt(x * x + y * y);
     const T reach = three_sigma_radius(args.conics + 3 * std::int64_t{r});
     radius = reach > radius ? reach : radius;

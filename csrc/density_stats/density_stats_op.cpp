@@ -2,7 +2,6 @@
 #include "density_stats/density_stats.h"
 
 #include "common/op.h"
-#include "scatter/scatter_op.h"
 
 namespace blitzgs {
 namespace {
@@ -19,9 +18,7 @@ void check_column(const char* name, const Tensor& column, ScalarType dtype, std:
 void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const Tensor& visible_ids_in,
                     const Tensor& row_offsets_in, const Tensor& v_means2d_in, const Tensor& conics_in,
                     const std::optional<Tensor>& phi_in, std::int64_t width, std::int64_t height,
-                    double weight, const std::optional<Tensor>& places,
-                    const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank,
-                    const std::optional<Tensor>& own) {
+                    double weight) {
   check_floating(kOp, "grad_sum", grad_sum);
   const ScalarType dtype = grad_sum.scalar_type();
   const std::int64_t rows = grad_sum.numel();
@@ -36,10 +33,7 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   check_dtype(kOp, "v_means2d", v_means2d_in, dtype);
   check_dtype(kOp, "conics", conics_in, dtype);
   check_shape(kOp, "conics", conics_in, {-1, 3});
-  const std::int64_t n_rows = conics_in.size(0);
-  std::optional<HeldReturns> returns;
-  if (places) returns.emplace(kOp, n_rows, *places, group_sizes, own_rank, own, dtype);
-  check_shape(kOp, "v_means2d", v_means2d_in, {returns ? total_rows(returns->groups) : n_rows, 2});
+  check_shape(kOp, "v_means2d", v_means2d_in, {conics_in.size(0), 2});
   std::optional<Tensor> phi;
   if (phi_in) {
     check_dtype(kOp, "phi", *phi_in, dtype);
@@ -55,14 +49,13 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   DeviceScope scope(grad_sum);
   dispatch_floating(grad_sum, [&](auto zero) {
     using T = decltype(zero);
-    const auto* v = data<T>(v_means2d);
-    const std::int64_t row = v_means2d.stride(0);  // floats
     const DensityStatsArgs<T> args{mutable_data<T>(grad_sum),
                                    mutable_data<std::int32_t>(grad_count),
                                    mutable_data<T>(max_radii),
                                    data<std::int32_t>(visible_ids),
                                    data<std::int32_t>(row_offsets),
-                                   returns ? returns->values(kOp, v, row, 0, 2) : own_values(v, row, n_rows),
+                                   data<T>(v_means2d),
+                                   v_means2d.stride(0),
                                    data<T>(conics),
                                    data_or_null<T>(phi),
                                    visible,

@@ -7,43 +7,6 @@
 namespace blitzgs {
 namespace {
 
-void return_to_peers(const Tensor& values, std::int64_t width, const std::vector<std::int64_t>& group_sizes,
-                     std::vector<Tensor> buffers, std::int64_t offset,
-                     const std::vector<std::int64_t>& starts, std::int64_t rank,
-                     const std::optional<Tensor>& fronts, bool back) {
-  constexpr const char* kOp = "return_to_peers_";
-  PeerReturn job{};
-  job.groups = checked_groups(kOp, "group_sizes", group_sizes);
-  check_dtype(kOp, "values", values, ScalarType::Float);
-  check_shape(kOp, "values", values, {total_rows(job.groups), -1});
-  STD_TORCH_CHECK(width > 0 && width <= values.size(1), "blitzgs::", kOp, ": width must be 1 to ",
-                  values.size(1), ", got ", width);
-  const Tensor held = as_contiguous(values);
-  job.values = data<float>(held);
-  job.stride = static_cast<int>(values.size(1));
-  job.width = static_cast<int>(width);
-  STD_TORCH_CHECK(!buffers.empty() && offset >= 0 && offset <= buffers[0].size(0), "blitzgs::", kOp,
-                  ": offset must lie in the buffers, got ", offset);
-  check_starts(kOp, buffers, starts, job.groups, (buffers[0].size(0) - offset) / width);
-  for (int m = 0; m < job.groups.count; ++m) {
-    job.targets[m] =
-        reinterpret_cast<float*>(mutable_data<std::int32_t>(buffers[m]) + offset) + starts[m] * width;
-  }
-  if (fronts) {
-    check_dtype(kOp, "fronts", *fronts, ScalarType::Long);
-    check_shape(kOp, "fronts", *fronts, {job.groups.count});
-    job.fronts = data<std::int64_t>(*fronts);
-    job.fronts_stride = fronts->stride(0);
-  }
-  STD_TORCH_CHECK(fronts || !back, "blitzgs::", kOp, ": back needs fronts");
-  STD_TORCH_CHECK(rank >= 0 && rank < job.groups.count, "blitzgs::", kOp, ": rank must be in [0, ",
-                  job.groups.count, "), got ", rank);
-  job.rank = static_cast<int>(rank);
-  job.back = back;
-  DeviceScope scope(held);
-  cuda::return_rows(job, scope.workspace, scope.stream);
-}
-
 void meet_peers(std::vector<Tensor> mail, std::int64_t rank, std::int64_t meeting,
                 const std::optional<Tensor>& values, std::int64_t first, double timeout_seconds,
                 std::optional<Tensor> known) {
@@ -76,8 +39,5 @@ void meet_peers(std::vector<Tensor> mail, std::int64_t rank, std::int64_t meetin
 }  // namespace
 }  // namespace blitzgs
 
-BLITZGS_REGISTER(m) {
-  m.impl("return_to_peers_", TORCH_BOX(&blitzgs::return_to_peers));
-  m.impl("meet_peers_", TORCH_BOX(&blitzgs::meet_peers));
-}
+BLITZGS_REGISTER(m) { m.impl("meet_peers_", TORCH_BOX(&blitzgs::meet_peers)); }
 #endif

@@ -99,20 +99,17 @@ inline constexpr int kOpacityColumn = 2, kColorColumn = 3;
 // What this rank writes to the others, as its device works it out.
 struct ProjectAdmitted {
   ProjectSizes sizes;
-  RowGroups groups;    // rows for each rank, and the row of its target that they begin at
-  std::int32_t split;  // rows of the first part
+  RowGroups groups;                // rows for each rank, and the row of its target that they begin at
+  std::int64_t filled[kMaxRanks];  // how many of these have been given a place
 };
 
 // Where rows go besides (CUDA): each to the ranks of its rank mask, as `scatter` does (scatter/scatter.h), in
 // every target behind the rows of the ranks before this one, unless some rank has more than `capacity` rows,
 // of its own, to send or to get: then nothing is written, here and, as all ranks know of it, at no other.
 // everyone: project_totals of each rank, on the device. targets: where the columns of each rank's rows begin.
-// admitted, places and filled [2, M] are written too. In each group the rows of the first `first_part` of the
-// visible Gaussians come first: those within its first filled[0][m].
+// admitted and places are written too.
 struct ProjectScatter {
   ProjectAdmitted* admitted;
-  double first_part;
-  std::int64_t* filled;
   RowPlace* places;
   const std::int64_t* everyone;
   int n_ranks, rank;

@@ -124,10 +124,8 @@ void project_bwd<float>(const Inputs& in, const ProjectRows& rows, const RowGrad
   if (blocks == 0) return;
   const StoreGradients sink{out, 3 * in.options.sh_stride};
   dispatch_backward(in, rows, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
-    backward_kernel<degree.value, quads.value>
-        <<<blocks_for(rows.n_visible, kBackwardThreads), kBackwardThreads, 0, stream>>>(args, sink);
+    launch_backward<degree.value, quads.value>(args, sink, stream);
   });
-  check_launch("project_bwd");
   if (!out.viewmats) return;
   auto* partial = workspace.allocate<double>(blocks * in.n_views * 12);
   std::visit(

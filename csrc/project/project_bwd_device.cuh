@@ -2,6 +2,7 @@
 // The projection's backward pass on CUDA, whatever becomes of the gradients.
 #pragma once
 #include "project/project_device.cuh"
+#include "project/row_reader.cuh"
 
 namespace blitzgs::cuda {
 
@@ -45,6 +46,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   __shared__ ShStage<DEGREE> stages[QUADS ? kBackwardThreads / 32 : 1];
   __shared__ TripleStage triples[kBackwardThreads / 32];
   __shared__ typename Sink::Shared shared;
+  extern __shared__ float4 pulled[];
   const Inputs& in = args.in;
   const int lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? threadIdx.x / 32 : 0];
@@ -57,6 +59,8 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
                      end = exists ? args.rows.row_offsets[u + 1] : 0;
   const std::int64_t stride = 3 * in.options.sh_stride;
   const bool has_colors = in.sh && args.v.colored();
+  using Reader = RowReader<Source>;
+  Reader reader(args.v, pulled, in.n_views);
   if constexpr (QUADS) {
     if (has_colors) stage.gather(in.sh, stride, id, lane);
   }
@@ -72,11 +76,12 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   const auto load_row = [&](std::int64_t r) {
     if (r >= end) return;
     view = args.rows.camera_ids[r];
-    v_row = args.v.geometry(r);
+    if constexpr (!Reader::kPulls) v_row = args.v.geometry(r);
   };
   load_row(begin);
-  load_cameras(in, cameras);
   const WarpRows warp{first, args.rows.n_visible - first, id, static_cast<int>(threadIdx.x) / 32, lane};
+  reader.pull(begin, end);
+  load_cameras(in, cameras);
   auto own = sink.begin(shared, warp);
   __syncthreads();
   const Vec3<float> mean = triple.share(mean_part, lane), scale = triple.share(scale_part, lane);
@@ -87,11 +92,13 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   GaussianGradient<float> gradient{};
   float axis_weight = 0.f;
   PoseGradient<float>* no_pose = nullptr;
-  for (std::int64_t r = begin; r < end;) {
+  reader.settle(begin, end);
+  reader.for_each(begin, end, [&](std::int64_t r, const auto& v) {
+    if constexpr (Reader::kPulls) v_row = v.geometry(r);
     project_row_vjp(cameras[view], gaussian, in.options, v_row, &gradient, no_pose);
     if (args.scale_reg) axis_weight += args.scale_reg[view];
-    load_row(++r);
-  }
+    load_row(r + 1);
+  });
 
   // The colours after the geometry, so that their coefficients are in registers for no longer than needed.
   Coefficients v_sh;
@@ -107,11 +114,11 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
 #pragma unroll
       for (int i = 0; i < Coefficients::kCount; ++i) sh.values[i] = in.sh[stride * id + i];
     }
-    for (std::int64_t r = begin; r < end; ++r) {
-      const Vec3<float> v_color = args.v.color(r);
+    reader.for_each(begin, end, [&](std::int64_t r, const auto& v) {
+      const Vec3<float> v_color = v.color(r);
       row_color_vjp(cameras[args.rows.camera_ids[r]], mean, sh.values, DEGREE, &v_color.x, v_sh.values,
                     &gradient.mean, no_pose);
-    }
+    });
   }
   if constexpr (QUADS) stage.write(lane, v_sh);
   float v_quat[4] = {}, v_opacity = 0.f;
@@ -126,6 +133,19 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   } else {
     sink.take_sh(shared, own, warp, v_sh);
   }
+}
+
+template <int DEGREE, bool QUADS, class Source, class Sink>
+void launch_backward(const BackwardInputs<Source>& args, const Sink& sink, CudaStream stream) {
+  const auto kernel = backward_kernel<DEGREE, QUADS, Source, Sink>;
+  const std::size_t bytes = RowReader<Source>::shared_bytes(args.v, args.in.n_views, kBackwardThreads / 32);
+  if (bytes > 0) {
+    check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)),
+          "project_bwd");
+  }
+  const unsigned blocks = blocks_for(args.rows.n_visible, kBackwardThreads);
+  kernel<<<blocks, kBackwardThreads, bytes, stream>>>(args, sink);
+  check_launch("project_bwd");
 }
 
 }  // namespace blitzgs::cuda

@@ -67,22 +67,22 @@ struct Backward {
 
 using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-BackwardTensors project_bwd(const Tensor& means, const Tensor& quats, const Tensor& scales,
-                            const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
-                            const Tensor& Ks, const Tensor& camera_ids, const Tensor& visible_ids,
-                            const Tensor& row_offsets, std::int64_t width, std::int64_t height,
-                            std::int64_t sh_degree, double eps2d, bool antialiased, bool raw,
-                            const Tensor& v_means2d, const Tensor& v_conics, const OptionalTensor& v_depths,
-                            const Tensor& v_row_opacities, const OptionalTensor& v_colors,
-                            const OptionalTensor& scale_reg, bool need_viewmats, const OptionalTensor& places,
-                            const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank,
-                            const std::optional<Tensor>& own, bool dense) {
+BackwardTensors project_bwd(
+    const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
+    const OptionalTensor& sh, const Tensor& viewmats, const Tensor& Ks, const Tensor& camera_ids,
+    const Tensor& visible_ids, const Tensor& row_offsets, std::int64_t width, std::int64_t height,
+    std::int64_t sh_degree, double eps2d, bool antialiased, bool raw, const OptionalTensor& v_means2d,
+    const OptionalTensor& v_conics, const OptionalTensor& v_depths, const OptionalTensor& v_row_opacities,
+    const OptionalTensor& v_colors, const OptionalTensor& scale_reg, bool need_viewmats,
+    const OptionalTensor& places, const std::vector<std::int64_t>& group_sizes,
+    const std::vector<std::int64_t>& starts, const std::optional<std::vector<Tensor>>& buffers,
+    std::int64_t offset, bool dense) {
   constexpr const char* kOp = "project_bwd";
   const Parameters p(kOp, means, quats, scales, opacities, sh, viewmats, Ks, sh_degree);
   const Backward b(kOp, p, camera_ids, visible_ids, row_offsets, width, height, sh_degree, eps2d, antialiased,
                    raw, scale_reg);
   HeldRowGradients v(kOp, p.means.scalar_type(), camera_ids.numel(), v_means2d, v_conics, v_depths,
-                     v_row_opacities, v_colors, places, group_sizes, own_rank, own);
+                     v_row_opacities, v_colors, {places, group_sizes, starts, buffers, offset}, std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
   const auto rows_of = [&](std::vector<std::int64_t> shape) {
     Tensor rows = make_empty(p.means, shape);
@@ -96,7 +96,7 @@ BackwardTensors project_bwd(const Tensor& means, const Tensor& quats, const Tens
   dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
     backend::project_bwd(
-        b.inputs<T>(), b.rows(), v.source<T>(scope), data_or_null<T>(b.scale_reg),
+        b.inputs<T>(), b.rows(), v.source<T>(), data_or_null<T>(b.scale_reg),
         ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
                             mutable_data<T>(v_opacities), sh ? mutable_data<T>(v_sh) : nullptr,
                             need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense},
@@ -112,10 +112,12 @@ void project_bwd_step_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
                        const Tensor& viewmats, const Tensor& Ks, const Tensor& camera_ids,
                        const Tensor& visible_ids, const Tensor& row_offsets, std::int64_t width,
                        std::int64_t height, std::int64_t sh_degree, double eps2d, bool antialiased,
-                       const Tensor& v_means2d, const Tensor& v_conics, const Tensor& v_row_opacities,
-                       const Tensor& v_colors, const OptionalTensor& scale_reg, const OptionalTensor& places,
-                       const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank,
-                       const std::optional<Tensor>& own) {
+                       const OptionalTensor& v_means2d, const OptionalTensor& v_conics,
+                       const OptionalTensor& v_row_opacities, const OptionalTensor& v_colors,
+                       const OptionalTensor& scale_reg, const OptionalTensor& places,
+                       const std::vector<std::int64_t>& group_sizes, const std::vector<std::int64_t>& starts,
+                       const std::optional<std::vector<Tensor>>& buffers, std::int64_t offset,
+                       const OptionalTensor& means2d_sums) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state{kOp,      params, exp_avgs,       exp_avg_sqs, last_step, moment_step, table,
                     lr_table, step,   explicit_steps, beta1,       beta2,     eps,         sparse};
@@ -125,12 +127,12 @@ void project_bwd_step_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
   const Backward b(kOp, p, camera_ids, visible_ids, row_offsets, width, height, sh_degree, eps2d, antialiased,
                    true, scale_reg);
   HeldRowGradients v(kOp, p.means.scalar_type(), camera_ids.numel(), v_means2d, v_conics, std::nullopt,
-                     v_row_opacities, v_colors, places, group_sizes, own_rank, own);
+                     v_row_opacities, v_colors, {places, group_sizes, starts, buffers, offset}, means2d_sums);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
-    backend::project_bwd_step(b.inputs<T>(), b.rows(), v.source<T>(scope), data_or_null<T>(b.scale_reg),
+    backend::project_bwd_step(b.inputs<T>(), b.rows(), v.source<T>(), data_or_null<T>(b.scale_reg),
                               state.arguments<T>(data<std::int32_t>(b.visible_ids), b.visible()),
                               scope.workspace, scope.stream);
   });

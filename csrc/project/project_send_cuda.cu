@@ -17,8 +17,7 @@ constexpr int kSendBlocks = 4, kColorSendBlocks = 2;
 constexpr int kSendPlaces = 6;  // with as many registers as if there were so many
 
 // One warp, a lane a rank. Rows that do not fit, here or at some rank, are not admitted.
-__global__ void admit_kernel(const __grid_constant__ ProjectScatter scatter, int n_views,
-                             const std::int32_t* row_offsets) {
+__global__ void admit_kernel(const __grid_constant__ ProjectScatter scatter, int n_views) {
   const int m = threadIdx.x, n_ranks = scatter.n_ranks;
   const std::int64_t stride = kTotalViews + n_views + 2 * n_ranks;
   const auto rows = [&](int source, int target) {
@@ -35,15 +34,13 @@ __global__ void admit_kernel(const __grid_constant__ ProjectScatter scatter, int
     }
     out->groups.size[m] = rows(scatter.rank, m);
     out->groups.start[m] = start;
-    scatter.filled[m] = scatter.filled[n_ranks + m] = 0;
+    out->filled[m] = 0;
   }
   const bool admitted = __all_sync(kFullWarp, max(own, max(sent, received)) <= scatter.capacity);
   if (m > 0) return;
   const std::int64_t* totals = scatter.everyone + scatter.rank * stride;
-  const std::int64_t visible = admitted ? totals[kTotalVisible] : 0;
-  out->sizes = {visible, admitted ? totals[kTotalRows] : 0};
+  out->sizes = admitted ? ProjectSizes{totals[kTotalVisible], totals[kTotalRows]} : ProjectSizes{0, 0};
   out->groups.count = n_ranks;
-  out->split = row_offsets[static_cast<std::int64_t>(scatter.first_part * static_cast<double>(visible))];
 }
 
 // Warps take a block of rows and a rank at a time: the rows of the one for the other are one run of the
@@ -100,8 +97,7 @@ __global__ void __launch_bounds__(kScatterBlock, kSendPlaces)
     }
     std::int32_t first = 0;
     if (lane == 0) {
-      first = static_cast<std::int32_t>(
-          state.take({groups.size, groups.start, n_ranks}, m, count, state.from_back(begin)));
+      first = static_cast<std::int32_t>(state.take(m, count));
     }
     first = __shfl_sync(kFullWarp, first, 0);
     __syncwarp();
@@ -171,7 +167,7 @@ const std::int32_t* words(const void* column) { return static_cast<const std::in
 
 void project_rows_to_ranks(const ProjectIds& ids, const ProjectOutputs<float>& out, int n_views,
                            const ProjectScatter& scatter, CudaStream stream) {
-  admit_kernel<<<1, 32, 0, stream>>>(scatter, n_views, ids.row_offsets);
+  admit_kernel<<<1, 32, 0, stream>>>(scatter, n_views);
   check_launch("project_send");
   if (scatter.capacity == 0) return;
   const std::int32_t* data[] = {words(out.means2d), words(out.conics), words(out.opacities),
@@ -189,7 +185,7 @@ void project_rows_to_ranks(const ProjectIds& ids, const ProjectOutputs<float>& o
   }
   send_kernel<<<blocks_beside(scatter.capacity, kSendBlocks), kScatterBlock, 0, stream>>>(
       {columns, out.rank_masks, scatter.capacity}, targets, scatter.admitted,
-      {scatter.filled, scatter.places, &scatter.admitted->split}, scatter.n_ranks);
+      {scatter.admitted->filled, scatter.places}, scatter.n_ranks);
   check_launch("project_send");
 }
 

@@ -9,14 +9,13 @@ namespace blitzgs {
 namespace {
 
 // Sends the rows of project_count, which has to have had room for `capacity` of them, where they are
-// composited. Returns places, filled and what has to live until the colours are there.
+// composited. Returns places and what has to live until the colours are there.
 std::vector<Tensor> project_rows_to_peers(const Tensor& means, const Tensor& quats, const Tensor& scales,
                                           const Tensor& opacities, const OptionalTensor& sh,
                                           const Tensor& viewmats, const Tensor& Ks, std::int64_t width,
                                           std::int64_t height, std::int64_t sh_degree, const Tensor& everyone,
                                           std::int64_t rank, RowList rows, std::vector<Tensor> buffers,
-                                          std::int64_t capacity, double first_part,
-                                          std::int64_t colors_stream) {
+                                          std::int64_t capacity, std::int64_t colors_stream) {
   constexpr const char* kOp = "project_rows_to_peers_";
   const auto n_ranks = static_cast<std::int64_t>(buffers.size());
   const std::vector<std::int64_t> tiles(buffers.size());
@@ -34,11 +33,8 @@ std::vector<Tensor> project_rows_to_peers(const Tensor& means, const Tensor& qua
   STD_TORCH_CHECK(everyone.is_contiguous() && !everyone.is_cpu() && rank >= 0 && rank < n_ranks,
                   "blitzgs::", kOp, ": everyone must be contiguous and on the GPU, and rank one of ", n_ranks,
                   ", got ", rank);
-  STD_TORCH_CHECK(first_part >= 0 && first_part <= 1, "blitzgs::", kOp,
-                  ": first_part must be in [0, 1], got ", first_part);
   const bool apart = colors_stream != 0;
   DeviceScope scope(f.p.means);
-  Tensor filled = make_empty(f.p.means, {2, n_ranks}, ScalarType::Long);
   Tensor places = make_places(f.p.means, capacity, n_ranks);
   Tensor admitted = make_empty(f.p.means, {(sizeof(ProjectAdmitted) + 7) / 8}, ScalarType::Long);
   const ProjectIds ids = row_ids(rows);
@@ -48,8 +44,6 @@ std::vector<Tensor> project_rows_to_peers(const Tensor& means, const Tensor& qua
   const ProjectRoom room{sizes, shown + rank * n_totals};
   const ProjectScatter scatter{
       reinterpret_cast<ProjectAdmitted*>(mutable_data<std::int64_t>(admitted)),
-      first_part,
-      mutable_data<std::int64_t>(filled),
       places_of(places),
       shown,
       static_cast<int>(n_ranks),
@@ -61,7 +55,7 @@ std::vector<Tensor> project_rows_to_peers(const Tensor& means, const Tensor& qua
   if (!apart) {
     cuda::project_colors(f.inputs<float>(), ids, room, values, scope.stream);
     cuda::project_rows_to_ranks(ids, values, n_views, scatter, scope.stream);
-    return {places, filled, admitted};
+    return {places, admitted};
   }
   const auto second = reinterpret_cast<CudaStream>(colors_stream);
   const cuda::StreamPoint met(scope.stream);
@@ -71,7 +65,7 @@ std::vector<Tensor> project_rows_to_peers(const Tensor& means, const Tensor& qua
   cuda::project_colors(f.inputs<float>(), ids, room, values, second, true);
   sent.hold(second);
   cuda::project_colors_to_ranks(values, scatter, second);
-  return {places, filled, admitted};
+  return {places, admitted};
 }
 
 }  // namespace

@@ -126,10 +126,7 @@ void project_bwd_step<float>(const Inputs& in, const ProjectRows& rows, const Ro
   if (moves_by_packs(adam)) {
     dispatch_backward(in, rows, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
       if constexpr (quads.value) {
-        backward_kernel<degree.value, true>
-            <<<blocks_for(rows.n_visible, kBackwardThreads), kBackwardThreads, 0, stream>>>(args,
-                                                                                            StepRows{adam});
-        check_launch("project_bwd_step");
+        launch_backward<degree.value, true>(args, StepRows{adam}, stream);
         done = true;
       }
     });

@@ -4,8 +4,8 @@
 #pragma once
 #include <variant>
 
+#include "peers/peers.h"
 #include "project/project_row.h"
-#include "scatter/scatter.h"
 
 namespace blitzgs {
 
@@ -23,9 +23,6 @@ struct ProjectRowGradients {
   }
   BLITZGS_HD Vec3<T> color(std::int64_t r) const { return load3(colors + 3 * r); }
 };
-
-// A row of a table of gradients: mean2d 2, conic 3, opacity 1, color 3.
-inline constexpr int kRowGradient = 9;
 
 // In the table that the rasteriser's backward pass adds them up in.
 struct PackedRowGradients {
@@ -46,32 +43,48 @@ struct PackedRowGradients {
   }
 };
 
-// In tables that came back from the ranks that composited the rows, added up in the order of ranks.
-struct ReturnedRowGradients {
-  RowValues<float> rows;
+// In such tables of all ranks that composited the rows (CUDA), added up in the order of ranks. The memory is
+// shared: `tables` are mapped here, each from this rank's first row on.
+struct TableRowGradients {
+  using Row = PackedRowGradients::Row;
+  const RowPlace* places;
+  int n_ranks;
+  const Row* tables[kMaxPeers];
+  std::int32_t sizes[kMaxPeers];  // this rank's rows in each
+  float* means2d;                 // null, or [P, 2]: where the projection's backward pass leaves these sums
 
   BLITZGS_HD bool colored() const { return true; }
   BLITZGS_HD RowGradient<float> geometry(std::int64_t r) const {
-    RowGradient<float> sum{};
-    rows.for_each(r, [&](const float* v) {
-      for (int i = 0; i < 2; ++i) sum.mean2d[i] += v[i];
-      for (int i = 0; i < 3; ++i) sum.conic[i] += v[2 + i];
-      sum.opacity += v[5];
-    });
-    return sum;
+    const Row row = sum(r);
+    return PackedRowGradients{&row}.geometry(0);
   }
   BLITZGS_HD Vec3<float> color(std::int64_t r) const {
-    Vec3<float> sum{};
-    rows.for_each(r, [&](const float* v) {
-      sum.x += v[6];
-      sum.y += v[7];
-      sum.z += v[8];
-    });
+    const Row row = sum(r);
+    return PackedRowGradients{&row}.color(0);
+  }
+  BLITZGS_HD Row sum(std::int64_t r) const {
+    Row sum{};
+    for (int m = 0; m < n_ranks; ++m) {
+      const Row* row = at(m, r);
+      if (!row) continue;
+      const Row v = *row;
+      for (int i = 0; i < 2; ++i) sum.mean2d[i] += v.mean2d[i];
+      for (int i = 0; i < 3; ++i) sum.conic[i] += v.conic[i];
+      sum.opacity += v.opacity;
+      for (int i = 0; i < 3; ++i) sum.color[i] += v.color[i];
+    }
     return sum;
+  }
+  // The row at rank m; null: that composited none of it.
+  BLITZGS_HD const Row* at(int m, std::uint64_t r) const {
+    const RowPlace place = places[r / kPlaceRows * n_ranks + m];
+    const auto in_run = static_cast<std::uint32_t>(r % kPlaceRows);
+    const std::int64_t row = place.of(in_run);
+    return place.has(in_run) && row < sizes[m] ? tables[m] + row : nullptr;
   }
 };
 
 // One that a kernel on CUDA reads; the CPU reads columns.
-using RowGradientSource = std::variant<ProjectRowGradients<float>, PackedRowGradients, ReturnedRowGradients>;
+using RowGradientSource = std::variant<ProjectRowGradients<float>, PackedRowGradients, TableRowGradients>;
 
 }  // namespace blitzgs

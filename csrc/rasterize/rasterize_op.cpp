@@ -74,6 +74,33 @@ struct Splats {
   std::optional<Tensor> backgrounds;
 };
 
+// Zeroes row_gradients, if there are any.
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> composite(const Splats& splats,
+                                                             std::optional<Tensor> row_gradients,
+                                                             bool clear_rest) {
+  const TileGrid& grid = splats.grid;
+  Tensor renders = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width, splats.n_channels});
+  Tensor transmittances = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width});
+  Tensor last_ids = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width}, ScalarType::Int);
+  Tensor tile_work = make_empty(splats.means2d, {grid.count()}, ScalarType::Int);
+  Tensor aux =
+      make_empty(splats.means2d,
+                 {backend::rasterize_aux_bytes(grid, splats.n_rows, static_cast<int>(splats.n_channels))},
+                 ScalarType::Byte);
+  DeviceScope scope(splats.means2d);
+  dispatch_floating(splats.means2d, [&](auto zero) {
+    using T = decltype(zero);
+    const RasterizeOutput<T> out{mutable_data<T>(renders),
+                                 mutable_data<T>(transmittances),
+                                 mutable_data<std::int32_t>(last_ids),
+                                 mutable_data<std::int32_t>(tile_work),
+                                 row_gradients ? mutable_data<T>(*row_gradients) : nullptr,
+                                 clear_rest};
+    backend::rasterize_fwd(splats.input<T>(), out, mutable_data<void>(aux), scope.workspace, scope.stream);
+  });
+  return {renders, transmittances, last_ids, tile_work, aux};
+}
+
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
@@ -84,28 +111,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid);
-  Tensor renders = make_empty(splats.means2d, {n_cameras, height, width, splats.n_channels});
-  Tensor transmittances = make_empty(splats.means2d, {n_cameras, height, width});
-  Tensor last_ids = make_empty(splats.means2d, {n_cameras, height, width}, ScalarType::Int);
-  Tensor tile_work = make_empty(splats.means2d, {grid.count()}, ScalarType::Int);
-  Tensor aux =
-      make_empty(splats.means2d,
-                 {backend::rasterize_aux_bytes(grid, splats.n_rows, static_cast<int>(splats.n_channels))},
-                 ScalarType::Byte);
   const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
   Tensor row_gradients = make_empty(splats.means2d, {packed ? splats.n_rows : 0, kPackedGradient});
-  DeviceScope scope(splats.means2d);
-  dispatch_floating(splats.means2d, [&](auto zero) {
-    using T = decltype(zero);
-    const RasterizeOutput<T> out{mutable_data<T>(renders),
-                                 mutable_data<T>(transmittances),
-                                 mutable_data<std::int32_t>(last_ids),
-                                 mutable_data<std::int32_t>(tile_work),
-                                 packed ? mutable_data<T>(row_gradients) : nullptr,
-                                 clear_rest};
-    backend::rasterize_fwd(splats.input<T>(), out, mutable_data<void>(aux), scope.workspace, scope.stream);
-  });
-  return {renders, transmittances, last_ids, tile_work, aux, row_gradients};
+  auto composited = composite(splats, packed ? std::optional(row_gradients) : std::nullopt, clear_rest);
+  return std::tuple_cat(std::move(composited), std::tuple(row_gradients));
 }
 
 // The arguments that the backward ops share, checked and contiguous.
@@ -186,6 +195,27 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
 }
 
 #ifdef BLITZGS_BACKEND_CUDA
+void check_packed(const char* op, const Splats& splats, const Tensor& packed) {
+  STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", op, ": colors must have 1 to 4 channels, got ",
+                  splats.n_channels);
+  check_shape(op, "packed", packed, {splats.n_rows, kPackedGradient});
+  check_dtype(op, "packed", packed, ScalarType::Float);
+  STD_TORCH_CHECK(packed.is_contiguous(), "blitzgs::", op, ": packed must be contiguous");
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd_packed(
+    const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
+    const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
+    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
+    std::int64_t tile_begin, std::int64_t tile_end, Tensor packed) {
+  constexpr const char* kOp = "rasterize_fwd_packed_";
+  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
+                      grid);
+  check_packed(kOp, splats, packed);
+  return composite(splats, packed, false);
+}
+
 void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
                           const Tensor& colors, const std::optional<Tensor>& backgrounds,
                           const Tensor& isect_rows, const Tensor& tile_offsets, const Tensor& renders,
@@ -197,13 +227,9 @@ void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Ten
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid);
-  STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", kOp, ": colors must have 1 to 4 channels, got ",
-                  splats.n_channels);
+  check_packed(kOp, splats, packed);
   const Composited composited(kOp, splats, renders, transmittances, last_ids, aux, v_renders, std::nullopt,
                               width, height);
-  check_shape(kOp, "packed", packed, {splats.n_rows, kPackedGradient});
-  check_dtype(kOp, "packed", packed, ScalarType::Float);
-  STD_TORCH_CHECK(packed.is_contiguous(), "blitzgs::", kOp, ": packed must be contiguous");
   DeviceScope scope(splats.means2d);
   cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_rows.size(0),
                              composited.own(), deterministic, mutable_data<float>(packed), scope.workspace,
@@ -218,6 +244,7 @@ BLITZGS_REGISTER(m) {
   m.impl("rasterize_fwd", TORCH_BOX(&blitzgs::rasterize_fwd));
   m.impl("rasterize_bwd", TORCH_BOX(&blitzgs::rasterize_bwd));
 #ifdef BLITZGS_BACKEND_CUDA
+  m.impl("rasterize_fwd_packed_", TORCH_BOX(&blitzgs::rasterize_fwd_packed));
   m.impl("rasterize_bwd_packed_", TORCH_BOX(&blitzgs::rasterize_bwd_packed));
 #endif
 }

@@ -84,8 +84,7 @@ struct ScatterRows {
   std::int64_t count;
 };
 
-// Values of rows, `width` apart: each row's own, or, with places, what came back from each rank it went to.
-// Those from rank `own_rank` (-1: none), which never left, may lie elsewhere, `own_width` apart.
+// Values of rows, `width` apart, that came back from each rank that a row went to.
 template <class T>
 struct RowValues {
   const T* values;
@@ -93,13 +92,10 @@ struct RowValues {
   std::int64_t count;
   const RowPlace* places;
   RowGroups groups;
-  const T* own = nullptr;
-  int own_width = 0, own_rank = -1;
 
   // Calls f(pointer to a row's values), for each rank in order.
   template <class F>
   BLITZGS_HD void for_each(std::uint64_t row, const F& f) const {
-    if (!places) return f(values + row * width);
     const RowPlace* run = places + row / kPlaceRows * groups.count;
     const auto in_run = static_cast<std::uint32_t>(row % kPlaceRows);
     std::uint64_t ranks = 0;
@@ -111,9 +107,7 @@ struct RowValues {
     for (; ranks != 0; ranks &= ranks - 1) {
       const int m = lowest_bit(ranks);
       const std::int64_t at = run[m].of(in_run);
-      if (at < groups.size[m]) {
-        f(m == own_rank ? own + at * own_width : values + (groups.start[m] + at) * width);
-      }
+      if (at < groups.size[m]) f(values + (groups.start[m] + at) * width);
     }
   }
 };

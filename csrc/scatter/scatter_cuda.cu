@@ -98,7 +98,7 @@ void scatter(const ScatterRows& rows, const RowGroups& groups, const ScatterTarg
   dispatch_ranks(groups.count, [&](auto ranks) {
     scatter_kernel<ranks.value>
         <<<static_cast<unsigned>(scatter_blocks(rows.count)), kScatterBlock, 0, stream>>>(
-            rows, groups, targets, ScatterState{filled, places, nullptr});
+            rows, groups, targets, ScatterState{filled, places});
   });
   check_launch("scatter_rows");
 }

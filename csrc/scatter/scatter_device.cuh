@@ -37,23 +37,16 @@ struct ScatterSizes {
   int n_ranks;
 };
 
-// What all blocks share: how far each group is filled from its front and, [M] more, from its back (zeroed
-// before), and what `scatter` returns. Blocks that begin at row *split or later fill from the back, the
-// others, or all of them without `split`, from the front.
+// What all blocks share: how far each group is filled (zeroed before), and what `scatter` returns.
 struct ScatterState {
   std::int64_t* filled;
   RowPlace* places;
-  const std::int32_t* split;
 
-  __device__ bool from_back(std::int64_t first) const { return split && first >= *split; }
   // Takes `count` places of group m; returns the first.
-  __device__ std::int64_t take(const ScatterSizes& groups, int m, int count, bool from_back) const {
+  __device__ std::int64_t take(int m, int count) const {
     if (count == 0) return 0;
-    auto* end = reinterpret_cast<unsigned long long*>(filled) + (from_back ? groups.n_ranks + m : m);
-    const auto taken = static_cast<std::int64_t>(atomicAdd(end, static_cast<unsigned long long>(count)));
-    if (!from_back) return taken;
-    const std::int64_t begin = groups.sizes[m] - taken - count;
-    return begin > 0 ? begin : 0;
+    return static_cast<std::int64_t>(
+        atomicAdd(reinterpret_cast<unsigned long long*>(filled) + m, static_cast<unsigned long long>(count)));
   }
 };
 
@@ -145,7 +138,7 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
   if (static_cast<int>(threadIdx.x) < n_ranks) {
     const int m = threadIdx.x;
     const int count = scan_warps(shared.before[m]);
-    const std::int64_t base = state.take(groups, m, count, state.from_back(first));
+    const std::int64_t base = state.take(m, count);
     const std::int64_t room = groups.sizes[m] - base;
     shared.base[m] = static_cast<int>(base);
     shared.target[m] = base + (groups.starts ? groups.starts[m] : 0);

@@ -50,13 +50,13 @@ std::vector<Tensor> gather_rows(const Tensor& packed, const std::vector<std::int
 }
 
 std::vector<Tensor> sum_rows(const Tensor& values, const Tensor& places,
-                             const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank,
-                             const std::optional<Tensor>& own, std::int64_t rows,
+                             const std::vector<std::int64_t>& group_sizes, std::int64_t rows,
                              const std::vector<std::int64_t>& widths) {
   constexpr const char* kOp = "sum_rows";
   STD_TORCH_CHECK(rows >= 0, "blitzgs::sum_rows: rows must not be negative, got ", rows);
   check_floating(kOp, "values", values);
-  const HeldReturns held(kOp, rows, places, group_sizes, own_rank, own, values.scalar_type());
+  const RowGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
+  const Tensor held = checked_places(kOp, places, rows, groups.count);
   const Tensor values_c = as_contiguous(values);
   std::vector<Tensor> sums;
   for (const std::int64_t width : widths) {
@@ -69,9 +69,9 @@ std::vector<Tensor> sum_rows(const Tensor& values, const Tensor& places,
     RowColumns<T> columns{};
     for (Tensor& sum : sums) add_column(kOp, columns, mutable_data<T>(sum), sum.size(1));
     const int width = columns.begin[columns.count];
-    check_shape(kOp, "values", values, {total_rows(held.groups), width});
-    backend::sum(held.values(kOp, data<T>(values_c), width, 0, width), columns, scope.workspace,
-                 scope.stream);
+    check_shape(kOp, "values", values, {total_rows(groups), width});
+    const RowValues<T> returned{data<T>(values_c), width, rows, places_in(held), groups};
+    backend::sum(returned, columns, scope.workspace, scope.stream);
   });
   return sums;
 }

@@ -2,7 +2,6 @@
 // Arguments that the ops on scattered rows share, checked the same way.
 #pragma once
 #include <limits>
-#include <optional>
 
 #include "common/op.h"
 #include "scatter/scatter.h"
@@ -63,55 +62,15 @@ struct HeldRows {
   ScatterRows rows{};
 };
 
-// What tells where values belong that came back from ranks: places and the sizes of the groups, as of
-// scatter_rows; of one group the values themselves [its size, W] or, with rank -1, of none. Keeps the
-// contiguous forms alive.
-struct HeldReturns {
-  HeldReturns(const char* op, std::int64_t rows_in, const Tensor& places_in,
-              const std::vector<std::int64_t>& group_sizes, std::int64_t own_rank_in,
-              const std::optional<Tensor>& own_in, ScalarType dtype)
-      : rows(rows_in),
-        places(as_contiguous(places_in)),
-        groups(checked_groups(op, "group_sizes", group_sizes)),
-        own_rank(static_cast<int>(own_rank_in)) {
-    check_shape(op, "places", places, {place_runs(rows), groups.count});
-    check_dtype(op, "places", places, ScalarType::Long);
-    STD_TORCH_CHECK(own_in ? own_rank_in >= 0 && own_rank_in < groups.count : own_rank_in == -1,
-                    "blitzgs::", op, ": own_rank must be one of ", groups.count, ", or -1 without own, got ",
-                    own_rank_in);
-    if (!own_in) return;
-    check_dtype(op, "own", *own_in, dtype);
-    check_shape(op, "own", *own_in, {groups.size[own_rank], -1});
-    own = as_contiguous(*own_in);
-  }
+// Places of rows in the groups of so many ranks, contiguous.
+inline Tensor checked_places(const char* op, const Tensor& places, std::int64_t rows, std::int64_t n_ranks) {
+  check_shape(op, "places", places, {place_runs(rows), n_ranks});
+  check_dtype(op, "places", places, ScalarType::Long);
+  return as_contiguous(places);
+}
 
-  // Values [.., width] of rows that came back, which are columns [column, column + width) of those of `own`.
-  // stride: between the rows.
-  template <class T>
-  RowValues<T> values(const char* op, const T* returned, std::int64_t stride, std::int64_t column,
-                      std::int64_t width) const {
-    RowValues<T> result{returned, static_cast<int>(stride), rows,
-                        reinterpret_cast<const RowPlace*>(data<std::int64_t>(places)), groups};
-    if (!own) return result;
-    STD_TORCH_CHECK(column + width <= own->size(1), "blitzgs::", op, ": own must have ", column + width,
-                    " columns, got ", own->size(1));
-    result.own = data<T>(*own) + column;
-    result.own_width = static_cast<int>(own->size(1));
-    result.own_rank = own_rank;
-    return result;
-  }
-
-  std::int64_t rows;
-  Tensor places;
-  RowGroups groups;
-  int own_rank;
-  std::optional<Tensor> own;
-};
-
-// Each row's own values.
-template <class T>
-RowValues<T> own_values(const T* values, std::int64_t width, std::int64_t rows) {
-  return {values, static_cast<int>(width), rows, nullptr, {}};
+inline const RowPlace* places_in(const Tensor& places) {
+  return reinterpret_cast<const RowPlace*>(data<std::int64_t>(places));
 }
 
 inline Tensor make_places(const Tensor& like, std::int64_t rows, std::int64_t n_ranks) {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows written to other ranks' memory and back: here all buffers lie on one GPU, and ranks take turns."""
+"""Rows written to other ranks' memory, and their gradients read there: ranks take turns on one GPU."""
 
 from types import SimpleNamespace
 
@@ -10,9 +10,10 @@ from cuda_scenes import Scene, ops
 from blitzgs.distributed.rows import PeerSpace, Traffic
 from blitzgs.ops.host import tell_host
 from blitzgs.ops.project import rows_of
-from blitzgs.ops.scatter import Returns, runs_of, sum_rows
+from blitzgs.ops.scatter import runs_of
+from tests.helpers import sum_tables
 
-VIEWS, WIDTH, HEIGHT, FIRST_PART = 2, 150, 100, 0.4
+VIEWS, WIDTH, HEIGHT = 2, 150, 100
 TILES = VIEWS * 10 * 7
 # Overlapping, as a rank composites some tiles around its own; the third composites nothing.
 BEGINS, ENDS = [0, 60, 100, 100], [70, 110, 100, TILES]
@@ -39,14 +40,14 @@ class Rank:
         _, _, totals, rows = ops.project_count(*self.arguments, capacity, capacity, self.ids)
         assert torch.equal(totals, self.totals)
         second = torch.cuda.Stream()
-        places, filled, kept = ops.project_rows_to_peers_(
+        places, kept = ops.project_rows_to_peers_(
             *self.arguments[:7], WIDTH, HEIGHT, self.arguments[12], everyone, self.number, rows, buffers,
-            capacity, FIRST_PART, second.cuda_stream if apart else 0,
+            capacity, second.cuda_stream if apart else 0,
         )  # fmt: skip
         torch.cuda.current_stream().wait_stream(second)
         counts = totals[:3].cpu()
         del kept
-        return [*rows_of(rows, counts)[:12], places[: runs_of(int(counts[1]))], filled]
+        return [*rows_of(rows, counts)[:12], places[: runs_of(int(counts[1]))]]
 
 
 def exchange(counts, slack=0, room=None, apart=False):
@@ -55,19 +56,19 @@ def exchange(counts, slack=0, room=None, apart=False):
     everyone = torch.stack([rank.totals for rank in ranks])
     traffic = [Traffic.of(everyone.tolist(), torch.empty(VIEWS), m) for m in range(len(ranks))]
     capacity = -(-traffic[0].most // 32) * 32 + slack if room is None else room
-    words = 22 * capacity
+    words = 25 * capacity
     buffers = [torch.full((words,), -1, dtype=torch.int32, device="cuda") for _ in ranks]
     spaces = [
-        PeerSpace(SimpleNamespace(rank=m, columns=[], buffers=buffers, exchanges=1), traffic[m], capacity, 1)
-        for m in range(len(ranks))
+        PeerSpace(SimpleNamespace(rank=m, columns=[], buffers=buffers, meet=lambda: None), *rest, 1)
+        for m, rest in enumerate(zip(traffic, [capacity] * len(ranks), strict=True))
     ]
     return ranks, spaces, [rank.send(everyone, buffers, capacity, apart) for rank in ranks]
 
 
 @pytest.mark.parametrize("slack", [32, 3200])
 @pytest.mark.parametrize("counts", [(3000, 900, 0, 40), (1, 0, 0, 2), (60_000, 0, 3, 90_000)])
-@pytest.mark.parametrize(("in_parts", "apart"), [(False, False), (True, False), (False, True)])
-def test_rows_arrive_and_their_gradients_return(counts, slack, in_parts, apart):
+@pytest.mark.parametrize("apart", [False, True])
+def test_rows_arrive_and_their_gradients_are_found(counts, slack, apart):
     ranks, spaces, sent = exchange(counts, slack, apart=apart)
     expected = [rank.rows() for rank in ranks]
     for got, want in zip(sent, expected, strict=True):
@@ -89,44 +90,27 @@ def test_rows_arrive_and_their_gradients_return(counts, slack, in_parts, apart):
             for a, b in zip(arrived, part, strict=True):
                 assert torch.equal(a[order], b)
             begin += len(part[0])
-    filled = torch.stack([rows[13] for rows in sent])
-    assert filled.sum(1).tolist() == spaces[0].traffic.rows
-    returned, tables = [], []
-    for m, space in enumerate(spaces):
-        splats = space.arrived()
+    for space in spaces:
+        splats, table = space.arrived(), space.clear_table()
+        assert table.shape == (len(splats.depths), 12) and not table.any()
         columns = [splats.means2d, splats.conics, splats.opacities[:, None], splats.colors]
-        packed = torch.cat([*columns, torch.ones_like(splats.conics)], 1)
-        tables.append(packed)
-        if in_parts:
-            fronts = filled[:, 0, m]
-            space.write_back(packed, fronts)
-            returned.append(space.write_back(packed, fronts, back=True))
-        else:
-            returned.append(space.write_back(packed))
-    for m, space in enumerate(spaces):
+        table.copy_(torch.cat([*columns, torch.full_like(splats.conics, torch.nan)], 1))
+    for m, (rank, space) in enumerate(zip(ranks, spaces, strict=True)):
         rows, masks, places = expected[m], sent[m][11], sent[m][12]
-        returns = Returns(places, space.traffic.sent, m, tables[m].split(space.traffic.received)[m])
-        sums = sum_rows(returned[m], returns, len(masks), [2, 3, 1, 3])
+        tables = space.share_table(places)
         times = sum((masks >> k & 1) for k in range(len(ranks)))[:, None]
-        for got, column in zip(sums, (rows[4], rows[5], rows[7][:, None], rows[8]), strict=True):
-            assert torch.equal(got, times * column)
-
-
-@pytest.mark.parametrize("count", [3, 20_000])
-def test_rows_of_the_first_gaussians_lie_in_front(count):
-    ranks, spaces, sent = exchange((count, 10, 10, count))
-    for rank, space, rows in zip(ranks, spaces, sent, strict=True):
-        first = rows[3][int(FIRST_PART * len(rows[2]))].item()  # rows before are of the first Gaussians
-        for m, target in enumerate(spaces):
-            begin = sum(target.traffic.received[: rank.number])
-            arrived = target.arrived()
-            keys = arrived.ids[begin:][: space.traffic.sent[m]] * VIEWS
-            keys += arrived.camera_ids[begin:][: space.traffic.sent[m]]
-            mine = rank.ids[rows[0][:first].long()] * VIEWS + rows[1][:first]
-            mine = mine[(rows[11][:first] >> m & 1).bool()]
-            front = int(rows[13][0, m])
-            assert torch.isin(mine, keys[:front]).all()
-            assert front <= len(mine) + 256  # a block's rows stay together
+        columns = [rows[4], rows[5], rows[7][:, None], rows[8]]
+        sums = [times * column for column in columns]
+        assert torch.equal(sum_tables(tables, len(masks))[:, :9], torch.cat(sums, 1))
+        arguments = (
+            *rank.arguments[:7], *rows[1:4], WIDTH, HEIGHT, rank.arguments[12], 0.3, False, True,
+        )  # fmt: skip
+        means2d, conics, opacities, colors = sums
+        want = ops.project_bwd(*arguments, means2d, conics, None, opacities.squeeze(1), colors, None, False)
+        got = ops.project_bwd(*arguments, None, None, None, None, None, None, False, *tables)
+        for x, y in zip(got, want, strict=True):
+            atol = 2e-6 * float(y.nan_to_num().abs().max()) if y.numel() else 0.0
+            torch.testing.assert_close(x, y, rtol=1e-5, atol=atol, equal_nan=True)
 
 
 @pytest.mark.parametrize("apart", [False, True])
@@ -145,29 +129,8 @@ def test_rows_need_the_room_that_others_count_on():
     with pytest.raises(RuntimeError, match="rows must have room for 64 visible Gaussians and rows, got 64"):
         ops.project_rows_to_peers_(
             *rank.arguments[:7], WIDTH, HEIGHT, rank.arguments[12], rank.totals[None], 0, rows,
-            [torch.zeros(22 * 64, dtype=torch.int32, device="cuda")], 64, FIRST_PART, 0,
+            [torch.zeros(25 * 64, dtype=torch.int32, device="cuda")], 64, 0,
         )  # fmt: skip
-
-
-@pytest.mark.parametrize("width,in_parts", [(1, False), (4, False), (9, False), (9, True)])
-def test_parts_of_rows_return(width, in_parts):
-    sizes, starts, offset = [700, 40, 5], [3, 0, 900], 17
-    values = torch.randn(sum(sizes), 12, device="cuda")
-    buffers = [torch.full((10_000,), -1, dtype=torch.int32, device="cuda") for _ in sizes]
-    fronts = torch.tensor([[400, 0], [0, 0], [9, 0]], device="cuda")[:, 0]
-    if in_parts:
-        ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 1, fronts, False)
-        assert (buffers[0][offset + (3 + 400) * width :] == -1).all()
-        ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 1, fronts, True)
-    else:
-        ops.return_to_peers_(values, width, sizes, buffers, offset, starts, 1, None, False)
-    assert (buffers[1] == -1).all()  # its own
-    for m, group in ((0, values[:700]), (2, values[740:])):
-        first = offset + starts[m] * width
-        end = first + sizes[m] * width
-        got = buffers[m][first:end].view(torch.float32).view(-1, width)
-        assert torch.equal(got, group[:, :width])
-        assert (buffers[m][:first] == -1).all() and (buffers[m][end:] == -1).all()
 
 
 @pytest.mark.parametrize("n_values", [0, 5, 100])

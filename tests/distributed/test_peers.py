@@ -12,18 +12,19 @@ import torch
 from blitzgs import pipeline
 from blitzgs.distributed import exchange
 from blitzgs.distributed import peers as peers_module
-from blitzgs.distributed.exchange import send_back, send_back_packed
+from blitzgs.distributed.exchange import send_back
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.distributed.peers import MAX_VALUES, Peers, mail_words
 from blitzgs.model import GaussianTable
 from blitzgs.ops.project import RowRoom
-from blitzgs.ops.scatter import sum_rows
+from blitzgs.ops.rasterize import gradient_columns
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
 from tests.distributed.rank_harness import RankError, run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.helpers import sum_tables
 from tests.training.tiny import random_gaussians
 
 TWO_GPUS = [
@@ -53,9 +54,10 @@ def _exchange(table, ranks, room=None):
         sums = send_back(gradients, frame.route, ranks)
     else:
         columns = [g[:, None] if g.dim() == 1 else g for g in gradients]
-        returned = send_back_packed(torch.cat((*columns, torch.ones_like(got.conics)), 1), frame.route)
-        sums = sum_rows(*returned, len(frame.rows.means2d), [2, 3, 1, 3])
-        sums[2] = sums[2].squeeze(1)
+        space = frame.route.space
+        space.table().copy_(torch.cat((*columns, torch.ones_like(got.conics)), 1))
+        returned = sum_tables(space.share_table(frame.route.places), len(frame.rows.means2d))
+        sums = [column.contiguous() for column in gradient_columns(returned)]
     own = ranges.pixel_mask(ranks.rank, ranks.device)
     return [*arrived, *sums, frame.renders[own], frame.visible.clone()]
 
@@ -98,40 +100,45 @@ def test_peers_bring_what_collectives_bring(world_size):
     assert len(set(sizes)) == 1
 
 
-def _steps_in_parts(ranks):
-    """Steps with gradients that return at once and in two parts: the same bits, also of tiny shards."""
-    assert ranks.peers is not None, ranks.transport
+def _gradients(ranks):
+    """Gradients read in the ranks' tables are those that collectives carry, also of tiny shards."""
+    peers = ranks.peers
+    assert peers is not None, ranks.transport
     exchange.LEAST_ROWS = 0
     options = dataclasses.replace(OPTIONS, sh_degree=3, deterministic=True)
-    views, sums = cameras(3, device=ranks.device), []
+    views, stepped = cameras(3, device=ranks.device), []
     optimiser = LazyAdam(OptimiserConfig(), Schedule(ScheduleConfig()), 1.0, ranks.device)
     for count in (3, 700, 100_000, 0):
-        share = Share(ranks, TileOwners(ranks).divide(range(3), views.width, views.height))
         small = _table(count, ranks)
         columns = {name: small[name] for name in small if "exp_avg" not in name}
         columns["sh"] = torch.nn.functional.pad(small["sh"], (0, 0, 0, 15))  # fused only so
-        tables = [GaussianTable.create({name: x.clone() for name, x in columns.items()}) for _ in range(2)]
-        for table, in_parts in zip(tables, (False, True), strict=True):
-            for step in (1, 2):
-                frame = pipeline.forward(table, views, options, share=share)
-                v_renders = frame.renders * 1e-3 + 1e-4
-                gradients = pipeline.backward_rows(frame, v_renders, in_parts=in_parts)
-                assert (gradients.second is not None) == in_parts
-                optimiser.step(table, frame, gradients, None, step)
-                if in_parts and count > 700:
-                    front, back = frame.route.filled.tolist()
-                    assert [a + b for a, b in zip(front, back, strict=True)] == frame.route.traffic.sent
-                    assert min(front) > 0 and min(back) > 0
-        for name in tables[0]:
-            assert torch.equal(tables[0][name], tables[1][name]), name
-        sums.append((tables[0]["last_step"] == 2).sum().item())
-    assert min(sums[1:3]) > 0
-    return sums
+        table = GaussianTable.create(columns)
+        frames, rows, gradients = [], [], []
+        for ranks.peers in (None, peers):
+            share = Share(ranks, TileOwners(ranks).divide(range(3), views.width, views.height))
+            frame = pipeline.forward(table, views, options, share=share, backward_follows=count != 700)
+            v_renders = torch.where(frame.renders > 0, 1e-3, 1e-4)
+            rows.append(pipeline.backward_rows(frame, v_renders))
+            gradients.append(pipeline.backward(table, frame, v_renders))  # from zeros again
+            frames.append(frame)
+        assert rows[0].tables.places is None and rows[1].means2d is None
+        found = sum_tables(rows[1].tables, len(frames[1].rows.means2d))
+        for x, y in zip(gradient_columns(found), rows[0][:4], strict=True):
+            assert torch.equal(x, y)
+        for x, y in zip(*gradients, strict=True):
+            atol = 2e-6 * float(x.abs().max()) if x.numel() else 0.0
+            torch.testing.assert_close(x, y, rtol=1e-5, atol=atol)
+        kept = torch.full_like(rows[0].means2d, torch.nan)
+        optimiser.step(table, frames[1], rows[1], None, 1, kept)
+        assert torch.equal(kept, rows[0].means2d)
+        stepped.append((table["last_step"] == 1).sum().item())
+    assert min(stepped[1:3]) > 0
+    return stepped
 
 
 @pytest.mark.parametrize("_", [pytest.param(0, marks=TWO_GPUS)])
-def test_gradients_in_two_parts_are_those_at_once(_):
-    assert len(run_ranks(_steps_in_parts, 2, device="cuda", transport="peer")) == 2
+def test_gradients_in_tables_are_those_that_return(_):
+    assert len(run_ranks(_gradients, 2, device="cuda", transport="peer")) == 2
 
 
 def _overtaken(ranks):
@@ -200,7 +207,7 @@ def test_numbers_are_not_overwritten_before_all_have_read_them(alone):
         (3, True, first + second, True),
         (4, True, first, True),
     ]
-    assert 1 + 2 * second + 2 == len(mail)
+    assert 1 + 2 * second + 1 == len(mail)
 
 
 def test_sums_are_where_no_rank_writes_numbers(alone):
@@ -226,9 +233,9 @@ def test_boards_have_two_places_and_grow(alone, monkeypatch):
     for words, begin in ((5, 0), (5, half), (half, 0), (7, half), (half + 1, 0), (5, half + 1), (5, 0)):
         (board,) = peers.boards(words)
         assert len(board) == words and board[0] == begin
-        peers.meet_apart(peers_module.SECOND)  # counts by itself
-        peers.meet_apart(peers_module.BESIDE)
-    assert [number for number, *_ in met] == [n for meeting in range(1, 8) for n in (meeting, meeting)]
+        peers.meet_beside()
+    peers.meet()  # counts by itself
+    assert [number for number, *_ in met] == [1, 2, 3, 4, 5, 6, 7, 1]
 
 
 def _refused(rank):

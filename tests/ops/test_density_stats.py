@@ -3,7 +3,6 @@ import pytest
 import torch
 
 from blitzgs.ops.density_stats import density_stats_
-from blitzgs.ops.scatter import OWN_VALUES, Returns, scatter_rows, sum_rows
 from tests.helpers import DEVICES
 
 WIDTH, HEIGHT, B = 640, 480, 3
@@ -79,28 +78,18 @@ def test_radii_keep_their_maximum_and_empty_steps_change_nothing(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_gradients_are_read_where_they_are(device):
-    """Those in the first columns of a table, and those that came back from two ranks."""
+    """Those in the first columns of a table."""
     visible, offsets, gradients, conics, _, _ = rows(device=device)
 
-    def sums(v_means2d, returns=OWN_VALUES):
+    def sums(v_means2d):
         columns = state(device=device)
-        density_stats_(*columns, visible, offsets, v_means2d, conics, WIDTH, HEIGHT, 1.0, returns=returns)
+        density_stats_(*columns, visible, offsets, v_means2d, conics, WIDTH, HEIGHT, 1.0)
         return columns[0]
 
     expected = sums(gradients)
     assert torch.equal(sums(torch.cat((gradients, gradients.exp()), 1)[:, :2]), expected)
-    masks = torch.arange(len(gradients), device=device) % 4
-    sizes = [int((masks >> m & 1).sum()) for m in range(2)]
-    sent, places = scatter_rows([gradients], masks, sizes)
-    parts = sent.view(torch.float32).view(-1, 2).repeat(1, 2)
-    returns = Returns(places, sizes)
-    total, _ = sum_rows(parts, returns, len(masks), [2, 2])
-    torch.testing.assert_close(sums(parts[:, :2], returns), sums(total))
-    own = parts[sizes[0] :].clone()
-    parts[sizes[0] :] = torch.nan
-    torch.testing.assert_close(sums(parts[:, :2], Returns(places, sizes, 1, own)), sums(total))
     with pytest.raises(RuntimeError, match=r"v_means2d must have shape \[\d+, 2\]"):
-        sums(gradients[1:].contiguous(), returns)
+        sums(gradients[1:].contiguous())
 
 
 def test_errors_name_the_value():

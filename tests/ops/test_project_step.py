@@ -8,8 +8,8 @@ from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam
 from blitzgs.ops.project import project
 from blitzgs.ops.project_step import project_bwd_step_
 from blitzgs.ops.rasterize import gradient_columns
-from blitzgs.ops.scatter import Returns, scatter_rows
-from tests.helpers import DEVICES
+from blitzgs.ops.scatter import NO_TABLES, RowTables, scatter_rows
+from tests.helpers import DEVICES, needs_cuda, sum_tables
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
 STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
@@ -54,14 +54,14 @@ class Scene:
         )  # fmt: skip
         shapes = (self.rows.means2d, self.rows.conics, self.rows.opacities, self.rows.colors)
         self.v = [torch.randn(s.shape, generator=self.seed, dtype=torch.float64).to(s) for s in shapes]
-        self.returns = Returns()
+        self.tables = NO_TABLES
 
     def backward(self, antialiased, need_viewmats=False):
         r = self.rows
         return torch.ops.blitzgs.project_bwd(
             *self.params, self.viewmats, self.Ks, r.camera_ids, r.visible_ids, r.row_offsets, WIDTH, HEIGHT,
             self.degree, EPS2D, antialiased, True, *self.v[:2], None, *self.v[2:], self.scale_reg,
-            need_viewmats, *self.returns,
+            need_viewmats, *self.tables,
         )  # fmt: skip
 
     def one_after_the_other(self, antialiased, sparse):
@@ -69,12 +69,12 @@ class Scene:
         *gradients, _ = self.backward(antialiased)
         lazy_adam_step_(*self.columns(), gradients, r.visible_ids, *self.stands(), *self.optimiser, sparse)
 
-    def at_once(self, antialiased, sparse):
+    def at_once(self, antialiased, sparse, means2d_sums=None):
         project_bwd_step_(
             *self.columns(), *self.stands(), *self.optimiser, sparse, self.rows, self.viewmats, self.Ks,
             WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D, antialiased=antialiased, v_means2d=self.v[0],
             v_conics=self.v[1], v_opacities=self.v[2], v_colors=self.v[3], scale_reg=self.scale_reg,
-            returns=self.returns,
+            tables=self.tables, means2d_sums=means2d_sums,
         )  # fmt: skip
 
     def pack(self, width):
@@ -84,27 +84,23 @@ class Scene:
         table[:, :9] = torch.cat(columns, 1)
         self.v = gradient_columns(table)
 
-    def tear(self, width, own_rank=-1, ranks=3):
-        """Replace the gradients by parts from ranks, `width` floats a row; return what they add up to.
-
-        Those from `own_rank` are apart from the others.
-        """
-        rows = len(self.v[0])
+    def spread(self):
+        """Replace the gradients by others, in tables of ranks amid what is of no use; return their sums."""
+        rows, sizes, starts, offset, ranks = len(self.v[0]), [], [5, 0, 900, 1], 16, 4
         masks = torch.randint(0, 2**ranks, (rows,), generator=self.seed) & ~2  # rank 1 had nothing
+        alone = torch.rand(rows, generator=self.seed) < 0.6  # as most rows are
+        masks[alone] = 2 ** (2 * (masks[alone] % 2))
         sizes = [int((masks >> m & 1).sum()) for m in range(ranks)]
-        masks, numbers = masks.to(self.v[0].device), torch.arange(rows, dtype=torch.int32)
-        sent, places = scatter_rows([numbers.to(masks.device)], masks, sizes)
-        table = torch.randn(len(sent), width, generator=self.seed, dtype=torch.float64).to(self.v[0])
-        total = table.new_zeros(rows, 9)
-        for part, group in zip(table.split(sizes), sent.long().split(sizes), strict=True):
-            total[group] += part[:, :9]
-        self.returns = Returns(places, sizes)
-        if own_rank >= 0:
-            part = table.split(sizes)[own_rank]
-            self.returns = Returns(places, sizes, own_rank, torch.nn.functional.pad(part, (0, 3)))
-            part.fill_(torch.nan)
-        self.v = gradient_columns(table)
-        return [column.contiguous() for column in gradient_columns(total)]
+        numbers = torch.arange(rows, dtype=torch.int32, device=self.v[0].device)
+        _, places = scatter_rows([numbers], masks.to(numbers.device), sizes)
+        words = offset + 12 * (max(starts) + max(sizes) + 1)
+        buffers = [torch.full((words,), -1, dtype=torch.int32, device=numbers.device) for _ in sizes]
+        for buffer, start, size in zip(buffers, starts, sizes, strict=True):
+            part = torch.randn(size, 12, generator=self.seed)
+            buffer[offset:][12 * start :][: 12 * size] = part.flatten().to(buffer.device).view(torch.int32)
+        self.tables = RowTables(places, sizes, starts, buffers, offset)
+        self.v = [None] * 4
+        return [column.contiguous() for column in gradient_columns(sum_tables(self.tables, rows))]
 
 
 def compare(a, b, exact):
@@ -146,33 +142,49 @@ def test_equals_backward_and_step(device, sparse, n, k, degree, views):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(
-    "source", [
-        "packed", "odd table", "returned", "returned packed", "returned columns", "returned but own",
-        "returned columns but own",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("width", [10, 12])
 @pytest.mark.parametrize(
     "n,k,degree,views", [(1, 16, 3, 1), (3000, 16, 3, 3), (700, 16, 2, 1), (700, 4, 1, 2), (700, 16, 0, 1)]
 )
-def test_gradients_are_read_where_they_are(device, source, n, k, degree, views):
-    """However the gradients of the rows are laid out: as from columns of their sums."""
+def test_gradients_are_read_where_they_are(device, width, n, k, degree, views):
+    """In the columns of a table: as from columns of their own."""
     plain, other = (Scene(n, k, views, device, torch.float32) for _ in range(2))
     for scene in (plain, other):
         scene.degree = degree
         scene.render(antialiased=False)
-    if source.startswith("returned"):
-        plain.v = other.tear(12 if source == "returned packed" else 9, 2 if "own" in source else -1)
-        if "columns" in source:
-            other.v = [column.contiguous() for column in other.v]
-    else:
-        other.pack(12 if source == "packed" else 10)
-    exact = device == "cpu"
+    other.pack(width)
+    agree(plain, other, device == "cpu")
+
+
+@pytest.mark.cuda
+@needs_cuda
+@pytest.mark.parametrize(
+    "n,k,degree,views",
+    [
+        (1, 16, 3, 1), (3000, 16, 3, 3), (3001, 16, 3, 4), (700, 16, 2, 1), (700, 4, 1, 2), (700, 16, 0, 1),
+        (70, 16, 3, 12), (500, 25, 3, 32),
+    ],
+)  # fmt: skip
+def test_gradients_in_tables_of_ranks(n, k, degree, views):
+    """Read where the ranks left them, some at several: as from columns of their sums."""
+    plain, other = (Scene(n, k, views, "cuda", torch.float32) for _ in range(2))
+    for scene in (plain, other):
+        scene.degree = degree
+        scene.render(antialiased=False)
+    assert n == 1 or len(plain.rows.camera_ids) > 2 * n * views // 3  # more than a warp holds at many views
+    plain.v = other.spread()
+    sums = torch.full_like(plain.rows.means2d, torch.nan)
+    agree(plain, other, False, sums)
+    assert torch.equal(sums, plain.v[0])
+
+
+def agree(plain, other, exact, means2d_sums=None):
+    """Compare backward passes, and steps."""
     for x, y in zip(plain.backward(False, True), other.backward(False, True), strict=True):
         assert len(x) and (torch.equal(x, y) or not exact)
         torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(x.abs().max()))
     plain.at_once(False, False)
-    other.at_once(False, False)
+    other.at_once(False, False, means2d_sums)
     compare(plain, other, exact)
 
 
@@ -213,17 +225,38 @@ def test_errors_name_the_value():
         scene.at_once(False, False)
 
 
-def test_errors_name_what_is_missing_of_returns():
+def test_errors_name_what_is_wrong_with_tables():
     scene = Scene(20, 16, 1, "cpu", torch.float32)
     scene.render(False)
-    scene.tear(9)
-    whole = scene.returns
-    scene.returns = whole._replace(places=whole.places[:, :-1])
-    with pytest.raises(RuntimeError, match=r"places must have shape \[\d+, 3\], got \[\d+, 2\]"):
-        scene.backward(False)
-    scene.returns = whole._replace(group_sizes=[0, 0, 0])
-    with pytest.raises(RuntimeError, match=r"v_means2d must have shape \[0, 2\]"):
+    scene.spread()
+    with pytest.raises(RuntimeError, match="project_bwd_step_: tables of ranks need CUDA"):
         scene.at_once(False, False)
+    scene.render(False)
+    scene.v[1] = None
+    with pytest.raises(RuntimeError, match="gradients of rows must be columns .* or, with places, in tables"):
+        scene.backward(False)
+    scene.render(False)
+    with pytest.raises(RuntimeError, match="means2d_sums needs tables"):
+        scene.at_once(False, False, torch.zeros_like(scene.rows.means2d))
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_errors_name_what_does_not_fit():
+    scene = Scene(20, 16, 1, "cuda", torch.float32)
+    scene.render(False)
+    scene.spread()
+    whole = scene.tables
+    for change, text in (
+        ({"places": whole.places[:, :-1]}, r"places must have shape \[\d+, 4\], got \[\d+, 3\]"),
+        ({"offset": -1}, "offset must lie in the buffers, got -1"),
+        ({"offset": 17}, "tables must lie at a multiple of 16 bytes"),
+        ({"starts": [5, 0, 10_000, 1]}, r"rows \[10000, \d+\) do not fit into the \d+ of rank 2"),
+        ({"buffers": whole.buffers[:3]}, "4 groups need as many buffers and starts, got 3 and 4"),
+    ):
+        scene.tables = whole._replace(**change)
+        with pytest.raises(RuntimeError, match=text):
+            scene.at_once(False, False)
 
 
 def test_opcheck():
@@ -236,10 +269,9 @@ def test_opcheck():
          scene.Ks, scene.rows.camera_ids, scene.rows.visible_ids, scene.rows.row_offsets, WIDTH, HEIGHT, 3,
          EPS2D, False, *scene.v, scene.scale_reg),
     )  # fmt: skip
-    scene.tear(9)
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd,
         (*scene.params, scene.viewmats, scene.Ks, scene.rows.camera_ids, scene.rows.visible_ids,
          scene.rows.row_offsets, WIDTH, HEIGHT, 3, EPS2D, False, True, *scene.v[:2], None, *scene.v[2:],
-         scene.scale_reg, True, *scene.returns),
+         scene.scale_reg, True),
     )  # fmt: skip

@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.ops.scatter import RUN, Returns, gather_rows, scatter_rows, sum_rows
+from blitzgs.ops.scatter import RUN, gather_rows, scatter_rows, sum_rows
 from tests.helpers import DEVICES
 
 RANKS = 3
@@ -60,15 +60,9 @@ def test_sums_follow_the_rows_back(n, device):
     expected = torch.zeros(n, 20)
     for part, group in zip(values.split(sizes), rows.split(sizes), strict=True):
         expected[group] += part
-    got = sum_rows(values.to(device), Returns(places, sizes), n, [2, 0, 17, 1])
+    got = sum_rows(values.to(device), places, sizes, n, [2, 0, 17, 1])
     assert [part.shape[1] for part in got] == [2, 0, 17, 1]
     assert torch.equal(torch.cat(got, 1).cpu(), expected)
-    # One group's values lie elsewhere, with something behind them.
-    parts = list(values.split(sizes))
-    own = torch.nn.functional.pad(parts[1], (0, 3), value=torch.nan).to(device)
-    parts[1] = torch.full_like(parts[1], torch.nan)
-    returns = Returns(places, sizes, 1, own)
-    assert torch.equal(sum_rows(torch.cat(parts).to(device), returns, n, [20])[0].cpu(), expected)
 
 
 def test_doubles_and_strided_columns():
@@ -79,7 +73,7 @@ def test_doubles_and_strided_columns():
     for got, column in zip(gather_rows(packed, data, [2, 2]), data, strict=True):
         assert torch.equal(got, column[[0, 2, 2, 3]])
     values = torch.arange(4, dtype=torch.float64)[:, None]
-    assert sum_rows(values, Returns(places, [2, 2]), 4, [1])[0].squeeze(1).tolist() == [0, 0, 3, 3]
+    assert sum_rows(values, places, [2, 2], 4, [1])[0].squeeze(1).tolist() == [0, 0, 3, 3]
 
 
 def test_errors():
@@ -93,14 +87,9 @@ def test_errors():
     with pytest.raises(RuntimeError, match=r"packed must have shape \[4\], got \[3\]"):
         gather_rows(torch.zeros(3, dtype=torch.int32), [torch.zeros(1, 2)], [1, 1])
     with pytest.raises(RuntimeError, match=r"values must have shape \[3, 1\], got \[2, 1\]"):
-        sum_rows(torch.zeros(2, 1), Returns(torch.zeros(1, 2, dtype=torch.int64), [1, 2]), 4, [1])
-    returns = Returns(torch.zeros(1, 2, dtype=torch.int64), [1, 2], 1, torch.zeros(2, 3))
-    with pytest.raises(RuntimeError, match=r"own must have shape \[1, \*\], got \[2, 3\]"):
-        sum_rows(torch.zeros(3, 4), returns._replace(own_rank=0), 4, [4])
-    with pytest.raises(RuntimeError, match="own must have 4 columns, got 3"):
-        sum_rows(torch.zeros(3, 4), returns, 4, [4])
-    with pytest.raises(RuntimeError, match="own_rank must be one of 2, or -1 without own, got 2"):
-        sum_rows(torch.zeros(3, 4), returns._replace(own_rank=2), 4, [4])
+        sum_rows(torch.zeros(2, 1), torch.zeros(1, 2, dtype=torch.int64), [1, 2], 4, [1])
+    with pytest.raises(RuntimeError, match=r"places must have shape \[1, 2\], got \[1, 3\]"):
+        sum_rows(torch.zeros(3, 1), torch.zeros(1, 3, dtype=torch.int64), [1, 2], 4, [1])
 
 
 def test_opcheck():
@@ -109,4 +98,4 @@ def test_opcheck():
     torch.library.opcheck(ops.scatter_rows, (words, masks, [1, 2]))
     packed, places = ops.scatter_rows(words, masks, [1, 2])
     torch.library.opcheck(ops.gather_rows, (packed, [2, 1], [1, 2]))
-    torch.library.opcheck(ops.sum_rows, (torch.randn(3, 3), places, [1, 2], 0, torch.randn(1, 4), 3, [2, 1]))
+    torch.library.opcheck(ops.sum_rows, (torch.randn(3, 3), places, [1, 2], 3, [2, 1]))
