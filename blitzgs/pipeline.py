@@ -135,7 +135,8 @@ class RowGradients(NamedTuple):
         conics: [P, 3].
         opacities: [P].
         colors: [P, 3].
-        tables: at the ranks that composited the rows; such are valid until the next exchange.
+        tables: at the ranks that composited the rows; such are valid until the next exchange, or the next
+            backward pass of the frame.
     """
 
     means2d: Tensor | None

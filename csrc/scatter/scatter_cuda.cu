@@ -17,8 +17,7 @@ __global__ void __launch_bounds__(kScatterBlock)
     scatter_kernel(const __grid_constant__ ScatterRows rows, const __grid_constant__ RowGroups groups,
                    const __grid_constant__ ScatterTargets targets, const ScatterState state) {
   __shared__ ScatterShared<RANKS> shared;
-  scatter_block<kScatterBlock>(shared, rows, rows.count, {groups.size, nullptr, groups.count}, targets,
-                               state);
+  scatter_block<kScatterBlock>(shared, rows, rows.count, {groups.size, groups.count}, targets, state);
 }
 
 // Block (x, y) copies a part of column y % count of group y / count.

@@ -31,9 +31,9 @@ struct ScatterShared {
   std::int64_t target[RANKS];  // the row of the rank's columns that the block's begin at
 };
 
-// How many rows go to each rank, and the row of its target that they begin at (null: 0).
+// How many rows go to each rank.
 struct ScatterSizes {
-  const std::int64_t *sizes, *starts;
+  const std::int64_t* sizes;
   int n_ranks;
 };
 
@@ -141,7 +141,7 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
     const std::int64_t base = state.take(m, count);
     const std::int64_t room = groups.sizes[m] - base;
     shared.base[m] = static_cast<int>(base);
-    shared.target[m] = base + (groups.starts ? groups.starts[m] : 0);
+    shared.target[m] = base;
     shared.count[m] = room >= count ? count : room > 0 ? static_cast<int>(room) : 0;
   }
   __syncthreads();
