@@ -32,10 +32,11 @@ struct StepRows {
   __device__ void take(Shared& shared, const Own& own, const WarpRows& warp, TripleStage& triple,
                        const Vec3<float>& v_mean, const float4& v_quat, const Vec3<float>& v_scale,
                        float v_opacity) const {
-    StepPack<0, 1> means[3];
-    StepPack<1, 4> quat;
-    StepPack<2, 1> scales[3];
-    StepPack<3, 1> opacity;
+    // Zeros, as the compiler keeps on the stack what lanes without a Gaussian would leave undefined.
+    StepPack<0, 1> means[3]{};
+    StepPack<1, 4> quat{};
+    StepPack<2, 1> scales[3]{};
+    StepPack<3, 1> opacity{};
     load_triples(shared, warp, means);
     load_triples(shared, warp, scales);
     if (warp.id >= 0) {
@@ -59,7 +60,7 @@ struct StepRows {
     const AdamColumn<float>& column = adam.columns[4];
 #pragma unroll 1
     for (int base = 0; base < kPacks; base += kBatch) {
-      StepPack<4, 4> packs[kBatch];
+      StepPack<4, 4> packs[kBatch]{};
 #pragma unroll
       for (int b = 0; b < kBatch; ++b) {
         const int at = (base + b) * 32 + warp.lane, local = at / kPacks;
