@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exchange of a step: projected splats from their owners to the ranks whose tiles they touch, and back.
 
-Each rank projects its own Gaussians. The counting pass of the projection finds where each row will have to
-go, and `read_traffic` shows everyone's counts to all, which is all the host waits for; `send` brings the rows
-there; `send_back` returns their gradients along the same routes, to be added up at the owner, by rank, so
+Each rank projects its own Gaussians. The projection also finds where each row will have to go, and
+`read_traffic` shows everyone's counts to all, which is all the host waits for; `send` brings the rows there;
+`send_back` returns their gradients along the same routes, to be added up at the owner, by rank, so
 that the sum does not depend on who was faster (paper §3.1). `exchange` is the differentiable form for use
 with autograd, `plan_route` for rows that are there already.
 

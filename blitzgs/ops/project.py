@@ -212,7 +212,7 @@ def _(
     visible_ids: Tensor,
     *rest: Any,
 ) -> Any:
-    dense = any(rest[18:])
+    dense = any(rest[19:])
     length = (means if dense else visible_ids).shape[0]
     return (
         means.new_empty(length, 3),

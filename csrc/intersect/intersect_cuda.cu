@@ -51,10 +51,10 @@ __global__ void count_kernel(const Input in, std::int32_t* counts) {
 
 // Writes the entries of a warp's rows, a row a lane, from `turn` on; start: of the lane's row behind `turn`.
 template <class Key>
-__device__ __forceinline__ void write_entries(const Input& in, std::int32_t row, const Touched& touched,
-                                              std::int32_t start, std::int64_t turn, std::int64_t capacity,
-                                              Key* keys, std::int32_t* entries, const TileDigits& digits,
-                                              std::uint32_t* counts) {
+__device__ __forceinline__ void write_entries(const Input& in, const Touched* all_touched, std::int32_t row,
+                                              const Touched& touched, std::int32_t start, std::int64_t turn,
+                                              std::int64_t capacity, Key* keys, std::int32_t* entries,
+                                              const TileDigits& digits, std::uint32_t* counts) {
   const int lane = threadIdx.x % 32;
   // Of compact rows each lane writes every 32nd entry, whosever it is.
   const std::int32_t count = touched.compact() ? touched.count() : 0;
@@ -83,7 +83,20 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t row,
     const int source = __ffs(left) - 1;
     const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
     std::int64_t at = turn + __shfl_sync(kFullWarp, start, source);
-    for_each_owned(in.grid, load_splat(in, of_row), [&](const Owned& owned) {
+    Splat splat = load_splat(in, of_row);
+    splat.opacity = __shfl_sync(kFullWarp, splat.opacity, 0);  // the same for all lanes, if it changes now
+    if (splat.opacity == 0.f) {
+      // Its owner has hidden the row since it was counted (project_colors_to_ranks). Nothing will be
+      // composited of its entries, so they may be any tile's, but there they must be.
+      const std::int32_t counted = all_touched[of_row].count();
+      for (int k = lane; k < counted && at + k < capacity; k += 32) {
+        keys[at + k] = 0;
+        entries[at + k] = of_row;
+        digits.count(0, counts);
+      }
+      continue;
+    }
+    for_each_owned(in.grid, splat, [&](const Owned& owned) {
       const int n = owned.last - owned.first;
       for (int k = lane; k < n && at + k < capacity; k += 32) {
         keys[at + k] = static_cast<Key>(owned.first + k);
@@ -138,8 +151,8 @@ __global__ void __launch_bounds__(kThreads, 4)
 
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
-    write_entries(in, row[k], touched[k], start[k], before + turn[k], capacity, keys, entries, digits,
-                  counts);
+    write_entries(in, all_touched, row[k], touched[k], start[k], before + turn[k], capacity, keys, entries,
+                  digits, counts);
   }
   __syncthreads();
   add_counts(counts, digits.passes * TileDigits::kBins, histograms);

@@ -65,6 +65,11 @@ std::vector<Tensor> project_rows_to_peers(const Tensor& means, const Tensor& qua
   cuda::project_colors(f.inputs<float>(), ids, room, values, second, true);
   sent.hold(second);
   cuda::project_colors_to_ranks(values, scatter, second);
+  // Contiguous copies end with this call: what takes their memory has to wait.
+  const auto copied = [](const Tensor& given) { return !given.is_contiguous(); };
+  if (copied(means) || (sh && copied(*sh)) || copied(viewmats) || copied(Ks)) {
+    cuda::StreamPoint(second).hold(scope.stream);
+  }
   return {places, admitted};
 }
 
