@@ -27,7 +27,8 @@ class RunningSum {
   // zeros: one for each block and one more.
   explicit RunningSum(std::uint64_t* zeros) : turn_(zeros), states_(zeros + 1) {}
 
-  // The block's number; called once by all its threads, and a barrier for them.
+  // The block's number; called by all its threads, and a barrier for them. Once, or again when what is before
+  // the last number is known: a block that does so stands for several.
   __device__ int take_turn() const {
     __shared__ int turn;
     if (threadIdx.x == 0) turn = static_cast<int>(Word(*turn_).fetch_add(1, ::cuda::memory_order_relaxed));

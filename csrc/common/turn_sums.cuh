@@ -6,9 +6,10 @@
 namespace blitzgs::cuda {
 
 // Each turn has a sum in [0, 2^62). The first block to ask gets no turn: a warp of it adds the sums up, in
-// order, for all others, each of which looks at a single word. (Where all look back themselves, as in
-// RunningSum, small turns wait for that alone.) Turns are numbered as they are asked for, so whoever waits
-// for those before waits for blocks that run.
+// order, for all others, each of which looks at a single word. That takes longer than looking back as with
+// RunningSum, but nothing of the blocks' time while they have something else to do between publishing and
+// asking. Turns are numbered as they are asked for, so whoever waits for those before waits for blocks that
+// run.
 class TurnSums {
  public:
   // zeros: one for each turn and one more.

@@ -22,20 +22,23 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
   __shared__ TripleStage triples[kColorThreads / 32];
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
-  const std::int64_t n_rows = fitting(room).rows, step = gridDim.x * std::int64_t{kColorThreads};
-  std::int64_t begin = blockIdx.x * std::int64_t{kColorThreads};
-  if (begin >= n_rows) return;
+  const std::int64_t n_rows = fitting(room).rows, step = gridDim.x * std::int64_t{kRowsOfBlock};
+  const std::int64_t of_block = blockIdx.x * std::int64_t{kRowsOfBlock};
+  if (of_block >= n_rows) return;
   load_cameras(in, cameras);
   __syncthreads();
-  for (; begin < n_rows; begin += step) {
-    const std::int64_t i = begin + threadIdx.x;
-    const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
-    int sh_slot = 0;
-    if constexpr (QUADS) sh_slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
-    const int view = id < 0 ? 0 : ids.camera_ids[i];
-    const Vec3<float> mean = triples[warp].gather(in.means, id, lane);
-    emit_color<DEGREE, QUADS>(in, cameras[view], mean, stage, sh_slot, out, i, id);
-    __syncwarp();
+  for (std::int64_t begin = of_block; begin < n_rows; begin += step) {
+#pragma unroll 1
+    for (int first = 0; first < kRowsOfBlock; first += kColorThreads) {
+      const std::int64_t i = begin + first + threadIdx.x;
+      const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
+      int sh_slot = 0;
+      if constexpr (QUADS) sh_slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
+      const int view = id < 0 ? 0 : ids.camera_ids[i];
+      const Vec3<float> mean = triples[warp].gather(in.means, id, lane);
+      emit_color<DEGREE, QUADS>(in, cameras[view], mean, stage, sh_slot, out, i, id);
+      __syncwarp();
+    }
   }
 }
 

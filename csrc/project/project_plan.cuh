@@ -32,7 +32,7 @@ __host__ __device__ inline int projected_at_once(int n_views) {
   return n_views > kMostPairs / kRowThreads ? kMostPairs / n_views : kRowThreads;
 }
 
-// For TurnSums of so many turns.
+// For a RunningSum over so many turns, or their TurnSums.
 inline std::uint64_t* turn_zeros(std::int64_t turns, Workspace& workspace, CudaStream stream) {
   const std::int64_t count = turns + 1;
   auto* zeros = workspace.allocate<std::uint64_t>(count);

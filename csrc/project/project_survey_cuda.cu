@@ -51,30 +51,26 @@ __device__ void quick_views(const Inputs& in, std::int64_t n_candidates, const F
 // A block takes candidates turn by turn; those that some view may see are listed behind those of the turns
 // before.
 __global__ void __launch_bounds__(kSurveyThreads, kBlocksPerMultiprocessor)
-    survey_kernel(const Inputs in, const Plan plan, const TurnSums turns) {
+    survey_kernel(const Inputs in, const Plan plan, const RunningSum before) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ Frustum frusta[kMaxViews];
   __shared__ std::uint32_t left_views[kWarps][kMostOfWarp];
   __shared__ std::int32_t left_ids[kWarps][kMostOfWarp];
-  __shared__ int left[kWarps], next_turn;
-  __shared__ std::int64_t base;
+  __shared__ int left[kWarps];
   const std::int64_t n_candidates = candidates_of(in);
   const int at_once = surveyed_at_once(n_candidates), of_warp = at_once / kWarps;
-  const int n_turns = static_cast<int>((n_candidates + at_once - 1) / at_once);
+  const std::int64_t n_turns = (n_candidates + at_once - 1) / at_once;
   if (blockIdx.x == 0 && threadIdx.x == 0 && n_turns == 0) *plan.count = 0;
-  if (static_cast<int>(blockIdx.x) > n_turns) return;
+  if (blockIdx.x >= n_turns) return;
   load_cameras(in, cameras);
   __syncthreads();
   for (int view = threadIdx.x; view < in.n_views; view += kSurveyThreads)
     frusta[view] = make_frustum(cameras[view], in.options);
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const unsigned below = (1u << lane) - 1u;
-  int turn = turns.first();
-  if (turn < 0) {
-    if (warp == 0) turns.add_up(n_turns);
-    return;
-  }
-  for (; turn < n_turns; turn = next_turn) {
+  for (;;) {
+    const int turn = before.take_turn();
+    if (turn >= n_turns) return;
     const std::int64_t first = turn * std::int64_t{at_once} + warp * of_warp;
     int n_left = 0;
     for (int batch = 0; batch < of_warp; batch += 32 * kSurveyBatch) {
@@ -100,20 +96,12 @@ __global__ void __launch_bounds__(kSurveyThreads, kBlocksPerMultiprocessor)
       if (other < warp) at += left[other];
       of_block += left[other];
     }
-    int next = 0;
-    if (threadIdx.x == 0) {
-      turns.publish(turn, of_block);
-      base = turns.before(turn);
-      next = turns.next();
-      if (turn == n_turns - 1) *plan.count = base + of_block;
-    }
-    __syncthreads();
+    const std::int64_t base = before.sum_before<kSurveyThreads>(turn, of_block);
+    if (turn == n_turns - 1 && threadIdx.x == 0) *plan.count = base + of_block;
     for (int i = lane; i < n_left; i += 32) {
       plan.views[base + at + i] = left_views[warp][i];
       plan.ids[base + at + i] = left_ids[warp][i];
     }
-    if (threadIdx.x == 0) next_turn = next;
-    __syncthreads();
   }
 }
 
@@ -131,9 +119,9 @@ void project_survey(const Inputs& in, void* plan_memory, Workspace& workspace, C
     check(cudaMemsetAsync(plan.count, 0, sizeof(*plan.count), stream), "project_survey");
     return;
   }
-  const std::int64_t blocks = std::min<std::int64_t>(1 + turns, kBlocksPerMultiprocessor * multiprocessors());
-  survey_kernel<<<static_cast<unsigned>(blocks), kSurveyThreads, 0, stream>>>(
-      in, plan, TurnSums(turn_zeros(turns, workspace, stream)));
+  const std::int64_t blocks = std::min<std::int64_t>(turns, kBlocksPerMultiprocessor * multiprocessors());
+  auto* zeros = turn_zeros(turns, workspace, stream);
+  survey_kernel<<<static_cast<unsigned>(blocks), kSurveyThreads, 0, stream>>>(in, plan, RunningSum(zeros));
   check_launch("project_survey");
 }
 
