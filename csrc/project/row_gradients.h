@@ -28,6 +28,13 @@ struct ProjectRowGradients {
 struct PackedRowGradients {
   struct alignas(16) Row {
     float mean2d[2], conic[3], opacity, color[3], unused[3];
+
+    BLITZGS_HD void add(const Row& v) {
+      for (int i = 0; i < 2; ++i) mean2d[i] += v.mean2d[i];
+      for (int i = 0; i < 3; ++i) conic[i] += v.conic[i];
+      opacity += v.opacity;
+      for (int i = 0; i < 3; ++i) color[i] += v.color[i];
+    }
   };
   const Row* rows;
 
@@ -68,10 +75,7 @@ struct TableRowGradients {
       const Row* row = at(m, r);
       if (!row) continue;
       const Row v = *row;
-      for (int i = 0; i < 2; ++i) sum.mean2d[i] += v.mean2d[i];
-      for (int i = 0; i < 3; ++i) sum.conic[i] += v.conic[i];
-      sum.opacity += v.opacity;
-      for (int i = 0; i < 3; ++i) sum.color[i] += v.color[i];
+      sum.add(v);
     }
     return sum;
   }

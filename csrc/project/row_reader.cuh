@@ -131,7 +131,7 @@ class RowReader<TableRowGradients> {
           if (found == nothing()) {
             found = at;
           } else {
-            add(stage()[found], stage()[at]);
+            stage()[found].add(stage()[at]);
           }
         }
         index()[r - first] = static_cast<std::uint8_t>(found);
@@ -166,12 +166,6 @@ class RowReader<TableRowGradients> {
   };
 
   static __device__ __forceinline__ int lane() { return static_cast<int>(threadIdx.x) % 32; }
-  static __device__ __forceinline__ void add(Row& sum, const Row& v) {
-    for (int i = 0; i < 2; ++i) sum.mean2d[i] += v.mean2d[i];
-    for (int i = 0; i < 3; ++i) sum.conic[i] += v.conic[i];
-    sum.opacity += v.opacity;
-    for (int i = 0; i < 3; ++i) sum.color[i] += v.color[i];
-  }
   // The runs that rows [begin, end) touch, by ranks.
   __device__ __forceinline__ int n_segments(std::int32_t begin, std::int32_t end) const {
     return begin == end ? 0 : ((end - 1) / kPlaceRows - begin / kPlaceRows + 1) * source_.n_ranks;
