@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Every op of BlitzGS, one readable list. N Gaussians, B views, P projected rows (a Gaussian in a view), U
 // Gaussians visible in at least one view, I row-tile intersections, D channels, K = (degree + 1)^2 SH
-// coefficients. Contracts: csrc/<op>/<op>.h; Python functions, fake kernels and autograd:
-// blitzgs/ops/<op>.py.
+// coefficients. An argument n_rows, int64 [1]: only the first of the P rows are there. Contracts:
+// csrc/<op>/<op>.h; Python functions, fake kernels and autograd: blitzgs/ops/<op>.py.
 #include <torch/csrc/stable/library.h>
 
 STABLE_TORCH_LIBRARY(blitzgs, m) {
@@ -71,7 +71,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor depths, Tensor camera_ids, "
       "Tensor? ids, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
-      "int n_isects) -> (Tensor isect_rows, Tensor tile_offsets)");
+      "int n_isects, Tensor? n_rows=None) -> (Tensor isect_rows, Tensor tile_offsets)");
 
   // Which ranks a row has to be sent to.
   m.def(
@@ -96,15 +96,15 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "backgrounds, "
       "Tensor isect_rows, Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, "
       "int tile_begin, int tile_end, Tensor? means2d_abs=None, bool clear_rest=True, "
-      "bool backward_follows=False) -> (Tensor renders, Tensor transmittances, Tensor last_ids, "
-      "Tensor tile_work, Tensor aux, Tensor row_gradients)");
+      "bool backward_follows=False, Tensor? n_rows=None) -> (Tensor renders, Tensor transmittances, "
+      "Tensor last_ids, Tensor tile_work, Tensor aux, Tensor row_gradients)");
   // The same for a backward pass that adds up gradients in `packed`, which is zeroed; pixels that nobody owns
   // are left as they are (CUDA).
   m.def(
       "rasterize_fwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
       "backgrounds, Tensor isect_rows, Tensor tile_offsets, int n_cameras, int width, int height, "
-      "int tile_size, int tile_begin, int tile_end, Tensor(a!) packed) -> (Tensor renders, "
-      "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor aux)");
+      "int tile_size, int tile_begin, int tile_end, Tensor(a!) packed, Tensor? n_rows=None) -> ("
+      "Tensor renders, Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor aux)");
   m.def(
       "rasterize_bwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
       "backgrounds, "

@@ -29,6 +29,7 @@ def intersect(
     tile_begin: int = 0,
     tile_end: int = -1,
     n_isects: int = -1,
+    n_rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """List, for every tile of every view, the rows that touch it, ordered by (depth, id).
 
@@ -50,7 +51,10 @@ def intersect(
         tile_begin: first owned tile; tiles outside [tile_begin, tile_end) get empty lists.
         tile_end: end of the owned tiles, -1 for all.
         n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``),
-            -1 to have them counted.
+            -1 to have them counted. Where there are more, CUDA lists the first so many, by depth.
+        n_rows: int64 [1] on the device of the rows: only the first so many of the P rows are there, the
+            others are never read. It lets CUDA be queued before the host knows the number. None: all; a
+            number that is not in [0, P] counts as 0.
 
     Returns:
         ``isect_rows`` int32 [I] row indices and ``tile_offsets`` int64 [B * T + 1]: tile t composites
@@ -58,12 +62,12 @@ def intersect(
         past ``tile_offsets[-1]`` mean nothing.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, a tile range outside the image, 2^31 rows or tiles or more, or
-            (CPU) more intersections than ``n_isects``.
+        RuntimeError: wrong shapes, dtypes or devices, a tile range outside the image, 2^31 rows or tiles or
+            more, or (CPU) more intersections than ``n_isects``.
     """
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         means2d, conics, row_opacities, depths, camera_ids, ids, n_cameras, width, height, tile_size,
-        tile_begin, tile_end, n_isects,
+        tile_begin, tile_end, n_isects, n_rows,
     )  # fmt: skip
     return isect_rows, tile_offsets
 
@@ -83,6 +87,7 @@ def _(
     tile_begin: int,
     tile_end: int,
     n_isects: int,
+    n_rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     tiles_x, tiles_y = tile_counts(width, height, tile_size)
     size = n_isects if n_isects >= 0 else torch.library.get_ctx().new_dynamic_size()

@@ -146,6 +146,7 @@ def _(
     means2d_abs: Tensor | None = None,
     clear_rest: bool = True,
     backward_follows: bool = False,
+    n_rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     pixels = (n_cameras, height, width)
     aux_size = torch.library.get_ctx().new_dynamic_size()  # each backend's own business
@@ -214,7 +215,7 @@ def _backward(
 ) -> tuple[Tensor | None, ...]:
     v_alphas = None if v_transmittances is None else -v_transmittances
     *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas)
-    return (*splat_gradients, *(None,) * 8, v_abs, None, None)
+    return (*splat_gradients, *(None,) * 8, v_abs, None, None, None)
 
 
 def _gradients(

@@ -63,15 +63,15 @@ struct DepthDigits {
 
 // The range of the depths by block, and zeros for the kernels that follow: one launch before all others.
 __global__ void __launch_bounds__(kRangeThreads)
-    range_kernel(const float* depths, std::int64_t n, DepthRange* ranges, uint4* zeros,
-                 std::int64_t n_zeros) {
+    range_kernel(const IntersectInput<float> in, DepthRange* ranges, uint4* zeros, std::int64_t n_zeros) {
   wait_for_earlier_kernels();
+  const std::int64_t n = rows_there(in);
   constexpr std::int64_t kStep = kRangeBlocks * kRangeThreads;
   const std::int64_t thread = blockIdx.x * static_cast<std::int64_t>(kRangeThreads) + threadIdx.x;
   DepthRange range{0xffffffffu, 0u};
 #pragma unroll 8
   for (std::int64_t i = thread; i < n; i += kStep) {
-    const std::uint32_t bits = ordered_bits(depths[i]);
+    const std::uint32_t bits = ordered_bits(in.depths[i]);
     range = {min(range.low, bits), max(range.high, bits)};
   }
   for (std::int64_t i = thread; i < n_zeros; i += kStep) zeros[i] = uint4{};
@@ -87,17 +87,17 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
   __shared__ std::uint32_t counts[kDepthPasses][kDepthBins];
   for (int bin = threadIdx.x; bin < kDepthPasses * kDepthBins; bin += kDepthThreads) counts[0][bin] = 0;
   wait_for_earlier_kernels();
+  // Less than 2^31; a 64-bit loop takes registers that are not there.
+  const auto n = static_cast<std::uint32_t>(rows_there(in));
   const DepthRange range = ranges[threadIdx.x].of_block<kDepthThreads>();  // and a barrier
   const DepthDigits digits(range, in.grid.n_cameras);
   if (blockIdx.x == 0 && threadIdx.x == 0) {
     *dropped_bits = digits.dropped;
     *width = digits.width;
-    *n_rows = in.n_rows;
+    *n_rows = n;
   }
-  const std::int64_t step = static_cast<std::int64_t>(gridDim.x) * kDepthThreads;
 #pragma unroll 1
-  for (std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kDepthThreads) + threadIdx.x; i < in.n_rows;
-       i += step) {
+  for (std::uint32_t i = blockIdx.x * kDepthThreads + threadIdx.x; i < n; i += gridDim.x * kDepthThreads) {
     const float depth = in.depths[i];
     const Splat splat = load_splat(in, i);
     const std::uint32_t key = digits.key(ordered_bits(depth) - range.low, splat.camera);
@@ -147,11 +147,12 @@ struct RowOrder {
 
 // Orders each run of equal keys: a thread the usual handful, its block the others, one by one.
 __global__ void __launch_bounds__(kDepthThreads)
-    order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows, std::int64_t n, RowOrder order,
-                      const int* dropped_bits) {
+    order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows, const std::int64_t* n_rows,
+                      RowOrder order, const int* dropped_bits) {
   __shared__ std::int64_t long_runs[kTieRows / kShortRun + 1];
   __shared__ int n_long;
   wait_for_earlier_kernels();
+  const std::int64_t n = *n_rows;
   if (*dropped_bits == 0) {
     if (!order.ids) return;  // the passes kept equal depths in the order of rows
     order.depths = nullptr;

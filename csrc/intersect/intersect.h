@@ -10,9 +10,12 @@
 //   tile t's list is isect_rows[tile_offsets[t] .. tile_offsets[t + 1]). Tiles that grid does not own have
 //   empty lists.
 //
-// capacity is the length of isect_rows and at least the true count; entries from tile_offsets[B*T] on are
-// left unspecified. The CPU kernel returns the true count and writes no list when it exceeds the capacity
-// (the op then fails with both numbers); the CUDA kernel may trust the capacity.
+// known_rows: null, or how many of the rows are there (common/row_count.h; CUDA alone).
+//
+// capacity is the length of isect_rows; entries from tile_offsets[B*T] on are left unspecified. Where there
+// are more entries than that, the CPU kernel returns their number and writes no list (the op then fails with
+// both numbers); the CUDA kernel, which nobody waits for, lists the first in depth order, and what it writes
+// is consistent.
 //
 // Deterministic: the lists depend on the rows alone, never on threads. Row order need not follow depth.
 // O(P) for the radix sort, O(tile rows) for the tests, O(I) to write. Counts are 64-bit; P and
@@ -20,6 +23,7 @@
 #pragma once
 #include <cstdint>
 
+#include "common/row_count.h"
 #include "common/stream.h"
 #include "math/tiles.h"
 
@@ -35,6 +39,7 @@ struct IntersectInput {
   const std::int64_t* ids;
   std::int64_t n_rows;
   TileGrid grid;
+  const std::int64_t* known_rows = nullptr;
 };
 
 namespace cpu {

@@ -46,7 +46,8 @@ struct TileDigits {
 
 __global__ void count_kernel(const Input in, std::int32_t* counts) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
-  if (i < in.n_rows) counts[i] = find_touched(in.grid, load_splat(in, i)).count();
+  if (i >= in.n_rows) return;
+  counts[i] = i < rows_there(in) ? find_touched(in.grid, load_splat(in, i)).count() : 0;
 }
 
 // Writes the entries of a warp's rows, a row a lane, from `turn` on; start: of the lane's row behind `turn`.
@@ -112,20 +113,23 @@ __device__ __forceinline__ void write_entries(const Input& in, const Touched* al
 // each, a warp 32 times kEmitItems of them in a row.
 template <class Key>
 __global__ void __launch_bounds__(kThreads, 4)
-    emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows, RunningSum running,
-                std::int64_t capacity, TileDigits digits, Key* keys, std::int32_t* entries,
-                std::uint64_t* histograms, std::int64_t* n_entries) {
+    emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows,
+                const std::int64_t* n_rows, RunningSum running, std::int64_t capacity, TileDigits digits,
+                Key* keys, std::int32_t* entries, std::uint64_t* histograms, std::int64_t* n_entries) {
   __shared__ std::int64_t warp_sums[kThreads / 32];
   __shared__ std::uint32_t counts[TileDigits::kMost * TileDigits::kBins];
   for (int bin = threadIdx.x; bin < digits.passes * TileDigits::kBins; bin += kThreads) counts[bin] = 0;
   wait_for_earlier_kernels();
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const std::int64_t n = *n_rows;
   const int block = running.take_turn();
-  const std::int64_t first = static_cast<std::int64_t>(block) * kEmitRows + warp * (32 * kEmitItems) + lane;
+  const std::int64_t begin = static_cast<std::int64_t>(block) * kEmitRows, end = begin + kEmitRows;
+  if (begin >= n) return;
+  const std::int64_t first = begin + warp * (32 * kEmitItems) + lane;
   std::int32_t row[kEmitItems];
   Touched touched[kEmitItems];
 #pragma unroll
-  for (int k = 0; k < kEmitItems; ++k) row[k] = first + 32 * k < in.n_rows ? rows[first + 32 * k] : -1;
+  for (int k = 0; k < kEmitItems; ++k) row[k] = first + 32 * k < n ? rows[first + 32 * k] : -1;
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) touched[k] = row[k] >= 0 ? all_touched[row[k]] : Touched{};
 
@@ -146,7 +150,7 @@ __global__ void __launch_bounds__(kThreads, 4)
     sum += warp_sums[i];
   }
   const std::int64_t earlier = running.sum_before<kThreads>(block, sum);
-  if (threadIdx.x == 0 && block == static_cast<int>(gridDim.x) - 1) *n_entries = min(earlier + sum, capacity);
+  if (threadIdx.x == 0 && end >= n) *n_entries = min(earlier + sum, capacity);
   before += earlier;
 
 #pragma unroll
@@ -236,8 +240,8 @@ DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Work
       allocate_arrays<Touched, std::uint32_t, std::uint32_t, std::int32_t, std::int32_t>(n, workspace);
   std::uint32_t* const keys[] = {keys_0, keys_1};
   std::int32_t* const rows[] = {rows_0, rows_1};
-  launch_early("intersect", range_kernel, {kRangeBlocks, kRangeThreads, stream}, in.depths, n,
-               counters.ranges, counters.begin, counters.n_zeros);
+  launch_early("intersect", range_kernel, {kRangeBlocks, kRangeThreads, stream}, in, counters.ranges,
+               counters.begin, counters.n_zeros);
   const unsigned blocks =
       std::min(blocks_for(n, kDepthThreads), static_cast<unsigned>(kDepthBlocks * multiprocessors()));
   launch_early("intersect", depth_keys_kernel, {blocks, kDepthThreads, stream}, in, counters.ranges, keys[0],
@@ -253,7 +257,7 @@ DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Work
                       counters.depth_blocks, stream);
   }
   launch_early("intersect", order_ties_kernel, {blocks_for(n, kTieRows), kDepthThreads, stream}, keys[from],
-               rows[from], n, {in.depths, in.ids}, counters.dropped_bits);
+               rows[from], counters.n_rows, {in.depths, in.ids}, counters.dropped_bits);
   return {touched, rows[from]};
 }
 
@@ -269,8 +273,8 @@ void list_rows(const Input& in, std::int64_t capacity, std::int32_t* isect_rows,
   const bool even = digits.passes % 2 == 0;
   std::int32_t* const entries[] = {even ? isect_rows : unsorted, even ? unsorted : isect_rows};
   launch_early("intersect", emit_kernel<Key>, {counters.emit_blocks, kThreads, stream}, in, order.touched,
-               order.rows, RunningSum(counters.running), capacity, digits, keys[0], entries[0],
-               counters.tile_histograms, counters.n_entries);
+               order.rows, counters.n_rows, RunningSum(counters.running), capacity, digits, keys[0],
+               entries[0], counters.tile_histograms, counters.n_entries);
   int from = 0;
   for (int pass = 0; pass < digits.passes; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * TileDigits::kBins;

@@ -6,6 +6,7 @@
 #include <tuple>
 
 #include "common/op.h"
+#include "common/row_count_op.h"
 #include "common/tile_grid_op.h"
 
 namespace blitzgs {
@@ -15,7 +16,8 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
                                      const Tensor& depths, const Tensor& camera_ids,
                                      const std::optional<Tensor>& ids, std::int64_t n_cameras,
                                      std::int64_t width, std::int64_t height, std::int64_t tile_size,
-                                     std::int64_t tile_begin, std::int64_t tile_end, std::int64_t n_isects) {
+                                     std::int64_t tile_begin, std::int64_t tile_end, std::int64_t n_isects,
+                                     const std::optional<Tensor>& known_rows) {
   constexpr const char* kOp = "intersect";
   check_floating(kOp, "means2d", means2d);
   const std::int64_t n_rows = means2d.size(0);
@@ -33,6 +35,7 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
     check_shape(kOp, "ids", *ids, {n_rows});
     check_dtype(kOp, "ids", *ids, ScalarType::Long);
   }
+  const RowCount row_count = checked_row_count(kOp, known_rows, means2d);
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   STD_TORCH_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(),
                   "blitzgs::intersect: tile numbers are 32-bit, got ", grid.count(),
@@ -57,8 +60,9 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
                                data<T>(order),
                                data<std::int32_t>(cameras),
                                data_or_null<std::int64_t>(id_rows),
-                               n_rows,
-                               grid};
+                               row_count.n_rows,
+                               grid,
+                               row_count.known_rows};
     const std::int64_t capacity =
         n_isects >= 0 ? n_isects : backend::count_intersections(in, scope.workspace, scope.stream);
     std::int64_t count = 0;

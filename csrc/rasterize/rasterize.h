@@ -27,11 +27,16 @@
 // background is sum over pixels of v_renders * T, left to the caller. Rows in no list get zeros. v_renders
 // of unowned tiles are not read.
 //
+// Forward may be queued with room for more rows than there are (known_rows, common/row_count.h; CUDA alone):
+// it packs, and zeroes gradients of, those that are there; gradients behind them are unspecified. Backward
+// may then be given just these rows.
+//
 // The CPU gradient is bitwise repeatable for any number of threads: one partial sum per (row, tile), added in
 // the order of the tiles. CUDA: when deterministic is set. O(entries processed x pixels of the splat).
 #pragma once
 #include <cstdint>
 
+#include "common/row_count.h"
 #include "common/stream.h"
 #include "math/tiles.h"
 
@@ -49,6 +54,7 @@ struct RasterizeInput {
   std::int64_t n_rows;
   int n_channels;
   TileGrid grid;
+  const std::int64_t* known_rows = nullptr;
 };
 
 template <class T>
@@ -84,8 +90,8 @@ struct RasterizeGradients {
 inline constexpr std::int64_t kPackedGradient = 12;
 
 // The backend's own memory between forward and backward, 64-byte aligned. Its size, rasterize_aux_bytes(),
-// depends on shapes, not on values on the device; it fits the backward pass of a grid if a forward pass over
-// these tiles, or more of them, can have left it.
+// depends on shapes, not on values on the device; it fits the backward pass of rows and a grid if a forward
+// pass with room for these rows, or more, over these tiles, or more of them, can have left it.
 struct RasterizeAux {
   const void* data;
   std::int64_t bytes;

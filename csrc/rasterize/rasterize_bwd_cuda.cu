@@ -10,6 +10,7 @@
 #include <string>
 
 #include "common/launch.cuh"
+#include "rasterize/aux_layout.cuh"
 #include "rasterize/backward_pixel.cuh"
 #include "rasterize/row_entries.cuh"
 #include "rasterize/unpack_gradients.cuh"
@@ -263,11 +264,11 @@ class PackedRows {
              const RasterizeAux& aux, bool deterministic, Workspace& workspace, CudaStream stream)
       : in_(in),
         saved_(saved),
-        aux_(aux.data),
+        layout_(in.grid, in.n_channels, aux.bytes),
+        aux_(const_cast<void*>(aux.data)),
         n_isects_(n_isects),
         stream_(stream),
-        empty_(n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin),
-        order_(order_in(aux, in)) {
+        empty_(n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin) {
     check_supported(in);
     if (empty_ || !deterministic) return;
     entries_ = static_cast<PackedGradient*>(workspace.allocate_bytes(n_isects * sizeof(PackedGradient)));
@@ -275,7 +276,7 @@ class PackedRows {
   }
 
   ChannelChunk chunk(int first) const {
-    return {in_.n_channels <= 4 ? aux_colors(aux_, in_.n_rows) : nullptr, in_.colors, in_.n_channels, first,
+    return {layout_.colors(aux_, in_.n_channels), in_.colors, in_.n_channels, first,
             std::min(4, in_.n_channels - first)};
   }
 
@@ -285,8 +286,16 @@ class PackedRows {
     if (entries_) {
       check(cudaMemsetAsync(entries_, 0, n_isects_ * sizeof(PackedGradient), stream_), "rasterize_bwd");
     }
-    const BackwardArguments args{aux_rows(aux_), chunk,  in_.backgrounds, in_.isect_rows, in_.tile_offsets,
-                                 in_.grid,       order_, saved_,          packed,         entries_};
+    const BackwardArguments args{layout_.rows(aux_),
+                                 chunk,
+                                 in_.backgrounds,
+                                 in_.isect_rows,
+                                 in_.tile_offsets,
+                                 in_.grid,
+                                 layout_.order(in_.grid, aux_),
+                                 saved_,
+                                 packed,
+                                 entries_};
     if (in_.grid.tile_size == 8) {
       dispatch_backward<8>(args, absolute, stream_);
     } else if (in_.grid.tile_size == 16) {
@@ -301,18 +310,13 @@ class PackedRows {
   }
 
  private:
-  static TileOrder order_in(const RasterizeAux& aux, const RasterizeInput<float>& in) {
-    const std::int64_t begin = aux_order_begin(in.n_rows, in.n_channels);
-    return {in.grid, static_cast<char*>(const_cast<void*>(aux.data)) + begin, aux.bytes - begin};
-  }
-
   const RasterizeInput<float>& in_;
   const RasterizeSaved<float>& saved_;
-  const void* aux_;
+  AuxLayout layout_;
+  void* aux_;  // not written
   std::int64_t n_isects_;
   CudaStream stream_;
   bool empty_;
-  TileOrder order_;  // as forward left it
   EntriesByRow sorted_{};
   PackedGradient* entries_ = nullptr;
 };

@@ -207,7 +207,7 @@ std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, int) {
 }
 
 bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes) {
-  return bytes == rasterize_aux_bytes(grid, n_rows, n_channels);
+  return bytes >= rasterize_aux_bytes(grid, n_rows, n_channels);
 }
 
 template <class T>

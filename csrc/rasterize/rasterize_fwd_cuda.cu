@@ -3,7 +3,7 @@
 #include <string>
 
 #include "common/launch.cuh"
-#include "rasterize/tile_batch.cuh"
+#include "rasterize/aux_layout.cuh"
 
 namespace blitzgs::cuda {
 
@@ -20,7 +20,8 @@ struct ForwardArguments {
   TileGrid grid;
   TileOrder order;
   RasterizeOutput<float> out;
-  std::int64_t quads, quads_per_block;  // of out.row_gradients, to be zeroed on the way
+  std::int64_t zero_rows, rows_per_block;  // of out.row_gradients, to be zeroed on the way
+  const std::int64_t* known_rows;          // null, or how many of these rows are there
 };
 
 __device__ __forceinline__ PackedRow pack_row(const RasterizeInput<float>& in, std::int64_t i) {
@@ -48,20 +49,21 @@ __global__ void prepare_kernel(RasterizeInput<float> in, PackedRow* rows, float4
     order.add(in.tile_offsets, static_cast<int>((blockIdx.x - pack_blocks) * kPackThreads + threadIdx.x));
     return;
   }
+  const std::int64_t n = rows_there(in);
   __shared__ PackedRow stages[kPackThreads];
   const PackedRow* stage = stages + threadIdx.x / 32 * 32;
   const int lane = threadIdx.x % 32;
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kPackThreads) + threadIdx.x;
-  if (i < in.n_rows) stages[threadIdx.x] = pack_row(in, i);
+  if (i < n) stages[threadIdx.x] = pack_row(in, i);
   __syncwarp();
 #pragma unroll
   for (int k = 0; k < 2; ++k) {
     const std::int64_t at = 2 * (i - lane) + 32 * k + lane;
-    if (at < 2 * in.n_rows) {
+    if (at < 2 * n) {
       reinterpret_cast<float4*>(rows)[at] = reinterpret_cast<const float4*>(stage)[32 * k + lane];
     }
   }
-  if (!colors || i >= in.n_rows) return;
+  if (!colors || i >= n) return;
   const float* color = in.colors + i * in.n_channels;
   float4 c{color[0], 0.f, 0.f, 0.f};
   if (in.n_channels > 1) c.y = color[1];
@@ -150,13 +152,14 @@ inline constexpr int kForwardBatch = TILE == 8 ? 64 : 256;
 
 // At most so many 16-byte stores of zeros a thread; where tiles are too few for that, they are no help.
 constexpr int kMostZeros = 16;
+constexpr int kQuads = kPackedGradient / 4;  // such stores for a row
 
 // This block's share of the zeros that backward starts from. Compositing waits for instructions, not for
 // memory, so the stores cost next to nothing; they ask for no room in the L2 cache, which the rows need.
-__device__ __forceinline__ void zero_share(const ForwardArguments& args, int threads) {
+__device__ __forceinline__ void zero_share(const ForwardArguments& args, std::int64_t n_rows, int threads) {
   auto* quads = reinterpret_cast<float4*>(args.out.row_gradients);
-  const std::int64_t begin = blockIdx.x * args.quads_per_block;
-  const std::int64_t end = min(begin + args.quads_per_block, args.quads);
+  const std::int64_t begin = blockIdx.x * args.rows_per_block * kQuads;
+  const std::int64_t end = min(begin + args.rows_per_block * kQuads, n_rows * kQuads);
   for (std::int64_t i = begin + threadIdx.x; i < end; i += threads) __stcs(quads + i, float4{});
 }
 
@@ -170,7 +173,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
   __shared__ int tile_work;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   wait_for_earlier_kernels();
-  zero_share(args, TILE * TILE);
+  const std::int64_t zero_rows = rows_there(args.zero_rows, args.known_rows);
   const int block = static_cast<int>(blockIdx.x), owned = args.order.n_tiles;
   const std::int64_t index = block < owned                          ? args.order.tile(block)
                              : block - owned < args.grid.tile_begin ? block - owned
@@ -178,6 +181,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
   const TilePlace tile = locate_tile<TILE>(args.grid, index);
   const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
   if (block >= owned) {
+    zero_share(args, zero_rows, TILE * TILE);
     constexpr float kBlack[CHANNELS] = {};
     if (pixel.inside) write_pixel<CHANNELS>(args, pixel, tile.camera, kBlack, 0.f, 0);
     if (thread == 0 && args.chunk.first == 0) args.out.tile_work[tile.tile] = 0;
@@ -195,6 +199,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
     return thread < kBatch && at < count ? args.isect_rows[start + at] : -1;
   };
   std::int32_t row = row_at(thread), next_row = row_at(thread + kBatch);
+  zero_share(args, zero_rows, TILE * TILE);  // while the list is on its way
   batch.fetch(0, args.rows, args.chunk, row, thread);
   for (int base = 0, buffer = 0; base < count; base += kBatch, buffer ^= 1) {
     if (thread < kBatch) batch.place(buffer, row >= 0, tile, thread);
@@ -226,15 +231,21 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
   if (thread == 0) args.out.tile_work[tile.tile] = tile_work;
 }
 
+void zero_gradients(const RasterizeOutput<float>& out, std::int64_t n_rows, CudaStream stream) {
+  if (n_rows == 0) return;
+  check(cudaMemsetAsync(out.row_gradients, 0, n_rows * kPackedGradient * sizeof(float), stream),
+        "rasterize_fwd");
+}
+
 template <int TILE>
 void launch_forward(ForwardArguments args, CudaStream stream) {
   const auto tiles = static_cast<unsigned>(args.out.clear_rest ? args.grid.count() : args.order.n_tiles);
-  if (args.quads > tiles * std::int64_t{kMostZeros * TILE * TILE}) {
-    check(cudaMemsetAsync(args.out.row_gradients, 0, args.quads * sizeof(float4), stream), "rasterize_fwd");
-    args.quads = 0;
+  if (kQuads * args.zero_rows > tiles * std::int64_t{kMostZeros * TILE * TILE}) {
+    zero_gradients(args.out, args.zero_rows, stream);
+    args.zero_rows = 0;
   }
   if (tiles == 0) return;
-  args.quads_per_block = (args.quads + tiles - 1) / tiles;
+  args.rows_per_block = (args.zero_rows + tiles - 1) / tiles;
   const auto kernel = args.chunk.count == 4 ? forward_kernel<TILE, 4> : forward_kernel<TILE, 3>;
   constexpr int kBytes = sizeof(EntryBatch<TILE, kForwardBatch<TILE>>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_fwd");
@@ -244,38 +255,42 @@ void launch_forward(ForwardArguments args, CudaStream stream) {
 }  // namespace
 
 std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, int n_channels) {
-  return aux_order_begin(n_rows, n_channels) + TileOrder::bytes(grid);
+  return AuxLayout::bytes(grid, n_rows, n_channels);
 }
 
 bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes) {
-  const std::int64_t begin = aux_order_begin(n_rows, n_channels);
-  return bytes >= begin && TileOrder::covers(bytes - begin, grid);
+  return AuxLayout(grid, n_channels, bytes).holds(grid, n_rows);
 }
 
 template <>
 void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out, void* aux,
                           Workspace&, CudaStream stream) {
-  const std::int64_t quads = out.row_gradients ? in.n_rows * (kPackedGradient / 4) : 0;
+  const std::int64_t zero_rows = out.row_gradients ? in.n_rows : 0;
   if (in.grid.count() == 0) {
-    if (quads) check(cudaMemsetAsync(out.row_gradients, 0, quads * sizeof(float4), stream), "rasterize_fwd");
+    zero_gradients(out, zero_rows, stream);
     return;
   }
-  float4* colors = in.n_channels <= 4 ? const_cast<float4*>(aux_colors(aux, in.n_rows)) : nullptr;
-  const TileOrder order(in.grid, static_cast<char*>(aux) + aux_order_begin(in.n_rows, in.n_channels),
-                        TileOrder::bytes(in.grid));
+  const AuxLayout layout(in.grid, in.n_channels, AuxLayout::bytes(in.grid, in.n_rows, in.n_channels));
+  PackedRow* const rows = layout.rows(aux);
+  float4* const colors = layout.colors(aux, in.n_channels);
+  const TileOrder order = layout.order(in.grid, aux);
   order.clear(stream);
   const unsigned blocks = blocks_for(in.n_rows, kPackThreads) + blocks_for(order.unordered(), kPackThreads);
   if (blocks > 0) {
-    launch_early("rasterize_fwd", prepare_kernel, {blocks, kPackThreads, stream}, in,
-                 static_cast<PackedRow*>(aux), colors, order);
+    launch_early("rasterize_fwd", prepare_kernel, {blocks, kPackThreads, stream}, in, rows, colors, order);
   }
   for (int first = 0; first < in.n_channels; first += 4) {
-    const ForwardArguments args{
-        aux_rows(aux),   {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},
-        in.backgrounds,  in.isect_rows,
-        in.tile_offsets, in.grid,
-        order,           out,
-        quads,           0};
+    const ForwardArguments args{rows,
+                                {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},
+                                in.backgrounds,
+                                in.isect_rows,
+                                in.tile_offsets,
+                                in.grid,
+                                order,
+                                out,
+                                zero_rows,
+                                0,
+                                in.known_rows};
     if (in.grid.tile_size == 8) {
       launch_forward<8>(args, stream);
     } else if (in.grid.tile_size == 16) {

@@ -5,6 +5,7 @@
 #include <tuple>
 
 #include "common/op.h"
+#include "common/row_count_op.h"
 #include "common/tile_grid_op.h"
 
 namespace blitzgs {
@@ -21,8 +22,9 @@ constexpr bool kPacked = false;
 struct Splats {
   Splats(const char* op, const Tensor& means2d_in, const Tensor& conics_in, const Tensor& opacities_in,
          const Tensor& colors_in, const std::optional<Tensor>& backgrounds_in, const Tensor& isect_rows_in,
-         const Tensor& tile_offsets_in, const TileGrid& grid_in)
-      : grid(grid_in), n_rows(means2d_in.size(0)) {
+         const Tensor& tile_offsets_in, const TileGrid& grid_in,
+         const std::optional<Tensor>& known_rows = std::nullopt)
+      : grid(grid_in), n_rows(means2d_in.size(0)), row_count(checked_row_count(op, known_rows, means2d_in)) {
     check_floating(op, "means2d", means2d_in);
     check_shape(op, "means2d", means2d_in, {n_rows, 2});
     check_shape(op, "conics", conics_in, {n_rows, 3});
@@ -63,13 +65,15 @@ struct Splats {
             data_or_null<T>(backgrounds),
             data<std::int32_t>(isect_rows),
             data<std::int64_t>(tile_offsets),
-            n_rows,
+            row_count.n_rows,
             static_cast<int>(n_channels),
-            grid};
+            grid,
+            row_count.known_rows};
   }
 
   TileGrid grid;
-  std::int64_t n_rows, n_channels = 0;
+  std::int64_t n_rows, n_channels = 0;  // of the columns
+  RowCount row_count;
   Tensor means2d, conics, opacities, colors, isect_rows, tile_offsets;
   std::optional<Tensor> backgrounds;
 };
@@ -106,11 +110,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
     std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
     std::int64_t tile_begin, std::int64_t tile_end, const std::optional<Tensor>&, bool clear_rest,
-    bool backward_follows) {
+    bool backward_follows, const std::optional<Tensor>& known_rows) {
   constexpr const char* kOp = "rasterize_fwd";
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
-                      grid);
+                      grid, known_rows);
   const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
   Tensor row_gradients = make_empty(splats.means2d, {packed ? splats.n_rows : 0, kPackedGradient});
   auto composited = composite(splats, packed ? std::optional(row_gradients) : std::nullopt, clear_rest);
@@ -146,9 +150,8 @@ struct Composited {
     STD_TORCH_CHECK(backend::rasterize_aux_fits(splats.grid, splats.n_rows,
                                                 static_cast<int>(splats.n_channels), aux.size(0)) &&
                         reinterpret_cast<std::uintptr_t>(aux.const_data_ptr()) % 64 == 0,
-                    "blitzgs::", op,
-                    ": aux must be as rasterize_fwd returned it for these tiles or more, got ", aux.size(0),
-                    " bytes");
+                    "blitzgs::", op, ": aux must be as rasterize_fwd returned it for these tiles and ",
+                    splats.n_rows, " rows, or more, got ", aux.size(0), " bytes");
   }
 
   RasterizeAux own() const { return {data<void>(aux), aux.size(0)}; }
@@ -198,7 +201,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
 void check_packed(const char* op, const Splats& splats, const Tensor& packed) {
   STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", op, ": colors must have 1 to 4 channels, got ",
                   splats.n_channels);
-  check_shape(op, "packed", packed, {splats.n_rows, kPackedGradient});
+  check_shape(op, "packed", packed, {-1, kPackedGradient});
+  STD_TORCH_CHECK(packed.size(0) >= splats.n_rows, "blitzgs::", op, ": packed must have ", splats.n_rows,
+                  " rows or more, got ", packed.size(0));
   check_dtype(op, "packed", packed, ScalarType::Float);
   STD_TORCH_CHECK(packed.is_contiguous(), "blitzgs::", op, ": packed must be contiguous");
 }
@@ -207,11 +212,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd_packed(
     const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
     std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t tile_begin, std::int64_t tile_end, Tensor packed) {
+    std::int64_t tile_begin, std::int64_t tile_end, Tensor packed, const std::optional<Tensor>& known_rows) {
   constexpr const char* kOp = "rasterize_fwd_packed_";
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
-                      grid);
+                      grid, known_rows);
   check_packed(kOp, splats, packed);
   return composite(splats, packed, false);
 }

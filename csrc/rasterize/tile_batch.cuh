@@ -39,18 +39,9 @@ struct __align__(16) PackedGradient {
   float4 quads[3];
 };
 
-// aux: PackedRow [P], then float4 [P] colors when there are at most 4 channels, then the order of the tiles.
-inline const PackedRow* aux_rows(const void* aux) { return static_cast<const PackedRow*>(aux); }
-inline const float4* aux_colors(const void* aux, std::int64_t n_rows) {
-  return reinterpret_cast<const float4*>(aux_rows(aux) + n_rows);
-}
-inline std::int64_t aux_order_begin(std::int64_t n_rows, int n_channels) {
-  return n_rows * static_cast<std::int64_t>(sizeof(PackedRow) + (n_channels <= 4 ? sizeof(float4) : 0));
-}
-
 // The channels of one launch: up to 4 of n_channels, from `first`.
 struct ChannelChunk {
-  const float4* packed;  // colors of aux, or null
+  const float4* packed;  // colors of aux (aux_layout.cuh), or null
   const float* colors;   // [P, n_channels] otherwise
   int n_channels, first, count;
 };

@@ -23,25 +23,18 @@ struct TileOrder {
   std::int64_t first;
   int n_tiles;
 
-  // Memory for the order of a grid's tiles.
-  static std::int64_t bytes(const TileGrid& grid) {
-    const std::int64_t n = grid.tile_end - grid.tile_begin;
-    return n == grid.count() ? 0 : (1 + n) * kBytesPerTile;
+  // Memory for the order of so many of the tiles of a grid's images.
+  static std::int64_t bytes(const TileGrid& grid, std::int64_t composited) {
+    return composited == grid.count() ? 0 : (1 + composited) * kBytesPerTile;
   }
 
-  // Whether `bytes` of memory can be the order of a grid that has all the tiles of this one.
-  static bool covers(std::int64_t bytes, const TileGrid& grid) {
-    return bytes == 0 ||
-           (bytes % kBytesPerTile == 0 && bytes >= (1 + grid.tile_end - grid.tile_begin) * kBytesPerTile);
-  }
-
-  // In memory of so many bytes: of the tiles of `grid`, or of a grid that has them all.
-  TileOrder(const TileGrid& grid, void* memory, std::int64_t bytes)
+  // In such memory, for tiles that are all among the composited ones.
+  TileOrder(const TileGrid& grid, std::int64_t composited, void* memory)
       : first(grid.tile_begin), n_tiles(static_cast<int>(grid.tile_end - grid.tile_begin)) {
-    if (bytes == 0) return;
+    if (composited == grid.count()) return;
     counts = static_cast<std::int32_t*>(memory);
     tiles = counts + kLengthClasses;
-    n_tiles = static_cast<int>(bytes / kBytesPerTile - 1);
+    n_tiles = static_cast<int>(composited);
   }
 
   // Before any tile is noted.

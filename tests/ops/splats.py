@@ -113,3 +113,11 @@ def near_a_cut(splats, width, height, margin=1e-5):
     alphas = pixel_alphas(*(t.double() for t in splats.values()[:3]), width, height)
     close = ((alphas * 255 - 1).abs() < margin).any(0)
     return close[None]
+
+
+def with_room(column, room):
+    """A column of `room` rows that begins with these; what lies behind them would not go unnoticed."""
+    garbage = float("nan") if column.is_floating_point() else torch.iinfo(column.dtype).max - 3
+    padded = column.new_full((room, *column.shape[1:]), garbage)
+    padded[: len(column)] = column
+    return padded
