@@ -42,7 +42,8 @@ __device__ __forceinline__ PackedRow pack_row(const RasterizeInput<float>& in, s
 
 // The last blocks order the tiles; the others pack rows. A warp's rows go through shared memory, so that each
 // store fills whole sectors.
-__global__ void prepare_kernel(RasterizeInput<float> in, PackedRow* rows, float4* colors, TileOrder order) {
+__global__ void __launch_bounds__(kPackThreads, 8)
+    prepare_kernel(RasterizeInput<float> in, PackedRow* rows, float4* colors, TileOrder order) {
   wait_for_earlier_kernels();
   const auto pack_blocks = static_cast<unsigned>((in.n_rows + kPackThreads - 1) / kPackThreads);
   if (blockIdx.x >= pack_blocks) {
