@@ -11,6 +11,7 @@ intersection, and its reverse between their gradients.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -18,21 +19,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.exchange import (
-    Route,
-    plan_route,
-    read_traffic,
-    send,
-    send_back,
-)
+from blitzgs.distributed.exchange import Route, send, send_back
 from blitzgs.distributed.ownership import Share
-from blitzgs.distributed.rows import PeerSpace, Splats
+from blitzgs.distributed.projection import Projection, project_views
+from blitzgs.distributed.rows import Splats
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.host import tell_host
-from blitzgs.ops.project import RowRoom, Rows, rows_of
+from blitzgs.ops.project import RowRoom, Rows
 from blitzgs.ops.rasterize import GradientRoom, gradient_columns
-from blitzgs.ops.scatter import NO_TABLES, RowTables, runs_of
+from blitzgs.ops.scatter import NO_TABLES, RowTables
 
 Mark = Callable[[str], None]
 
@@ -165,8 +160,8 @@ def forward(
         active: rows to consider, and the views of each; None: all.
         share: who composites which tiles; every rank of the job calls this with its table. None: render all
             of the views from this table alone.
-        room: for the rows, of the frames before; the result does not depend on it. None: wait for their
-            number.
+        room: for the rows and their lists, of the frames before; the result does not depend on it. None:
+            wait for their number.
         mark: called at the end of each stage: "project", "exchange", "sort", "raster".
         backward_follows: prepare for a backward pass, which is then faster; it works in any case.
 
@@ -174,9 +169,14 @@ def forward(
         The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
         ranks shared the work.
     """
+    room = room or RowRoom()
     # Past autograd's Python: an op that is differentiable elsewhere spends 20 us of the host's time there.
     with torch._C._AutoDispatchBelowAutograd():
-        return _forward(table, views, options, active, share, room or RowRoom(), mark, backward_follows)
+        while True:
+            with ExitStack() as waiting:
+                frame = _forward(table, views, options, active, share, room, mark, backward_follows, waiting)
+            if frame is not None:
+                return frame
 
 
 def _forward(
@@ -188,46 +188,54 @@ def _forward(
     room: RowRoom,
     mark: Mark,
     backward_follows: bool,
-) -> Frame:
-    count, tiles = len(views), (0, -1)
-    rows, splats, route, n_isects, visible = _project(table, views, options, active, share, room)
+    waiting: ExitStack,
+) -> Frame | None:
+    """Queue all of it, then wait for the numbers of rows; None: the room was too small, and has learnt."""
+    count, tiles = len(views), (0, -1) if share is None else share.composited
+    projection = _project(table, views, options, active, share, room, waiting)
+    splats, route, n_rows = projection.splats, projection.route, projection.n_rows
     mark("project")
     if share is not None and route is not None:
-        splats, tiles = send(splats, route, share.ranks), share.composited
+        splats = send(splats, route, share.ranks)
     mark("exchange")
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids, count,
-        views.width, views.height, options.tile_size, *tiles, n_isects,
+        views.width, views.height, options.tile_size, *tiles, projection.n_isects, n_rows,
     )  # fmt: skip
     mark("sort")
     backgrounds = _backgrounds(options.background, count, table.device)
-    if route is not None and route.space is not None and route.kept is not None:
-        route.space.meet_colors()
+    space = None if route is None else route.space
+    if space is not None and route is not None and route.kept is not None:
+        space.meet_colors()
     arguments = (
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
         count, views.width, views.height, options.tile_size, *tiles,
     )  # fmt: skip
-    if route is None or route.space is None:
-        *composited, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, None, False, backward_follows)
+    if space is None:
+        *composited, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, None, False, backward_follows, n_rows)
         gradients = GradientRoom(zeros)
     elif backward_follows:
-        zeros = route.space.table()
-        composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, zeros)
-        gradients = GradientRoom(zeros, route.space.clear_table)
+        zeros = space.table()
+        composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, zeros, n_rows)
+        gradients = GradientRoom(zeros, space.clear_table)
     else:
-        *composited, _ = torch.ops.blitzgs.rasterize_fwd(*arguments, None, False)
-        gradients = GradientRoom(None, route.space.clear_table)
-    renders, transmittances, last_ids, tile_work, aux = composited
-    room.learn(rows.counts)
+        *composited, _ = torch.ops.blitzgs.rasterize_fwd(*arguments, None, False, False, n_rows)
+        gradients = GradientRoom(None, space.clear_table)
     mark("raster")
+    known = projection.settle()
+    if known is None:
+        return None
+    if n_rows is not None:
+        splats = known.splats
+    renders, transmittances, last_ids, tile_work, aux = composited
     return Frame(
         views,
         options,
-        rows,
+        known.rows,
         splats,
         share,
         route,
-        visible,
+        known.visible,
         backgrounds,
         isect_rows,
         tile_offsets,
@@ -325,13 +333,9 @@ def _project(
     active: ActiveRows | None,
     share: Share | None,
     room: RowRoom,
-) -> tuple[Rows, Splats, Route | None, int, Tensor]:
-    """Project a table and, on several ranks, agree on which row goes where: `forward`'s one wait.
-
-    Returns this rank's rows; the same as splats, or what the other ranks' projections write here; where rows
-    go (None: they stay); at least the number of intersections to composite here; rows of each view over all
-    ranks, int64 [B].
-    """
+    waiting: ExitStack,
+) -> Projection:
+    """Project a table and, on several ranks, agree on which row goes where."""
     # Halves are routed by what arrives: rounding may move a splat's border over that of a tile.
     asking = share if share is not None and not share.half else None
     wanted = [] if asking is None else [asking.ranges.composited(m) for m in range(asking.ranks.world_size)]
@@ -341,51 +345,4 @@ def _project(
         options.tile_size, options.sh_degree, options.near_plane, options.far_plane, options.eps2d, 0.0,
         options.antialiased, True, [begin for begin, _ in wanted], [end for _, end in wanted], length,
     )  # fmt: skip
-    persistent, traffic, sizes = table["id"], None, room.sizes
-    if asking is not None and asking.ranks.peers is not None:
-        rank, peers = asking.ranks.rank, asking.ranks.peers
-        apart = peers.second if peers.apart else None
-
-        def count(space: int) -> tuple[Tensor, list[Tensor]]:
-            return torch.ops.blitzgs.project_count(*arguments, space, space, persistent)[2:]
-
-        def send_rows(
-            rows: list[Tensor], everyone: Tensor, buffers: list[Tensor], capacity: int
-        ) -> list[Tensor]:
-            return torch.ops.blitzgs.project_rows_to_peers_(
-                *arguments[:7], views.width, views.height, options.sh_degree, everyone, rank, rows, buffers,
-                capacity, apart.cuda_stream if apart is not None else 0,
-            )  # fmt: skip
-
-        columns, (places, kept), space = PeerSpace.fill(len(views), asking.ranks, count, send_rows)
-        rows = rows_of(columns, space.traffic.counts)
-        route = Route(
-            space.traffic, rows.rank_masks, places=places[: runs_of(len(rows.camera_ids))], space=space,
-            kept=kept if apart is not None else None,
-        )  # fmt: skip
-        peers.apart = route.pays_apart
-        return rows, space.arrived(), route, space.traffic.n_isects, space.traffic.visible
-    plan, carry, totals, written = torch.ops.blitzgs.project_count(*arguments, *sizes, persistent)
-
-    def finish(counts: Tensor) -> list[Tensor]:
-        return torch.ops.blitzgs.project_finish_(*arguments, plan, carry, totals, counts, written, persistent)
-
-    if asking is None:
-        with tell_host(totals) as known:
-            *columns, row_ids = finish(known)
-        counts = known[:3]
-    else:
-        traffic = read_traffic(totals, len(views), asking.ranks)
-        counts = traffic.counts
-        *columns, row_ids = finish(counts)
-    rows = Rows._make((*columns, counts))
-    splats = Splats(
-        rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids, row_ids
-    )
-    if traffic is not None:
-        route = Route(traffic, rows.rank_masks)
-    elif share is not None:
-        route = plan_route(splats, share.ranges, share.ranks, share.half)
-    else:
-        return rows, splats, None, int(counts[2]), totals[3 : 3 + len(views)]
-    return rows, splats, route, route.traffic.n_isects, route.traffic.visible
+    return project_views(arguments, table["id"], len(views), share, room, waiting)

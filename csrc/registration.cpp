@@ -30,17 +30,15 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
       "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
       "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count, Tensor plan, "
-      "Tensor carry, Tensor counts) -> (Tensor gaussian_ids, "
+      "Tensor carry, Tensor counts, Tensor? ids=None) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, "
       "Tensor means2d, Tensor conics, Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, "
-      "Tensor tiles_touched, Tensor rank_masks)");
-  // Instead, for rows that project_count had room for: these, or others.
+      "Tensor tiles_touched, Tensor rank_masks, Tensor row_ids)");
+  // The colours of the rows that project_count had room for.
   m.def(
-      "project_finish_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
-      "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
-      "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
-      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count, Tensor plan, "
-      "Tensor carry, Tensor totals, Tensor counts, Tensor(a!)[] rows, Tensor? ids) -> Tensor(a!)[]");
+      "project_colors_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
+      "Tensor viewmats, Tensor Ks, int width, int height, int sh_degree, Tensor totals, "
+      "Tensor(a!)[] rows) -> ()");
   // Colours, unless colors_stream is 0, in that stream: they are valid, here and there, once it was waited
   // for.
   m.def(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
@@ -13,25 +13,32 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 
 
 @contextmanager
-def tell_host(values: Tensor) -> Iterator[Tensor]:
-    """Give a tensor on the CPU that holds a few numbers once the current stream was waited for.
+def tell_host(values: Tensor) -> Iterator[Callable[[], Tensor]]:
+    """Give a function that waits for a few numbers and returns them on the CPU.
 
-    On CUDA a kernel writes them there: a copy would make the stream wait for the copying engine, 15 us. So
-    the memory has to live until then: whoever uses this waits within it, and an exception does so too.
+    What is queued before it is called runs meanwhile. On CUDA a kernel writes the numbers into the host's
+    memory: a copy would make the stream wait for the copying engine, 15 us. That memory has to live until
+    then, so leaving waits too.
 
     Args:
         values: int64 [n].
     """
     if not values.is_cuda:
-        yield values
+        yield lambda: values
         return
     known = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
     torch.ops.blitzgs.tell_host_(known, values)
+    told = torch.cuda.Event()
+    told.record(torch.cuda.current_stream(values.device))
+
+    def wait() -> Tensor:
+        told.synchronize()
+        return known
+
     try:
-        yield known
-    except BaseException:
-        torch.cuda.current_stream(values.device).synchronize()
-        raise
+        yield wait
+    finally:
+        told.synchronize()
 
 
 @torch.library.register_fake("blitzgs::tell_host_")

@@ -45,26 +45,72 @@ def rows_of(columns: Sequence[Tensor], counts: Tensor) -> Rows:
 
 
 class RowRoom:
-    """Room for the rows of a frame, by what the frames before needed.
+    """Room for the rows of a frame and for what is listed of them, by what the frames before needed.
 
-    CUDA then writes rows before the host knows how many there are; where there is too little room they are
-    written once more.
+    CUDA then works before the host knows how much there is; where there is too little room it works once
+    more.
 
     Attributes:
-        sizes: visible Gaussians and rows that there is room for; zeros: the host waits.
+        sizes: visible Gaussians, rows and row-tile intersections that there is room for; zeros: the host
+            waits.
     """
 
     def __init__(self) -> None:
-        self.sizes = (0, 0)
+        self.sizes = (0, 0, 0)
 
-    def learn(self, counts: Tensor) -> None:
-        """Take note of what a frame needed: `Rows.counts`."""
+    def holds(self, needed: Sequence[int]) -> bool:
+        """Tell whether there is room for so many of the first of `sizes`."""
+        return all(n <= size for n, size in zip(needed, self.sizes, strict=False))
+
+    def learn(self, needed: Sequence[int]) -> None:
+        """Take note of what a frame needed, as `sizes`."""
         # Views differ: what the largest one of late needed, and some more.
-        visible, rows = (
-            max(needed * 9 // 8, room - room // 256)
-            for needed, room in zip(counts.tolist(), self.sizes, strict=False)
+        visible, rows, isects = (
+            max(n * 9 // 8, size - size // 256) for n, size in zip(needed, self.sizes, strict=True)
         )
-        self.sizes = (visible, rows)
+        self.sizes = (visible, rows, isects)
+
+
+def queue_rows(arguments: Sequence[Any], room: RowRoom, ids: Tensor | None = None) -> tuple[
+    tuple[Tensor, Tensor], Tensor, list[Tensor]
+]:
+    """Have rows written into the room there is for them, without waiting for their number.
+
+    Args:
+        arguments: of the op `project_count`, from means to active_count.
+        room: for the rows.
+        ids: int64 [N], see `emit_rows`.
+
+    Returns:
+        What `emit_rows` takes; the totals of `project_count`, on the device; the columns of `Rows` but
+        counts, and the rows' ids, with room behind them and without colours, or nothing: there was no room.
+    """
+    plan, carry, totals, columns = torch.ops.blitzgs.project_count(*arguments, *room.sizes[:2], ids)
+    return (plan, carry), totals, columns
+
+
+def color_rows(arguments: Sequence[Any], totals: Tensor, columns: list[Tensor]) -> None:
+    """Give the rows of `queue_rows` their colours, as far as there was room for rows."""
+    if columns:
+        width, height, _, sh_degree = arguments[9:13]
+        torch.ops.blitzgs.project_colors_(*arguments[:7], width, height, sh_degree, totals, columns)
+
+
+def emit_rows(
+    arguments: Sequence[Any], planned: tuple[Tensor, Tensor], counts: Tensor, ids: Tensor | None = None
+) -> list[Tensor]:
+    """Write all rows of a projection, once their number is known.
+
+    Args:
+        arguments: as for `queue_rows`.
+        planned: from `queue_rows`.
+        counts: the totals, on the CPU.
+        ids: int64 [N], persistent, of the Gaussians; None: the rows' are not wanted.
+
+    Returns:
+        The columns of `Rows` but counts, and the rows' ids.
+    """
+    return list(torch.ops.blitzgs.project_emit(*arguments, *planned, counts, ids))
 
 
 def project(
@@ -137,23 +183,24 @@ def project(
         raise ValueError("sparse_grad is not supported under torch.compile")
     plan, carry, totals, _ = torch.ops.blitzgs.project_count(*arguments, [], [])
     counts = totals.cpu()[:3]
-    emitted = torch.ops.blitzgs.project_emit(*arguments, [], [], None, plan, carry, counts)
+    *emitted, _ = torch.ops.blitzgs.project_emit(*arguments, [], [], None, plan, carry, counts)
     return Rows._make((*emitted, counts))
 
 
 def project_rows(*arguments: Any) -> Rows:
     """`project` without gradients, with the positional arguments of its ops, from means to raw."""
     means, viewmats = arguments[0], arguments[5]
-    room = _room(means.device, len(means), len(viewmats))
+    room, arguments = _room(means.device, len(means), len(viewmats)), (*arguments, [], [], None)
     with torch._C._AutoDispatchBelowAutograd():
-        plan, carry, totals, rows = torch.ops.blitzgs.project_count(*arguments, [], [], None, *room.sizes)
-        with tell_host(totals) as known:
-            *columns, _ = torch.ops.blitzgs.project_finish_(
-                *arguments, [], [], None, plan, carry, totals, known, rows, None
-            )
-    counts = known[:3]
-    room.learn(counts)
-    return Rows._make((*columns, counts))
+        planned, totals, columns = queue_rows(arguments, room)
+        with tell_host(totals) as told:
+            color_rows(arguments, totals, columns)
+            counts = told()[:3]
+        needed = counts.tolist()
+        if not columns or not room.holds(needed[:2]):
+            columns = emit_rows(arguments, planned, counts)
+    room.learn(needed)
+    return rows_of(columns, counts)
 
 
 @lru_cache(maxsize=16)
@@ -196,6 +243,7 @@ def _(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tenso
         ints(P, 2),
         ints(P),
         means.new_empty(P if tile_begins else 0, dtype=torch.int64),
+        means.new_empty(P if any(ids is not None for ids in rest[20:]) else 0, dtype=torch.int64),
     )
 
 
@@ -228,7 +276,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
     means, quats, scales, opacities, sh, viewmats, Ks = inputs[:7]
     width, height, _, sh_degree = inputs[9:13]
     eps2d, _, antialiased, raw = inputs[15:19]
-    rows = Rows._make((*output, None))
+    rows = Rows._make((*output[:12], None))
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(
         means, quats, scales, opacities, sh, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets
@@ -238,7 +286,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
-    return (*_gradients(ctx, v_output), *(None,) * 19)
+    return (*_gradients(ctx, v_output[:12]), *(None,) * 20)
 
 
 def _gradients(ctx: Any, v_output: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:

@@ -26,7 +26,7 @@ class GradientRoom:
         """Keep the zeros.
 
         Args:
-            zeros: [P, 12], the last output of `rasterize_fwd`, or none, [0, 12] or None.
+            zeros: [P or more, 12], the last output of `rasterize_fwd`, or none, [0, 12] or None.
             others: makes others; None: they are allocated.
         """
         self._zeros, self._others = zeros, others
@@ -34,8 +34,8 @@ class GradientRoom:
     def take(self, means2d: Tensor) -> Tensor:
         """Return zeros [P, 12] for the P rows."""
         zeros, self._zeros = self._zeros, None
-        if zeros is not None and len(zeros) == len(means2d):
-            return zeros
+        if zeros is not None and len(zeros) >= len(means2d):
+            return zeros[: len(means2d)]
         return means2d.new_zeros(len(means2d), PACKED_GRADIENT) if self._others is None else self._others()
 
 

@@ -110,21 +110,6 @@ inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& sh
   return Tensor(handle);
 }
 
-// The first rows of a contiguous tensor, without a copy; by the shortest way, too.
-inline Tensor first_rows(const Tensor& tensor, std::int64_t rows) {
-  if (tensor.size(0) == rows) return tensor;
-  const auto rank = tensor.dim();
-  std::vector<std::int64_t> shape(rank), strides(rank);
-  for (std::int64_t i = 0; i < rank; ++i) {
-    shape[i] = i == 0 ? rows : tensor.size(i);
-    strides[i] = tensor.stride(i);
-  }
-  AtenTensorHandle handle = nullptr;
-  TORCH_ERROR_CODE_CHECK(
-      aoti_torch__reinterpret_tensor(tensor.get(), rank, shape.data(), strides.data(), 0, &handle));
-  return Tensor(handle);
-}
-
 template <class T>
 const T* data(const Tensor& tensor) {
   return static_cast<const T*>(tensor.const_data_ptr());

@@ -2,7 +2,6 @@
 // What the ops of the projection's forward pass share: their arguments, and the tensors of rows.
 #pragma once
 #include <algorithm>
-#include <limits>
 #include <vector>
 
 #include "project/project_op.h"
@@ -124,16 +123,6 @@ inline ProjectSizes room_of(const RowList& rows) {
   return rows.empty() ? ProjectSizes{0, 0} : ProjectSizes{rows[kVisibleIds].size(0), rows[0].size(0)};
 }
 
-// Without the rows that turned out not to be needed.
-inline void shorten(RowList& rows, const ProjectSizes& sizes) {
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    const std::int64_t length = i == kVisibleIds   ? sizes.visible
-                                : i == kRowOffsets ? sizes.visible + 1
-                                                   : sizes.rows;
-    if (rows[i].size(0) > length) rows[i] = first_rows(rows[i], length);
-  }
-}
-
 inline OptionalTensor checked_ids(const char* op, const Forward& f, const OptionalTensor& ids) {
   if (!ids) return std::nullopt;
   check_dtype(op, "ids", *ids, ScalarType::Long);
@@ -152,32 +141,6 @@ inline void check_rows(const char* op, const Forward& f, const RowList& rows) {
   if (rows.empty()) return;
   STD_TORCH_CHECK(rows.size() == kRowTensors && rows[0].device() == f.p.means.device(), "blitzgs::", op,
                   ": rows must be those of project_count");
-}
-
-// Writes all rows of a plan.
-inline RowList write_rows(const char* op, const Forward& f, const Tensor& plan,
-                          [[maybe_unused]] const Tensor* carry, const ProjectSizes& sizes,
-                          const OptionalTensor& ids, DeviceScope& scope) {
-  STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ", sizes.rows,
-                  " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
-  RowList rows = make_rows(f, sizes, ids.has_value());
-  dispatch_floating(f.p.means, [&](auto zero) {
-    using T = decltype(zero);
-    const ProjectInputs<T> in = f.inputs<T>();
-    const ProjectIds listed = row_ids(rows);
-    const ProjectOutputs<T> values = row_values<T>(f, rows, ids);
-    const ProjectRoom room{sizes, nullptr};
-#ifdef BLITZGS_BACKEND_CUDA
-    cuda::project_rows(in, f.ranks, plan.const_data_ptr(), sizes, listed, values, nullptr, scope.workspace,
-                       scope.stream);
-    cuda::project_colors(in, listed, room, values, scope.stream);
-#else
-    cpu::project_list(in, plan.const_data_ptr(), room, listed, scope.workspace, scope.stream);
-    cpu::project_emit(in, f.ranks, carry->const_data_ptr(), listed, room, values, scope.workspace,
-                      scope.stream);
-#endif
-  });
-  return rows;
 }
 
 }  // namespace blitzgs

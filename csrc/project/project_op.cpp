@@ -3,10 +3,6 @@
 
 #include "project/project_forward_op.h"
 
-#ifdef BLITZGS_BACKEND_CUDA
-#include "common/stream_point.h"
-#endif
-
 namespace blitzgs {
 namespace {
 
@@ -72,8 +68,9 @@ ProjectSizes told_sizes(const char* op, const Tensor& counts) {
 }
 
 using RowTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                              Tensor, Tensor>;
+                              Tensor, Tensor, Tensor>;
 
+// Writes all rows of a plan.
 RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& scales,
                         const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
                         const Tensor& Ks, const OptionalTensor& active_ids,
@@ -82,54 +79,56 @@ RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& 
                         double eps2d, double radius_clip, bool antialiased, bool raw,
                         const std::vector<std::int64_t>& tile_begins,
                         const std::vector<std::int64_t>& tile_ends, const OptionalTensor& active_count,
-                        const Tensor& plan, const Tensor& carry, const Tensor& counts) {
+                        const Tensor& plan, [[maybe_unused]] const Tensor& carry, const Tensor& counts,
+                        const OptionalTensor& ids) {
   constexpr const char* kOp = "project_emit";
   const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
                   height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
                   tile_begins, tile_ends, active_count);
   check_plan(kOp, f, plan);
+  const OptionalTensor persistent = checked_ids(kOp, f, ids);
+  const ProjectSizes sizes = told_sizes(kOp, counts);
+  STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", kOp, ": ", sizes.rows,
+                  " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
+  RowList r = make_rows(f, sizes, persistent.has_value());
   DeviceScope scope(f.p.means);
-  const RowList r = write_rows(kOp, f, plan, &carry, told_sizes(kOp, counts), std::nullopt, scope);
-  return {r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11]};
+  dispatch_floating(f.p.means, [&](auto zero) {
+    using T = decltype(zero);
+    const ProjectInputs<T> in = f.inputs<T>();
+    const ProjectIds listed = row_ids(r);
+    const ProjectOutputs<T> values = row_values<T>(f, r, persistent);
+    const ProjectRoom room{sizes, nullptr};
+#ifdef BLITZGS_BACKEND_CUDA
+    cuda::project_rows(in, f.ranks, plan.const_data_ptr(), sizes, listed, values, nullptr, scope.workspace,
+                       scope.stream);
+    cuda::project_colors(in, listed, room, values, scope.stream);
+#else
+    cpu::project_list(in, plan.const_data_ptr(), room, listed, scope.workspace, scope.stream);
+    cpu::project_emit(in, f.ranks, carry.const_data_ptr(), listed, room, values, scope.workspace,
+                      scope.stream);
+#endif
+  });
+  return {r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12]};
 }
 
-// Gives the rows of project_count their colours, or writes them where there was too little room, which the
-// host learns while the GPU works on what can be done before. counts hold when what was queued before is
-// done.
-RowList project_finish(const Tensor& means, const Tensor& quats, const Tensor& scales,
-                       const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
-                       const Tensor& Ks, const OptionalTensor& active_ids, const OptionalTensor& active_views,
-                       std::int64_t width, std::int64_t height, std::int64_t tile_size,
-                       std::int64_t sh_degree, double near_plane, double far_plane, double eps2d,
-                       double radius_clip, bool antialiased, bool raw,
-                       const std::vector<std::int64_t>& tile_begins,
-                       const std::vector<std::int64_t>& tile_ends, const OptionalTensor& active_count,
-                       const Tensor& plan, const Tensor& carry, [[maybe_unused]] const Tensor& totals,
-                       const Tensor& counts, RowList rows, const OptionalTensor& ids) {
-  constexpr const char* kOp = "project_finish_";
-  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
-                  height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
-                  tile_begins, tile_ends, active_count);
-  check_plan(kOp, f, plan);
-  check_rows(kOp, f, rows);
-  const OptionalTensor persistent = checked_ids(kOp, f, ids);
-  DeviceScope scope(f.p.means);
-  const ProjectSizes room = room_of(rows);
 #ifdef BLITZGS_BACKEND_CUDA
-  const cuda::StreamPoint told(scope.stream);
-  if (!rows.empty()) {
-    cuda::project_colors(f.inputs<float>(), row_ids(rows), {room, data<std::int64_t>(totals)},
-                         row_values<float>(f, rows, persistent), scope.stream);
-  }
-  told.wait();
-#endif
-  const ProjectSizes sizes = told_sizes(kOp, counts);
-  if (rows.empty() || sizes.visible > room.visible || sizes.rows > room.rows) {
-    return write_rows(kOp, f, plan, &carry, sizes, persistent, scope);
-  }
-  shorten(rows, sizes);
-  return rows;
+// Gives the rows of project_count their colours, as far as there was room for them.
+void project_colors(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
+                    const OptionalTensor& sh, const Tensor& viewmats, const Tensor& Ks, std::int64_t width,
+                    std::int64_t height, std::int64_t sh_degree, const Tensor& totals, RowList rows) {
+  constexpr const char* kOp = "project_colors_";
+  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, std::nullopt, std::nullopt, width,
+                  height, 16, sh_degree, 0, 0, 0, 0, false, false, {}, {}, std::nullopt);
+  check_rows(kOp, f, rows);
+  check_dtype(kOp, "totals", totals, ScalarType::Long);
+  STD_TORCH_CHECK(!rows.empty() && totals.is_contiguous() && totals.device() == f.p.means.device() &&
+                      totals.numel() >= project_totals(f.p.n_views, 0),
+                  "blitzgs::", kOp, ": rows and totals must be those of project_count");
+  DeviceScope scope(f.p.means);
+  cuda::project_colors(f.inputs<float>(), row_ids(rows), {room_of(rows), data<std::int64_t>(totals)},
+                       row_values<float>(f, rows, std::nullopt), scope.stream);
 }
+#endif
 
 }  // namespace
 }  // namespace blitzgs
@@ -137,5 +136,7 @@ RowList project_finish(const Tensor& means, const Tensor& quats, const Tensor& s
 BLITZGS_REGISTER(m) {
   m.impl("project_count", TORCH_BOX(&blitzgs::project_count));
   m.impl("project_emit", TORCH_BOX(&blitzgs::project_emit));
-  m.impl("project_finish_", TORCH_BOX(&blitzgs::project_finish));
+#ifdef BLITZGS_BACKEND_CUDA
+  m.impl("project_colors_", TORCH_BOX(&blitzgs::project_colors));
+#endif
 }

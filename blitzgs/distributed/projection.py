@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projection on any number of ranks: rows queued for compositing, wherever they are composited.
+
+Where there is room for them, rows are projected, sent and listed before the host knows how many there are: it
+learns that, and whether the room was enough, when compositing is queued (`Projection.settle`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.exchange import Route, plan_route, read_traffic
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import Share
+from blitzgs.distributed.rows import PeerSpace, Splats
+from blitzgs.ops.host import tell_host
+from blitzgs.ops.project import RowRoom, Rows, color_rows, emit_rows, queue_rows, rows_of
+from blitzgs.ops.scatter import runs_of
+
+
+class Known(NamedTuple):
+    """What the host knows of a projection in the end.
+
+    Attributes:
+        rows: this rank's.
+        splats: what was composited, where rows did not travel by collectives.
+        visible: int64 [B], rows of each view over all ranks.
+    """
+
+    rows: Rows
+    splats: Splats
+    visible: Tensor
+
+
+class Projection(NamedTuple):
+    """Rows on their way to compositing.
+
+    Attributes:
+        splats: the rows, or what the other ranks' projections write here; with room behind them.
+        route: where rows go; None: they stay.
+        n_rows: int64 [1], how many splats there are, on the device; None: there is no room behind them.
+        n_isects: how many intersections there are at most, or may be listed.
+        settle: waits for the numbers; None: there was too little room for something.
+    """
+
+    splats: Splats
+    route: Route | None
+    n_rows: Tensor | None
+    n_isects: int
+    settle: Callable[[], Known | None]
+
+
+def project_views(
+    arguments: Sequence[Any], ids: Tensor, n_views: int, share: Share | None, room: RowRoom, waiting: ExitStack
+) -> Projection:
+    """Project this rank's Gaussians and, on several ranks, agree on which row goes where.
+
+    Args:
+        arguments: of the op `project_count`, from means to active_count, with the tiles of each rank.
+        ids: int64 [N], persistent, of the Gaussians.
+        n_views: B.
+        share: who composites which tiles; None: this rank alone.
+        room: for the rows and their lists, of the frames before.
+        waiting: left when all was queued that needs the rows.
+    """
+    if share is None:
+        return _project_here(arguments, ids, n_views, room, waiting)
+    if share.ranks.peers is not None and not share.half:
+        return _project_to_peers(arguments, ids, n_views, share.ranks)
+    return _project_and_route(arguments, ids, n_views, share)
+
+
+def _project_here(
+    arguments: Sequence[Any], ids: Tensor, n_views: int, room: RowRoom, waiting: ExitStack
+) -> Projection:
+    """Project for one rank: where there is room, without waiting for the number of rows."""
+    planned, totals, columns = queue_rows(arguments, room, ids)
+    told = waiting.enter_context(tell_host(totals))
+    visible = totals[3 : 3 + n_views]
+    if not columns:
+        counts = told()[:3]
+        needed = counts.tolist()
+        room.learn(needed)
+        columns = emit_rows(arguments, planned, counts, ids)
+        known = Known(rows_of(columns, counts), _splats_of(columns), visible)
+        return Projection(known.splats, None, None, needed[2], lambda: known)
+    color_rows(arguments, totals, columns)
+
+    def settle() -> Known | None:
+        counts = told()[:3]
+        needed = counts.tolist()
+        fits = room.holds(needed)
+        room.learn(needed)
+        if not fits:
+            return None
+        count = needed[1]
+        return Known(
+            rows_of(columns, counts), Splats(*(column[:count] for column in _splats_of(columns))), visible
+        )
+
+    return Projection(_splats_of(columns), None, totals[1:2], room.sizes[2], settle)
+
+
+def _splats_of(columns: Sequence[Tensor]) -> Splats:
+    """Return what is composited of the columns of `queue_rows`."""
+    rows = Rows._make((*columns[:12], None))
+    return Splats(
+        rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids, columns[12]
+    )
+
+
+def _project_to_peers(arguments: Sequence[Any], ids: Tensor, n_views: int, ranks: Ranks) -> Projection:
+    """Project and write rows to the ranks that composite them, through memory that these share."""
+    peers = ranks.peers
+    assert peers is not None
+    apart = peers.second if peers.apart else None
+    width, height, _, sh_degree = arguments[9:13]
+
+    def count(space: int) -> tuple[Tensor, list[Tensor]]:
+        return torch.ops.blitzgs.project_count(*arguments, space, space, ids)[2:]
+
+    def send_rows(rows: list[Tensor], everyone: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
+        return torch.ops.blitzgs.project_rows_to_peers_(
+            *arguments[:7], width, height, sh_degree, everyone, ranks.rank, rows, buffers, capacity,
+            apart.cuda_stream if apart is not None else 0,
+        )  # fmt: skip
+
+    columns, (places, kept), space = PeerSpace.fill(n_views, ranks, count, send_rows)
+    rows = rows_of(columns, space.traffic.counts)
+    route = Route(
+        space.traffic, rows.rank_masks, places=places[: runs_of(len(rows.camera_ids))], space=space,
+        kept=kept if apart is not None else None,
+    )  # fmt: skip
+    peers.apart = route.pays_apart
+    known = Known(rows, space.arrived(), space.traffic.visible)
+    return Projection(known.splats, route, None, space.traffic.n_isects, lambda: known)
+
+
+def _project_and_route(arguments: Sequence[Any], ids: Tensor, n_views: int, share: Share) -> Projection:
+    """Project, and agree on which row will travel where by collectives."""
+    planned, totals, _ = queue_rows(arguments, RowRoom(), ids)
+    if share.half:
+        with tell_host(totals) as told:
+            counts = told()[:3]
+    else:
+        traffic = read_traffic(totals, n_views, share.ranks)
+        counts = traffic.counts
+    columns = emit_rows(arguments, planned, counts, ids)
+    rows, splats = rows_of(columns, counts), _splats_of(columns)
+    if share.half:
+        route = plan_route(splats, share.ranges, share.ranks, share.half)
+    else:
+        route = Route(traffic, rows.rank_masks)
+    known = Known(rows, splats, route.traffic.visible)
+    return Projection(splats, route, None, route.traffic.n_isects, lambda: known)
