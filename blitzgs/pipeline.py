@@ -212,7 +212,9 @@ def _forward(
         count, views.width, views.height, options.tile_size, *tiles,
     )  # fmt: skip
     if space is None:
-        *composited, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, None, False, backward_follows, n_rows)
+        *composited, zeros = torch.ops.blitzgs.rasterize_fwd(
+            *arguments, None, False, backward_follows, n_rows
+        )
         gradients = GradientRoom(zeros)
     elif backward_follows:
         zeros = space.table()

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from blitzgs.lazy_dict import Later, LazyDict
 from blitzgs.ops.intersect import intersect
-from blitzgs.ops.project import Rows, project
+from blitzgs.ops.project import Rows, differentiable_rows
 from blitzgs.ops.rasterize import rasterize
+from blitzgs.ops.render import render_queued
 
 # What the CUDA kernels composite; for any other size, meta's lists are of the tiles asked for alone.
 CUDA_TILE_SIZES = (8, 16, 32)
@@ -123,26 +124,23 @@ def rasterization(
     sh = colors if sh_degree is not None and shaded else None
     if sh_degree is None and shaded:
         opacities = _hide_non_finite(opacities, colors)
-    rows = project(
-        means,
-        quats,
-        scales,
-        opacities,
-        sh,
-        viewmats,
-        Ks,
-        width,
-        height,
-        tile_size=tile_size,
-        sh_degree=sh_degree or 0,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        eps2d=eps2d,
-        radius_clip=radius_clip,
-        antialiased=rasterize_mode == "antialiased",
-        raw=False,
-        sparse_grad=sparse_grad,
-    )
+    arguments = (
+        means, quats, scales, opacities, sh, viewmats, Ks, None, None, width, height, tile_size,
+        sh_degree or 0, near_plane, far_plane, eps2d, radius_clip, rasterize_mode == "antialiased", False,
+    )  # fmt: skip
+    background = _background_channels(backgrounds, render_mode)
+    ready = None
+    # What is composited comes from the rows alone, however many there are.
+    from_rows = packed and (sh_degree is not None or not shaded)
+    if means.is_cuda and from_rows and tile_size in CUDA_TILE_SIZES and not torch.compiler.is_compiling():
+        differentiable = any(x.requires_grad for x in (means, quats, scales, opacities, colors, viewmats))
+        ready = render_queued(
+            arguments,
+            lambda rows: _channels(_Seen(rows, len(viewmats), len(means)), colors, render_mode, sh_degree),
+            background,
+            torch.is_grad_enabled() and differentiable and not absgrad,
+        )
+    rows = differentiable_rows(arguments, sparse_grad, None if ready is None else ready.rows)
     n_cameras = viewmats.shape[0]
     seen = _Seen(rows, n_cameras, len(means))
     means2d = rows.means2d if packed else seen.of_all(rows.means2d)
@@ -153,18 +151,22 @@ def rasterization(
         "height": height,
         "tile_size": tile_size,
     }
-    n_isects = rows.counts.tolist()[2]
-    lists = intersect(*splats, rows.depths, rows.camera_ids, n_isects=n_isects, **grid)
-    composited = lists
+    if ready is None:
+        n_isects = rows.counts.tolist()[2]
+        lists = intersect(*splats, rows.depths, rows.camera_ids, n_isects=n_isects, **grid)
+    else:
+        lists = ready.isect_rows, ready.tile_offsets
+    listed = lists
     if means.is_cuda and tile_size not in CUDA_TILE_SIZES:
         grid["tile_size"] = CUDA_TILE_SIZES[1]
-        composited = intersect(*splats, rows.depths, rows.camera_ids, **grid)
+        listed = intersect(*splats, rows.depths, rows.camera_ids, **grid)
     renders, alphas = rasterize(
         *splats,
         _channels(seen, colors, render_mode, sh_degree),
-        *composited,
-        backgrounds=_background_channels(backgrounds, render_mode),
+        *listed,
+        backgrounds=background,
         means2d_abs=_absolute_gradient_probe(means2d, None if packed else seen) if absgrad else None,
+        composited=None if ready is None else ready.composited,
         **grid,
     )
     alphas = alphas[..., None]

@@ -56,7 +56,12 @@ class Projection(NamedTuple):
 
 
 def project_views(
-    arguments: Sequence[Any], ids: Tensor, n_views: int, share: Share | None, room: RowRoom, waiting: ExitStack
+    arguments: Sequence[Any],
+    ids: Tensor,
+    n_views: int,
+    share: Share | None,
+    room: RowRoom,
+    waiting: ExitStack,
 ) -> Projection:
     """Project this rank's Gaussians and, on several ranks, agree on which row goes where.
 

@@ -71,9 +71,9 @@ class RowRoom:
         self.sizes = (visible, rows, isects)
 
 
-def queue_rows(arguments: Sequence[Any], room: RowRoom, ids: Tensor | None = None) -> tuple[
-    tuple[Tensor, Tensor], Tensor, list[Tensor]
-]:
+def queue_rows(
+    arguments: Sequence[Any], room: RowRoom, ids: Tensor | None = None
+) -> tuple[tuple[Tensor, Tensor], Tensor, list[Tensor]]:
     """Have rows written into the room there is for them, without waiting for their number.
 
     Args:
@@ -177,8 +177,19 @@ def project(
         means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width, height, tile_size,
         sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
     )  # fmt: skip
+    return differentiable_rows(arguments, sparse_grad)
+
+
+def differentiable_rows(arguments: tuple[Any, ...], sparse_grad: bool, rows: Rows | None = None) -> Rows:
+    """`project`, by position.
+
+    Args:
+        arguments: from means to raw, in the order of the op.
+        sparse_grad: see `project`.
+        rows: what `project_rows` returned or would return, if they are there already.
+    """
     if not torch.compiler.is_compiling():
-        return Rows._make(_Project.apply(*arguments[:6], arguments[6:], sparse_grad))  # type: ignore[no-untyped-call]
+        return Rows._make(_Project.apply(*arguments[:6], arguments[6:], sparse_grad, rows))  # type: ignore[no-untyped-call]
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
     plan, carry, totals, _ = torch.ops.blitzgs.project_count(*arguments, [], [])
@@ -189,8 +200,8 @@ def project(
 
 def project_rows(*arguments: Any) -> Rows:
     """`project` without gradients, with the positional arguments of its ops, from means to raw."""
-    means, viewmats = arguments[0], arguments[5]
-    room, arguments = _room(means.device, len(means), len(viewmats)), (*arguments, [], [], None)
+    room = room_for(*arguments)
+    arguments = (*arguments, [], [], None)
     with torch._C._AutoDispatchBelowAutograd():
         planned, totals, columns = queue_rows(arguments, room)
         with tell_host(totals) as told:
@@ -201,6 +212,12 @@ def project_rows(*arguments: Any) -> Rows:
             columns = emit_rows(arguments, planned, counts)
     room.learn(needed)
     return rows_of(columns, counts)
+
+
+def room_for(*arguments: Any) -> RowRoom:
+    """Return the room that is kept for calls of `project_rows` of a size."""
+    means, viewmats = arguments[0], arguments[5]
+    return _room(means.device, len(means), len(viewmats))
 
 
 @lru_cache(maxsize=16)
@@ -345,9 +362,10 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        *parameters, options, sparse_grad = arguments
+        *parameters, options, sparse_grad, rows = arguments
         inputs = (*parameters, *options)
-        rows = project_rows(*inputs)
+        if rows is None:
+            rows = project_rows(*inputs)
         _setup_context(ctx, inputs, rows[:-1])
         ctx.mark_non_differentiable(rows.counts)
         ctx.sparse_grad = sparse_grad
@@ -355,7 +373,7 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
-        return (*_gradients(ctx, v_output[:-1]), None, None)
+        return (*_gradients(ctx, v_output[:-1]), None, None, None)
 
 
 torch.library.register_autograd("blitzgs::project_emit", _backward, setup_context=_setup_context)

@@ -67,6 +67,7 @@ def rasterize(
     tile_begin: int = 0,
     tile_end: int = -1,
     means2d_abs: Tensor | None = None,
+    composited: tuple[Tensor, ...] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Composite the rows of each tile's list into images.
 
@@ -97,6 +98,7 @@ def rasterize(
         tile_end: end of the owned tiles, -1 for all.
         means2d_abs: a tensor [P, 2] that requires grad (its values are not used) to receive, as its
             gradient, the sum over pixels of the absolute gradient of means2d, per axis.
+        composited: what the op `rasterize_fwd` has returned of these arguments already; None: it is called.
 
     Returns:
         Renders [B, H, W, D] and alphas [B, H, W].
@@ -112,7 +114,7 @@ def rasterize(
     else:
         # Whose gradients stay packed, see `_gradients`.
         packed = means2d_abs is None and torch.is_grad_enabled() and any(x.requires_grad for x in splats[:4])
-        renders, alphas = _Rasterize.apply(*splats, grid, means2d_abs, packed)  # type: ignore[no-untyped-call]
+        renders, alphas = _Rasterize.apply(*splats, grid, means2d_abs, packed, composited)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
         alphas = alphas * _owned_pixels(alphas, tile_size, tile_begin, tile_end)
     return renders, alphas
@@ -255,8 +257,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *splats, grid, means2d_abs, backward_follows = arguments
-        output = rasterize_fwd(*splats, *grid, None, True, backward_follows)
+        *splats, grid, means2d_abs, backward_follows, output = arguments
+        if output is None:
+            output = rasterize_fwd(*splats, *grid, None, True, backward_follows)
         _save(ctx, splats, grid, means2d_abs, output)
         return output[0], 1 - output[1]
 
@@ -264,7 +267,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *v_output: Tensor | None) -> tuple[Tensor | None, ...]:
         v_renders, v_alphas = v_output
         *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, may_pack=True)
-        return (*splat_gradients, None, None, None, v_abs, None)
+        return (*splat_gradients, None, None, None, v_abs, None, None)
 
 
 torch.library.register_autograd("blitzgs::rasterize_fwd", _backward, setup_context=_setup_context)
