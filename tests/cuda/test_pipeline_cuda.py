@@ -9,6 +9,7 @@ from cuda_scenes import ops, relative_error
 
 from blitzgs import pipeline
 from blitzgs.model import GaussianTable
+from blitzgs.ops.project import RowRoom
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
 from tests.training.tiny import random_gaussians
 
@@ -57,3 +58,45 @@ def test_a_second_backward_pass_starts_from_zeros_too():
     for _ in range(2):
         for x, y in zip(pipeline.backward_rows(frame, v_renders)[:4], expected[:4], strict=True):
             assert torch.equal(x, y)
+
+
+def test_frames_do_not_depend_on_the_room_that_was_guessed():
+    small = random_gaussians(5000)
+    table = GaussianTable({name: small[name].cuda() for name in small})
+    options, views = dataclasses.replace(OPTIONS, deterministic=True), cameras(3, device="cuda")
+    plain = pipeline.forward(table, views, options)
+    needed = plain.rows.counts.tolist()
+    v_renders = torch.randn_like(plain.renders)
+    expected = pipeline.backward(table, plain, v_renders)
+    rooms = [tuple(n * k // 100 for n in needed) for k in (100, 101, 250)]
+    rooms += [tuple(n - (i == short) for i, n in enumerate(needed)) for short in range(3)]
+    for sizes in [*rooms, (1, 1, 1)]:
+        room, attempts = RowRoom(), []
+        room.sizes = sizes
+        enough = room.holds(needed)
+        frame = pipeline.forward(
+            table, views, options, room=room, mark=attempts.append, backward_follows=True
+        )
+        assert attempts.count("raster") == (1 if enough else 2)
+        assert room.holds(needed)
+        for x, y in zip(frame.rows, plain.rows, strict=True):
+            assert torch.equal(x, y)
+        for x, y in zip(frame.splats, plain.splats, strict=True):
+            assert torch.equal(x, y)
+        for name in ("renders", "transmittances", "last_ids", "tile_work", "tile_offsets", "visible"):
+            assert torch.equal(getattr(frame, name), getattr(plain, name)), name
+        for x, y in zip(pipeline.backward(table, frame, v_renders), expected, strict=True):
+            assert torch.equal(x, y)
+
+
+def test_a_frame_without_rows_takes_no_room_and_any():
+    small = random_gaussians(500)
+    table = GaussianTable({name: small[name].cuda() for name in small})
+    table["means"].add_(1e6)
+    views, room = cameras(2, device="cuda"), RowRoom()
+    room.sizes = (10, 10, 10)
+    for _ in range(3):
+        frame = pipeline.forward(table, views, OPTIONS, room=room, backward_follows=True)
+        assert len(frame.rows.gaussian_ids) == 0 and not frame.renders.any()
+        assert not any(g.any() for g in pipeline.backward(table, frame, torch.ones_like(frame.renders)))
+        room.sizes = (0, 0, 0)
