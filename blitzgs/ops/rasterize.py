@@ -35,7 +35,7 @@ class GradientRoom:
         """Return zeros [P, 12] for the P rows."""
         zeros, self._zeros = self._zeros, None
         if zeros is not None and len(zeros) >= len(means2d):
-            return zeros[: len(means2d)]
+            return zeros if len(zeros) == len(means2d) else zeros[: len(means2d)]
         return means2d.new_zeros(len(means2d), PACKED_GRADIENT) if self._others is None else self._others()
 
 

@@ -346,6 +346,7 @@ def test_zeros_for_gradients_serve_once():
         taken = others.take(means2d)
         assert taken is not zeros and taken.shape == (5, 12) and not taken.any()
     assert GradientRoom(torch.zeros(0, 12)).take(means2d[:0]).shape == (0, 12)
+    assert GradientRoom(zeros).take(means2d[:3]).data_ptr() == zeros.data_ptr()
 
 
 def test_the_images_do_not_depend_on_a_backward_pass_to_follow():
