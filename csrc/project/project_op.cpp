@@ -120,10 +120,11 @@ void project_colors(const Tensor& means, const Tensor& quats, const Tensor& scal
   const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, std::nullopt, std::nullopt, width,
                   height, 16, sh_degree, 0, 0, 0, 0, false, false, {}, {}, std::nullopt);
   check_rows(kOp, f, rows);
+  if (rows.empty()) return;
   check_dtype(kOp, "totals", totals, ScalarType::Long);
-  STD_TORCH_CHECK(!rows.empty() && totals.is_contiguous() && totals.device() == f.p.means.device() &&
+  STD_TORCH_CHECK(totals.is_contiguous() && totals.device() == f.p.means.device() &&
                       totals.numel() >= project_totals(f.p.n_views, 0),
-                  "blitzgs::", kOp, ": rows and totals must be those of project_count");
+                  "blitzgs::", kOp, ": totals must be those of project_count");
   DeviceScope scope(f.p.means);
   cuda::project_colors(f.inputs<float>(), row_ids(rows), {room_of(rows), data<std::int64_t>(totals)},
                        row_values<float>(f, rows, std::nullopt), scope.stream);
