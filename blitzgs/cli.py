@@ -150,6 +150,9 @@ def _add_run(parser: argparse.ArgumentParser, needs_data: bool = True) -> None:
     parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a run")
     if needs_data:
         parser.add_argument("--data", metavar="DIR", help="where the capture is now (default: where it was)")
+        parser.add_argument(
+            "--share-gpus", action="store_true", help="with torchrun: let ranks share too few GPUs (slow)"
+        )
     _add_device(parser)
 
 
@@ -172,8 +175,9 @@ def _train(args: argparse.Namespace) -> int:
         return 0
     if args.out is None:
         args.parser.error("the following arguments are required: --out")
+    job = config.ranks
     with Ranks.from_environment(
-        args.device, config.ranks.timeout_seconds, cast(Transport, config.ranks.transport)
+        args.device, job.timeout_seconds, cast(Transport, job.transport), job.share_gpus
     ) as ranks:
         capture, images = run.open_capture(config, ranks)
         summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
@@ -191,7 +195,7 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
 
 
 def _eval(args: argparse.Namespace) -> int:
-    with Ranks.from_environment(args.device) as ranks:
+    with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
         model = run.open_model(args.folder, ranks, args.data)
         capture, images = run.open_capture(model.config, ranks)
         run.check_capture(model.space, capture, args.folder)
@@ -217,7 +221,7 @@ def _eval(args: argparse.Namespace) -> int:
 
 
 def _render(args: argparse.Namespace) -> int:
-    with Ranks.from_environment(args.device) as ranks:
+    with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
         model = run.open_model(args.folder, ranks, args.data)
         capture, _ = run.open_capture(model.config, ranks)
         run.check_capture(model.space, capture, args.folder)

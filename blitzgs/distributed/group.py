@@ -45,6 +45,7 @@ class Ranks:
         local_world_size: number of processes on this host.
         device: where this rank computes.
         timeout_seconds: a rank that does not show up at a collective for this long ends the job.
+        shares_gpu: several ranks of this host compute on one GPU.
         peers: memory shared between the ranks; None: rows travel by collectives.
         transport: how rows travel, in words, for the log.
     """
@@ -55,6 +56,7 @@ class Ranks:
     local_world_size: int = 1
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
+    shares_gpu: bool = False
     watchdog: Watchdog | None = None
     peers: Peers | None = None
     transport: str = "none: one rank"
@@ -66,14 +68,19 @@ class Ranks:
         device: str = "auto",
         timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS,
         transport: Transport = "auto",
+        share_gpus: bool = False,
     ) -> Ranks:
         """Join the job that torchrun's environment describes: Gloo on the CPU, NCCL on CUDA.
+
+        NCCL knows no two ranks on one GPU: where ranks share one, Gloo carries what is on it, too.
 
         Args:
             device: "auto" (CUDA when this torch has a GPU), "cpu", "cuda" or "cuda:INDEX".
             timeout_seconds: see the class.
             transport: of rows between ranks: "peer" writes them to the other GPUs' memory, "collective"
                 lets NCCL or Gloo carry them, "auto" prefers the former where it works.
+            share_gpus: where a host has fewer GPUs than ranks, deal them out in turn, so that ranks share
+                them: for development, as each then waits for the others' turns on the GPU.
 
         Returns:
             The ranks; the trivial object when torchrun started a single process or none.
@@ -87,14 +94,16 @@ class Ranks:
         world_size = int(os.environ.get("WORLD_SIZE", "1"))
         rank = int(os.environ.get("RANK", "0"))
         local_rank = int(os.environ.get("LOCAL_RANK", "0"))
-        place = _resolve_device(device, local_rank)
+        local_world_size = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+        place, shared = _resolve_device(device, local_rank, local_world_size, share_gpus)
         ranks = cls(
             rank=rank,
             world_size=world_size,
             local_rank=local_rank,
-            local_world_size=int(os.environ.get("LOCAL_WORLD_SIZE", "1")),
+            local_world_size=local_world_size,
             device=place,
             timeout_seconds=timeout_seconds,
+            shares_gpu=shared,
         )
         if place.type == "cuda":
             torch.cuda.set_device(place)
@@ -103,14 +112,17 @@ class Ranks:
         return ranks
 
     def _join(self, transport: Transport) -> None:
-        on_gpu = self.device.type == "cuda"
+        if self.shares_gpu:
+            # Read at every mapping of shared memory.
+            os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
+        nccl = self.device.type == "cuda" and not self.shares_gpu
         dist.init_process_group(
-            backend="nccl" if on_gpu else "gloo",
+            backend="nccl" if nccl else "gloo",
             store=open_store("group", self.rank == 0, STARTUP_TIMEOUT_SECONDS),
             rank=self.rank,
             world_size=self.world_size,
             timeout=timedelta(seconds=STARTUP_TIMEOUT_SECONDS),
-            device_id=self.device if on_gpu else None,
+            device_id=self.device if nccl else None,
         )
         self.barrier()
         # The libraries' own timeouts say only which socket or operation; ours comes first and names a rank.
@@ -126,7 +138,8 @@ class Ranks:
         if transport != "collective":
             peers = connect(self, timeout_seconds)
         if isinstance(peers, Peers):
-            self.peers, self.transport = peers, "peer: rows are written to the other GPUs' memory"
+            others = "ranks' memory on shared GPUs" if self.shares_gpu else "GPUs' memory"
+            self.peers, self.transport = peers, f"peer: rows are written to the other {others}"
         elif transport == "peer":
             raise RuntimeError(f"transport peer is impossible: {peers}; use auto or collective")
         else:
@@ -331,17 +344,26 @@ def _shorten(text: str, limit: int = 200) -> str:
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
-def _resolve_device(device: str, local_rank: int) -> torch.device:
+def _resolve_device(
+    device: str, local_rank: int, local_world_size: int, share_gpus: bool
+) -> tuple[torch.device, bool]:
+    """Return where a rank computes, and whether ranks of its host share GPUs."""
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {device!r}")
     place = torch.device(device)
-    if place.type == "cuda" and place.index is None:
-        place = torch.device("cuda", local_rank)
-    if place.type == "cuda" and place.index >= torch.cuda.device_count():
+    if place.type == "cpu":
+        return place, False
+    count = torch.cuda.device_count()
+    # All ranks of a host are given the same device, by number or not.
+    shared = share_gpus and local_world_size > (count if place.index is None else 1)
+    if place.index is None:
+        place = torch.device("cuda", local_rank % max(count, 1) if shared else local_rank)
+    if place.index >= count:
         raise ValueError(
-            f"local rank {local_rank} needs {place}, but this host has {torch.cuda.device_count()} "
-            "CUDA devices; start fewer processes per node (torchrun --nproc-per-node) or use --device cpu"
+            f"local rank {local_rank} needs {place}, but this host has {count} CUDA devices; start fewer "
+            "processes per node (torchrun --nproc-per-node), use --device cpu or, for development, let ranks "
+            "share GPUs (train: --ranks.share_gpus=true; eval and render: --share-gpus)"
         )
-    return place
+    return place, shared

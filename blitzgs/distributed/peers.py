@@ -196,7 +196,7 @@ def connect(ranks: Ranks, timeout_seconds: float) -> Peers | str:
     """
     place = (socket.gethostname(), ranks.device.index if ranks.device.type == "cuda" else None)
     places = ranks.all_gather_object(place)
-    obstacle, mail = _obstacle(places, ranks.rank), None
+    obstacle, mail = _obstacle(places, ranks), None
     if obstacle is None:
         try:
             words = mail_words(ranks.world_size)
@@ -212,18 +212,19 @@ def connect(ranks: Ranks, timeout_seconds: float) -> Peers | str:
     return peers
 
 
-def _obstacle(places: list[tuple[str, Any]], rank: int) -> str | None:
+def _obstacle(places: list[tuple[str, Any]], ranks: Ranks) -> str | None:
     """Say what keeps a rank from the others' memory."""
     hosts, devices = {host for host, _ in places}, [device for _, device in places]
+    mine = ranks.device.index
     if None in devices:
         return "not every rank computes on a GPU"
     if len(hosts) > 1:
         return f"the ranks are on {len(hosts)} hosts"
-    if len(set(devices)) < len(devices):
+    if len(set(devices)) < len(devices) and not ranks.shares_gpu:
         return "some ranks see their GPU under the same number"
     if len(devices) > MAX_PEERS:
         return f"at most {MAX_PEERS} ranks can share memory, not {len(devices)}"
     for other in devices:
-        if other != devices[rank] and not torch.cuda.can_device_access_peer(devices[rank], other):
-            return f"cuda:{devices[rank]} has no access to the memory of cuda:{other}"
+        if other != mine and not torch.cuda.can_device_access_peer(mine, other):
+            return f"cuda:{mine} has no access to the memory of cuda:{other}"
     return None

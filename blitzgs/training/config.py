@@ -187,6 +187,8 @@ class RanksConfig:
         timeout_seconds: a rank that does not show up at a collective for this long ends the job.
         transport: how Gaussians travel: "peer" (written to the other GPUs' memory), "collective" (NCCL or
             Gloo) or "auto" (the former where it works).
+        share_gpus: where a host has fewer GPUs than ranks, let ranks share them, for development: a step
+            then waits for each rank's turn on the GPU.
         half_exchange: exchange projected Gaussians in half precision (for slow links, less exact; always
             collective).
         max_imbalance: Gaussians move between ranks when the largest shard exceeds the smallest by this
@@ -195,6 +197,7 @@ class RanksConfig:
 
     timeout_seconds: float = 120.0
     transport: str = "auto"
+    share_gpus: bool = False
     half_exchange: bool = False
     max_imbalance: float = 1.1
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs a function on M ranks: Gloo on the CPU, NCCL on as many GPUs.
+"""Runs a function on M ranks: Gloo on the CPU, NCCL on as many GPUs; where there are fewer, ranks share them.
 
 A fork server imports torch once, so CPU ranks start quickly; a CUDA context does not survive a fork.
 """
@@ -16,6 +16,7 @@ import torch
 from torch.distributed import TCPStore
 
 from blitzgs.distributed.group import Ranks
+from tests.helpers import needs_cuda
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli"])
@@ -34,7 +35,7 @@ def _child(function, rank, world_size, port, timeout_seconds, join, device, tran
     )
     try:
         if join:
-            with Ranks.from_environment(device, timeout_seconds, transport) as ranks:
+            with Ranks.from_environment(device, timeout_seconds, transport, share_gpus=True) as ranks:
                 result = function(ranks, *pickle.loads(arguments))
         else:
             result = function(rank, *pickle.loads(arguments))
@@ -56,19 +57,23 @@ class RankError(AssertionError):
         self.messages = messages
 
 
-def on_each_device(*world_sizes):
-    """Parameters (world_size, device) for a test: all on the CPU, and those there are GPUs for on CUDA."""
-    cpu = [pytest.param(size, "cpu", id=f"cpu-{size}") for size in world_sizes]
+def on_cuda(*world_sizes):
+    """Parameters (world_size, device) for a test on CUDA; with fewer GPUs than ranks these share them."""
     gpus = torch.cuda.device_count()
-    return cpu + [
+    return [
         pytest.param(
             size,
             "cuda",
-            id=f"cuda-{size}",
-            marks=[pytest.mark.cuda, pytest.mark.skipif(gpus < size, reason=f"needs {size} GPUs")],
+            id=f"cuda-{size}-shared" if 0 < gpus < size else f"cuda-{size}",
+            marks=[pytest.mark.cuda, needs_cuda],
         )
         for size in world_sizes
     ]
+
+
+def on_each_device(*world_sizes):
+    """Parameters (world_size, device) for a test: on the CPU, and on CUDA where there is a GPU."""
+    return [pytest.param(size, "cpu", id=f"cpu-{size}") for size in world_sizes] + on_cuda(*world_sizes)
 
 
 def run_ranks(

@@ -5,24 +5,32 @@ import time
 import pytest
 import torch
 
-from blitzgs.distributed.group import MismatchError, Ranks
-from tests.distributed.rank_harness import RankError, run_ranks
+from blitzgs.distributed.group import MismatchError, Ranks, _resolve_device
+from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 
 
 def _collectives(ranks):
-    m, size = ranks.rank, ranks.world_size
-    assert ranks.all_reduce(torch.tensor([m, 10])).tolist() == [size * (size - 1) // 2, 10 * size]
-    assert ranks.all_reduce(torch.tensor(m), "max").item() == size - 1
-    assert ranks.all_reduce(torch.tensor(float(m)), "min").item() == 0
+    m, size, place = ranks.rank, ranks.world_size, ranks.device
+    assert ranks.all_reduce(torch.tensor([m, 10], device=place)).tolist() == [
+        size * (size - 1) // 2,
+        10 * size,
+    ]
+    assert ranks.all_reduce(torch.tensor(m, device=place), "max").item() == size - 1
+    assert ranks.all_reduce(torch.tensor(float(m), device=place), "min").item() == 0
+    assert ranks.share(torch.tensor([m, 7], device=place)).tolist() == [[n, 7] for n in range(size)]
     # Rank m sends m + n + 1 rows to rank n, and nothing to itself.
     sent = [0 if n == m else m + n + 1 for n in range(size)]
-    rows = torch.cat([torch.full((count, 2), 100 * m + n) for n, count in enumerate(sent)])
-    got, counts = ranks.exchange_rows(rows, sent)
-    assert counts == [0 if n == m else m + n + 1 for n in range(size)]
-    assert got[:, 0].tolist() == [100 * n + m for n in range(size) for _ in range(counts[n])]
+    for dtype in (torch.int64, torch.uint8, torch.float32, torch.float16):
+        rows = torch.cat([torch.full((count, 2), 100 * m + n) for n, count in enumerate(sent)])
+        got, counts = ranks.exchange_rows(rows.to(place, dtype), sent)
+        assert counts == [0 if n == m else m + n + 1 for n in range(size)]
+        assert got.device == place and got.dtype == dtype
+        assert got[:, 0].tolist() == [100 * n + m for n in range(size) for _ in range(counts[n])]
+        assert len(ranks.exchange_rows(got[:0], [0] * size)[0]) == 0
     assert ranks.broadcast_object({"from": m}, source=1) == {"from": 1}
     assert ranks.all_gather_object(m) == list(range(size))
-    assert [part.item() for part in ranks.all_gather(torch.tensor(m))] == list(range(size))
+    gathered = ranks.all_gather(torch.tensor(m, device=place))
+    assert [part.item() for part in gathered] == list(range(size))
     ranks.barrier()
     ranks.compare_across_ranks({"config": {"a": 1}, "code": "x"})
     try:
@@ -32,9 +40,11 @@ def _collectives(ranks):
     return None
 
 
-def test_collectives_and_mismatch_on_three_ranks():
+@pytest.mark.parametrize("transport", ["auto", "collective"])
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(3))
+def test_collectives_and_mismatch(world_size, device, transport):
     start = time.monotonic()
-    messages = run_ranks(_collectives, 3)
+    messages = run_ranks(_collectives, world_size, device=device, transport=transport)
     assert time.monotonic() - start < 60
     for message in messages:
         assert "the ranks disagree on code: ranks 0, 1" in message
@@ -57,6 +67,25 @@ def test_one_process_needs_no_group():
 def test_missing_gpu_is_named():
     with pytest.raises(ValueError, match="local rank 0 needs cuda:99"):
         Ranks.from_environment("cuda:99")
+
+
+def test_ranks_share_gpus_only_when_told(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    first, second = torch.device("cuda:0"), torch.device("cuda:1")
+
+    def places(device, ranks, share_gpus):
+        return [_resolve_device(device, m, ranks, share_gpus) for m in range(ranks)]
+
+    assert places("cuda", 2, False) == places("cuda", 2, True) == [(first, False), (second, False)]
+    assert places("cuda", 3, True) == [(first, True), (second, True), (first, True)]
+    assert places("cuda:1", 2, True) == [(second, True)] * 2
+    assert places("cuda:1", 1, True) == [(second, False)]
+    assert places("cpu", 2, True) == [(torch.device("cpu"), False)] * 2
+    with pytest.raises(ValueError, match=r"local rank 2 needs cuda:2, but .* 2 CUDA.*ranks\.share_gpus=true"):
+        places("cuda", 3, False)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(ValueError, match="local rank 0 needs cuda:0, but this host has 0 CUDA devices"):
+        places("cuda", 2, True)
 
 
 def _out_of_memory():

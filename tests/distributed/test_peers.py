@@ -22,15 +22,10 @@ from blitzgs.ops.rasterize import gradient_columns
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
-from tests.distributed.rank_harness import RankError, run_ranks
+from tests.distributed.rank_harness import RankError, on_cuda, run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import sum_tables
 from tests.training.tiny import random_gaussians
-
-TWO_GPUS = [
-    pytest.mark.cuda,
-    pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs 2 GPUs"),
-]
 
 
 def _table(count, ranks):
@@ -82,21 +77,9 @@ def _both_ways(ranks):
     return sizes[2]
 
 
-@pytest.mark.parametrize(
-    "world_size",
-    [
-        pytest.param(
-            size,
-            marks=[
-                pytest.mark.cuda,
-                pytest.mark.skipif(torch.cuda.device_count() < size, reason=f"needs {size} GPUs"),
-            ],
-        )
-        for size in (2, 4)
-    ],
-)
-def test_peers_bring_what_collectives_bring(world_size):
-    sizes = run_ranks(_both_ways, world_size, device="cuda", transport="peer")
+@pytest.mark.parametrize(("world_size", "device"), on_cuda(2, 4))
+def test_peers_bring_what_collectives_bring(world_size, device):
+    sizes = run_ranks(_both_ways, world_size, device=device, transport="peer")
     assert len(set(sizes)) == 1
 
 
@@ -132,13 +115,13 @@ def _gradients(ranks):
         optimiser.step(table, frames[1], rows[1], None, 1, kept)
         assert torch.equal(kept, rows[0].means2d)
         stepped.append((table["last_step"] == 1).sum().item())
-    assert min(stepped[1:3]) > 0
+    assert (min(stepped[1:3]) > 0) == (ranks.rank != 2)
     return stepped
 
 
-@pytest.mark.parametrize("_", [pytest.param(0, marks=TWO_GPUS)])
-def test_gradients_in_tables_are_those_that_return(_):
-    assert len(run_ranks(_gradients, 2, device="cuda", transport="peer")) == 2
+@pytest.mark.parametrize(("world_size", "device"), on_cuda(2, 4))
+def test_gradients_in_tables_are_those_that_return(world_size, device):
+    assert len(run_ranks(_gradients, world_size, device=device, transport="peer")) == world_size
 
 
 def _overtaken(ranks):
@@ -151,9 +134,9 @@ def _overtaken(ranks):
     return True
 
 
-@pytest.mark.parametrize("_", [pytest.param(0, marks=TWO_GPUS)])
-def test_an_overtaken_exchange_is_refused(_):
-    assert run_ranks(_overtaken, 2, device="cuda") == [True, True]
+@pytest.mark.parametrize(("world_size", "device"), on_cuda(2))
+def test_an_overtaken_exchange_is_refused(world_size, device):
+    assert run_ranks(_overtaken, world_size, device=device, transport="peer") == [True] * world_size
 
 
 def _abandoned(ranks, how):
@@ -166,11 +149,12 @@ def _abandoned(ranks, how):
     _exchange(table, ranks)
 
 
-@pytest.mark.parametrize("how", [pytest.param(how, marks=TWO_GPUS) for how in ("kill", "hang")])
-def test_a_rank_that_leaves_a_meeting_is_named(how):
+@pytest.mark.parametrize("how", ["kill", "hang"])
+@pytest.mark.parametrize(("world_size", "device"), on_cuda(2))
+def test_a_rank_that_leaves_a_meeting_is_named(world_size, device, how):
     start = time.monotonic()
     with pytest.raises(RankError) as failure:
-        run_ranks(_abandoned, 2, how, device="cuda", timeout_seconds=3.0, limit=50)
+        run_ranks(_abandoned, world_size, how, device=device, timeout_seconds=3.0, limit=50)
     assert time.monotonic() - start < 50
     assert "waited 3 s in read: rank 1 has not" in failure.value.blame
 
@@ -248,6 +232,15 @@ def test_peers_need_gpus():
     assert run_ranks(_refused, 2, join=False) == [True, True]
     with pytest.raises(ValueError, match="transport must be one of auto, peer, collective, not 'pigeon'"):
         Ranks.from_environment("cpu", transport="pigeon")
+
+
+def test_ranks_on_one_gpu_need_to_be_told(monkeypatch):
+    places = [("host", 0), ("host", 1), ("host", 0)]
+    monkeypatch.setattr(torch.cuda, "can_device_access_peer", lambda mine, other: mine != other)
+    gpu = torch.device("cuda:0")
+    assert "under the same number" in peers_module._obstacle(places, Ranks(device=gpu))
+    assert peers_module._obstacle(places, Ranks(device=gpu, shares_gpu=True)) is None
+    assert peers_module._obstacle(places[:2], Ranks(device=gpu)) is None
 
 
 def _falls_back(ranks):
