@@ -8,7 +8,8 @@ Errors are against the float64 reference of the same mode in a few windows of th
 absolute error of the image away from the declared cut pixels, and the largest error of a parameter's gradient
 (max |difference| / max |reference|). Fails when the default setting misses its bounds.
 
-Writes a table (Markdown), the figures (JSON) and, with matplotlib, a Pareto plot.
+Writes a table (Markdown), the figures (JSON) and, with matplotlib, a Pareto plot; anew with each option, so
+that a run that is cut off leaves what it measured.
 
 The row "exact exponential" needs a second build of the kernels, whose folder --exact-library names:
 
@@ -194,28 +195,29 @@ def measure_library(folder: Path, arguments: list[str]) -> Figures:
     return replace(Figures(**row), name="exact exponential")
 
 
-def table(rows: list[Figures]) -> str:
-    lines = [
-        "| option | forward + backward, ms a view | image error | gradient error | cut pixels |",
-        "|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r.name} | {r.milliseconds:.2f} | {r.image_error:.1e} | {r.gradient_error:.1e} | "
-        f"{r.cut_pixels:.2%} |"
-        for r in rows
-    ]
-    return "\n".join(lines)
+HEAD = """\
+| option | forward + backward, ms a view | image error | gradient error | cut pixels |
+|---|---|---|---|---|"""
+
+
+def line(figures: Figures) -> str:
+    """Return an option's line of the table."""
+    f = figures
+    errors = f"{f.image_error:.1e} | {f.gradient_error:.1e}"
+    return f"| {f.name} | {f.milliseconds:.2f} | {errors} | {f.cut_pixels:.2%} |"
 
 
 def plot(rows: list[Figures], title: str, path: Path) -> None:
-    """Draw time against error, better towards the lower left, and the line of what nothing beats in both."""
+    """Draw time against error, better towards the lower left, and the line of what nothing beats in both.
+
+    Without matplotlib there is no plot.
+    """
     try:
         import matplotlib
 
         matplotlib.use("Agg")
         from matplotlib import pyplot as plt
     except ImportError:
-        print("matplotlib is not installed: no plot")
         return
     figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharex=True)
     bounds = (("image_error", IMAGE_BOUND), ("gradient_error", GRADIENT_BOUND))
@@ -239,6 +241,15 @@ def plot(rows: list[Figures], title: str, path: Path) -> None:
     axes[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5), fontsize=8, title=title, title_fontsize=8)
     figure.tight_layout()
     figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+def write(rows: list[Figures], title: str, folder: Path) -> None:
+    """Write the table, the figures and the plot."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "accuracy.md").write_text("\n".join([HEAD, *map(line, rows)]) + "\n")
+    (folder / "accuracy.json").write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
+    plot(rows, title, folder / "accuracy.png")
 
 
 def require_bounds(default: Figures) -> None:
@@ -268,9 +279,18 @@ def main() -> None:
     batch = aerial(gaussians, args.device, views=4, width=width, height=width * 2 // 3)
     scenes = {1: batch.first_views(1), 4: batch}
     title = f"{args.device}, {gaussians:,} Gaussians, {batch.width} x {batch.height}"
-    print(title)
-    options = [o for o in options_for(args.device) if args.only in (None, o.name)]
-    rows = [measure(option, scenes, args.repeats) for option in options]
+    print(f"{title}\n\n{HEAD}", flush=True)
+    rows: list[Figures] = []
+
+    def add(figures: Figures) -> None:
+        rows.append(figures)
+        print(line(figures), flush=True)
+        if args.out:
+            write(rows, title, args.out)
+
+    for option in options_for(args.device):
+        if args.only in (None, option.name):
+            add(measure(option, scenes, args.repeats))
     if args.exact_library:
         repeated = [
             "--device",
@@ -282,13 +302,7 @@ def main() -> None:
             "--repeats",
             args.repeats,
         ]
-        rows.append(measure_library(args.exact_library, [str(value) for value in repeated]))
-    print(table(rows))
-    if args.out:
-        args.out.mkdir(parents=True, exist_ok=True)
-        (args.out / "accuracy.md").write_text(table(rows) + "\n")
-        (args.out / "accuracy.json").write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
-        plot(rows, title, args.out / "accuracy.png")
+        add(measure_library(args.exact_library, [str(value) for value in repeated]))
     require_bounds(rows[0])
 
 

@@ -116,7 +116,8 @@ def load_latest(
 ) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
     """Load this rank's share of the newest sound checkpoint.
 
-    A damaged one is refused with a warning that names it and the reason, and the one before it is tried.
+    A damaged one is refused and the one before it tried; a warning then names each refused, why, and the one
+    that is used.
 
     Args:
         directory: folder given to `save`.
@@ -133,11 +134,13 @@ def load_latest(
     refused = []
     for name in reversed(found):
         try:
-            return load(Path(directory) / name, ranks, device)
+            loaded = load(Path(directory) / name, ranks, device)
         except CheckpointError as error:
             refused.append(str(error))
-            if ranks.rank == 0:
-                warnings.warn(f"{error}; trying the one before it", stacklevel=2)
+            continue
+        if refused and ranks.rank == 0:
+            warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
+        return loaded
     if refused:
         raise CheckpointError(f"no sound checkpoint in {directory}: {'; '.join(refused)}")
     return None

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The accuracy benchmark must see an error where there is one."""
 
+import json
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -58,11 +59,29 @@ def test_table_and_figures(scene, tmp_path):
     exact = bm_accuracy.Option("float64", dtype=torch.float64)
     figures = bm_accuracy.measure(exact, {1: scene}, repeats=1)
     assert figures.image_error < 1e-12 and figures.milliseconds > 0
-    assert bm_accuracy.table([figures]).splitlines()[-1].startswith("| float64 |")
+    bm_accuracy.write([figures], "title", tmp_path)
+    assert (tmp_path / "accuracy.md").read_text().splitlines()[-1].startswith("| float64 |")
+    assert json.loads((tmp_path / "accuracy.json").read_text()) == [asdict(figures)]
     bm_accuracy.require_bounds(figures)
     figures.gradient_error = 2e-4
     with pytest.raises(SystemExit, match="gradients 2.0e-04 of 1e-04"):
         bm_accuracy.require_bounds(figures)
     pytest.importorskip("matplotlib")
-    bm_accuracy.plot([figures], "title", tmp_path / "plot.png")
-    assert (tmp_path / "plot.png").stat().st_size > 1000
+    assert (tmp_path / "accuracy.png").stat().st_size > 1000
+
+
+def test_what_was_measured_stays_when_a_run_is_cut_off(scene, tmp_path, monkeypatch, capsys):
+    def measure(option, *_):
+        if option.name == "tiles of 8":
+            raise KeyboardInterrupt
+        return bm_accuracy.Figures(option.name, 1.0, 1e-6, 1e-5, 0.01)
+
+    monkeypatch.setattr(bm_accuracy, "measure", measure)
+    monkeypatch.setattr(bm_accuracy, "aerial", lambda *_, **__: scene)
+    monkeypatch.setattr(sys, "argv", ["bm_accuracy.py", "--device", "cpu", "--out", str(tmp_path)])
+    with pytest.raises(KeyboardInterrupt):
+        bm_accuracy.main()
+    names = [row["name"] for row in json.loads((tmp_path / "accuracy.json").read_text())]
+    assert names == ["default", "antialiased"]
+    for text in ((tmp_path / "accuracy.md").read_text(), capsys.readouterr().out):
+        assert text.splitlines()[-1].startswith("| antialiased |")

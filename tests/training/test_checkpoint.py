@@ -94,7 +94,9 @@ def test_a_damaged_one_is_refused_by_name(tmp_path, damage, reason):
     checkpoint.save(tmp_path, table(50, 1), {"iteration": 1}, ALONE)
     newest = checkpoint.save(tmp_path, table(50, 2), {"iteration": 2}, ALONE)
     damage(newest)
-    with pytest.warns(UserWarning, match=f"checkpoint_000001 is damaged.*{reason}"):
+    with pytest.warns(
+        UserWarning, match=f"checkpoint_000001 is damaged.*{reason}.*; using checkpoint_000000"
+    ):
         columns, state = checkpoint.load_latest(tmp_path, ALONE, "cpu")
     assert state == {"iteration": 1}
     assert equal(columns, table(50, 1))
@@ -104,14 +106,23 @@ def test_a_damaged_one_is_refused_by_name(tmp_path, damage, reason):
     assert checkpoint.save(tmp_path, table(5), {}, ALONE).name == "checkpoint_000002"
 
 
-def test_none_sound_is_an_error(tmp_path):
-    path = checkpoint.save(tmp_path, table(5), {}, ALONE)
-    (path / "manifest.json").unlink()
-    with (
-        pytest.warns(UserWarning),
-        pytest.raises(checkpoint.CheckpointError, match="no sound checkpoint"),
-    ):
+def test_each_damaged_one_is_named_once(tmp_path):
+    paths = [checkpoint.save(tmp_path, table(5), {}, ALONE) for _ in range(3)]
+    for path in paths[1:]:
+        (path / "manifest.json").unlink()
+    with pytest.warns(UserWarning) as caught:
         checkpoint.load_latest(tmp_path, ALONE, "cpu")
+    (warning,) = caught
+    (paths[0] / "manifest.json").unlink()
+    with (
+        warnings.catch_warnings(),
+        pytest.raises(checkpoint.CheckpointError, match="no sound checkpoint") as failure,
+    ):
+        warnings.simplefilter("error")
+        checkpoint.load_latest(tmp_path, ALONE, "cpu")
+    for path in paths:
+        assert str(warning.message).count(path.name) == 1
+        assert str(failure.value).count(path.name) == 1
 
 
 def _save_and_die(directory, point, keep):
