@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A real training, some way in: what a step and a density event take, and where the GPU and the host wait.
+
+    python benchmarks/bm_training.py --data DIR --config configs/aerial.yaml [--images 10000] [--FIELD=VALUE]
+    torchrun --nproc-per-node=2 benchmarks/bm_training.py --data DIR --config configs/aerial.yaml
+
+Trains the capture with `--images` images, as `blitzgs train` does, batches loaded and logged, but without
+checkpoints and evaluations. Then measures, by the host's clock and with the GPU waited for at their ends,
+`--steps` further steps with the density events that fall among them. On CUDA `--profiled` more steps, without
+density events, go under torch's profiler: how long kernels and copies keep the main stream busy (the stream
+that works most), how long the host stands in calls that wait for the GPU, and the longest gaps on the main
+stream by what stands before and after them. The figures are rank 0's; ranks meet in every step.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import torch
+from harness import markdown_table, report
+from torch.profiler import ProfilerActivity, profile
+
+from blitzgs.distributed.group import Ranks, Transport
+from blitzgs.training import run
+from blitzgs.training.config_io import load_config
+from blitzgs.training.run_log import RunLog
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.trainer import Trainer
+
+LEAST_GAP = 3.0  # us; what lies between two kernels that were queued long before
+
+
+class Times(NamedTuple):
+    """Seconds of some steps in a row, and of each density event among them."""
+
+    steps: float
+    events: list[float]
+
+
+class StreamUse(NamedTuple):
+    """What the main stream and the host did in the profiled steps.
+
+    Attributes:
+        busy: share of the time, from the first to the last kernel, in which the main stream works.
+        waiting: share of the same time that the thread which launches kernels waits for the GPU.
+        launches: kernels and copies on all streams.
+        gaps: (before, after) -> the main stream's gaps between these, in us.
+    """
+
+    busy: float
+    waiting: float
+    launches: int
+    gaps: dict[tuple[str, str], list[float]]
+
+
+class MeasuredTrainer(Trainer):
+    """A trainer that stops on the way to measure."""
+
+    @torch.no_grad()
+    def begin(self, steps: int) -> None:
+        """Train the first steps, with their density events."""
+        self._clock = time.monotonic()
+        folder = self.folder if self.ranks.rank == 0 else None
+        self.log = RunLog(folder, steps * self.schedule.batch_size, done=0, tensorboard=False)
+        self.timed(steps)
+
+    @torch.no_grad()
+    def timed(self, steps: int) -> Times:
+        """Train further steps with their density events, and measure both."""
+        size, first = self.schedule.batch_size, self.progress.step + 1
+        spent, events = 0.0, []
+        begin = self._now()
+        for step in range(first, first + steps):
+            self._step(step, self.log)
+            for event in self.schedule.events((step - 1) * size, step * size):
+                if event.kind == "densify":
+                    stopped = self._now()
+                    self._densify(event, step, self.log)
+                    spent, begin, stopped = spent + stopped - begin, self._now(), stopped
+                    events.append(begin - stopped)
+        return Times(spent + self._now() - begin, events)
+
+    @torch.no_grad()
+    def profiled(self, steps: int) -> list[dict[str, Any]]:
+        """Train further steps without density events; return the events of the profiler's trace."""
+        first = self.progress.step + 1
+        self._now()
+        with profile(activities=[ProfilerActivity.CUDA]) as profiler:
+            for step in range(first, first + steps):
+                self._step(step, self.log)
+            self._now()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "trace.json"
+            profiler.export_chrome_trace(str(path))
+            events: list[dict[str, Any]] = json.loads(path.read_text())["traceEvents"]
+        return events
+
+    def close(self) -> None:
+        """Stop loading batches."""
+        self._loader.close()
+        self.log.close()
+
+    def _now(self) -> float:
+        """Wait for the GPU and return the host's time in seconds."""
+        if self.ranks.device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+def stream_use(trace: Sequence[dict[str, Any]]) -> StreamUse:
+    """Read how busy the main stream was, its gaps, and how long the host waited."""
+    work: dict[int, list[tuple[float, float, str]]] = defaultdict(list)
+    calls: dict[int, list[tuple[str, float]]] = defaultdict(list)
+    for event in trace:
+        kind = event.get("cat")
+        if kind in ("kernel", "gpu_memcpy", "gpu_memset"):
+            end = event["ts"] + event["dur"]
+            work[event["args"]["stream"]].append((event["ts"], end, short_name(event["name"])))
+        elif kind in ("cuda_runtime", "cuda_driver"):
+            calls[event["tid"]].append((event["name"], event["dur"]))
+    main = sorted(max(work.values(), key=lambda items: sum(end - begin for begin, end, _ in items)))
+    span = main[-1][1] - main[0][0]
+    busy, last, before = 0.0, main[0][0], ""
+    gaps: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for begin, end, name in main:
+        if begin - last > LEAST_GAP:
+            gaps[before, name].append(begin - last)
+        busy += max(end - max(begin, last), 0.0)
+        if end >= last:
+            last, before = end, name
+    launching = max(calls.values(), key=lambda items: sum("Launch" in name for name, _ in items), default=[])
+    waits = sum(length for name, length in launching if "Synchronize" in name)
+    return StreamUse(busy / span, waits / span, sum(map(len, work.values())), dict(gaps))
+
+
+def short_name(name: str) -> str:
+    """Return a kernel's name without namespaces, template arguments and parameters."""
+    name = name.replace("(anonymous namespace)::", "").removeprefix("void ")
+    return re.split(r"[<(]", name)[0].split("::")[-1].strip()
+
+
+def figures(times: Times, steps: int, use: StreamUse | None, profiled: int) -> list[dict[str, Any]]:
+    """Return the rows of the table."""
+    rows: list[tuple[str, Any]] = [("a step without density events, ms", 1e3 * times.steps / steps)]
+    if times.events:
+        every = steps / len(times.events)
+        rows += [
+            (f"with them, one in {every:.3g} steps, ms", 1e3 * (times.steps + sum(times.events)) / steps),
+            ("a density event, ms", 1e3 * sum(times.events) / len(times.events)),
+        ]
+    if use is not None:
+        rows += [
+            ("the main stream is busy", f"{use.busy:.0%}"),
+            ("the host waits for the GPU", f"{use.waiting:.0%}"),
+            ("kernels and copies a step", use.launches / profiled),
+        ]
+    return [{"figure": name, "value": value} for name, value in rows]
+
+
+def longest_gaps(use: StreamUse, steps: int, count: int = 8) -> list[dict[str, Any]]:
+    """Return the rows of the table of gaps, those that take most first."""
+    ordered = sorted(use.gaps.items(), key=lambda item: -sum(item[1]))
+    return [
+        {"before": before, "after": after, "us a step": sum(gaps) / steps, "times a step": len(gaps) / steps}
+        for (before, after), gaps in ordered[:count]
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", required=True, metavar="DIR", help="the capture")
+    parser.add_argument("--config", type=Path, metavar="YAML", help="of the training (default: the defaults)")
+    parser.add_argument("--images", type=int, default=10_000, help="trained before (%(default)s)")
+    parser.add_argument("--steps", type=int, default=500, help="timed steps (%(default)s)")
+    parser.add_argument("--profiled", type=int, default=40, help="steps under the profiler (%(default)s)")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    args, overrides = parser.parse_known_args(arguments)
+    config = load_config(args.config, [*overrides, f"data.path={json.dumps(str(Path(args.data).resolve()))}"])
+    job, schedule = config.ranks, Schedule(config.schedule)
+    before = args.images // schedule.batch_size
+    if before + args.steps + args.profiled > schedule.steps:
+        raise SystemExit(f"the schedule ends after {schedule.iterations:,} images: lower --images")
+    with (
+        Ranks.from_environment(
+            args.device, job.timeout_seconds, cast(Transport, job.transport), job.share_gpus
+        ) as ranks,
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        capture, images = run.open_capture(config, ranks)
+        trainer = MeasuredTrainer(config, capture, images, Path(folder), ranks)
+        trainer.begin(before)
+        times, use = trainer.timed(args.steps), None
+        if ranks.device.type == "cuda":
+            use = stream_use(trainer.profiled(args.profiled))
+        count = int(ranks.all_reduce(torch.tensor([len(trainer.table)], device=ranks.device)))
+        trainer.close()
+        if ranks.rank == 0:
+            title = (
+                f"Training: {ranks.world_size} rank(s), {count:,} Gaussians after {args.images:,} images, "
+                f"{schedule.batch_size} a step"
+            )
+            report(title, figures(times, args.steps, use, args.profiled), args.json, ranks.device)
+            if use is not None and use.gaps:
+                print(markdown_table(longest_gaps(use, args.profiled)))
+
+
+if __name__ == "__main__":
+    main()
