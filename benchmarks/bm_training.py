@@ -84,7 +84,8 @@ class MeasuredTrainer(Trainer):
                 if event.kind == "densify":
                     stopped = self._now()
                     self._densify(event, step, self.log)
-                    spent, begin, stopped = spent + stopped - begin, self._now(), stopped
+                    spent += stopped - begin
+                    begin = self._now()
                     events.append(begin - stopped)
         return Times(spent + self._now() - begin, events)
 
