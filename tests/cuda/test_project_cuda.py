@@ -164,7 +164,7 @@ def test_rows_do_not_depend_on_the_room_that_was_guessed(scene, rows_seen):
         plan, carry, counted, written = ops.project_count(*arguments, *room, ids)
         assert torch.equal(counted, totals)
         ops.project_colors_(*arguments[:7], scene.width, scene.height, scene.degree, counted, written)
-        if room[0] >= visible and room[1] >= rows:
+        if written and room[0] >= visible and room[1] >= rows:
             columns = [*rows_of(written, counts)[:12], written[12][:rows]]
         else:
             columns = ops.project_emit(*arguments, plan, carry, counts, ids)
