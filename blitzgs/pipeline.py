@@ -193,10 +193,10 @@ def _forward(
     """Queue all of it, then wait for the numbers of rows; None: the room was too small, and has learnt."""
     count, tiles = len(views), (0, -1) if share is None else share.composited
     projection = _project(table, views, options, active, share, room, waiting)
-    splats, route, n_rows = projection.splats, projection.route, projection.n_rows
+    splats, space, n_rows = projection.splats, projection.space, projection.n_rows
     mark("project")
-    if share is not None and route is not None:
-        splats = send(splats, route, share.ranks)
+    if share is not None and projection.route is not None:
+        splats = send(splats, projection.route, share.ranks)
     mark("exchange")
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids, count,
@@ -204,8 +204,7 @@ def _forward(
     )  # fmt: skip
     mark("sort")
     backgrounds = _backgrounds(options.background, count, table.device)
-    space = None if route is None else route.space
-    if space is not None and route is not None and route.kept is not None:
+    if space is not None:
         space.meet_colors()
     arguments = (
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
@@ -236,7 +235,7 @@ def _forward(
         known.rows,
         splats,
         share,
-        route,
+        known.route,
         known.visible,
         backgrounds,
         isect_rows,

@@ -8,7 +8,7 @@ that the sum does not depend on who was faster (paper §3.1). `exchange` is the 
 with autograd, `plan_route` for rows that are there already.
 
 Rows travel in one of two ways. Where the ranks share memory (`blitzgs.distributed.peers`), each writes its
-rows into the columns that the others composite from, and the host waits for the numbers when all of that is
+rows into the columns that the others composite from, and the host waits for the numbers when compositing is
 queued: `PeerSpace` does so. Nothing is sent back then: the projection's backward pass reads the gradients
 where the ranks that composited the rows added them up (`PeerSpace.share_table`), so that they travel while
 the optimiser works. Otherwise rows are packed, carried by one all-to-all and taken apart, and their gradients
@@ -55,8 +55,6 @@ class Route:
             them as they are.
         places: int64, of the rows sent, see `blitzgs.ops.scatter`; None: not sent yet.
         space: where peers write; None: rows travel by collectives.
-        kept: what has to live until the rows' colours, which travel on their own, are there; None: they
-            travel with them.
     """
 
     traffic: Traffic
@@ -64,7 +62,6 @@ class Route:
     halves: Tensor | None = None
     places: Tensor | None = None
     space: PeerSpace | None = None
-    kept: Tensor | None = None
 
     @property
     def pays_apart(self) -> bool:
@@ -76,7 +73,7 @@ def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:
     """Agree on how many rows go where; waits for the device.
 
     Args:
-        totals: as for `PeerSpace.fill`.
+        totals: as for `PeerSpace.queue`.
         n_views: B.
         ranks: the job.
     """
@@ -124,16 +121,13 @@ def send(splats: Splats, route: Route, ranks: Ranks) -> Splats:
     """Carry rows to the ranks whose tiles they touch.
 
     Args:
-        splats: this rank's rows; where peers write: what they write here.
-        route: of these rows; remembers their places.
+        splats: this rank's rows.
+        route: of these rows, without peers; remembers their places.
         ranks: the job.
 
     Returns:
-        The rows that touch the tiles this rank composites, grouped by source rank. Where peers write them,
-        they are valid until the next exchange; colours that travel apart, after `PeerSpace.meet_colors`.
+        The rows that touch the tiles this rank composites, grouped by source rank.
     """
-    if route.space is not None:
-        return splats
     columns = [splats.means2d, splats.depths, splats.camera_ids, splats.ids]
     if route.halves is None:
         columns += [splats.conics, splats.opacities, splats.colors]

@@ -24,11 +24,12 @@ behind it, on any rank, finds done what any rank queued before it. Hence
   the next. Sums of the numbers lie where no other rank ever writes: a rank's own second meeting after
   overwrites them.
 
-Rows are queued for writing behind A while the counts are on their way to the host. Where they do not fit into
-somebody's buffer no rank writes any, which each finds from the same counts; then all wait for the counts, so
-when buffers have to grow, no kernel of any rank uses them. A rank that dies leaves the others in a meeting:
-their hosts wait in `Ranks.reading`, where the watchdog finds them, and a meeting that lasts longer than that
-aborts the process's kernels.
+Rows are queued for writing behind A, and for compositing, while the counts are on their way to the host.
+Where they do not fit into somebody's buffer no rank writes any, which each finds from the same counts, and
+nothing is composited; then all wait for what they have queued, so when buffers grow, no kernel of any rank
+uses them, and all is queued again. So it is where one rank has more intersections than all have room for. A
+rank that dies leaves the others in a meeting: their hosts wait in `Ranks.reading`, where the watchdog finds
+them, and a meeting that lasts longer than that aborts the process's kernels.
 """
 
 from __future__ import annotations
@@ -87,6 +88,8 @@ class Peers:
         buffers: int32 [words] of each rank, mapped here.
         columns: of the rows in this rank's buffer, as `PeerSpace.arrived` has them; empty: not made yet.
         exchanges: how often rows were written: tells whose rows are in the buffers.
+        n_isects: how many intersections of arrived rows may be listed before their number is known, by what
+            frames of late needed; the same on all ranks.
         second: stream for colours.
         apart: whether the next exchange's colours travel apart from their rows; the same on all ranks.
     """
@@ -97,6 +100,7 @@ class Peers:
         self.buffers: list[Tensor] = []
         self.columns: list[Tensor] = []
         self.exchanges = 0
+        self.n_isects = 0
         self.apart = False
         self.second = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._meetings = 0
@@ -120,6 +124,10 @@ class Peers:
     def meet(self) -> None:
         """Meet the other ranks, in stream order."""
         self._meet(None, self.world_size, None)
+
+    def learn(self, n_isects: int) -> None:
+        """Take note of the most intersections that a rank had."""
+        self.n_isects = max(n_isects * 9 // 8, self.n_isects - self.n_isects // 256)
 
     def meet_beside(self) -> None:
         """Meet the other ranks on the stream beside the step, whatever meetings the step is at."""

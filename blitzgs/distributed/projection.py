@@ -29,11 +29,13 @@ class Known(NamedTuple):
     Attributes:
         rows: this rank's.
         splats: what was composited, where rows did not travel by collectives.
+        route: where rows went; None: they stayed.
         visible: int64 [B], rows of each view over all ranks.
     """
 
     rows: Rows
     splats: Splats
+    route: Route | None
     visible: Tensor
 
 
@@ -42,7 +44,8 @@ class Projection(NamedTuple):
 
     Attributes:
         splats: the rows, or what the other ranks' projections write here; with room behind them.
-        route: where rows go; None: they stay.
+        route: where rows have to be sent; None: they stay, or go there by themselves.
+        space: where they arrive then; None: by collectives.
         n_rows: int64 [1], how many splats there are, on the device; None: there is no room behind them.
         n_isects: how many intersections there are at most, or may be listed.
         settle: waits for the numbers; None: there was too little room for something.
@@ -50,6 +53,7 @@ class Projection(NamedTuple):
 
     splats: Splats
     route: Route | None
+    space: PeerSpace | None
     n_rows: Tensor | None
     n_isects: int
     settle: Callable[[], Known | None]
@@ -76,7 +80,7 @@ def project_views(
     if share is None:
         return _project_here(arguments, ids, n_views, room, waiting)
     if share.ranks.peers is not None and not share.half:
-        return _project_to_peers(arguments, ids, n_views, share.ranks)
+        return _project_to_peers(arguments, ids, n_views, share.ranks, waiting)
     return _project_and_route(arguments, ids, n_views, share)
 
 
@@ -92,8 +96,8 @@ def _project_here(
         needed = counts.tolist()
         room.learn(needed)
         columns = emit_rows(arguments, planned, counts, ids)
-        known = Known(rows_of(columns, counts), _splats_of(columns), visible)
-        return Projection(known.splats, None, None, needed[2], lambda: known)
+        known = Known(rows_of(columns, counts), _splats_of(columns), None, visible)
+        return Projection(known.splats, None, None, None, needed[2], lambda: known)
     color_rows(arguments, totals, columns)
 
     def settle() -> Known | None:
@@ -104,11 +108,10 @@ def _project_here(
         if not fits:
             return None
         count = needed[1]
-        return Known(
-            rows_of(columns, counts), Splats(*(column[:count] for column in _splats_of(columns))), visible
-        )
+        splats = Splats(*(column[:count] for column in _splats_of(columns)))
+        return Known(rows_of(columns, counts), splats, None, visible)
 
-    return Projection(_splats_of(columns), None, totals[1:2], room.sizes[2], settle)
+    return Projection(_splats_of(columns), None, None, totals[1:2], room.sizes[2], settle)
 
 
 def _splats_of(columns: Sequence[Tensor]) -> Splats:
@@ -119,31 +122,48 @@ def _splats_of(columns: Sequence[Tensor]) -> Splats:
     )
 
 
-def _project_to_peers(arguments: Sequence[Any], ids: Tensor, n_views: int, ranks: Ranks) -> Projection:
-    """Project and write rows to the ranks that composite them, through memory that these share."""
+def _project_to_peers(
+    arguments: Sequence[Any], ids: Tensor, n_views: int, ranks: Ranks, waiting: ExitStack
+) -> Projection:
+    """Project, and write rows to the ranks that composite them, through memory that these share."""
     peers = ranks.peers
-    assert peers is not None
-    apart = peers.second if peers.apart else None
+    assert peers is not None and peers.second is not None
+    second = peers.second
+    colors_stream = second.cuda_stream if peers.apart else 0
     width, height, _, sh_degree = arguments[9:13]
 
-    def count(space: int) -> tuple[Tensor, list[Tensor]]:
-        return torch.ops.blitzgs.project_count(*arguments, space, space, ids)[2:]
+    def project(capacity: int) -> tuple[Tensor, list[Tensor]]:
+        return torch.ops.blitzgs.project_count(*arguments, capacity, capacity, ids)[2:]
 
-    def send_rows(rows: list[Tensor], everyone: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
+    def send(rows: list[Tensor], everyone: Tensor, buffers: list[Tensor], capacity: int) -> list[Tensor]:
         return torch.ops.blitzgs.project_rows_to_peers_(
             *arguments[:7], width, height, sh_degree, everyone, ranks.rank, rows, buffers, capacity,
-            apart.cuda_stream if apart is not None else 0,
+            colors_stream,
         )  # fmt: skip
 
-    columns, (places, kept), space = PeerSpace.fill(n_views, ranks, count, send_rows)
-    rows = rows_of(columns, space.traffic.counts)
-    route = Route(
-        space.traffic, rows.rank_masks, places=places[: runs_of(len(rows.camera_ids))], space=space,
-        kept=kept if apart is not None else None,
-    )  # fmt: skip
-    peers.apart = route.pays_apart
-    known = Known(rows, space.arrived(), space.traffic.visible)
-    return Projection(known.splats, route, None, space.traffic.n_isects, lambda: known)
+    def release(error: type[BaseException] | None, *_: object) -> None:
+        """Keep the rows' memory from others as long as colours are written into it."""
+        if error is not None:
+            torch.cuda.current_stream().wait_stream(second)
+
+    waiting.push(release)
+    while True:
+        columns, places, space = PeerSpace.queue(n_views, ranks, project, send)
+        if space.n_isects > 0 or space.settle(ranks):
+            break
+
+    def settle() -> Known | None:
+        if not space.settle(ranks):
+            return None
+        traffic = space.traffic
+        assert traffic is not None
+        rows = rows_of(columns, traffic.counts)
+        route = Route(traffic, rows.rank_masks, places=places[: runs_of(len(rows.camera_ids))], space=space)
+        peers.apart = route.pays_apart
+        return Known(rows, space.arrived(), route, traffic.visible)
+
+    n_isects = space.n_isects if space.traffic is None else space.traffic.n_isects
+    return Projection(space.arrived(), None, space, space.arrived_count, n_isects, settle)
 
 
 def _project_and_route(arguments: Sequence[Any], ids: Tensor, n_views: int, share: Share) -> Projection:
@@ -161,5 +181,5 @@ def _project_and_route(arguments: Sequence[Any], ids: Tensor, n_views: int, shar
         route = plan_route(splats, share.ranges, share.ranks, share.half)
     else:
         route = Route(traffic, rows.rank_masks)
-    known = Known(rows, splats, route.traffic.visible)
-    return Projection(splats, route, None, route.traffic.n_isects, lambda: known)
+    known = Known(rows, splats, route, route.traffic.visible)
+    return Projection(splats, route, None, None, route.traffic.n_isects, lambda: known)

@@ -27,7 +27,7 @@ _COLUMNS = (
     (torch.int64, 2, ()),
 )
 _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
-# Projects, and sends rows to the peers: see `PeerSpace.fill`.
+# Projects, and sends rows to the peers: see `PeerSpace.queue`.
 Projection = Callable[[int], tuple[Tensor, list[Tensor]]]
 Sending = Callable[[list[Tensor], Tensor, list[Tensor], int], list[Tensor]]
 # A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
@@ -66,6 +66,7 @@ class Traffic:
         rank: this rank.
         most: most rows that any rank has, sends or gets.
         n_isects: row-tile intersections among the rows received, or a few more.
+        most_isects: the most that any rank has of these.
         visible: int64 [B], rows of each view before the exchange, over all ranks; over shared memory valid
             until the next exchange.
     """
@@ -75,6 +76,7 @@ class Traffic:
     rank: int
     most: int
     n_isects: int
+    most_isects: int
     visible: Tensor
 
     @classmethod
@@ -83,12 +85,14 @@ class Traffic:
         first = 3 + len(visible)
         rows = [list(numbers[first::2]) for numbers in known]
         most = max(*(n[1] for n in known), *map(sum, rows), *map(sum, zip(*rows, strict=True)))
+        isects = [sum(column) for column in zip(*(n[first + 1 :: 2] for n in known), strict=True)]
         return cls(
             counts=torch.tensor(known[rank][:3]),
             rows=rows,
             rank=rank,
             most=most,
-            n_isects=sum(numbers[first + 2 * rank + 1] for numbers in known),
+            n_isects=isects[rank],
+            most_isects=max(isects),
             visible=visible,
         )
 
@@ -103,31 +107,44 @@ class Traffic:
         return [row[self.rank] for row in self.rows]
 
 
-@dataclass(frozen=True)
+@dataclass
 class PeerSpace:
     """Where the rows of one exchange lie in the peers' memory, see `blitzgs.distributed.peers`.
 
     Attributes:
         peers: the memory.
-        traffic: what goes where.
         capacity: length of the columns of arriving rows.
         exchange: number of this exchange; only the last one's rows are there.
+        n_isects: how many intersections of a rank's rows may be listed; 0: any, but first `settle`.
+        apart: whether colours travel on their own.
+        arrived_count: int64 [1] on the device, how many rows arrive; none where some rank lacks room.
+        admitted: what has to live until the rows' colours are there.
+        known: on the CPU, every rank's totals, once `told` has come to pass.
+        told: behind the meeting that brings them.
+        visible: int64 [B], rows of each view over all ranks.
+        traffic: what goes where, from `settle` on.
     """
 
     peers: Peers
-    traffic: Traffic
     capacity: int
     exchange: int
+    n_isects: int
+    apart: bool
+    arrived_count: Tensor
+    admitted: Tensor
+    known: Tensor
+    told: torch.cuda.Event
+    visible: Tensor
+    traffic: Traffic | None = None
 
     @classmethod
-    def fill(
+    def queue(
         cls, n_views: int, ranks: Ranks, project: Projection, send: Sending
-    ) -> tuple[list[Tensor], list[Tensor], PeerSpace]:
-        """Have the rows of all ranks written to each other, and agree on how many. Collective.
+    ) -> tuple[list[Tensor], Tensor, PeerSpace]:
+        """Queue that all ranks' rows are written to each other, up to the meeting that ends it. Collective.
 
-        All is queued, up to the meeting that ends it, before the host waits for the numbers: they come while
-        rows travel. Each rank has room for as many rows of its own as the buffers have for those that arrive,
-        so that all ranks know, on the device too, whether everything fits.
+        Each rank has room for as many rows of its own as the buffers have for those that arrive, so that all
+        ranks know, on the device too, whether everything fits.
 
         Args:
             n_views: B.
@@ -138,48 +155,69 @@ class PeerSpace:
                 each has room for; returns, as that, places and what has to live.
 
         Returns:
-            This rank's rows, with room behind them; what `send` returned; and where the rows are.
+            This rank's rows, with room behind them; their places; and where the rows of all are. Until
+            `settle` says that they fit, none may be there.
         """
         peers = ranks.peers
-        assert peers is not None and peers.second is not None
-        while True:
-            room = len(peers.buffers[0]) // (_ROW_WORDS + PACKED_GRADIENT) // _ALIGNMENT * _ALIGNMENT
-            totals, rows = project(room)
-            everyone, sums, known = peers.share(totals)
-            told = torch.cuda.Event()
-            told.record()
-            sent = send(rows, everyone, peers.buffers, room)
-            peers.meet()
-            ranks.reading(told.synchronize)
-            traffic = Traffic.of(known.tolist(), sums[3 : 3 + n_views], ranks.rank)
-            if traffic.most <= room:
-                peers.exchanges += 1
-                return rows, sent, cls(peers, traffic, room, peers.exchanges)
+        assert peers is not None
+        room = len(peers.buffers[0]) // (_ROW_WORDS + PACKED_GRADIENT) // _ALIGNMENT * _ALIGNMENT
+        totals, rows = project(room)
+        everyone, sums, known = peers.share(totals)
+        told = torch.cuda.Event()
+        told.record()
+        places, admitted = send(rows, everyone, peers.buffers, room)
+        peers.meet()
+        peers.exchanges += 1
+        numbers = peers.exchanges, peers.n_isects, peers.apart
+        visible = sums[3 : 3 + n_views]
+        return rows, places, cls(peers, room, *numbers, admitted[:1], admitted, known, told, visible)
+
+    def settle(self, ranks: Ranks) -> bool:
+        """Wait for the numbers, `traffic`. Collective.
+
+        Returns:
+            Whether there was room for all of every rank; where not, there is now.
+        """
+        peers = self.peers
+        if self.traffic is None:
+            ranks.reading(self.told.synchronize)
+            self.traffic = Traffic.of(self.known.tolist(), self.visible, ranks.rank)
+            peers.learn(self.traffic.most_isects)
+        most = self.traffic.most
+        if most > self.capacity:
+            assert peers.second is not None
             torch.cuda.current_stream().wait_stream(peers.second)
-            needed = -(-traffic.most // _ALIGNMENT) * _ALIGNMENT
+            needed = -(-most // _ALIGNMENT) * _ALIGNMENT
             ranks.reading(partial(peers.reserve, (_ROW_WORDS + PACKED_GRADIENT) * needed))
+        return most <= self.capacity and (self.n_isects == 0 or self.traffic.most_isects <= self.n_isects)
+
+    @property
+    def length(self) -> int:
+        """How many rows arrive here or, before `settle`, may."""
+        return self.capacity if self.traffic is None else sum(self.traffic.received)
 
     def arrived(self) -> Splats:
-        """Return the rows that arrive here; they may be read after the next meeting."""
-        peers, count = self.peers, sum(self.traffic.received)
+        """Return the rows that arrive here, before `settle` with room; they may be read after the meeting."""
+        peers = self.peers
         if len(peers.columns) == 0 or len(peers.columns[0]) != self.capacity:
             peers.columns = _columns(peers.buffers[peers.rank], self.capacity)
-        return Splats(*(column[:count] for column in peers.columns))
+        return Splats(*(column[: self.length] for column in peers.columns))
 
     def meet_colors(self) -> None:
-        """Wait, in stream order, for the colours of all ranks."""
-        assert self.peers.second is not None
-        torch.cuda.current_stream().wait_stream(self.peers.second)
-        self.peers.meet()
+        """Wait, in stream order, for the colours of all ranks, unless they came with the rows."""
+        if self.apart:
+            assert self.peers.second is not None
+            torch.cuda.current_stream().wait_stream(self.peers.second)
+            self.peers.meet()
 
     def table(self) -> Tensor:
-        """Return the table for gradients of the rows that arrived here, [R, 12], see `rasterize_bwd_packed_`.
+        """Return the table for gradients of the rows of `arrived`, [R, 12], see `rasterize_bwd_packed_`.
 
         It may be written between the meeting for the rows and the one that `share_table` waits for.
         """
-        begin, count = self.capacity * _ROW_WORDS, sum(self.traffic.received)
-        words = self.peers.buffers[self.peers.rank][begin : begin + count * PACKED_GRADIENT]
-        return words.view(torch.float32).view(count, PACKED_GRADIENT)
+        begin = self.capacity * _ROW_WORDS
+        words = self.peers.buffers[self.peers.rank][begin : begin + self.length * PACKED_GRADIENT]
+        return words.view(torch.float32).view(self.length, PACKED_GRADIENT)
 
     def check_current(self) -> None:
         """Raise a RuntimeError if a later exchange has begun."""
@@ -202,6 +240,7 @@ class PeerSpace:
         """
         self.peers.meet()
         traffic, me = self.traffic, self.peers.rank
+        assert traffic is not None
         starts = [sum(column[:me]) for column in zip(*traffic.rows, strict=True)]
         return RowTables(places, traffic.sent, starts, self.peers.buffers, self.capacity * _ROW_WORDS)
 

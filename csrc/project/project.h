@@ -98,6 +98,7 @@ inline constexpr int kOpacityColumn = 2, kColorColumn = 3;
 
 // What this rank writes to the others, as its device works it out.
 struct ProjectAdmitted {
+  std::int64_t received;  // rows that arrive here: the first word, for what takes that number on the device
   ProjectSizes sizes;
   RowGroups groups;                // rows for each rank, and the row of its target that they begin at
   std::int64_t filled[kMaxRanks];  // how many of these have been given a place

@@ -9,8 +9,8 @@ namespace blitzgs::cuda {
 
 namespace {
 
-// kColorBlocks fill a multiprocessor; kBlocksBeside leave a place, such as a meeting of ranks needs at once.
-constexpr int kColorThreads = 128, kColorBlocks = 5, kBlocksBeside = 2;
+// kColorBlocks fill a multiprocessor; kBlocksBeside leave a place to what sends rows meanwhile.
+constexpr int kColorThreads = 128, kColorBlocks = 5, kBlocksBeside = 3;
 constexpr int kRowsOfBlock = 2 * kColorThreads;
 
 template <int DEGREE, bool QUADS>

@@ -13,7 +13,7 @@ namespace blitzgs::cuda {
 namespace {
 
 // Blocks of a multiprocessor: enough to fill the links, and few enough that what computes has its place.
-constexpr int kSendBlocks = 4, kColorSendBlocks = 2;
+constexpr int kSendBlocks = 2, kColorSendBlocks = 2;
 constexpr int kSendPlaces = 6;  // with as many registers as if there were so many
 
 // One warp, a lane a rank. Rows that do not fit, here or at some rank, are not admitted.
@@ -37,9 +37,11 @@ __global__ void admit_kernel(const __grid_constant__ ProjectScatter scatter, int
     out->filled[m] = 0;
   }
   const bool admitted = __all_sync(kFullWarp, max(own, max(sent, received)) <= scatter.capacity);
+  const std::int64_t received_here = __shfl_sync(kFullWarp, received, scatter.rank);
   if (m > 0) return;
   const std::int64_t* totals = scatter.everyone + scatter.rank * stride;
   out->sizes = admitted ? ProjectSizes{totals[kTotalVisible], totals[kTotalRows]} : ProjectSizes{0, 0};
+  out->received = admitted ? received_here : 0;
   out->groups.count = n_ranks;
 }
 

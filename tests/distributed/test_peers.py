@@ -17,7 +17,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.distributed.peers import MAX_VALUES, Peers, mail_words
 from blitzgs.model import GaussianTable
-from blitzgs.ops.project import RowRoom
 from blitzgs.ops.rasterize import gradient_columns
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 from blitzgs.training.optimiser import LazyAdam
@@ -36,11 +35,11 @@ def _table(count, ranks):
     return GaussianTable({name: table[name].to(ranks.device) for name in table})
 
 
-def _exchange(table, ranks, room=None):
+def _exchange(table, ranks):
     """Rows that arrive here in a fixed order, and the sums of a function of them that return."""
     views = cameras(3, device=ranks.device)
     ranges = TileOwners(ranks).divide(range(3), views.width, views.height)
-    frame = pipeline.forward(table, views, OPTIONS, share=Share(ranks, ranges), room=room)
+    frame = pipeline.forward(table, views, OPTIONS, share=Share(ranks, ranges))
     got = frame.splats
     order = (got.ids * 4 + got.camera_ids).argsort()
     arrived = [column[order].clone() for column in got]
@@ -59,21 +58,23 @@ def _exchange(table, ranks, room=None):
 
 def _both_ways(ranks):
     """Exchanges of growing, shrinking and empty shards; each by peers and by collectives."""
-    peers, sizes, room = ranks.peers, [], RowRoom()
+    peers, sizes = ranks.peers, []
     assert peers is not None, ranks.transport
     for count in (3, 700, 400_000, 0, 1000):
         table = _table(count, ranks)
         ranks.peers = peers
         written = _exchange(table, ranks)
-        for _ in range(2):  # room as the sizes before needed it, then as this one does
-            again = _exchange(table, ranks, room)
+        needed = peers.n_isects * 8 // 9
+        for room in (peers.n_isects, needed // 2, 0):  # for lists: enough, too little, not known
+            peers.n_isects = room
+            again = _exchange(table, ranks)
             assert all(torch.equal(x, y) for x, y in zip(written, again, strict=True))
+            assert peers.n_isects >= needed
         ranks.peers = None
         for x, y in zip(written, _exchange(table, ranks), strict=True):
             assert x.dtype == y.dtype and torch.equal(x, y)
         sizes.append(len(peers.buffers[0]))
     assert sizes[0] == sizes[1] < sizes[2] == sizes[3] == sizes[4]
-    assert (room.sizes[1] > 0) == (ranks.rank != 2)
     return sizes[2]
 
 
@@ -122,6 +123,37 @@ def _gradients(ranks):
 @pytest.mark.parametrize(("world_size", "device"), on_cuda(2, 4))
 def test_gradients_in_tables_are_those_that_return(world_size, device):
     assert len(run_ranks(_gradients, world_size, device=device, transport="peer")) == world_size
+
+
+def _hidden(ranks):
+    """A rank composites what one rank would, where rows are hidden after it has listed them."""
+    exchange.LEAST_ROWS = 0
+    whole, views = random_gaussians(2000), cameras(3, device=ranks.device)
+    whole["scales"].add_(1)
+    whole["sh"][::5] = torch.nan
+    columns = {name: whole[name] for name in whole if "exp_avg" not in name}
+    parts = [
+        GaussianTable.create({name: column[first::step].to(ranks.device) for name, column in columns.items()})
+        for first, step in ((ranks.rank, ranks.world_size), (0, 1))
+    ]
+    ranges = TileOwners(ranks).divide(range(3), views.width, views.height)
+    own = ranges.pixel_mask(ranks.rank, ranks.device)
+    alone = pipeline.forward(parts[1], views, OPTIONS)
+    apart = []
+    for _ in range(4):
+        frame = pipeline.forward(parts[0], views, OPTIONS, share=Share(ranks, ranges))
+        assert torch.equal(frame.renders[own], alone.renders[own])
+        assert torch.equal(frame.transmittances[own], alone.transmittances[own])
+        apart.append(frame.route.space.apart)
+    hidden = frame.splats.opacities == 0
+    assert hidden.any() and not hidden.all()
+    return apart
+
+
+@pytest.mark.parametrize(("world_size", "device"), on_cuda(2, 4))
+def test_rows_that_turn_out_to_be_hidden_are_not_composited(world_size, device):
+    apart = run_ranks(_hidden, world_size, device=device, transport="peer")
+    assert apart == [[False, True, True, True]] * world_size
 
 
 def _overtaken(ranks):
