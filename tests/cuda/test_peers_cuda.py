@@ -40,13 +40,14 @@ class Rank:
         _, _, totals, rows = ops.project_count(*self.arguments, capacity, capacity, self.ids)
         assert torch.equal(totals, self.totals)
         second = torch.cuda.Stream()
-        places, kept = ops.project_rows_to_peers_(
+        places, admitted = ops.project_rows_to_peers_(
             *self.arguments[:7], WIDTH, HEIGHT, self.arguments[12], everyone, self.number, rows, buffers,
             capacity, second.cuda_stream if apart else 0,
         )  # fmt: skip
         torch.cuda.current_stream().wait_stream(second)
-        counts = totals[:3].cpu()
-        del kept
+        counts, rest = totals[:3].cpu(), everyone[:, 3 + VIEWS :]
+        most = max(everyone[:, 1].max(), rest[:, ::2].sum(0).max(), rest[:, ::2].sum(1).max())
+        assert admitted[0] == (rest[:, 2 * self.number].sum() if most <= capacity else 0)
         return [*rows_of(rows, counts)[:12], places[: runs_of(int(counts[1]))]]
 
 
@@ -59,8 +60,20 @@ def exchange(counts, slack=0, room=None, apart=False):
     words = 25 * capacity
     buffers = [torch.full((words,), -1, dtype=torch.int32, device="cuda") for _ in ranks]
     spaces = [
-        PeerSpace(SimpleNamespace(rank=m, columns=[], buffers=buffers, meet=lambda: None), *rest, 1)
-        for m, rest in enumerate(zip(traffic, [capacity] * len(ranks), strict=True))
+        PeerSpace(
+            SimpleNamespace(rank=m, columns=[], buffers=buffers, meet=lambda: None),
+            capacity,
+            exchange=1,
+            n_isects=0,
+            apart=apart,
+            arrived_count=None,
+            admitted=None,
+            known=None,
+            told=None,
+            visible=None,
+            traffic=its,
+        )
+        for m, its in enumerate(traffic)
     ]
     return ranks, spaces, [rank.send(everyone, buffers, capacity, apart) for rank in ranks]
 

@@ -53,7 +53,7 @@ def _exchange(table, ranks):
         returned = sum_tables(space.share_table(frame.route.places), len(frame.rows.means2d))
         sums = [column.contiguous() for column in gradient_columns(returned)]
     own = ranges.pixel_mask(ranks.rank, ranks.device)
-    return [*arrived, *sums, frame.renders[own], frame.visible.clone()]
+    return [*arrived, *sums, frame.renders[own], frame.visible.clone()], frame.route.traffic.most_isects
 
 
 def _both_ways(ranks):
@@ -63,15 +63,16 @@ def _both_ways(ranks):
     for count in (3, 700, 400_000, 0, 1000):
         table = _table(count, ranks)
         ranks.peers = peers
-        written = _exchange(table, ranks)
-        needed = peers.n_isects * 8 // 9
-        for room in (peers.n_isects, needed // 2, 0):  # for lists: enough, too little, not known
-            peers.n_isects = room
-            again = _exchange(table, ranks)
+        written, needed = _exchange(table, ranks)
+        for room in (needed, needed // 2, 0):  # for lists: enough, too little, not known
+            peers.n_isects, before = room, peers.exchanges
+            again, _ = _exchange(table, ranks)
             assert all(torch.equal(x, y) for x, y in zip(written, again, strict=True))
             assert peers.n_isects >= needed
+            assert peers.exchanges - before == (2 if 0 < room < needed else 1)
         ranks.peers = None
-        for x, y in zip(written, _exchange(table, ranks), strict=True):
+        carried, _ = _exchange(table, ranks)
+        for x, y in zip(written, carried, strict=True):
             assert x.dtype == y.dtype and torch.equal(x, y)
         sizes.append(len(peers.buffers[0]))
     assert sizes[0] == sizes[1] < sizes[2] == sizes[3] == sizes[4]
