@@ -69,7 +69,7 @@ class MeasuredTrainer(Trainer):
         """Train the first steps, with their density events."""
         self._clock = time.monotonic()
         folder = self.folder if self.ranks.rank == 0 else None
-        self.log = RunLog(folder, steps * self.schedule.batch_size, done=0, tensorboard=False)
+        self.log = RunLog(folder, self.schedule.iterations, done=0, tensorboard=False)
         self.timed(steps)
 
     @torch.no_grad()
@@ -94,7 +94,7 @@ class MeasuredTrainer(Trainer):
         """Train further steps without density events; return the events of the profiler's trace."""
         first = self.progress.step + 1
         self._now()
-        with profile(activities=[ProfilerActivity.CUDA]) as profiler:
+        with profile(activities=[ProfilerActivity.CUDA], acc_events=True) as profiler:
             for step in range(first, first + steps):
                 self._step(step, self.log)
             self._now()
