@@ -19,7 +19,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import Share
 from blitzgs.distributed.rows import PeerSpace, Splats
 from blitzgs.ops.host import tell_host
-from blitzgs.ops.project import RowRoom, Rows, color_rows, emit_rows, queue_rows, rows_of
+from blitzgs.ops.project import RowRoom, Rows, color_rows, emit_rows, holds, queue_rows, rows_of
 from blitzgs.ops.scatter import runs_of
 
 
@@ -88,7 +88,8 @@ def _project_here(
     arguments: Sequence[Any], ids: Tensor, n_views: int, room: RowRoom, waiting: ExitStack
 ) -> Projection:
     """Project for one rank: where there is room, without waiting for the number of rows."""
-    planned, totals, columns = queue_rows(arguments, room, ids)
+    sizes = room.sizes
+    planned, totals, columns = queue_rows(arguments, sizes, ids)
     told = waiting.enter_context(tell_host(totals))
     visible = totals[3 : 3 + n_views]
     if not columns:
@@ -103,15 +104,14 @@ def _project_here(
     def settle() -> Known | None:
         counts = told()[:3]
         needed = counts.tolist()
-        fits = room.holds(needed)
         room.learn(needed)
-        if not fits:
+        if not holds(sizes, needed):
             return None
         count = needed[1]
         splats = Splats(*(column[:count] for column in _splats_of(columns)))
         return Known(rows_of(columns, counts), splats, None, visible)
 
-    return Projection(_splats_of(columns), None, None, totals[1:2], room.sizes[2], settle)
+    return Projection(_splats_of(columns), None, None, totals[1:2], sizes[2], settle)
 
 
 def _splats_of(columns: Sequence[Tensor]) -> Splats:
@@ -168,7 +168,7 @@ def _project_to_peers(
 
 def _project_and_route(arguments: Sequence[Any], ids: Tensor, n_views: int, share: Share) -> Projection:
     """Project, and agree on which row will travel where by collectives."""
-    planned, totals, _ = queue_rows(arguments, RowRoom(), ids)
+    planned, totals, _ = queue_rows(arguments, (0, 0, 0), ids)
     if share.half:
         with tell_host(totals) as told:
             counts = told()[:3]

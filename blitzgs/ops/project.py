@@ -44,6 +44,10 @@ def rows_of(columns: Sequence[Tensor], counts: Tensor) -> Rows:
     return Rows._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
 
 
+# Visible Gaussians, rows and row-tile intersections.
+Sizes = tuple[int, int, int]
+
+
 class RowRoom:
     """Room for the rows of a frame and for what is listed of them, by what the frames before needed.
 
@@ -51,16 +55,12 @@ class RowRoom:
     more.
 
     Attributes:
-        sizes: visible Gaussians, rows and row-tile intersections that there is room for; zeros: the host
-            waits.
+        sizes: how much there is room for; zeros: the host waits. Threads may share a room: take its sizes
+            once a frame.
     """
 
     def __init__(self) -> None:
-        self.sizes = (0, 0, 0)
-
-    def holds(self, needed: Sequence[int]) -> bool:
-        """Tell whether there is room for so many of the first of `sizes`."""
-        return all(n <= size for n, size in zip(needed, self.sizes, strict=False))
+        self.sizes: Sizes = (0, 0, 0)
 
     def learn(self, needed: Sequence[int]) -> None:
         """Take note of what a frame needed, as `sizes`."""
@@ -71,21 +71,26 @@ class RowRoom:
         self.sizes = (visible, rows, isects)
 
 
+def holds(sizes: Sizes, needed: Sequence[int]) -> bool:
+    """Tell whether there is room for so many of the first of `sizes`."""
+    return all(n <= size for n, size in zip(needed, sizes, strict=False))
+
+
 def queue_rows(
-    arguments: Sequence[Any], room: RowRoom, ids: Tensor | None = None
+    arguments: Sequence[Any], sizes: Sizes, ids: Tensor | None = None
 ) -> tuple[tuple[Tensor, Tensor], Tensor, list[Tensor]]:
     """Have rows written into the room there is for them, without waiting for their number.
 
     Args:
         arguments: of the op `project_count`, from means to active_count.
-        room: for the rows.
+        sizes: how much there is room for.
         ids: int64 [N], see `emit_rows`.
 
     Returns:
         What `emit_rows` takes; the totals of `project_count`, on the device; the columns of `Rows` but
         counts, and the rows' ids, with room behind them and without colours, or nothing: there was no room.
     """
-    plan, carry, totals, columns = torch.ops.blitzgs.project_count(*arguments, *room.sizes[:2], ids)
+    plan, carry, totals, columns = torch.ops.blitzgs.project_count(*arguments, *sizes[:2], ids)
     return (plan, carry), totals, columns
 
 
@@ -201,14 +206,15 @@ def differentiable_rows(arguments: tuple[Any, ...], sparse_grad: bool, rows: Row
 def project_rows(*arguments: Any) -> Rows:
     """`project` without gradients, with the positional arguments of its ops, from means to raw."""
     room = room_for(*arguments)
+    sizes = room.sizes
     arguments = (*arguments, [], [], None)
     with torch._C._AutoDispatchBelowAutograd():
-        planned, totals, columns = queue_rows(arguments, room)
+        planned, totals, columns = queue_rows(arguments, sizes)
         with tell_host(totals) as told:
             color_rows(arguments, totals, columns)
             counts = told()[:3]
         needed = counts.tolist()
-        if not columns or not room.holds(needed[:2]):
+        if not columns or not holds(sizes, needed[:2]):
             columns = emit_rows(arguments, planned, counts)
     room.learn(needed)
     return rows_of(columns, counts)

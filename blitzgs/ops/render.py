@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.host import tell_host
-from blitzgs.ops.project import Rows, color_rows, queue_rows, room_for, rows_of
+from blitzgs.ops.project import Rows, color_rows, holds, queue_rows, room_for, rows_of
 
 
 class Rendered(NamedTuple):
@@ -42,11 +42,12 @@ def render_queued(
         None where no call before told how much room is needed, or it was too little.
     """
     room = room_for(*arguments)
+    sizes = room.sizes
     viewmats, (width, height, tile_size) = arguments[5], arguments[9:12]
     grid = (len(viewmats), width, height, tile_size, 0, -1)
     with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
         queued = (*arguments, [], [], None)
-        _, totals, columns = queue_rows(queued, room)
+        _, totals, columns = queue_rows(queued, sizes)
         if not columns:
             return None
         with tell_host(totals) as told:
@@ -54,7 +55,7 @@ def render_queued(
             rows = Rows._make((*columns[:12], None))
             splats, n_rows = (rows.means2d, rows.conics, rows.opacities), totals[1:2]
             isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
-                *splats, rows.depths, rows.camera_ids, None, *grid, room.sizes[2], n_rows
+                *splats, rows.depths, rows.camera_ids, None, *grid, sizes[2], n_rows
             )
             composited = torch.ops.blitzgs.rasterize_fwd(
                 *splats, channels(rows), backgrounds, isect_rows, tile_offsets, *grid, None, True,
@@ -62,8 +63,7 @@ def render_queued(
             )  # fmt: skip
             counts = told()[:3]
     needed = counts.tolist()
-    fits = room.holds(needed)
     room.learn(needed)
-    if not fits:
+    if not holds(sizes, needed):
         return None
     return Rendered(rows_of(columns, counts), isect_rows[: needed[2]], tile_offsets, composited)
