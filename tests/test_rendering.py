@@ -189,6 +189,17 @@ def test_a_call_does_not_depend_on_those_before(device):
         assert relative_error(gradient, expected) < 1e-5  # atomic sums are in no particular order
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_meta_may_be_changed_in_place(device):
+    scene = random_scene(n=40, device=device).leaves()
+    for _ in range(2):  # the second call has room for its rows
+        _, _, meta = rasterize_scene(scene)
+        for name in ("means2d", "conics", "depths", "opacities", "radii", "tiles_per_gauss"):
+            meta[name].mul_(2)
+    meta["means2d"].sum().backward()
+    assert scene.means.grad.any()
+
+
 def test_meta_read_late_is_differentiable_as_the_call_was():
     scene = random_scene(n=20).leaves()
     with torch.no_grad():

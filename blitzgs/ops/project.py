@@ -41,7 +41,9 @@ def rows_of(columns: Sequence[Tensor], counts: Tensor) -> Rows:
     """
     visible, rows = counts[:2].tolist()
     lengths = (rows, rows, visible, visible + 1, *(rows,) * 8)
-    return Rows._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
+    # No views to autograd: a Function may return those, but nobody might change them in place.
+    with torch._C._AutoDispatchBelowADInplaceOrView():
+        return Rows._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
 
 
 # Visible Gaussians, rows and row-tile intersections.
