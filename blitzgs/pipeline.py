@@ -161,7 +161,7 @@ def forward(
         share: who composites which tiles; every rank of the job calls this with its table. None: render all
             of the views from this table alone.
         room: for the rows and their lists, of the frames before; the result does not depend on it. None:
-            wait for their number.
+            wait for their number. With `share` it is not used: peers keep their own.
         mark: called at the end of each stage: "project", "exchange", "sort", "raster".
         backward_follows: prepare for a backward pass, which is then faster; it works in any case.
 

@@ -65,8 +65,8 @@ class Route:
 
     @property
     def pays_apart(self) -> bool:
-        """Whether colours had better travel on their own; as all ranks see it."""
-        return self.space is not None and self.traffic.most >= LEAST_ROWS
+        """Whether colours had better travel on their own, where peers write; as all ranks see it."""
+        return self.traffic.most >= LEAST_ROWS
 
 
 def read_traffic(totals: Tensor, n_views: int, ranks: Ranks) -> Traffic:

@@ -28,7 +28,7 @@ _COLUMNS = (
 )
 _ROW_WORDS = sum(words for _, words, _ in _COLUMNS)
 # Projects, and sends rows to the peers: see `PeerSpace.queue`.
-Projection = Callable[[int], tuple[Tensor, list[Tensor]]]
+Projecting = Callable[[int], tuple[Tensor, list[Tensor]]]
 Sending = Callable[[list[Tensor], Tensor, list[Tensor], int], list[Tensor]]
 # A buffer holds a multiple of this many rows, so that every column begins at a full memory transaction.
 _ALIGNMENT = 32
@@ -139,7 +139,7 @@ class PeerSpace:
 
     @classmethod
     def queue(
-        cls, n_views: int, ranks: Ranks, project: Projection, send: Sending
+        cls, n_views: int, ranks: Ranks, project: Projecting, send: Sending
     ) -> tuple[list[Tensor], Tensor, PeerSpace]:
         """Queue that all ranks' rows are written to each other, up to the meeting that ends it. Collective.
 

@@ -43,13 +43,13 @@ def render_queued(
     """
     room = room_for(*arguments)
     sizes = room.sizes
+    if not all(sizes[:2]):
+        return None
     viewmats, (width, height, tile_size) = arguments[5], arguments[9:12]
     grid = (len(viewmats), width, height, tile_size, 0, -1)
     with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
         queued = (*arguments, [], [], None)
         _, totals, columns = queue_rows(queued, sizes)
-        if not columns:
-            return None
         with tell_host(totals) as told:
             color_rows(queued, totals, columns)
             rows = Rows._make((*columns[:12], None))
