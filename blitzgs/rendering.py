@@ -52,8 +52,8 @@ def rasterization(
     """Render N Gaussians into C pinhole views; the argument names, shapes and meta keys are gsplat's.
 
     The image differs from gsplat's where BlitzGS defines it otherwise: alpha is capped at 0.99 (there: 0.999)
-    and no splat is cut at a number of standard deviations, only where alpha falls below 1/255. Differentiable
-    in means, quats, scales, opacities, colors, viewmats and backgrounds.
+    and no splat is cut at a number of standard deviations, only where alpha falls below 1/255.
+    Differentiable, once, in means, quats, scales, opacities, colors, viewmats and backgrounds.
 
     Args:
         means: [N, 3] in world units, float32, or float64 on the CPU.

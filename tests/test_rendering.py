@@ -191,6 +191,15 @@ def test_a_call_does_not_depend_on_those_before(device):
         assert relative_error(gradient, expected) < 1e-5  # atomic sums are in no particular order
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_second_derivative_is_refused(device):
+    scene = random_scene(n=20, device=device).leaves()
+    image, _, _ = rasterize_scene(scene)
+    (gradient,) = torch.autograd.grad(image.square().sum(), scene.means, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
 def test_nothing_is_queued_where_no_call_told_how_much_room_is_needed(monkeypatch):
     monkeypatch.setattr(render, "queue_rows", None)
     monkeypatch.setattr(render, "room_for", lambda *_: RowRoom())

@@ -25,6 +25,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileRanges
@@ -196,6 +197,7 @@ class _Exchange(torch.autograd.Function):
         return tuple(received)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *own, _, _ = gradients
         returned = send_back(own, ctx.route, ctx.ranks)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.ops.host import tell_host
@@ -380,6 +381,7 @@ class _Project(torch.autograd.Function):
         return tuple(rows)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
         return (*_gradients(ctx, v_output[:-1]), None, None, None)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from blitzgs._library import without_autograd
 from blitzgs.ops.intersect import tile_counts
@@ -264,6 +265,7 @@ class _Rasterize(torch.autograd.Function):
         return output[0], 1 - output[1]
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *v_output: Tensor | None) -> tuple[Tensor | None, ...]:
         v_renders, v_alphas = v_output
         *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, may_pack=True)
