@@ -69,6 +69,13 @@ def test_missing_gpu_is_named():
         Ranks.from_environment("cuda:99")
 
 
+def test_ranks_of_several_hosts_share_no_gpus(monkeypatch):
+    for name, value in {"WORLD_SIZE": 4, "RANK": 1, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 2}.items():
+        monkeypatch.setenv(name, str(value))
+    with pytest.raises(ValueError, match="ranks of one host, but 2 of 4 are on this one"):
+        Ranks.from_environment("cpu", share_gpus=True)
+
+
 def test_ranks_share_gpus_only_when_told(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     first, second = torch.device("cuda:0"), torch.device("cuda:1")
