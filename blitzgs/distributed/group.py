@@ -86,8 +86,8 @@ class Ranks:
             The ranks; the trivial object when torchrun started a single process or none.
 
         Raises:
-            ValueError: a CUDA device was asked for that does not exist, a transport that is not known, or ranks
-                of several hosts were to share GPUs.
+            ValueError: a CUDA device was asked for that does not exist, a transport that is not known, or
+                ranks of several hosts were to share GPUs.
             RuntimeError: the other ranks did not appear, or "peer" was asked for and is impossible.
         """
         if transport not in get_args(Transport):
@@ -99,8 +99,8 @@ class Ranks:
         if share_gpus and local_world_size < world_size:
             # Hosts with enough GPUs would choose NCCL, the others Gloo.
             raise ValueError(
-                f"share_gpus is for the ranks of one host, but {local_world_size} of {world_size} are on this one; "
-                "leave it out, and start no more processes per node than it has GPUs"
+                f"share_gpus is for the ranks of one host, but {local_world_size} of {world_size} are on this"
+                " one; leave it out, and start no more processes per node than it has GPUs"
             )
         place, shared = _resolve_device(device, local_rank, local_world_size, share_gpus)
         ranks = cls(
