@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// CUDA only: a point in a stream that the host, or another stream, waits for while work is queued behind it.
+// CUDA only: a point in a stream that another stream waits for while work is queued behind it.
 #pragma once
 #include "common/stream.h"
 
@@ -15,7 +15,6 @@ class StreamPoint {
   StreamPoint(const StreamPoint&) = delete;
   StreamPoint& operator=(const StreamPoint&) = delete;
 
-  void wait() const;
   // What is queued in another stream from now on waits for it.
   void hold(CudaStream other) const;
 

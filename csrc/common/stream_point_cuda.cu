@@ -12,8 +12,6 @@ StreamPoint::StreamPoint(CudaStream stream) {
 
 StreamPoint::~StreamPoint() { cudaEventDestroy(event_); }
 
-void StreamPoint::wait() const { check(cudaEventSynchronize(event_), "what was queued so far"); }
-
 void StreamPoint::hold(CudaStream other) const { check(cudaStreamWaitEvent(other, event_, 0), "an event"); }
 
 }  // namespace blitzgs::cuda
