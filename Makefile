@@ -43,14 +43,18 @@ io:
 	  $(filter-out %_test.cpp,$(wildcard csrc/io/*.cpp)) \
 	  -o blitzgs/_lib/_io$$($(PYTHON) -c "import sysconfig; print(sysconfig.get_config_var('EXT_SUFFIX'))")
 
+# A second `make demo` continues the run where it stopped, or measures the finished one again. A new run from the
+# start goes into a folder of its own: make demo DEMO=runs/another
 demo: venv build
 	$(RUN) blitzgs synth $(DEMO)/city --preset demo
-	$(RUN) blitzgs train --config configs/smoke.yaml --data $(DEMO)/city --out $(DEMO)/run
+	$(RUN) blitzgs train --config configs/smoke.yaml --data $(DEMO)/city --out $(DEMO)/run \
+	  $(if $(wildcard $(DEMO)/run/checkpoints/*),--resume)
 	$(RUN) blitzgs export $(DEMO)/run --ply $(DEMO)/city.ply
 	@echo
 	@echo "Pictures (render | photograph | error): $(DEMO)/run/evaluation"
 	@echo "Figures:                           $(DEMO)/run/summary.json"
 	@echo "The model, for any 3DGS viewer:    $(DEMO)/city.ply"
+	@echo "Another run from the start:        make demo DEMO=runs/another"
 
 test: venv-test lint test-cxx test-python
 
