@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Accuracy against time: each option's image and gradient error next to what it costs.
 
-python benchmarks/bm_accuracy.py [--device cuda] [--gaussians 4000000] [--out runs/accuracy]
+python benchmarks/bm_accuracy.py [--device cuda] [--gaussians 4000000] [--out runs/accuracy] [--json FILE]
 
 Renders the aerial scene with each option as training does, forward and backward. Times are medians, per view.
 Errors are against the float64 reference of the same mode in a few windows of the same images: the largest
@@ -31,6 +31,7 @@ from pathlib import Path
 
 import torch
 from exact_windows import EPS2D, FAR, NEAR, ExactWindows
+from harness import write_json
 from scenes import BenchmarkScene, aerial
 from timing import median_ms
 from torch import Tensor
@@ -272,6 +273,7 @@ def main() -> None:
     parser.add_argument("--only", help="the one option to measure")
     parser.add_argument("--exact-library", type=Path, help="kernels built with BLITZGS_EXACT_EXP=ON")
     parser.add_argument("--out", type=Path, help="folder for accuracy.json, accuracy.md and accuracy.png")
+    parser.add_argument("--json", type=Path, help="write the figures, commit and machine to this file")
     args = parser.parse_args()
     on_gpu = args.device.startswith("cuda")
     gaussians = args.gaussians or (4_000_000 if on_gpu else 100_000)
@@ -287,6 +289,8 @@ def main() -> None:
         print(line(figures), flush=True)
         if args.out:
             write(rows, title, args.out)
+        if args.json:
+            write_json(args.json, args.device, title=title, rows=[asdict(row) for row in rows])
 
     for option in options_for(args.device):
         if args.only in (None, option.name):

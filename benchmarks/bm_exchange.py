@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from harness import write_json
 from scenes import aerial
 
 from blitzgs import pipeline
@@ -337,7 +338,7 @@ def main() -> None:
         reports.append(json.loads(line.removeprefix("REPORT ")))
         show(reports[-1])
     if args.json:
-        args.json.write_text(json.dumps(reports, indent=1))
+        write_json(args.json, args.device, results=reports)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of L1 + SSIM, forward and backward, against its byte floor and against plain PyTorch convolutions.
 
-python benchmarks/bm_photometric.py [--device cuda] [--height 1064 --width 1600] [--views 1]
+python benchmarks/bm_photometric.py [--device cuda] [--height 1064 --width 1600] [--views 1] [--json FILE]
 """
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import torch
 import torch.nn.functional as F  # noqa: N812
+from harness import write_json
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
@@ -39,6 +41,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=1600)
     parser.add_argument("--views", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     shape = (args.views, args.height, args.width, 3)
     sets = []
@@ -53,8 +56,11 @@ def main() -> None:
     bandwidth = copy_bandwidth(args.device, 2048 if args.device == "cuda" else 256)
     print(f"{args.views} view(s) of {args.width} x {args.height}, {args.device}, copy {bandwidth:.0f} GB/s")
 
+    results = []
+
     def report(name: str, milliseconds: float, bytes_per_value: float) -> None:
         floor = bytes_per_value * values / bandwidth / 1e6
+        results.append({"work": name, "ms": milliseconds, "floor_ms": floor})
         print(f"{name:36s} {milliseconds:8.3f} ms   byte floor {floor:7.4f} ms")
 
     def plain(x: Tensor, y: Tensor) -> Tensor:
@@ -69,6 +75,9 @@ def main() -> None:
     report("the same, the middle quarter", median_ms(photometric_fwd_bwd, quarter, args.repeats), 9 / 4)
     leaves = [(x.clone().requires_grad_(), y) for x, y, *_ in sets]
     report("plain PyTorch, forward + backward", median_ms(plain, leaves, args.repeats), 9)
+    if args.json:
+        shape_info = {"views": args.views, "height": args.height, "width": args.width}
+        write_json(args.json, args.device, **shape_info, results=results)
 
 
 if __name__ == "__main__":

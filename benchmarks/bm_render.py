@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Render forward and backward on CUDA, against gsplat in the same run when it is installed.
 
-    python benchmarks/bm_render.py [--scenes aerial1 aerial4 aerial16 garden] [--repeats 30]
+    python benchmarks/bm_render.py [--scenes aerial1 aerial4 aerial16 garden] [--repeats 30] [--json FILE]
 
 Gradients for every parameter; SH degree 3, float32. Ours: the ops of the training step in order (project,
 intersect, rasterize and their gradients, in compact rows), and the same through `blitzgs.rasterization` and
@@ -14,7 +14,6 @@ is a median over repeats of CUDA event times; memory is the peak above the input
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 from collections.abc import Callable
 from functools import partial
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from harness import write_json
 from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
@@ -214,7 +214,7 @@ def main() -> None:
     )
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     results = []
     for name in args.scenes:
@@ -230,7 +230,7 @@ def main() -> None:
                       f"x{r['total'] / result['blitzgs']['total']:.2f}", flush=True)  # fmt: skip
         torch.cuda.empty_cache()
     if args.json:
-        args.json.write_text(json.dumps(results, indent=1))
+        write_json(args.json, "cuda", results=results)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A whole training step on CUDA against gsplat with torch's fused Adam, stage by stage.
 
-    python benchmarks/bm_step.py [--scenes aerial4 aerial16] [--views 1] [--order morton] [--repeats 20]
+    python benchmarks/bm_step.py [--scenes aerial4 aerial16] [--views 1] [--order morton] [--json FILE]
 
 SH degree 3, every parameter trained, gradients of L1 + SSIM. Ours is the trainer's own step
 (`blitzgs.training.step`): find the active rows, catch them up (they are 0 to 39 steps behind), render,
@@ -17,9 +17,12 @@ import statistics
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import torch
 from bm_render import CallRender
+from harness import write_json
 from scenes import BenchmarkScene, aerial, garden_like
 
 from blitzgs.distributed.group import Ranks
@@ -161,8 +164,39 @@ def measure(step: OurStep | GsplatStep, repeats: int) -> list[tuple[str, float]]
     return [(column[0][0], statistics.median(ms for _, ms in column)) for column in columns]
 
 
+def run(name: str, views: int, order: str, repeats: int) -> dict[str, Any]:
+    """Measure both steps on one scene; prints as it goes."""
+    result: dict[str, Any] = {"views": views, "order": order}
+    for label, kind in (("blitzgs", OurStep), ("gsplat + fused Adam", GsplatStep)):
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+        scene = make_scene(name, views, order)
+        result["scene"] = scene.name
+        try:
+            step = kind(scene)
+        except ImportError:
+            continue
+        times = measure(step, repeats)
+        peak = torch.cuda.max_memory_allocated() / 1e9
+        # Stages of one name, at both ends of a step, count together.
+        stages: dict[str, float] = {}
+        for stage, ms in times:
+            stages[stage] = stages.get(stage, 0.0) + ms
+        result[label] = {"ms": stages, "peak_gb": peak}
+        visible = f", {step.visible} visible" if isinstance(step, OurStep) else ""
+        print(f"{scene.name}, {views} view(s), {order} order{visible}: {label}")
+        print(f"  {', '.join(f'{stage} {ms:.3f}' for stage, ms in times)} ms  peak {peak:.2f} GB")
+        if isinstance(step, OurStep):
+            result["visible"] = step.visible
+        del step, scene
+    if "gsplat + fused Adam" in result:
+        ratio = result["gsplat + fused Adam"]["ms"]["total"] / result["blitzgs"]["ms"]["total"]
+        print(f"  ratio {ratio:.2f}", flush=True)
+    return result
+
+
 def main() -> None:
-    """Measure the scenes asked for and print the stages."""
+    """Measure the scenes asked for, print the stages, and write them as JSON when a file is named."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -172,26 +206,11 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=1, help="views in a batch")
     parser.add_argument("--order", default="morton", choices=["morton", "random"], help="of the rows")
     parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
-    for name in args.scenes:
-        totals = []
-        for label, kind in (("blitzgs", OurStep), ("gsplat + fused Adam", GsplatStep)):
-            torch.cuda.empty_cache()
-            torch.cuda.reset_peak_memory_stats()
-            scene = make_scene(name, args.views, args.order)
-            try:
-                step = kind(scene)
-            except ImportError:
-                continue
-            times = measure(step, args.repeats)
-            totals.append(times[-1][1])
-            peak = torch.cuda.max_memory_allocated() / 1e9
-            visible = f", {step.visible} visible" if isinstance(step, OurStep) else ""
-            print(f"{scene.name}, {args.views} view(s), {args.order} order{visible}: {label}")
-            print(f"  {', '.join(f'{stage} {ms:.3f}' for stage, ms in times)} ms  peak {peak:.2f} GB")
-            del step, scene
-        if len(totals) == 2:
-            print(f"  ratio {totals[1] / totals[0]:.2f}", flush=True)
+    results = [run(name, args.views, args.order, args.repeats) for name in args.scenes]
+    if args.json:
+        write_json(args.json, "cuda", results=results)
 
 
 if __name__ == "__main__":

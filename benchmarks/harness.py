@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reporting that benchmarks share: a Markdown table on stdout with the environment, and JSON on request."""
+"""Reporting that benchmarks share: a Markdown table on stdout, and JSON with command, commit and machine."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import platform
+import shlex
+import subprocess
+import sys
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
@@ -24,7 +31,53 @@ def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
     }
     if torch.device(device).type == "cuda":
         info["device"] = torch.cuda.get_device_name(device)
+        info["cuda"] = str(torch.version.cuda)
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        info["gsplat"] = metadata.version("gsplat")
     return info
+
+
+def commit() -> str:
+    """Return the commit of the code that runs, with "+changes" when tracked files differ from it.
+
+    A copy of the sources without their repository takes it from the environment variable BLITZGS_COMMIT;
+    without that it is "unknown".
+    """
+    if named := os.environ.get("BLITZGS_COMMIT"):
+        return named
+    try:
+        revision = _git("rev-parse", "--short=10", "HEAD")
+        changed = _git("status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return revision + ("+changes" if changed else "")
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(ROOT), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def command_line() -> str:
+    """Return the command that started this program, without the interpreter's folder and without --json."""
+    words = [os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]]
+    if "--json" in words:
+        at = words.index("--json")
+        del words[at : at + 2]
+    return shlex.join(["python", *words])
+
+
+def write_json(path: Path, device: torch.device | str, **results: Any) -> None:
+    """Write the results of a benchmark as JSON, with what `benchmarks/report.py` has to know about them.
+
+    Args:
+        path: the file; its folder is made.
+        device: on which the benchmark ran.
+        results: what was measured, beside the keys "command", "commit" and "environment".
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    about = {"command": command_line(), "commit": commit(), "environment": environment(device)}
+    path.write_text(json.dumps(about | results, indent=1) + "\n")
 
 
 def processor_name() -> str:
@@ -66,7 +119,4 @@ def report(
     print(f"## {title}\n\n{', '.join(f'{key} {value}' for key, value in info.items())}\n")
     print(markdown_table(rows) + "\n")
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(
-            json.dumps({"title": title, "environment": info, "rows": list(rows)}, indent=2) + "\n"
-        )
+        write_json(path, device, title=title, rows=list(rows))
