@@ -31,6 +31,7 @@ from torch.profiler import ProfilerActivity, profile
 from blitzgs.distributed.group import Ranks, Transport
 from blitzgs.training import run
 from blitzgs.training.config_io import load_config
+from blitzgs.training.events import densify
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
@@ -67,23 +68,23 @@ class MeasuredTrainer(Trainer):
     @torch.no_grad()
     def begin(self, steps: int) -> None:
         """Train the first steps, with their density events."""
-        self._clock = time.monotonic()
-        folder = self.folder if self.ranks.rank == 0 else None
-        self.log = RunLog(folder, self.schedule.iterations, done=0, tensorboard=False)
+        self.state.start_clock()
+        folder = self.state.folder if self.state.ranks.rank == 0 else None
+        self.state.log = RunLog(folder, self.state.schedule.iterations, done=0, tensorboard=False)
         self.timed(steps)
 
     @torch.no_grad()
     def timed(self, steps: int) -> Times:
         """Train further steps with their density events, and measure both."""
-        size, first = self.schedule.batch_size, self.progress.step + 1
+        size, first = self.state.schedule.batch_size, self.state.progress.step + 1
         spent, events = 0.0, []
         begin = self._now()
         for step in range(first, first + steps):
-            self._step(step, self.log)
-            for event in self.schedule.events((step - 1) * size, step * size):
+            self.step(step)
+            for event in self.state.schedule.events((step - 1) * size, step * size):
                 if event.kind == "densify":
                     stopped = self._now()
-                    self._densify(event, step, self.log)
+                    densify.run(self.state, event)
                     spent += stopped - begin
                     begin = self._now()
                     events.append(begin - stopped)
@@ -92,11 +93,11 @@ class MeasuredTrainer(Trainer):
     @torch.no_grad()
     def profiled(self, steps: int) -> list[dict[str, Any]]:
         """Train further steps without density events; return the events of the profiler's trace."""
-        first = self.progress.step + 1
+        first = self.state.progress.step + 1
         self._now()
         with profile(activities=[ProfilerActivity.CUDA], acc_events=True) as profiler:
             for step in range(first, first + steps):
-                self._step(step, self.log)
+                self.step(step)
             self._now()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "trace.json"
@@ -104,14 +105,9 @@ class MeasuredTrainer(Trainer):
             events: list[dict[str, Any]] = json.loads(path.read_text())["traceEvents"]
         return events
 
-    def close(self) -> None:
-        """Stop loading batches."""
-        self._loader.close()
-        self.log.close()
-
     def _now(self) -> float:
         """Wait for the GPU and return the host's time in seconds."""
-        if self.ranks.device.type == "cuda":
+        if self.state.ranks.device.type == "cuda":
             torch.cuda.synchronize()
         return time.perf_counter()
 
@@ -205,7 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         times, use = trainer.timed(args.steps), None
         if ranks.device.type == "cuda":
             use = stream_use(trainer.profiled(args.profiled))
-        count = int(ranks.all_reduce(torch.tensor([len(trainer.table)], device=ranks.device)))
+        count = int(ranks.all_reduce(torch.tensor([len(trainer.state.table)], device=ranks.device)))
         trainer.close()
         if ranks.rank == 0:
             title = (

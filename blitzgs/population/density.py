@@ -106,6 +106,34 @@ def densify(
     return report
 
 
+@torch.no_grad()
+def cap_opacities(table: GaussianTable, opacity: float) -> None:
+    """Cap the opacities of all rows, which must have been caught up, and clear the moments of all opacities.
+
+    Args:
+        table: changed in place.
+        opacity: the cap, in (0, 1).
+    """
+    table["opacities"].clamp_(max=math.log(opacity / (1.0 - opacity)))
+    table["exp_avg.opacities"].zero_()
+    table["exp_avg_sq.opacities"].zero_()
+
+
+@torch.no_grad()
+def decay_opacities(table: GaussianTable, share: float) -> None:
+    """Take a share of its opacity from every row, all of which must have been caught up.
+
+    The logit l of the opacity o becomes that of (1 - share) o: l + log(1 - share) - log(1 + share e^l), an
+    identity that does not cancel where o is close to 1.
+
+    Args:
+        table: changed in place.
+        share: in [0, 1).
+    """
+    logits = table["opacities"]
+    logits.add_(math.log1p(-share) - torch.log1p(share * logits.exp()))
+
+
 def child_ids(parents: Tensor, time: int, slots: Tensor) -> Tensor:
     """Return the ids, int64 [M] in [0, 2^63), of children born of `parents` (int64 [M]) in one event.
 

@@ -94,6 +94,8 @@ class ScheduleConfig:
         batch_size: views per optimiser step B; one step advances the clock by B.
         densify_from, densify_until, densify_every: density-control events at from, from + every, ... < until.
         size_prune_after: density events later than this also prune by size.
+        reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
+            `densify_until`; 0: never.
         sh_every: the spherical-harmonics degree grows by one each time.
         position_decay: length of the exponential decay of the position learning rate.
         checkpoint_every: 0 saves at the end only.
@@ -107,6 +109,7 @@ class ScheduleConfig:
     densify_until: int = 15_000
     densify_every: int = 100
     size_prune_after: int = 3_000
+    reset_every: int = 0
     sh_every: int = 1_000
     position_decay: int = 30_000
     checkpoint_every: int = 0
@@ -166,6 +169,8 @@ class PopulationConfig:
             densified.
         clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split.
         min_opacity: Gaussians below are pruned.
+        reset_opacity: what `schedule.reset_every` caps the opacities at.
+        opacity_decay: share of its opacity that every Gaussian loses at each density event.
         prune_screen_radius: pixels; larger Gaussians are pruned after `schedule.size_prune_after`.
         prune_world_scale: relative to extent; Gaussians with a larger axis are pruned after the same time.
         max_gaussians: the population never exceeds this; the strongest candidates come first. 0: no cap.
@@ -174,6 +179,8 @@ class PopulationConfig:
     grad_threshold: float = 2e-4
     clone_scale: float = 0.01
     min_opacity: float = 0.005
+    reset_opacity: float = 0.01
+    opacity_decay: float = 0.0
     prune_screen_radius: float = 20.0
     prune_world_scale: float = 0.1
     max_gaussians: int = 0

@@ -181,6 +181,7 @@ def _check(config: Config) -> None:
         (schedule.scale > 0, "schedule.scale", schedule.scale, "positive"),
         (1 <= schedule.batch_size <= 32, "schedule.batch_size", schedule.batch_size, "1 to 32"),
         (schedule.densify_every >= 1, "schedule.densify_every", schedule.densify_every, "1 or more"),
+        (schedule.reset_every >= 0, "schedule.reset_every", schedule.reset_every, "0 (never) or more"),
         (schedule.sh_every >= 1, "schedule.sh_every", schedule.sh_every, "1 or more"),
         (schedule.position_decay >= 1, "schedule.position_decay", schedule.position_decay, "1 or more"),
         (
@@ -191,6 +192,18 @@ def _check(config: Config) -> None:
         ),
         (0 <= config.loss.ssim <= 1, "loss.ssim", config.loss.ssim, "between 0 and 1"),
         (config.loss.scale_reference > 0, "loss.scale_reference", config.loss.scale_reference, "positive"),
+        (
+            population.min_opacity < population.reset_opacity < 1,
+            "population.reset_opacity",
+            population.reset_opacity,
+            f"between population.min_opacity ({population.min_opacity}) and 1, or all Gaussians are pruned",
+        ),
+        (
+            0 <= population.opacity_decay < 1,
+            "population.opacity_decay",
+            population.opacity_decay,
+            "in [0, 1)",
+        ),
         (
             population.max_gaussians >= 0,
             "population.max_gaussians",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 
-EventKind = Literal["densify", "evaluate", "checkpoint"]
+EventKind = Literal["densify", "reset_opacities", "evaluate", "checkpoint"]
 # The columns of the learning-rate table.
 RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
@@ -51,18 +51,19 @@ class Schedule:
     def events(self, begin: int, end: int) -> list[Event]:
         """Return the events with begin <= time < end, in the order in which they happen."""
         config = self._config
-        found = [
-            Event(time, 0, "densify")
-            for time in self._series(
-                config.densify_from, config.densify_until, config.densify_every, begin, end
-            )
+        series: list[tuple[EventKind, float, float, float]] = [
+            ("densify", config.densify_from, config.densify_until, config.densify_every),
+            # A reset follows the density event of the same image: what it caps has grown and been pruned.
+            ("reset_opacities", config.reset_every, config.densify_until, config.reset_every),
+            ("evaluate", config.evaluate_every, math.inf, config.evaluate_every),
+            ("checkpoint", config.checkpoint_every, math.inf, config.checkpoint_every),
         ]
-        for order, (kind, every) in enumerate(
-            (("evaluate", config.evaluate_every), ("checkpoint", config.checkpoint_every)), start=1
-        ):
-            if every > 0:
-                times = self._series(every, math.inf, every, begin, end)
-                found += [Event(time, order, kind) for time in times]  # type: ignore[arg-type]
+        found = [
+            Event(time, order, kind)
+            for order, (kind, first, until, every) in enumerate(series)
+            if every > 0
+            for time in self._series(first, until, every, begin, end)
+        ]
         return sorted(found)
 
     def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
@@ -80,6 +81,10 @@ class Schedule:
         """Degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
         every = self._config.sh_every * self._config.scale
         return min(limit, math.ceil((begin + self.batch_size) / every - 1e-9) - 1)
+
+    def gathers_statistics(self, begin: int) -> bool:
+        """Tell whether the step at [begin, begin + B) counts for a density event still to come."""
+        return begin < self._config.densify_until * self._config.scale
 
     def prunes_by_size(self, time: int) -> bool:
         """Tell whether a density event at `time` also prunes by screen and world size."""

@@ -8,17 +8,17 @@ import sys
 from blitzgs.cli import main
 from blitzgs.training.trainer import Trainer
 
-step = Trainer._step
+step = Trainer.step
 
 
-def killed_once(self, number, log):
+def killed_once(self, number):
     first = os.environ["TORCHELASTIC_RESTART_COUNT"] == "0"
-    if number == 25 and first and self.ranks.rank == 1:
-        (self.folder / "killed").touch()
+    if number == 25 and first and self.state.ranks.rank == 1:
+        (self.state.folder / "killed").touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    step(self, number, log)
+    step(self, number)
 
 
 if __name__ == "__main__":
-    Trainer._step = killed_once
+    Trainer.step = killed_once
     sys.exit(main())

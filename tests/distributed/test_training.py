@@ -44,7 +44,7 @@ def _train(ranks, folder, *overrides):
     capture, images = tiny_scene()
     trainer = Trainer(tiny_config(*SETTINGS, *overrides), capture, images, folder, ranks, resume=True)
     summary = trainer.train()
-    return summary, trainer.table["id"].cpu()
+    return summary, trainer.state.table["id"].cpu()
 
 
 def records(folder):
@@ -131,14 +131,14 @@ def _train_and_stop(rank, arguments, signalled_at):
     torch.set_num_threads(1)
     from blitzgs.cli import main
 
-    step = Trainer._step
+    step = Trainer.step
 
-    def stopping(self, number, log):
-        step(self, number, log)
+    def stopping(self, number):
+        step(self, number)
         if rank == 1 and number == signalled_at:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    Trainer._step = stopping
+    Trainer.step = stopping
     return main(arguments)
 
 

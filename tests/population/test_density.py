@@ -10,7 +10,13 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
-from blitzgs.population.density import DensityRules, densify, rotations
+from blitzgs.population.density import (
+    DensityRules,
+    cap_opacities,
+    decay_opacities,
+    densify,
+    rotations,
+)
 
 TIME, STEP, SEED, LEVELS = 1200, 300, 9, 4
 
@@ -162,3 +168,24 @@ def test_empty_table():
         table, DensityRules(1e-4, 0.1, 0.01), time=0, step=1, seed=0, level_count=1, ranks=Ranks()
     )
     assert len(table) == 0 and report.cloned == report.split == report.pruned == report.held_back == 0
+
+
+def test_capping_opacities_touches_what_lies_above_and_every_moment():
+    table = random_table(200)
+    before, others = table["opacities"].clone(), table["exp_avg.means"].clone()
+    cap_opacities(table, 0.01)
+    after = table["opacities"].sigmoid()
+    low = before.sigmoid() <= 0.01
+    assert 0 < int(low.sum()) < 200
+    assert torch.equal(table["opacities"][low], before[low])
+    torch.testing.assert_close(after[~low], torch.full_like(after[~low], 0.01))
+    assert not table["exp_avg.opacities"].any() and not table["exp_avg_sq.opacities"].any()
+    assert torch.equal(table["exp_avg.means"], others)
+
+
+def test_decaying_opacities_takes_the_same_share_of_each():
+    table = random_table(200)
+    table["opacities"][:3] = torch.tensor([-30.0, 0.0, 15.0])
+    before = table["opacities"].double().sigmoid()
+    decay_opacities(table, 0.2)
+    torch.testing.assert_close(table["opacities"].double().sigmoid(), 0.8 * before, rtol=2e-6, atol=0)

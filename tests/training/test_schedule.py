@@ -88,3 +88,15 @@ def test_learning_rates(share):
         left = share ** ((step - 1) * 4 / 1_000)
         expected = torch.tensor([position, *[rate * left for rate in others]]).double()
         torch.testing.assert_close(table[step], 2.0 * expected, rtol=1e-6, atol=0.0)
+
+
+def test_opacities_are_reset_while_densifying_and_after_the_density_event_of_the_same_image():
+    config = ScheduleConfig(
+        iterations=3_000, densify_from=100, densify_until=1_500, densify_every=100, reset_every=500
+    )
+    _, steps = all_events(config)
+    events = [(event.time, event.kind) for step in steps for event in step]
+    assert [time for time, kind in events if kind == "reset_opacities"] == [500, 1_000]
+    assert events.index((500, "densify")) + 1 == events.index((500, "reset_opacities"))
+    schedule = Schedule(config)
+    assert schedule.gathers_statistics(1_499) and not schedule.gathers_statistics(1_500)

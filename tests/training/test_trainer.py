@@ -36,14 +36,14 @@ def assert_same_table(a, b):
 
 
 def stop_at_step_50(monkeypatch):
-    step = Trainer._step
+    step = Trainer.step
 
-    def interrupted(self, number, log):
-        step(self, number, log)
+    def interrupted(self, number):
+        step(self, number)
         if number == 50:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(Trainer, "_step", interrupted)
+    monkeypatch.setattr(Trainer, "step", interrupted)
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +57,9 @@ def test_training_improves_the_images(whole_run, tmp_path):
     _, start = train(tmp_path, "schedule.iterations=1")
     assert summary["psnr"] > start["psnr"] + 3
     assert summary["ssim"] > start["ssim"]
-    assert summary["gaussians"] == len(trainer.table)
-    assert trainer.progress.sh_degree == 3
-    assert trainer.table["birth"].max() > 0
+    assert summary["gaussians"] == len(trainer.state.table)
+    assert trainer.state.progress.sh_degree == 3
+    assert trainer.state.table["birth"].max() > 0
 
 
 def test_what_a_run_leaves_behind(whole_run):
@@ -79,12 +79,12 @@ def test_what_a_run_leaves_behind(whole_run):
     records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     assert [r["t"] for r in records if "loss" in r] == [20, 40, 60, 80, 100]
     assert [r["t"] for r in records if r.get("event") == "densify"] == [20, 40, 60, 80]
-    assert run.load_config(folder / "config.yaml") == trainer.config
+    assert run.load_config(folder / "config.yaml") == trainer.state.config
     metrics = json.loads((folder / "evaluation" / "000100" / "metrics.json").read_text())
     assert list(metrics["views"]) == ["03.png"]
     assert (folder / "evaluation" / "000100" / "03.png.jpg").stat().st_size > 0
     model = run.open_model(folder, Ranks())
-    assert_same_table(model.table, trainer.table)
+    assert_same_table(model.table, trainer.state.table)
 
 
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
@@ -92,21 +92,21 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     _, whole, _ = whole_run
     stop_at_step_50(monkeypatch)
     first, summary = train(tmp_path)
-    assert summary is None and first.progress.step == 50
+    assert summary is None and first.state.progress.step == 50
     monkeypatch.undo()
     torch.set_num_threads(1)
     second, summary = train(tmp_path, resume=True)
     assert summary is not None
-    assert_same_table(second.table, whole.table)
-    assert second.progress.peak_gaussians == whole.progress.peak_gaussians
+    assert_same_table(second.state.table, whole.state.table)
+    assert second.state.progress.peak_gaussians == whole.state.progress.peak_gaussians
 
 
 @pytest.mark.parametrize("power", [-7, 10])
 def test_a_world_scaled_by_a_power_of_two_trains_to_the_same_bits(whole_run, tmp_path, power):
     _, whole, expected = whole_run
     scaled, summary = train(tmp_path, scale=2.0**power)
-    assert_same_table(scaled.table, whole.table)
-    assert scaled.space.unit == whole.space.unit * 2.0**power
+    assert_same_table(scaled.state.table, whole.state.table)
+    assert scaled.state.space.unit == whole.state.space.unit * 2.0**power
     assert summary["psnr"] == expected["psnr"]
 
 
@@ -125,11 +125,11 @@ def test_batches_masks_background_and_sparse_adam(tmp_path):
         "population.max_gaussians=420",
     )
     trainer = Trainer(config, capture, images, tmp_path, Ranks())
-    start = len(trainer.table)
+    start = len(trainer.state.table)
     summary = trainer.train()
-    assert summary["images"] == 120 and trainer.progress.step == 30
+    assert summary["images"] == 120 and trainer.state.progress.step == 30
     assert summary["psnr"] > 15
-    assert max(start, 420) >= trainer.progress.peak_gaussians
+    assert max(start, 420) >= trainer.state.progress.peak_gaussians
 
 
 def test_views_that_see_nothing(tmp_path):
@@ -138,15 +138,15 @@ def test_views_that_see_nothing(tmp_path):
         turned = np.diag([-1.0, 1.0, -1.0, 1.0])
         camera.world_to_camera = turned @ camera.world_to_camera
     trainer = Trainer(tiny_config("schedule.iterations=40"), capture, images, tmp_path, Ranks())
-    before = trainer.table["means"].clone()
+    before = trainer.state.table["means"].clone()
     trainer.train()
-    assert torch.equal(trainer.table["means"], before)
+    assert torch.equal(trainer.state.table["means"], before)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_non_finite_values_stop_the_run_by_name(tmp_path, device):
     trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(device=torch.device(device)))
-    trainer.table["scales"][trainer.table["id"] == 7, 1] = float("nan")
+    trainer.state.table["scales"][trainer.state.table["id"] == 7, 1] = float("nan")
     with pytest.raises(
         NonFiniteError, match=r"step 20: column 'scales' is not finite in 1 Gaussians \(ids 7\)"
     ):
@@ -192,4 +192,4 @@ def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path, monke
     monkeypatch.undo()
     resumed = Trainer(config, *tiny_scene(), tmp_path / "cut", ranks, resume=True)
     resumed.train()
-    assert_same_table(resumed.table, whole.table)
+    assert_same_table(resumed.state.table, whole.state.table)

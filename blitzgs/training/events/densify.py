@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The event that clones, splits and prunes Gaussians."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+
+from blitzgs.population.density import DensityRules, decay_opacities, densify
+from blitzgs.population.redistribution import redistribute
+from blitzgs.training.guard import check_table
+from blitzgs.training.schedule import Event
+from blitzgs.training.state import TrainingState
+
+
+def run(state: TrainingState, event: Event) -> None:
+    """Run one density event and log what it did.
+
+    Raises:
+        NonFiniteError: a parameter is not finite.
+    """
+    step = state.progress.step
+    state.catch_up()
+    check_table(state.table, step)
+    if state.config.population.opacity_decay > 0:
+        decay_opacities(state.table, state.config.population.opacity_decay)
+    report = densify(
+        state.table,
+        density_rules(state, event.time),
+        time=event.time,
+        step=step,
+        seed=state.config.seed,
+        level_count=state.progress.level_count,
+        ranks=state.ranks,
+    )
+    counts = dataclasses.asdict(report) | {"gaussians": len(state.table)}
+    values = state.ranks.all_reduce(torch.tensor(list(counts.values()), device=state.ranks.device))
+    counts = dict(zip(counts, values.tolist(), strict=True))
+    if redistribute(state.table, state.ranks, state.config.ranks.max_imbalance):
+        counts["redistributed"] = 1
+        state.sort()
+    state.stepper.reindex()
+    peak = max(state.progress.peak_gaussians, counts["gaussians"])
+    state.progress = dataclasses.replace(state.progress, peak_gaussians=peak)
+    state.log.event(event.time, "densify", counts)
+
+
+def density_rules(state: TrainingState, time: int) -> DensityRules:
+    """Return the rules of a density event at `time`, with lengths in the unit of the means."""
+    population, extent = state.config.population, state.space.extent
+    by_size = state.schedule.prunes_by_size(time)
+    return DensityRules(
+        grad_threshold=population.grad_threshold,
+        clone_scale=population.clone_scale * extent,
+        min_opacity=population.min_opacity,
+        max_screen_radius=(population.prune_screen_radius or None) if by_size else None,
+        max_scale=(population.prune_world_scale * extent or None) if by_size else None,
+        max_gaussians=population.max_gaussians or None,
+    )

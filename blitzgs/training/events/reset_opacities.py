@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The event that makes every Gaussian almost transparent, so that those which are needed show it."""
+
+from __future__ import annotations
+
+from blitzgs.population.density import cap_opacities
+from blitzgs.training.schedule import Event
+from blitzgs.training.state import TrainingState
+
+
+def run(state: TrainingState, event: Event) -> None:
+    """Cap all opacities at `population.reset_opacity` and clear their moments (Kerbl et al. 2023, section 5).
+
+    The pending optimiser steps are applied first, because they would otherwise move the opacities with
+    moments that no longer exist.
+    """
+    state.catch_up()
+    cap_opacities(state.table, state.config.population.reset_opacity)
+    state.log.event(event.time, "reset_opacities", {"opacity": state.config.population.reset_opacity})

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sets a run up: checks that the ranks agree, makes or restores the Gaussians, builds what trains them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.model import GaussianTable
+from blitzgs.population.initialisation import octree_gaussians
+from blitzgs.scene.capture import Capture
+from blitzgs.training import run
+from blitzgs.training.batches import Images
+from blitzgs.training.config import Config
+from blitzgs.training.config_io import save_config
+from blitzgs.training.evaluation import load_lpips
+from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.run import Progress
+from blitzgs.training.run_log import RunLog
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.state import TrainingState
+from blitzgs.training.step import Stepper
+from blitzgs.training.views import Space, ViewSet, camera_centres
+from blitzgs.view.blocks import morton_order
+from blitzgs.view.levels import measure_levels
+
+
+def set_up(
+    config: Config, capture: Capture, images: Images, folder: Path, ranks: Ranks, resume: bool
+) -> TrainingState:
+    """Make the state of a new run, or of the run in `folder` where it stopped.
+
+    Args:
+        config: what to compute.
+        capture: cameras and points.
+        images: its photographs.
+        folder: of the run; gets configuration, log, checkpoints, evaluation and summary.
+        ranks: the job.
+        resume: continue from the newest checkpoint in `folder`, if there is one.
+
+    Raises:
+        FileExistsError: the folder holds a trained run and `resume` is not set.
+        ConfigError: the run to resume was started with another configuration.
+        MismatchError: the ranks differ in configuration, code or capture.
+    """
+    run.check_alike(config, capture, ranks)
+    schedule = Schedule(config.schedule)
+    space = Space.of(capture.offset, capture.extent)
+    lpips = load_lpips(config.log.lpips_weights)
+    if not resume and any((folder / run.CHECKPOINTS).glob("*")):
+        raise FileExistsError(
+            f"{folder} already holds a run: add --resume to continue it, or choose another --out"
+        )
+    restored = run.restore(folder, ranks) if resume else None
+    if restored is None:
+        table, progress = first_gaussians(config, capture, space, ranks)
+    else:
+        table, progress, saved_space, saved_config = restored
+        run.check_resumable(saved_config, config)
+        run.check_capture(saved_space, capture, folder)
+    if ranks.rank == 0:
+        folder.mkdir(parents=True, exist_ok=True)
+        save_config(config, folder / run.CONFIG)
+    optimiser = LazyAdam(config.optimiser, schedule, space.extent, ranks.device)
+    owners = TileOwners(ranks)
+    length_unit = space.extent * config.loss.scale_reference
+    return TrainingState(
+        config=config,
+        capture=capture,
+        images=images,
+        folder=folder,
+        ranks=ranks,
+        schedule=schedule,
+        space=space,
+        table=table,
+        progress=progress,
+        views=ViewSet(list(capture.cameras), space, ranks.device),
+        optimiser=optimiser,
+        stepper=Stepper(table, optimiser, owners, config.loss, length_unit, config.ranks.half_exchange),
+        owners=owners,
+        lpips=lpips,
+        log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
+    )
+
+
+def first_gaussians(
+    config: Config, capture: Capture, space: Space, ranks: Ranks
+) -> tuple[GaussianTable, Progress]:
+    """Make the first Gaussians from the capture's points; each rank keeps its share of them."""
+    lod, device = config.lod, ranks.device
+    points = torch.from_numpy(capture.points) / space.unit
+    centres = camera_centres([capture.cameras[i] for i in capture.train], space).to(device)
+    levels = measure_levels(points.to(device), centres, lod.fork, lod.base_resolution)
+    table = octree_gaussians(
+        points,
+        torch.from_numpy(capture.colors),
+        centres,
+        levels,
+        visible_threshold=lod.visible_threshold,
+        sh_degree=config.model.sh_degree,
+        opacity=config.model.initial_opacity,
+    )
+    count = len(table)
+    table.keep(torch.arange(count) % ranks.world_size == ranks.rank)
+    table = GaussianTable({name: table[name].to(device) for name in table})
+    table.permute(morton_order(table["means"]))
+    return table, Progress(step=0, sh_degree=0, level_count=levels.count, peak_gaussians=count, seconds=0.0)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a training run is made of: the objects that the loop and the schedule's events share."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.model import GaussianTable
+from blitzgs.pipeline import RenderOptions
+from blitzgs.scene.capture import Capture
+from blitzgs.training.batches import Images
+from blitzgs.training.config import Config
+from blitzgs.training.evaluation import Lpips
+from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.run import Progress
+from blitzgs.training.run_log import RunLog
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.step import Stepper
+from blitzgs.training.views import Space, ViewSet, render_options
+from blitzgs.view.blocks import morton_order
+
+
+@dataclass
+class TrainingState:
+    """One run on one rank; an event is a function `run(state, event)` that may change it.
+
+    Attributes:
+        config: what to compute.
+        capture: cameras and points.
+        images: the capture's photographs.
+        folder: of the run; rank 0 writes most of it.
+        ranks: the job.
+        schedule: answers what happens when.
+        space: how the trained world lies in the capture's.
+        table: this rank's Gaussians.
+        progress: where the run stands.
+        views: all cameras of the capture, on the device.
+        optimiser: of the table.
+        stepper: takes the optimiser steps.
+        owners: knows what tiles cost, and divides them.
+        lpips: the perceptual metric, or None.
+        log: where the run reports; silent until the loop opens the run's own.
+    """
+
+    config: Config
+    capture: Capture
+    images: Images
+    folder: Path
+    ranks: Ranks
+    schedule: Schedule
+    space: Space
+    table: GaussianTable
+    progress: Progress
+    views: ViewSet
+    optimiser: LazyAdam
+    stepper: Stepper
+    owners: TileOwners
+    lpips: Lpips | None
+    log: RunLog
+    _started: float = field(default_factory=time.monotonic)
+
+    @property
+    def images_seen(self) -> int:
+        """The clock: images trained on so far."""
+        return self.progress.step * self.schedule.batch_size
+
+    @property
+    def render_options(self) -> RenderOptions:
+        """How the run renders at its present spherical-harmonics degree."""
+        return render_options(self.config, self.space, self.progress.sh_degree)
+
+    def start_clock(self) -> None:
+        """Count training time from now on, on top of what a resumed run has already taken."""
+        self._started = time.monotonic() - self.progress.seconds
+
+    def stepped(self, step: int, sh_degree: int) -> None:
+        """Note that optimiser step `step` (from 1) was taken at a spherical-harmonics degree."""
+        seconds = time.monotonic() - self._started
+        self.progress = replace(self.progress, step=step, sh_degree=sh_degree, seconds=seconds)
+
+    @contextlib.contextmanager
+    def paused_clock(self) -> Iterator[None]:
+        """Leave what happens inside out of the training time."""
+        paused = time.monotonic()
+        try:
+            yield
+        finally:
+            self._started += time.monotonic() - paused
+
+    def catch_up(self) -> None:
+        """Apply every pending optimiser step, so that all rows of the table can be read."""
+        self.optimiser.catch_up(self.table, None, self.progress.step)
+
+    def sort(self) -> None:
+        """Put neighbours in space next to each other, so that blocks of rows are small."""
+        self.table.permute(morton_order(self.table["means"]))
+
+    def population(self) -> int:
+        """Count the Gaussians of all ranks; every rank calls this."""
+        count = torch.tensor([len(self.table)], device=self.ranks.device)
+        return int(self.ranks.all_reduce(count).item())

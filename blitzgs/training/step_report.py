@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the log says about one step: loss, PSNR of the batch, visible Gaussians, speed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.host_sum import HostSum
+from blitzgs.pipeline import Frame
+from blitzgs.training.batches import Batch
+from blitzgs.training.guard import check_table
+from blitzgs.training.loss import batch_psnr, photometric, scale_term
+from blitzgs.training.state import TrainingState
+
+
+def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
+    """Return the batch's L_scale and PSNR, the visible Gaussians and all, float64 [4], without a wait."""
+    length_unit = state.space.extent * state.config.loss.scale_reference
+    scale = scale_term(frame, state.table, length_unit).mean()
+    counts = [
+        state.ranks.all_reduce(torch.full((), float(count), dtype=torch.float64, device=scale.device))
+        for count in (len(frame.rows.visible_ids), len(state.table))
+    ]
+    return torch.stack([scale.double(), batch_psnr(frame, batch).double(), *counts])
+
+
+def log_step(
+    state: TrainingState, measured: Tensor, batch: Batch, names: Sequence[str], sums: HostSum
+) -> None:
+    """Write one log record; waits for the device, and checks the table meanwhile.
+
+    Args:
+        state: after the step.
+        measured: from `measure_step`.
+        batch: of the step.
+        names: of the batch's views.
+        sums: `LossTerms.parts` over all ranks.
+
+    Raises:
+        NonFiniteError: a parameter is not finite.
+    """
+    check_table(state.table, state.progress.step)
+    loss = state.config.loss
+    losses = photometric(sums.read()[: 2 * len(names)], batch.samples.cpu(), loss)
+    scale, psnr, visible, population = measured.tolist()
+    values = {
+        "loss": losses.mean().item() + loss.scale * scale,
+        "l_scale": scale,
+        "psnr": psnr,
+        "visible": visible,
+        "gaussians": int(population),
+        "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
+    }
+    state.log.scalars(state.images_seen, values)
