@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import math
 import sys
@@ -15,13 +16,15 @@ from typing import cast
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
 from blitzgs import __version__
 from blitzgs.distributed.group import MismatchError, Ranks, Transport
 from blitzgs.distributed.ownership import TileOwners
+from blitzgs.output import OutputFolder
 from blitzgs.progress import image_progress
 from blitzgs.scene import ply
-from blitzgs.scene.pictures import save_image
+from blitzgs.scene.pictures import encode_image
 from blitzgs.scene.synth import command as synth
 from blitzgs.training import run
 from blitzgs.training.checkpoint import CheckpointError
@@ -214,6 +217,7 @@ def _eval(args: argparse.Namespace) -> int:
                 pictures=args.pictures,
                 lpips=load_lpips(args.lpips),
                 report=report,
+                inputs=run.input_files(capture),
             )
         if ranks.rank == 0:
             print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
@@ -229,6 +233,9 @@ def _render(args: argparse.Namespace) -> int:
         options = render_options(model.config, model.space, model.progress.sh_degree)
         indices = range(len(capture.cameras)) if args.split == "all" else getattr(capture, args.split)
         owners = TileOwners(ranks)
+        output = OutputFolder(args.out, run.input_files(capture))
+        # Of all views, so that a view's file has the same name whichever split is rendered.
+        paths = output.paths([view.name for view in capture.cameras], ".npy" if args.raw else ".png")
         args.out.mkdir(parents=True, exist_ok=True)
         with image_progress("Rendering", ranks.rank == 0) as report:
             for position, index in enumerate(indices):
@@ -237,15 +244,17 @@ def _render(args: argparse.Namespace) -> int:
                 report(position + 1, len(indices))
                 if render is None:
                     continue
-                path = (args.out / capture.cameras[index].name).with_suffix(".npy" if args.raw else ".png")
-                path.parent.mkdir(parents=True, exist_ok=True)
-                if args.raw:
-                    np.save(path, render.cpu().numpy())
-                else:
-                    save_image(path, render)
+                content = _npy(render) if args.raw else encode_image(render, ".png")
+                output.write(paths[index], content)
         if ranks.rank == 0:
             print(f"{args.out}: {len(indices)} images")
     return 0
+
+
+def _npy(render: Tensor) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, render.cpu().numpy())
+    return buffer.getvalue()
 
 
 def _export(args: argparse.Namespace) -> int:

@@ -12,6 +12,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from blitzgs.output import write_file
+
 UInt8 = npt.NDArray[np.uint8]
 
 # Shown in the last colour of an error map.
@@ -34,15 +36,26 @@ def save_image(path: Path | str, image: Tensor) -> None:
 
     Raises:
         OSError: the file cannot be written.
+        ValueError: the format is not known.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, encode_image(image, path.suffix), sync=False)
+
+
+def encode_image(image: Tensor, suffix: str) -> bytes:
+    """Return an RGB image, float [H, W, 3] in [0, 1] or uint8, as a file of the format of `suffix`.
+
+    Raises:
+        ValueError: the format is not known.
+    """
     try:
-        written = cv2.imwrite(str(path), np.ascontiguousarray(to_uint8(image)[..., ::-1]))
+        written, data = cv2.imencode(suffix, np.ascontiguousarray(to_uint8(image)[..., ::-1]))
     except cv2.error as error:
-        raise OSError(f"cannot write the picture {path}: {error}") from error
+        raise ValueError(f"cannot write a picture as '{suffix}': {error}") from error
     if not written:
-        raise OSError(f"cannot write the picture {path}")
+        raise ValueError(f"cannot write a picture as '{suffix}'")
+    return bytes(data)
 
 
 def error_map(
@@ -83,16 +96,12 @@ def strip(images: Sequence[Tensor], labels: Sequence[str]) -> Tensor:
     return torch.from_numpy(np.concatenate(panels[:-1], axis=1))
 
 
-def save_comparison(path: Path | str, render: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
-    """Write render | photograph | error of one view.
+def comparison(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return render | photograph | error of one view side by side, uint8 RGB.
 
     Args:
-        path: file to write.
         render: float [H, W, 3].
         target: float or uint8 [H, W, 3].
         mask: uint8 [H, W] of the pixels that count, or None.
-
-    Raises:
-        OSError: the file cannot be written.
     """
-    save_image(path, strip([render, target, error_map(render, target, mask)], _LABELS))
+    return strip([render, target, error_map(render, target, mask)], _LABELS)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ from blitzgs.distributed.ownership import Share, TileOwners
 from blitzgs.distributed.pixels import collect_images
 from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import ssim
+from blitzgs.output import OutputFolder
 from blitzgs.pipeline import RenderOptions
 from blitzgs.progress import Report
-from blitzgs.scene.pictures import save_comparison
+from blitzgs.scene.pictures import comparison, encode_image
 from blitzgs.training.batches import Images
 from blitzgs.training.views import CameraLike, ViewSet
 
@@ -104,6 +106,8 @@ def evaluate(
     pictures: int = 0,
     lpips: Lpips | None = None,
     report: Report | None = None,
+    inputs: Iterable[Path] = (),
+    optional_files: bool = False,
 ) -> dict[str, Any]:
     """Render views and compare them with their photographs; the ranks take turns at comparing.
 
@@ -119,18 +123,20 @@ def evaluate(
         pictures: evenly spaced views of which to write render | photograph | error side by side.
         lpips: from `load_lpips`.
         report: is told (views rendered, all of them) after each.
+        inputs: files that must stay as they are, wherever `folder` is.
+        optional_files: warn instead of failing when a file cannot be written, as while training.
 
     Returns:
         {"psnr": mean, "ssim": mean, ("lpips": mean,) "views": {name: {...}}}; the means are absent without
         views. The same on every rank.
+
+    Raises:
+        OSError: a file cannot be written, and `optional_files` is not set.
     """
     ranks = owners.ranks
-    chosen = (
-        {indices[k * len(indices) // pictures] for k in range(pictures)} if indices and pictures else set()
-    )
+    files = None if folder is None else _Files(folder, inputs, optional_files)
+    chosen = files.plan(indices, cameras, pictures) if files is not None else {}
     per_view: dict[str, dict[str, float]] = {}
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
     own = list(indices[ranks.rank :: ranks.world_size])
     for position, index in enumerate(indices):
         turn, destination = divmod(position, ranks.world_size)
@@ -151,8 +157,9 @@ def evaluate(
             ]
             metrics["lpips"] = float(lpips(pair[0], pair[1]))
         per_view[cameras[index].name] = metrics
-        if folder is not None and index in chosen:
-            save_comparison(folder / (cameras[index].name.replace("/", "_") + ".jpg"), render, target, mask)
+        if files is not None and index in chosen:
+            picture = comparison(render, target, mask)
+            files.write(chosen[index], encode_image(picture, ".jpg"))
     found = {name: view for part in ranks.all_gather_object(per_view) for name, view in part.items()}
     per_view = {cameras[index].name: found[cameras[index].name] for index in indices}
     result: dict[str, Any] = {}
@@ -161,6 +168,36 @@ def evaluate(
         if values:
             result[metric] = sum(values) / len(values)
     result["views"] = per_view
-    if folder is not None and ranks.rank == 0:
-        (folder / "metrics.json").write_text(json.dumps(result, indent=1))
+    if files is not None and ranks.rank == 0:
+        files.write(files.output.root / "metrics.json", json.dumps(result, indent=1).encode())
     return result
+
+
+class _Files:
+    """What an evaluation leaves in its folder."""
+
+    def __init__(self, folder: Path, inputs: Iterable[Path], optional: bool) -> None:
+        self.output = OutputFolder(folder, inputs)
+        self._optional = optional
+
+    def plan(self, indices: Sequence[int], cameras: Sequence[CameraLike], pictures: int) -> dict[int, Path]:
+        """The cameras of evenly spaced views, and where their pictures go."""
+        count = min(pictures, len(indices))
+        chosen = [indices[k * len(indices) // count] for k in range(count)]
+        try:
+            paths = self.output.paths([cameras[index].name for index in chosen], ".jpg", flat=True)
+        except OSError as error:
+            self._failed(error)
+            return {}
+        return dict(zip(chosen, paths, strict=True))
+
+    def write(self, path: Path, content: bytes) -> None:
+        try:
+            self.output.write(path, content)
+        except OSError as error:
+            self._failed(error)
+
+    def _failed(self, error: OSError) -> None:
+        if not self._optional:
+            raise error
+        warnings.warn(f"the evaluation could not write a file and goes on without it: {error}", stacklevel=2)

@@ -99,6 +99,12 @@ def open_capture(config: Config, ranks: Ranks) -> tuple[Capture, ImageStore]:
     return capture, ImageStore(capture, budget, data.threads, background=config.model.background)
 
 
+def input_files(capture: Capture) -> list[Path]:
+    """The photographs and masks of a capture, which no command may overwrite."""
+    images = [camera.image_path for camera in capture.cameras]
+    return images + [camera.mask_path for camera in capture.cameras if camera.mask_path is not None]
+
+
 def check_capture(space: Space, capture: Capture, folder: Path) -> None:
     """Check that a capture is the one that the run in `folder` was trained on.
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.scene.pictures import error_map, save_comparison, save_image, strip, to_uint8
+from blitzgs.scene.pictures import comparison, error_map, save_image, strip, to_uint8
 
 
 def test_saved_pictures_are_rgb_rounded_and_clamped(tmp_path):
@@ -19,8 +19,13 @@ def test_saved_pictures_are_rgb_rounded_and_clamped(tmp_path):
 
 
 def test_unwritable_pictures_are_named(tmp_path):
-    with pytest.raises(OSError, match="cannot write the picture .*a.unknown"):
+    with pytest.raises(ValueError, match="cannot write a picture as '.unknown'"):
         save_image(tmp_path / "a.unknown", torch.zeros(2, 2, 3))
+    (tmp_path / "target.png").write_bytes(b"precious")
+    (tmp_path / "link.png").symlink_to(tmp_path / "target.png")
+    with pytest.raises(OSError, match="link.png is a symbolic link, which is not overwritten"):
+        save_image(tmp_path / "link.png", torch.zeros(2, 2, 3))
+    assert (tmp_path / "target.png").read_bytes() == b"precious"
 
 
 def test_error_map_runs_from_blue_to_red_and_masked_pixels_are_grey():
@@ -35,7 +40,7 @@ def test_error_map_runs_from_blue_to_red_and_masked_pixels_are_grey():
 
 def test_comparison_strip_holds_all_three(tmp_path):
     render, target = torch.rand(20, 30, 3), torch.randint(0, 256, (20, 30, 3), dtype=torch.uint8)
-    save_comparison(tmp_path / "c.png", render, target)
+    save_image(tmp_path / "c.png", comparison(render, target))
     found = torch.from_numpy(cv2.imread(str(tmp_path / "c.png"))[..., ::-1].copy())
     assert found.shape == (44, 98, 3)
     np.testing.assert_array_equal(found[24:, :30], to_uint8(render))

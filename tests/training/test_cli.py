@@ -16,6 +16,7 @@ import torch
 
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
+from blitzgs.scene.capture import load_capture
 from blitzgs.scene.ply import read_ply
 from blitzgs.training import run
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, write_tiny_capture
@@ -148,3 +149,49 @@ def test_show_config_and_help(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     assert "--resume" in capsys.readouterr().out
+
+
+def transforms_capture(folder, name_of):
+    """The tiny capture as a transforms.json whose file paths are `name_of(path of the photograph)`."""
+    write_tiny_capture(folder)
+    capture = load_capture(folder)
+    (folder / "photos").mkdir()
+    frames = []
+    for camera in capture.cameras:
+        path = folder / "photos" / camera.name
+        camera.image_path.rename(path)
+        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": name_of(path), "transform_matrix": pose.tolist()})
+    shutil.rmtree(folder / "sparse")
+    (folder / "capture").mkdir()
+    K = capture.cameras[0].K
+    content = {"w": WIDTH, "h": HEIGHT, "fl_x": K[0, 0], "fl_y": K[1, 1], "frames": frames}
+    (folder / "capture" / "transforms.json").write_text(json.dumps(content))
+    return folder / "capture", folder / "photos"
+
+
+def digest(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.mark.parametrize("kind", ["absolute", "parent"])
+def test_render_leaves_the_photographs_alone(tmp_path, kind):
+    def name_of(path):
+        return str(path) if kind == "absolute" else f"../photos/{path.name}"
+
+    data, photos = transforms_capture(tmp_path, name_of)
+    flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.02", "--log.pictures=1"]
+    assert main(["train", "--data", str(data), "--out", str(tmp_path / "run"), *flags]) == 0
+    before, everything = digest(photos), {path for path in tmp_path.rglob("*")}
+    out = tmp_path / "rend" / "a"
+    assert main(["render", str(tmp_path / "run"), "--split", "all", "--out", str(out)]) == 0
+    assert digest(photos) == before
+    assert len([path for path in out.rglob("*") if path.is_file()]) == 8
+    assert all(
+        out in path.parents or path in out.parents or path == out
+        for path in set(tmp_path.rglob("*")) - everything
+    )
+    # Among the photographs nothing is written at all.
+    assert main(["render", str(tmp_path / "run"), "--split", "all", "--out", str(photos)]) == 1
+    assert main(["eval", str(tmp_path / "run"), "--out", str(photos)]) == 1
+    assert digest(photos) == before

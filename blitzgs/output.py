@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that a user asked for: written whole or not at all, in the folder asked for, never onto an input.
+
+Image names come from captures, that is from other programs: they may be absolute, climb out with `..`, or
+fall together once their suffix is exchanged. `OutputFolder` turns them into paths that do none of this.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+import stat
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePath
+
+# Bytes of a file name that file systems agree on, less room for a suffix and a number.
+_LONGEST_NAME = 200
+
+
+@contextmanager
+def new_file(path: Path, sync: bool = True) -> Iterator[Path]:
+    """Give a temporary file to fill; it takes its final name when the context ends without an error.
+
+    Whoever reads `path` sees what was there before or the whole new file. Only a regular file is replaced.
+
+    Args:
+        path: the final name; its folder must exist.
+        sync: wait until the disk has it, so that a power failure leaves one or the other as well.
+
+    Yields:
+        The temporary file, empty, in the same folder.
+
+    Raises:
+        OSError: `path` is a link, a device or a folder, or cannot be written; what was there is untouched.
+    """
+    check_replaceable(path)
+    partial = path.with_name(f".{secrets.token_hex(6)}.partial")
+    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    try:
+        yield partial
+        if sync:
+            _sync(partial)
+        check_replaceable(path)
+        os.replace(partial, path)
+        if sync:
+            _sync(path.parent)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_file(path: Path, content: bytes | str, sync: bool = True) -> None:
+    """Write a file whole or not at all; see `new_file`."""
+    with new_file(path, sync) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def check_replaceable(path: Path) -> None:
+    """Check that `path` is free or a regular file.
+
+    Raises:
+        OSError: it is a link, a device, a folder or something else that must not be replaced.
+    """
+    try:
+        mode = path.lstat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    if not stat.S_ISREG(mode):
+        kinds = {stat.S_IFLNK: "a symbolic link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe"}
+        kind = kinds.get(stat.S_IFMT(mode), "a device or socket")
+        raise OSError(f"{path} is {kind}, which is not overwritten: remove it or choose another name")
+
+
+class OutputFolder:
+    """A folder that gets one file for each of some names; no file lands elsewhere or on an input."""
+
+    def __init__(self, root: Path, inputs: Iterable[Path] = ()) -> None:
+        """Note the folder; it is made by the first write.
+
+        Args:
+            root: the folder.
+            inputs: files that must stay as they are.
+        """
+        self.root = root
+        self._inputs: dict[tuple[int, int], Path] = {}
+        self._input_folders: dict[str, Path] = {}
+        for path in inputs:
+            self._input_folders.setdefault(os.path.dirname(os.path.realpath(path)), path)
+            if (identity := _identity(path)) is not None:
+                self._inputs[identity] = path
+
+    def paths(self, names: Sequence[str], suffix: str, flat: bool = False) -> list[Path]:
+        """Return a path below the folder for each name, all different, none of them an input.
+
+        `photos/a.jpg` becomes `photos/a` + suffix. Parts that lead elsewhere (`/`, `..`) are left out,
+        and so are the folders that all absolute names share. Where two names fall together, each keeps its
+        own suffix before the new one; where that does not tell them apart, later ones are numbered. The same
+        names give the same paths.
+
+        Args:
+            names: of images, as their capture writes them.
+            suffix: of the new files, with its dot.
+            flat: put every file into the folder itself, `a/b.jpg` as `a_b.jpg` + suffix.
+
+        Raises:
+            OSError: a path is an input, is no regular file, or leaves the folder through a link.
+        """
+        shared = _shared_parts([name for name in names if name.startswith("/")])
+        parts = [_inner_parts(name, shared if name.startswith("/") else 0) for name in names]
+        if flat:
+            parts = [("_".join(inner),) for inner in parts]
+        short = [_key(PurePath(*inner).with_suffix("")) for inner in parts]
+        counts = Counter(short)
+        taken: set[str] = set()
+        folders = {_key(PurePath(*inner[:end])) for inner in parts for end in range(1, len(inner))}
+        relatives = []
+        for inner, key in zip(parts, short, strict=True):
+            whole = PurePath(*inner)
+            stem = whole if flat or counts[key] > 1 else whole.with_suffix("")
+            relative, number = _with_name(stem, suffix), 1
+            while _key(relative) in taken or _key(relative) in folders:
+                number += 1
+                relative = _with_name(whole, f"_{number}{suffix}")
+            taken.add(_key(relative))
+            relatives.append(relative)
+        found = [self.root / relative for relative in relatives]
+        for path in found:
+            self.check(path)
+        return found
+
+    def check(self, path: Path) -> None:
+        """Check that a path below the folder may be written.
+
+        Raises:
+            OSError: see `paths`.
+        """
+        root, folder = os.path.realpath(self.root), os.path.realpath(path.parent)
+        if os.path.commonpath([root, folder]) != root:
+            raise OSError(
+                f"{path.parent} leads out of {self.root} to {folder}: remove that link or choose another "
+                "--out"
+            )
+        for place in (root, folder):
+            if place in self._input_folders:
+                raise OSError(
+                    f"{path} would lie among the inputs ({self._input_folders[place]}): choose another --out"
+                )
+        check_replaceable(path)
+        # Another name of an input, by a hard link.
+        source = self._inputs.get(identity) if (identity := _identity(path)) is not None else None
+        if source is not None:
+            raise OSError(f"{path} would overwrite the input {source}: choose another --out")
+
+    def write(self, path: Path, content: bytes) -> None:
+        """Write one of `paths`; what the folder looks like is checked again."""
+        self.check(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.check(path)
+        write_file(path, content, sync=False)
+
+
+def _inner_parts(name: str, shared: int = 0) -> tuple[str, ...]:
+    """The parts of a name that stay inside a folder, without the first `shared`; at least one."""
+    parts = [part for part in PurePath(name.replace("\0", "_")).parts if part not in ("/", "//", "..", ".")]
+    return tuple(_shortened(part) for part in parts[shared:]) or ("image",)
+
+
+def _shared_parts(names: Sequence[str]) -> int:
+    """How many folders all of the names begin with."""
+    folders = [_inner_parts(name)[:-1] for name in names]
+    return len(os.path.commonprefix(folders)) if folders else 0
+
+
+def _shortened(part: str) -> str:
+    """A part that a file system takes: what is too long is cut and gets a digest of the whole."""
+    data = os.fsencode(part)
+    if len(data) <= _LONGEST_NAME:
+        return part
+    digest = hashlib.sha256(data).hexdigest()[:12]
+    return f"{data[: _LONGEST_NAME - 13].decode(errors='ignore')}_{digest}"
+
+
+def _with_name(path: PurePath, suffix: str) -> PurePath:
+    return path.with_name(_shortened(path.name) + suffix)
+
+
+def _key(path: PurePath) -> str:
+    # Some file systems do not tell upper from lower case.
+    return str(path).casefold()
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
