@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -25,24 +26,51 @@ from blitzgs.training.batches import Images
 from blitzgs.training.views import CameraLike, ViewSet
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
+METRICS = ("psnr", "ssim", "psnr_corrected", "lpips")
 
 
 def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
-    """Return PSNR in dB and SSIM of one view.
+    """Return PSNR in dB, SSIM, and the PSNR after `correct_colours` ("psnr_corrected") of one view.
 
     Args:
         render: float [H, W, 3]; clamped to [0, 1] and not quantised.
         target: uint8 [H, W, 3].
-        mask: uint8 [H, W], pixels with 0 are left out of both; or None.
+        mask: uint8 [H, W], pixels with 0 are left out of all; or None.
     """
     render = render.clamp(0.0, 1.0)
-    error = (render - target.float() / 255.0) ** 2
     counted = torch.ones_like(target[..., 0]) if mask is None else mask
-    samples = 3 * int((counted != 0).sum())
-    mse = error[counted != 0].double().sum().item() / max(1, samples)
+    pixels, wanted = render[counted != 0].double(), target[counted != 0].double() / 255.0
     similarity = ssim(render[None], target[None], None if mask is None else mask[None])
-    psnr = -10.0 * float(torch.tensor(max(mse, 1e-12), dtype=torch.float64).log10())
-    return {"psnr": psnr, "ssim": similarity.item()}
+    return {
+        "psnr": _psnr(pixels, wanted),
+        "ssim": similarity.item(),
+        "psnr_corrected": _psnr(correct_colours(pixels, wanted), wanted),
+    }
+
+
+def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
+    """Return colours changed by the affine map (a 3 x 4 matrix) that brings them closest to those wanted.
+
+    A photograph's exposure and white balance are no property of the scene. Least squares over the pixels of
+    one view find the map, so that what is left of the error is a matter of neither.
+
+    Args:
+        pixels: float64 [P, 3].
+        wanted: float64 [P, 3].
+
+    Returns:
+        float64 [P, 3], clamped to [0, 1].
+    """
+    known = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
+    # The pseudo-inverse serves a view of a single colour, too, for which many maps are equally good.
+    inverse = torch.linalg.pinv(known.T @ known, hermitian=True)
+    return (known @ (inverse @ (known.T @ wanted))).clamp(0.0, 1.0)
+
+
+def _psnr(pixels: Tensor, wanted: Tensor) -> float:
+    """Return the PSNR in dB of colours [P, 3]; 120 where they are equal or there are none."""
+    mse = ((pixels - wanted) ** 2).sum().item() / max(1, pixels.numel())
+    return -10.0 * math.log10(max(mse, 1e-12))
 
 
 def load_lpips(path: str | None) -> Lpips | None:
@@ -127,8 +155,8 @@ def evaluate(
         optional_files: warn instead of failing when a file cannot be written, as while training.
 
     Returns:
-        {"psnr": mean, "ssim": mean, ("lpips": mean,) "views": {name: {...}}}; the means are absent without
-        views. The same on every rank.
+        {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}; the
+        means are absent without views. The same on every rank.
 
     Raises:
         OSError: a file cannot be written, and `optional_files` is not set.
@@ -163,7 +191,7 @@ def evaluate(
     found = {name: view for part in ranks.all_gather_object(per_view) for name, view in part.items()}
     per_view = {cameras[index].name: found[cameras[index].name] for index in indices}
     result: dict[str, Any] = {}
-    for metric in ("psnr", "ssim", "lpips"):
+    for metric in METRICS:
         values = [view[metric] for view in per_view.values() if metric in view]
         if values:
             result[metric] = sum(values) / len(values)

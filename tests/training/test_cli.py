@@ -43,7 +43,7 @@ def test_eval_repeats_the_metrics_of_training(trained, tmp_path, capsys):
     summary = json.loads((trained[1] / "summary.json").read_text())
     assert main(["eval", str(trained[1]), "--out", str(tmp_path), "--pictures", "1", "--share-gpus"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed == {name: summary[name] for name in ("psnr", "ssim")}
+    assert printed == {name: summary[name] for name in ("psnr", "ssim", "psnr_corrected")}
     assert len(list(tmp_path.glob("*.jpg"))) == 1
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from blitzgs.training.evaluation import image_metrics, load_lpips
+from blitzgs.training.evaluation import correct_colours, image_metrics, load_lpips
 
 
 def plain_ssim(x, y):
@@ -44,6 +44,29 @@ def test_a_perfect_render():
     target = torch.randint(0, 256, (20, 20, 3), dtype=torch.uint8)
     metrics = image_metrics(target.float() / 255, target, None)
     assert metrics["psnr"] >= 100 and metrics["ssim"] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_the_corrected_psnr_forgives_an_affine_change_of_colour_and_nothing_else():
+    g = torch.Generator().manual_seed(1)
+    clean = torch.rand(40, 30, 3, generator=g) * 0.5 + 0.2
+    turned = clean @ torch.tensor([[0.8, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.1, 0.7]]).T + 0.04
+    target = (turned * 255).round().byte()
+    metrics = image_metrics(clean, target, None)
+    # What is left is the photograph's rounding to 256 values: a twelfth of a step squared.
+    assert metrics["psnr"] < 30 and metrics["psnr_corrected"] == pytest.approx(
+        -10 * math.log10(1 / 255**2 / 12), abs=0.3
+    )
+    noise = 0.1 * torch.randn(40, 30, 3, generator=g)
+    noisy = image_metrics(clean, (clean + noise).clamp(0, 1).mul(255).byte(), None)
+    assert noisy["psnr"] <= noisy["psnr_corrected"] < noisy["psnr"] + 1
+
+    pixels, wanted = torch.rand(500, 3, generator=g).double(), torch.rand(500, 3, generator=g).double()
+    known = torch.cat([pixels, torch.ones(500, 1, dtype=torch.float64)], dim=1)
+    expected = known @ torch.linalg.lstsq(known, wanted).solution
+    torch.testing.assert_close(correct_colours(pixels, wanted), expected.clamp(0, 1))
+    # One colour everywhere: any map to the mean colour is the best.
+    flat = correct_colours(torch.full((500, 3), 0.25, dtype=torch.float64), wanted)
+    torch.testing.assert_close(flat, wanted.mean(0).expand(500, 3))
 
 
 def test_lpips_is_a_torchscript_module(tmp_path):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from blitzgs.distributed.ownership import TileOwners
@@ -19,20 +21,32 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
         The mean of each metric.
     """
     with state.paused_clock():
-        state.catch_up()
-        metrics = evaluate(
-            state.table,
-            state.views,
-            state.capture.cameras,
-            state.images,
-            state.capture.test or state.capture.train,
-            state.render_options,
-            state.folder / run_folder.EVALUATION / f"{state.images_seen:06d}",
-            TileOwners(state.ranks),
-            pictures=state.config.log.pictures,
-            lpips=state.lpips,
-        )
+        folder = state.folder / run_folder.EVALUATION / f"{state.images_seen:06d}"
+        metrics = measure(state, state.capture.test or state.capture.train, folder)
         means = {name: value for name, value in metrics.items() if name != "views"}
         text = "evaluation: " + "  ".join(f"{name} {value:.4f}" for name, value in means.items())
         state.log.event(state.images_seen, "evaluation", means, text)
     return means
+
+
+def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -> dict[str, Any]:
+    """Compare the model with the photographs of some cameras; see `blitzgs.training.evaluation.evaluate`.
+
+    Args:
+        state: of the run; every rank calls this.
+        indices: cameras of the capture.
+        folder: gets the metrics and the pictures; None: nothing is written.
+    """
+    state.catch_up()
+    return evaluate(
+        state.table,
+        state.views,
+        state.capture.cameras,
+        state.images,
+        indices,
+        state.render_options,
+        folder,
+        TileOwners(state.ranks),
+        pictures=state.config.log.pictures,
+        lpips=state.lpips,
+    )
