@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write the tables of docs/performance.md and README.md from the results in benchmarks/results.
+
+    python benchmarks/report.py           # writes the tables
+    python benchmarks/report.py --check   # fails when a page differs from the results
+
+Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` names the file and the command. A
+page holds a pair of comments around each table, `<!-- table: NAME -->` and `<!-- end: NAME -->`, and what is
+between them is replaced. All files must come from one commit, because figures of different code do not
+compare. In place of a table whose file is absent the page names the command that makes it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+PAGES = (ROOT / "docs" / "performance.md", ROOT / "README.md")
+TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
+
+Json = dict[str, Any]
+Results = dict[str, Json]
+
+
+class ReportError(Exception):
+    """The results cannot be reported, and why."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One table: the files that it needs, and what makes its lines.
+
+    Attributes:
+        files: names in `COMMANDS`.
+        lines: takes the content of each file, in the order of `files`.
+    """
+
+    files: tuple[str, ...]
+    lines: Callable[..., list[str]]
+
+
+# File in benchmarks/results (without .json) -> the command that writes it.
+EXCHANGE = "python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda --batch 4 --batches 4"
+COMMANDS = {
+    "render": "python benchmarks/bm_render.py",
+    "step_1": "python benchmarks/bm_step.py --views 1",
+    "step_4": "python benchmarks/bm_step.py --views 4",
+    "exchange": f"{EXCHANGE} --ranks 1 2 4",
+    "training": "python benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000",
+    "photometric": "python benchmarks/bm_photometric.py",
+    "accuracy": "python benchmarks/bm_accuracy.py",
+}
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    names = list(head)
+    return [f"| {' | '.join(line)} |" for line in (names, ["---"] * len(names), *rows)]
+
+
+def ms(value: float) -> str:
+    """Return milliseconds with two decimals, three below a tenth."""
+    return f"{value:.2f}" if value >= 0.1 else f"{value:.3f}"
+
+
+def fastest_gsplat(result: Json) -> Json | None:
+    """Return the figures of gsplat's faster mode, or None where gsplat was not installed."""
+    modes = [result[name] for name in ("gsplat", "gsplat packed") if name in result]
+    return min(modes, key=lambda mode: mode["total"]) if modes else None
+
+
+def render_lines(render: Json) -> list[str]:
+    """Forward and backward pass, against gsplat's faster mode."""
+
+    def cells(figures: Json) -> list[str]:
+        parts = " / ".join(ms(figures[name]) for name in ("forward", "backward", "total"))
+        return [parts, f"{figures['peak_gb']:.2f}"]
+
+    rows = []
+    for result in render["results"]:
+        ours, theirs = result["blitzgs"], fastest_gsplat(result)
+        row = [result["scene"], f"{result['visible'] / 1e6:.2f} M", *cells(ours)]
+        row += [*cells(theirs), f"**{theirs['total'] / ours['total']:.2f}**"] if theirs else ["–"] * 3
+        rows.append(row)
+    head = ["scene", "visible", "BlitzGS forward / backward / total, ms", "peak GB",
+            "gsplat forward / backward / total, ms", "peak GB", "ratio"]  # fmt: skip
+    return table(head, rows)
+
+
+def stage_lines(render: Json) -> list[str]:
+    """Stages of the forward and backward pass."""
+    stages = list(render["results"][0]["stages"])
+    rows = [
+        [
+            result["scene"],
+            f"{result['rows'] / 1e6:.2f} M",
+            f"{result['intersections'] / 1e6:.2f} M",
+            *(ms(result["stages"][stage]) for stage in stages),
+        ]
+        for result in render["results"]
+    ]
+    return table(["scene", "splats", "tile entries", *(s.replace("_", " ") for s in stages)], rows)
+
+
+def call_lines(render: Json) -> list[str]:
+    """The same work through `blitzgs.rasterization` and autograd."""
+    columns = {
+        "blitzgs": "the training step's ops",
+        "rasterization": "the call, dense gradients",
+        "sparse": "sparse gradients",
+        "sparse, 1 thread": "sparse, autograd in one thread",
+        "sparse, meta": "sparse, all of meta read",
+        "gsplat": "gsplat",
+        "gsplat, 1 thread": "gsplat, autograd in one thread",
+    }
+    rows = [
+        [result["scene"], *(ms(result[name]["total"]) if name in result else "–" for name in columns)]
+        for result in render["results"]
+    ]
+    return table(["scene", *columns.values()], rows)
+
+
+def step_lines(*files: Json) -> list[str]:
+    """A whole training step, against gsplat with torch's fused Adam."""
+    results = [result for file in files for result in file["results"]]
+
+    def cells(figures: Json | None) -> list[str]:
+        if figures is None:
+            return ["–", "–"]
+        parts = ", ".join(f"{name} {ms(value)}" for name, value in figures["ms"].items() if name != "total")
+        return [parts, f"**{ms(figures['ms']['total'])}**"]
+
+    rows = []
+    for result in results:
+        ours, theirs = result["blitzgs"], result.get("gsplat + fused Adam")
+        ratio = f"**{theirs['ms']['total'] / ours['ms']['total']:.2f}**" if theirs else "–"
+        rows.append([result["scene"], str(result["views"]), *cells(ours), *cells(theirs), ratio])
+    head = ["scene", "views", "BlitzGS by stage, ms", "total", "gsplat by stage, ms", "total", "ratio"]
+    return table(head, rows)
+
+
+def exchange_lines(exchange: Json) -> list[str]:
+    """A step on several GPUs, by stage."""
+    reports = exchange["results"]
+    names = {"alone": "a step alone, behind a barrier", "step": "**steps in a row**"}
+    rows = [[names.get(stage, stage), *(ms(report["ms"][stage]) for report in reports)]
+            for stage in reports[0]["ms"]]  # fmt: skip
+    first = reports[0]["ms"]["step"] * reports[0]["ranks"]
+    rows += [
+        ["speed-up of steps in a row", *(f"{first / report['ms']['step']:.2f}" for report in reports)],
+        ["largest cost over the mean", *(f"{report['balance']['measured']:.3f}" for report in reports)],
+        ["MB between ranks", *(f"{sum(r['bytes per step'].values()) / 1e6:.0f}" for r in reports)],
+    ]
+    return table(["ms", *(f"{report['ranks']} GPU" for report in reports)], rows)
+
+
+def row_lines(file: Json) -> list[str]:
+    """The rows that a benchmark has put together itself."""
+    rows = file["rows"]
+    cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
+    return [f"{file['title']}.", "", *table(rows[0], cells)]
+
+
+def photometric_lines(photometric: Json) -> list[str]:
+    """L1 + SSIM against its byte floor and plain PyTorch."""
+    rows = [[r["work"], ms(r["ms"]), ms(r["floor_ms"])] for r in photometric["results"]]
+    size = "{views} view(s) of {width} × {height}".format(**photometric)
+    return table([size, "ms", "byte floor, ms"], rows)
+
+
+def accuracy_lines(accuracy: Json) -> list[str]:
+    """Error against time of each option."""
+    rows = [
+        [r["name"], ms(r["milliseconds"]), f"{r['image_error']:.1e}", f"{r['gradient_error']:.1e}",
+         f"{r['cut_pixels']:.2%}"]
+        for r in accuracy["rows"]
+    ]  # fmt: skip
+    return table(["option", "ms a view", "image error", "gradient error", "cut pixels"], rows)
+
+
+def summary_lines(render: Json, step_1: Json, step_4: Json, exchange: Json) -> list[str]:
+    """The README's table: one line for each kind of work."""
+    rows = []
+
+    def add(work: str, ours: float, theirs: float | None, unit: str, other: str, command: str) -> None:
+        their_cells = [f"{other} {theirs:.2f} {unit}", f"{theirs / ours:.1f}"] if theirs else ["–", "–"]
+        rows.append([work, f"{ours:.2f} {unit}", *their_cells, f"`{command}`"])
+
+    for result in render["results"]:
+        ours, theirs = result["blitzgs"], fastest_gsplat(result)
+        total = theirs["total"] if theirs else None
+        add(f"render forward + backward, {result['scene']}", ours["total"], total, "ms", "gsplat",
+            COMMANDS["render"])  # fmt: skip
+    last = render["results"][-1]
+    for result in render["results"]:
+        last = result if result["blitzgs"]["peak_gb"] > last["blitzgs"]["peak_gb"] else last
+    theirs = fastest_gsplat(last)
+    add(f"memory above the parameters, {last['scene']}", last["blitzgs"]["peak_gb"],
+        theirs["peak_gb"] if theirs else None, "GB", "gsplat", COMMANDS["render"])  # fmt: skip
+    for name, file in (("step_1", step_1), ("step_4", step_4)):
+        for result in file["results"]:
+            their = result.get("gsplat + fused Adam")
+            add(f"whole training step, {result['scene']}, {result['views']} view(s)",
+                result["blitzgs"]["ms"]["total"], their["ms"]["total"] if their else None, "ms",
+                "gsplat + fused Adam", COMMANDS[name])  # fmt: skip
+    one = exchange["results"][0]
+    for report in exchange["results"][1:]:
+        add(f"step of 4 views, {report['gaussians'] / 1e6:.0f} M Gaussians, on {report['ranks']} GPUs",
+            report["ms"]["step"], one["ms"]["step"], "ms", f"{one['ranks']} GPU",
+            COMMANDS["exchange"])  # fmt: skip
+    return table(["work", "BlitzGS", "compared with", "ratio", "command"], rows)
+
+
+SECTIONS = {
+    "render": Section(("render",), render_lines),
+    "stages": Section(("render",), stage_lines),
+    "call": Section(("render",), call_lines),
+    "step": Section(("step_1", "step_4"), step_lines),
+    "exchange": Section(("exchange",), exchange_lines),
+    "training": Section(("training",), row_lines),
+    "photometric": Section(("photometric",), photometric_lines),
+    "accuracy": Section(("accuracy",), accuracy_lines),
+    "summary": Section(("render", "step_1", "step_4", "exchange"), summary_lines),
+}
+
+
+def load_results(folder: Path = RESULTS) -> Results:
+    """Read every result.
+
+    Raises:
+        ReportError: a file has no known name, does not name its commit, or is of another commit.
+    """
+    results: Results = {}
+    for path in sorted(folder.glob("*.json")):
+        if path.stem not in COMMANDS:
+            raise ReportError(f"{path}: no table is made of it; known names: {', '.join(COMMANDS)}")
+        results[path.stem] = json.loads(path.read_text())
+        commit = results[path.stem].get("commit", "unknown")
+        if commit == "unknown" or commit.endswith("+changes"):
+            raise ReportError(
+                f"{path}: its commit is {commit}; measure a clean checkout, or a copy of one "
+                "with its commit in BLITZGS_COMMIT"
+            )
+        first, expected = next((name, file["commit"]) for name, file in results.items())
+        if commit != expected:
+            raise ReportError(
+                f"{path} is of commit {commit}, {first}.json of {expected}: measure both on one"
+            )
+    return results
+
+
+def machine_line(file: Json) -> str:
+    """Say what a result was measured on, and with which command."""
+    about = file["environment"]
+    machine = f"{about['device']}, CUDA {about['cuda']}" if "device" in about else about["processor"]
+    peers = f", gsplat {about['gsplat']}" if "gsplat" in about else ""
+    return f"`{file['command']}`, {machine}, torch {about['torch']}{peers}, commit {file['commit']}."
+
+
+def section_lines(name: str, results: Results) -> list[str]:
+    """Return the lines of one table, or the commands that would make it."""
+    section = SECTIONS[name]
+    missing = [file for file in section.files if file not in results]
+    if missing:
+        commands = [f"{COMMANDS[file]} --json benchmarks/results/{file}.json" for file in missing]
+        return ["Not measured on the current code yet. The commands that measure it:", "",
+                *(f"    {command}" for command in commands)]  # fmt: skip
+    files = [results[file] for file in section.files]
+    lines = section.lines(*files)
+    if name == "summary":  # each of its lines has its command
+        return [*lines, "", f"{machine_line(files[0]).split('`, ', 1)[1]}"]
+    return [*lines, "", *("- " + machine_line(file) for file in files)]
+
+
+def render_page(text: str, results: Results) -> str:
+    """Return a page with every table made anew.
+
+    Raises:
+        ReportError: the page asks for a table that nothing here makes.
+    """
+
+    def replace(match: re.Match[str]) -> str:
+        if match[2] not in SECTIONS:
+            raise ReportError(f"no table is called {match[2]}; known: {', '.join(SECTIONS)}")
+        lines = "\n".join(section_lines(match[2], results))
+        return f"{match[1]}\n{lines}\n\n{match[3]}"
+
+    return TABLE.sub(replace, text)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write or check the pages; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="change nothing; fail when a page is out of date"
+    )
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the results (%(default)s)")
+    args = parser.parse_args(arguments)
+    status = 0
+    try:
+        results = load_results(args.results)
+        for page in PAGES:
+            text = page.read_text()
+            made = render_page(text, results)
+            if args.check and made != text:
+                print(f"{page} differs from the results: run python benchmarks/report.py", file=sys.stderr)
+                status = 1
+            elif made != text:
+                page.write_text(made)
+                print(f"wrote {page}")
+    except ReportError as error:
+        print(f"report.py: {error}", file=sys.stderr)
+        return 1
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
