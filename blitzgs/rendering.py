@@ -77,8 +77,8 @@ def rasterization(
             fastest there.
         backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
-        sparse_grad: whether means, quats and scales, and with `sh_degree` opacities and colors, get sparse
-            gradients, over the visible Gaussians alone. Dense ones cost a pass over all N.
+        sparse_grad: whether means, quats and scales, and with `sh_degree` opacities and colors that are
+            leaves, get sparse gradients, over the visible Gaussians alone. Dense ones cost a pass over all N.
         absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased".
         channel_chunk: accepted and not needed: any channel count is rendered in one pass.
@@ -160,12 +160,16 @@ def rasterization(
     if means.is_cuda and tile_size not in CUDA_TILE_SIZES:
         grid["tile_size"] = CUDA_TILE_SIZES[1]
         listed = intersect(*splats, rows.depths, rows.camera_ids, **grid)
+
+    def tell_absgrad(gradient: Tensor) -> None:
+        means2d.absgrad = gradient if packed else seen.of_all(gradient)  # type: ignore[attr-defined]
+
     renders, alphas = rasterize(
         *splats,
         _channels(seen, colors, render_mode, sh_degree),
         *listed,
         backgrounds=background,
-        means2d_abs=_absolute_gradient_probe(means2d, None if packed else seen) if absgrad else None,
+        tell_absgrad=tell_absgrad if absgrad else None,
         composited=None if ready is None else ready.composited,
         **grid,
     )
@@ -283,16 +287,6 @@ def _background_channels(backgrounds: Tensor | None, render_mode: str) -> Tensor
     if render_mode == "RGB":
         return backgrounds
     return torch.cat([backgrounds, torch.zeros_like(backgrounds[:, :1])], dim=1)
-
-
-def _absolute_gradient_probe(means2d: Tensor, seen: _Seen | None) -> Tensor:
-    """Return zeros [P, 2] whose gradient, the absolute sums, is stored as `means2d.absgrad` in backward.
-
-    With `seen`, means2d and so the gradient are of all Gaussians.
-    """
-    probe = torch.zeros_like(means2d, requires_grad=True)
-    probe.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient))
-    return probe * 1.0 if seen is None else seen.of_rows(probe)
 
 
 def _meta(

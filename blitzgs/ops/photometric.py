@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.derivatives import first_only
 
 
 def photometric_loss(
@@ -180,7 +181,11 @@ def _save_inputs(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
 
 def _backward(ctx: Any, v_l1_sums: Tensor, v_ssim_sums: Tensor) -> tuple[Tensor | None, ...]:
     renders, targets, masks = ctx.saved_tensors
-    v_renders = torch.ops.blitzgs.photometric_bwd(renders, targets, masks, v_l1_sums, v_ssim_sums, *ctx.tiles)
+    with torch.no_grad():
+        v_renders = torch.ops.blitzgs.photometric_bwd(
+            renders, targets, masks, v_l1_sums, v_ssim_sums, *ctx.tiles
+        )
+    (v_renders,) = first_only("photometric_loss", [v_renders], [renders, v_l1_sums, v_ssim_sums])
     return v_renders, None, None, None, None, None
 
 

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.host import tell_host
 
 
@@ -172,7 +172,8 @@ def project(
         antialiased: scale opacities by sqrt(det before / det after) of that addition.
         raw: whether scales and opacities are before their activation.
         sparse_grad: whether gradients of Gaussians are sparse tensors of the visible ones, without a pass
-            over all N: those of means, quats and scales, and with `sh` also of opacities and sh.
+            over all N: those of means, quats and scales, and with `sh` also of opacities and sh where these
+            are leaves (what made others of them might not take a sparse gradient).
 
     Returns:
         Rows, bit-identical for a Gaussian and a view whatever else is projected with them.
@@ -308,7 +309,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
         means, quats, scales, opacities, sh, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets
     )
     ctx.options = (width, height, sh_degree, eps2d, antialiased, raw)
-    ctx.sparse_grad = False
+    ctx.sparse = (False,) * 5
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
@@ -317,19 +318,27 @@ def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
 
 def _gradients(ctx: Any, v_output: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
     """Return the gradients of means, quats, scales, opacities, sh and viewmats, where they are needed."""
-    parameters, (viewmats, Ks, *rows) = ctx.saved_tensors[:5], ctx.saved_tensors[5:]
+    saved = ctx.saved_tensors  # read once: checkpointing recomputes them for each reading
+    with torch.no_grad():
+        gradients = _first_gradients(ctx, saved, v_output)
+    return first_only("project", gradients, (*saved[:6], *v_output))
+
+
+def _first_gradients(
+    ctx: Any, saved: tuple[Any, ...], v_output: tuple[Tensor | None, ...]
+) -> tuple[Tensor | None, ...]:
+    parameters, (viewmats, Ks, *rows) = saved[:5], saved[5:]
     means, *_, sh = parameters
     *needed, need_viewmats = ctx.needs_input_grad[:6]
     # Where all are to be dense, the kernel writes them so; a dense one that nobody needs would cost memory.
-    dense = not ctx.sparse_grad and all(needed if sh is not None else needed[:4])
+    dense = not any(ctx.sparse) and all(needed if sh is not None else needed[:4])
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         *parameters, viewmats, Ks, *rows, *ctx.options, *_row_gradients(means, sh, rows[0], v_output), None,
         need_viewmats, dense=dense,
     )  # fmt: skip
     if not dense:
         ids = rows[1].long()
-        sparse = (ctx.sparse_grad,) * 3 + (ctx.sparse_grad and sh is not None,) * 2
-        columns = zip(parameters, gradients, sparse, needed, strict=True)
+        columns = zip(parameters, gradients, ctx.sparse, needed, strict=True)
         gradients = [_of_all(ids, *column) if wanted else None for *column, wanted in columns]
     elif sh is None:
         gradients[4] = None
@@ -377,11 +386,12 @@ class _Project(torch.autograd.Function):
             rows = project_rows(*inputs)
         _setup_context(ctx, inputs, rows[:-1])
         ctx.mark_non_differentiable(rows.counts)
-        ctx.sparse_grad = sparse_grad
+        if sparse_grad:
+            opacities, sh = parameters[3:5]
+            ctx.sparse = (True, True, True, *(sh is not None and t.is_leaf for t in (opacities, sh)))
         return tuple(rows)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
         return (*_gradients(ctx, v_output[:-1]), None, None, None)
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from blitzgs._library import without_autograd
+from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import tile_counts
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
@@ -67,7 +67,7 @@ def rasterize(
     backgrounds: Tensor | None = None,
     tile_begin: int = 0,
     tile_end: int = -1,
-    means2d_abs: Tensor | None = None,
+    tell_absgrad: Callable[[Tensor], object] | None = None,
     composited: tuple[Tensor, ...] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Composite the rows of each tile's list into images.
@@ -97,8 +97,8 @@ def rasterize(
         backgrounds: [B, D], or None for black.
         tile_begin: first owned tile; pixels of tiles outside [tile_begin, tile_end) are zero.
         tile_end: end of the owned tiles, -1 for all.
-        means2d_abs: a tensor [P, 2] that requires grad (its values are not used) to receive, as its
-            gradient, the sum over pixels of the absolute gradient of means2d, per axis.
+        tell_absgrad: is called in the backward pass, whatever that is asked for, with the sum over pixels of
+            the absolute gradient of means2d, per axis: [P, 2].
         composited: what the op `rasterize_fwd` has returned of these arguments already; None: it is called.
 
     Returns:
@@ -106,16 +106,19 @@ def rasterize(
 
     Raises:
         RuntimeError: wrong shapes or dtypes, or a tile range outside the images.
+        ValueError: `tell_absgrad` under `torch.compile`.
     """
     splats = (means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets)
     grid = (n_cameras, width, height, tile_size, tile_begin, tile_end)
     if torch.compiler.is_compiling():
-        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid, means2d_abs)
+        if tell_absgrad is not None:
+            raise ValueError("absolute gradients are not supported under torch.compile")
+        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid)
         alphas = 1 - transmittances
     else:
         # Whose gradients stay packed, see `_gradients`.
-        packed = means2d_abs is None and torch.is_grad_enabled() and any(x.requires_grad for x in splats[:4])
-        renders, alphas = _Rasterize.apply(*splats, grid, means2d_abs, packed, composited)  # type: ignore[no-untyped-call]
+        packed = tell_absgrad is None and torch.is_grad_enabled() and any(x.requires_grad for x in splats[:4])
+        renders, alphas = _Rasterize.apply(*splats, grid, tell_absgrad, packed, composited)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
         alphas = alphas * _owned_pixels(alphas, tile_size, tile_begin, tile_end)
     return renders, alphas
@@ -201,28 +204,29 @@ def _(
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     *_, last_ids, tile_work, aux, row_gradients = output
     ctx.mark_non_differentiable(last_ids, tile_work, aux, row_gradients)
-    _save(ctx, inputs[:7], inputs[7:13], inputs[13], output)
+    _save(ctx, inputs[:7], inputs[7:13], output)
+    ctx.absgrad = inputs[13] is not None and inputs[13].requires_grad
 
 
-def _save(ctx: Any, splats: Any, grid: Any, means2d_abs: Tensor | None, output: tuple[Tensor, ...]) -> None:
-    renders, transmittances, last_ids, _, aux, row_gradients = output
+def _save(ctx: Any, splats: Any, grid: Any, output: tuple[Tensor, ...]) -> None:
+    # Not the renders, which callers may change in place: the backward pass does not need them.
+    _, transmittances, last_ids, _, aux, row_gradients = output
     ctx.set_materialize_grads(False)
     ctx.room = GradientRoom(row_gradients)
-    ctx.save_for_backward(*splats, renders, transmittances, last_ids, aux)
+    ctx.save_for_backward(*splats, transmittances, last_ids, aux)
     ctx.grid = grid
-    ctx.absgrad = means2d_abs is not None and means2d_abs.requires_grad
 
 
 def _backward(
     ctx: Any, v_renders: Tensor | None, v_transmittances: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
     v_alphas = None if v_transmittances is None else -v_transmittances
-    *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas)
+    *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, ctx.absgrad)
     return (*splat_gradients, *(None,) * 8, v_abs, None, None, None)
 
 
 def _gradients(
-    ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None, may_pack: bool = False
+    ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None, absgrad: bool, may_pack: bool = False
 ) -> tuple[Tensor | None, ...]:
     """Return the gradients of means2d, conics, row_opacities, colors, backgrounds and means2d_abs.
 
@@ -230,24 +234,40 @@ def _gradients(
     """
     if v_renders is None and v_alphas is None:
         return (None,) * 6
-    *splats, renders, transmittances, last_ids, aux = ctx.saved_tensors
+    saved = ctx.saved_tensors  # read once: checkpointing recomputes them for each reading
+    with torch.no_grad():
+        gradients = _first_gradients(ctx, saved, v_renders, v_alphas, absgrad, may_pack)
+    return first_only("rasterize", gradients, (*saved[:5], v_renders, v_alphas))
+
+
+def _first_gradients(
+    ctx: Any,
+    saved: tuple[Any, ...],
+    v_renders: Tensor | None,
+    v_alphas: Tensor | None,
+    absgrad: bool,
+    may_pack: bool,
+) -> tuple[Tensor | None, ...]:
+    *splats, transmittances, last_ids, aux = saved
+    colors = splats[3]
     if v_renders is None:
-        v_renders = torch.zeros_like(renders)
-    arguments = (*splats, renders, transmittances, last_ids, aux, v_renders)
+        v_renders = transmittances.new_zeros(*transmittances.shape, colors.shape[1])
+    # The op looks at the renders' shape and dtype alone, which are those of their gradient.
+    arguments = (*splats, v_renders, transmittances, last_ids, aux, v_renders)
     deterministic = torch.are_deterministic_algorithms_enabled()
     v_abs = v_backgrounds = None
     v_splats: Sequence[Tensor]
-    if may_pack and renders.is_cuda and renders.shape[-1] == 3 and v_alphas is None and not ctx.absgrad:
+    if may_pack and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
         packed = ctx.room.take(splats[0])
         torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, *ctx.grid, deterministic, packed)
         v_splats = gradient_columns(packed)
     else:
         *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *arguments, v_alphas, *ctx.grid, ctx.absgrad, deterministic
+            *arguments, v_alphas, *ctx.grid, absgrad, deterministic
         )
     if ctx.needs_input_grad[4]:
         v_backgrounds = torch.einsum("bhwd,bhw->bd", v_renders, transmittances)
-    return (*v_splats, v_backgrounds, v_abs if ctx.absgrad else None)
+    return (*v_splats, v_backgrounds, v_abs if absgrad else None)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -258,18 +278,21 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *splats, grid, means2d_abs, backward_follows, output = arguments
+        *splats, grid, tell_absgrad, backward_follows, output = arguments
         if output is None:
             output = rasterize_fwd(*splats, *grid, None, True, backward_follows)
-        _save(ctx, splats, grid, means2d_abs, output)
+        _save(ctx, splats, grid, output)
+        ctx.tell_absgrad = tell_absgrad
         return output[0], 1 - output[1]
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *v_output: Tensor | None) -> tuple[Tensor | None, ...]:
         v_renders, v_alphas = v_output
-        *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, may_pack=True)
-        return (*splat_gradients, None, None, None, v_abs, None, None)
+        tell = ctx.tell_absgrad
+        *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, tell is not None, may_pack=True)
+        if v_abs is not None:
+            tell(v_abs.detach())
+        return (*splat_gradients, *(None,) * 6)
 
 
 torch.library.register_autograd("blitzgs::rasterize_fwd", _backward, setup_context=_setup_context)
