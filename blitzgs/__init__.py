@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
+    from blitzgs.ops.importance import contributions
     from blitzgs.rendering import rasterization
 
 __version__ = "0.1.0"
-__all__ = ["rasterization"]
+__all__ = ["contributions", "rasterization"]
 
 
 def __getattr__(name: str) -> Any:
@@ -24,4 +25,8 @@ def __getattr__(name: str) -> Any:
         from blitzgs.rendering import rasterization
 
         return rasterization
+    if name == "contributions":
+        from blitzgs.ops.importance import contributions
+
+        return contributions
     raise AttributeError(f"module 'blitzgs' has no attribute {name!r}")

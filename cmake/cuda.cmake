@@ -52,7 +52,7 @@ set_source_files_properties(
 )
 
 if(BLITZGS_EXACT_EXP)
-  file(GLOB rasterize_kernels csrc/rasterize/*_cuda.cu)
+  file(GLOB rasterize_kernels csrc/rasterize/*_cuda.cu csrc/importance/*_cuda.cu)
   set_source_files_properties(${rasterize_kernels} PROPERTIES COMPILE_DEFINITIONS BLITZGS_EXACT_EXP)
 endif()
 

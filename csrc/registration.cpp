@@ -117,6 +117,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "last_ids, Tensor aux, Tensor v_renders, int n_cameras, int width, int height, int tile_size, "
       "int tile_begin, int tile_end, bool deterministic, Tensor(a!) packed) -> ()");
 
+  // What each row contributes to the pixels, without colours.
+  m.def(
+      "contributions(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor isect_rows, "
+      "Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, int tile_begin, "
+      "int tile_end, Tensor? n_rows=None) -> (Tensor weights, Tensor pixels)");
+
   // L1 and SSIM of the owned tiles; fwd_bwd does both at once when the weights of the sums are known.
   m.def(
       "photometric_fwd(Tensor renders, Tensor targets, Tensor? masks, int tile_size, int tile_begin, "

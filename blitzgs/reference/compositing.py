@@ -49,18 +49,38 @@ def composite(
         tolerance: relative distance within which alpha (to 1/255 or 0.99), transmittance (to 1e-4) or the
             depths of two consecutive splats of a pixel count as undecided.
     """
-    alphas, unclipped = _alphas(means2d, conics, opacities, width, height)
-    touched = alphas >= ALPHA_CUT
-    alphas = torch.where(touched, alphas, torch.zeros_like(alphas))
-    after = torch.cumprod(1 - alphas, dim=0)  # [M, H W], never increasing
-    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-    composited = touched & (after >= MIN_TRANSMITTANCE)
-    weights = torch.where(composited, alphas * before, torch.zeros_like(alphas))
+    unclipped, alphas, before, after, weights = _weights(means2d, conics, opacities, width, height)
     values = torch.einsum("mp,md->pd", weights, colors)
-    transmittances = torch.where(composited, 1 - alphas, torch.ones_like(alphas)).prod(dim=0)
+    transmittances = torch.where(weights > 0, 1 - alphas, torch.ones_like(alphas)).prod(dim=0)
     cut = _cut(unclipped.detach(), after.detach(), before.detach(), depths.detach(), tolerance)
     shape = (height, width)
     return Composite(values.reshape(*shape, -1), transmittances.reshape(shape), cut.reshape(shape))
+
+
+def composited_weights(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Return alpha T of M splats, ordered front to back, at every pixel [M, H, W], and the cut pixels [H, W].
+
+    See `composite`; alpha T is zero where a splat is not composited, and positive where it is.
+    """
+    unclipped, _, before, after, weights = _weights(means2d, conics, opacities, width, height)
+    cut = _cut(unclipped, after, before, depths, 1e-4)
+    return weights.reshape(-1, height, width), cut.reshape(height, width)
+
+
+def _weights(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return alpha before clipping, alpha, T before and after it, and alpha T where composited, [M, H W]."""
+    alphas, unclipped = _alphas(means2d, conics, opacities, width, height)
+    touched = alphas >= ALPHA_CUT
+    alphas = torch.where(touched, alphas, torch.zeros_like(alphas))
+    after = torch.cumprod(1 - alphas, dim=0)  # never increasing
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    composited = touched & (after >= MIN_TRANSMITTANCE)
+    weights = torch.where(composited, alphas * before, torch.zeros_like(alphas))
+    return unclipped, alphas, before, after, weights
 
 
 def _alphas(

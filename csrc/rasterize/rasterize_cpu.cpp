@@ -1,118 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 #include <cstring>
-#include <type_traits>
 #include <vector>
 
-#include "common/cpu_features.h"
 #include "common/parallel.h"
 #include "rasterize/rasterize.h"
-#include "rasterize/tile_kernels.h"
+#include "rasterize/tile_jobs.h"
 
 namespace blitzgs::cpu {
 namespace {
 
 // Partial gradients held at once: a few megabytes, so that they are summed out of the cache.
 constexpr std::int64_t kPartialsPerChunk = 1 << 17;
-
-template <class T>
-TileKernels<T> tile_kernels(int n_channels, bool absgrad) {
-  if constexpr (std::is_same_v<T, float>) {
-    if (use_avx2()) return avx2_tile_kernels(n_channels, absgrad);
-  }
-  return select_kernels<PlainLanes<T>>(n_channels, absgrad);
-}
-
-template <class T>
-SplatRow<T> pack_row(const RasterizeInput<T>& in, std::int64_t row) {
-  constexpr T kScale = ExponentScale<T>::value;
-  constexpr T kRounding = sizeof(T) == 4 ? T(2e-6) : T(2e-14);
-  SplatRow<T> splat{};
-  SplatEllipse<T> e;
-  splat.x = in.means2d[2 * row];
-  splat.y = in.means2d[2 * row + 1];
-  splat.half_height = T(-1);
-  splat.cut = T(-1);
-  splat.opacity = T(1);
-  if (!tiles::finite(splat.x) || !tiles::finite(splat.y)) return splat;
-  if (!make_ellipse(in.conics + 3 * row, in.opacities[row], &e)) return splat;
-  const ConicFactor<T> factor = factor_conic(in.conics + 3 * row);
-  const T root = std::sqrt(kScale);
-  splat.l11 = factor.l11 * root;
-  splat.l21 = factor.l21 * root;
-  splat.l22 = factor.l22 * root;
-  splat.opacity = in.opacities[row];
-  splat.cut = e.cut * kScale;
-  splat.inv_l11 = T(1) / splat.l11;
-  splat.shear = e.shear;
-  splat.half_height = e.half_height + kRounding * std::fabs(splat.y);
-  const T height = static_cast<T>(in.grid.height);
-  splat.slack = kRounding * (std::fabs(splat.x) + std::fabs(e.shear) * (std::fabs(splat.y) + height) +
-                             std::sqrt(splat.cut) * splat.inv_l11);
-  for (int c = 0; c < std::min(in.n_channels, kPackedChannels); ++c) {
-    splat.color[c] = in.colors[row * in.n_channels + c];
-  }
-  return splat;
-}
-
-template <class T>
-const SplatRow<T>* pack_rows(const RasterizeInput<T>& in, SplatRow<T>* splats) {
-  parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t row = begin; row < end; ++row) splats[row] = pack_row(in, row);
-  });
-  return splats;
-}
-
-// Memory for the rows that lasts as long as the workspace.
-template <class T>
-SplatRow<T>* allocate_rows(std::int64_t n_rows, Workspace& workspace) {
-  const std::size_t bytes = static_cast<std::size_t>(n_rows + 1) * sizeof(SplatRow<T>);
-  const auto address = reinterpret_cast<std::uintptr_t>(workspace.allocate_bytes(bytes));
-  return reinterpret_cast<SplatRow<T>*>((address + 63) / 64 * 64);
-}
-
-// The part of a job that is the tile's place in the images and its list.
-template <class T>
-TileJob<T> make_job(const RasterizeInput<T>& in, const SplatRow<T>* splats, std::int64_t tile) {
-  const TileGrid& grid = in.grid;
-  const std::int64_t camera = tile / grid.per_image(), within = tile % grid.per_image();
-  TileJob<T> job{};
-  job.splats = splats;
-  job.colors = in.colors;
-  job.background = in.backgrounds ? in.backgrounds + camera * in.n_channels : nullptr;
-  job.list = in.isect_rows + in.tile_offsets[tile];
-  job.n_entries = static_cast<std::int32_t>(in.tile_offsets[tile + 1] - in.tile_offsets[tile]);
-  job.n_channels = in.n_channels;
-  job.tile_size = grid.tile_size;
-  job.x0 = static_cast<int>(within % grid.tiles_x) * grid.tile_size;
-  job.y0 = static_cast<int>(within / grid.tiles_x) * grid.tile_size;
-  job.width = std::min(grid.tile_size, grid.width - job.x0);
-  job.height = std::min(grid.tile_size, grid.height - job.y0);
-  job.image_width = grid.width;
-  job.first_pixel = (camera * grid.height + job.y0) * grid.width + job.x0;
-  return job;
-}
-
-// Memory of each worker for the pixels of its tile.
-template <class T>
-class TileMemory {
- public:
-  TileMemory(const RasterizeInput<T>& in, Workspace& workspace)
-      : numbers_(tile_memory(in.grid.tile_size, in.n_channels)),
-        integers_(PlaneLayout(in.grid.tile_size).plane),
-        memory_(workspace.allocate<T>(static_cast<std::int64_t>(numbers_) * num_threads())),
-        last_(workspace.allocate<std::int32_t>(static_cast<std::int64_t>(integers_) * num_threads())) {}
-
-  void lend(int worker, TileJob<T>* job) const {
-    job->memory = memory_ + worker * numbers_;
-    job->last_memory = last_ + worker * integers_;
-  }
-
- private:
-  std::size_t numbers_, integers_;
-  T* memory_;
-  std::int32_t* last_;
-};
 
 template <class T>
 void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {

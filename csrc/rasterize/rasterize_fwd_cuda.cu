@@ -4,12 +4,12 @@
 
 #include "common/launch.cuh"
 #include "rasterize/aux_layout.cuh"
+#include "rasterize/compositor.cuh"
+#include "rasterize/pack_rows.cuh"
 
 namespace blitzgs::cuda {
 
 namespace {
-
-constexpr int kPackThreads = 256;
 
 struct ForwardArguments {
   const PackedRow* rows;
@@ -24,108 +24,19 @@ struct ForwardArguments {
   const std::int64_t* known_rows;          // null, or how many of these rows are there
 };
 
-__device__ __forceinline__ PackedRow pack_row(const RasterizeInput<float>& in, std::int64_t i) {
-  const float conic[3] = {in.conics[3 * i], in.conics[3 * i + 1], in.conics[3 * i + 2]};
-  const ConicFactor<float> factor = factor_conic(conic);
-  PackedRow row;
-  row.x = in.means2d[2 * i];
-  row.y = in.means2d[2 * i + 1];
-  row.l11 = kFactorScale * factor.l11;
-  row.l21 = kFactorScale * factor.l21;
-  row.l22 = kFactorScale * factor.l22;
-  row.log2_opacity = log2f(in.opacities[i]);
-  row.dx_per_dy = -conic[1] / conic[0];
-  const float width = sqrtf(conic[2] / static_cast<float>(conic_determinant(conic)));
-  row.turn = conic[1] == 0.f ? 0.f : -(conic[1] / conic[2]) * (width / kFactorScale);
-  return row;
-}
-
-// The last blocks order the tiles; the others pack rows. A warp's rows go through shared memory, so that each
-// store fills whole sectors.
-__global__ void __launch_bounds__(kPackThreads, 8)
-    prepare_kernel(RasterizeInput<float> in, PackedRow* rows, float4* colors, TileOrder order) {
-  wait_for_earlier_kernels();
-  const auto pack_blocks = static_cast<unsigned>((in.n_rows + kPackThreads - 1) / kPackThreads);
-  if (blockIdx.x >= pack_blocks) {
-    order.add(in.tile_offsets, static_cast<int>((blockIdx.x - pack_blocks) * kPackThreads + threadIdx.x));
-    return;
-  }
-  const std::int64_t n = rows_there(in);
-  __shared__ PackedRow stages[kPackThreads];
-  const PackedRow* stage = stages + threadIdx.x / 32 * 32;
-  const int lane = threadIdx.x % 32;
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kPackThreads) + threadIdx.x;
-  if (i < n) stages[threadIdx.x] = pack_row(in, i);
-  __syncwarp();
-#pragma unroll
-  for (int k = 0; k < 2; ++k) {
-    const std::int64_t at = 2 * (i - lane) + 32 * k + lane;
-    if (at < 2 * n) {
-      reinterpret_cast<float4*>(rows)[at] = reinterpret_cast<const float4*>(stage)[32 * k + lane];
-    }
-  }
-  if (!colors || i >= n) return;
-  const float* color = in.colors + i * in.n_channels;
-  float4 c{color[0], 0.f, 0.f, 0.f};
-  if (in.n_channels > 1) c.y = color[1];
-  if (in.n_channels > 2) c.z = color[2];
-  if (in.n_channels > 3) c.w = color[3];
-  colors[i] = c;
-}
-
-// One pixel's state while its list is composited. Entries are named by their offset in the batch.
+// What four entries add to the colour of a pixel.
 template <int CHANNELS>
-struct Compositor {
-  static constexpr std::uint32_t kNone = ~0u;
-  float transmittance = 1.f;
-  float color[CHANNELS] = {};
-  float limit;                  // least log2(alpha) that still counts: infinite once the pixel has ended
-  std::uint32_t last = kNone;   // composited last
-  std::uint32_t ended = kNone;  // at which the pixel ended
-
-  // Composites four entries of a batch. Whether the pixel ends is asked once for all of them.
-  __device__ __forceinline__ void add(const char* entries, const QuadOffsets& offsets, const Pixel& pixel) {
-    float alpha[4];
-    bool touched[4];
-    float after = transmittance;
+__device__ __forceinline__ void add_colors(const char* entries, const QuadOffsets& offsets,
+                                           const QuadWeights& weights, float* color) {
 #pragma unroll
-    for (int k = 0; k < 4; ++k) {
-      const float log2_a = log2_alpha(entry_at(entries, offsets.at[k]), pixel);
-      touched[k] = log2_a >= limit;
-      alpha[k] = touched[k] ? fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax)) : 0.f;
-      after = __fmaf_rn(-alpha[k], after, after);
-    }
-    if (__any_sync(kFullWarp, after < static_cast<float>(kMinTransmittance))) end(alpha, touched, offsets);
+  for (int k = 0; k < 4; ++k) {
+    const float4 row_color = *reinterpret_cast<const float4*>(entry_at(entries, offsets.at[k]).color);
+    if (weights.touched[k]) {
 #pragma unroll
-    for (int k = 0; k < 4; ++k) {
-      const float weight = alpha[k] * transmittance;
-      transmittance = __fmaf_rn(-alpha[k], transmittance, transmittance);
-      const float4 row_color = *reinterpret_cast<const float4*>(entry_at(entries, offsets.at[k]).color);
-      if (touched[k]) {
-        last = offsets.at[k];
-#pragma unroll
-        for (int c = 0; c < CHANNELS; ++c) color[c] = __fmaf_rn(weight, channel(row_color, c), color[c]);
-      }
+      for (int c = 0; c < CHANNELS; ++c) color[c] = __fmaf_rn(weights.at[k], channel(row_color, c), color[c]);
     }
   }
-
-  // Takes the entry that would end the pixel, and those behind it, out of the four.
-  __device__ __forceinline__ void end(float (&alpha)[4], bool (&touched)[4], const QuadOffsets& offsets) {
-    float after = transmittance;
-#pragma unroll
-    for (int k = 0; k < 4; ++k) {
-      after = __fmaf_rn(-alpha[k], after, after);
-      if (ended == kNone && after < static_cast<float>(kMinTransmittance)) ended = offsets.at[k];
-      if (ended != kNone) {
-        alpha[k] = 0.f;
-        touched[k] = false;
-        limit = INFINITY;
-      }
-    }
-  }
-
-  __device__ __forceinline__ bool done() const { return limit == INFINITY; }
-};
+}
 
 __device__ __forceinline__ int entry_number(std::uint32_t offset) {
   return static_cast<int>(offset / sizeof(Entry));
@@ -147,9 +58,6 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
   args.out.transmittances[pixel.index] = transmittance;
   args.out.last_ids[pixel.index] = last;
 }
-
-template <int TILE>
-inline constexpr int kForwardBatch = TILE == 8 ? 64 : 256;
 
 // At most so many 16-byte stores of zeros a thread; where tiles are too few for that, they are no help.
 constexpr int kMostZeros = 16;
@@ -193,7 +101,8 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
   if (thread == 0) tile_work = 0;
   batch.init(thread);
 
-  Compositor<CHANNELS> state;
+  Compositor state;
+  float color[CHANNELS] = {};
   state.limit = pixel.inside ? kLog2Cut : INFINITY;
   int last = 0, work = pixel.inside ? count : 0;
   const auto row_at = [&](int at) {
@@ -214,7 +123,11 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
     const char* entries = reinterpret_cast<const char*>(batch.entries[buffer]);
     const uint2* list = batch.quads(pixel.subtile);
     for (int i = 0; i < quads && !__all_sync(kFullWarp, state.done());) {
-      for (const int stop = min(i + 8, quads); i < stop; ++i) state.add(entries, QuadOffsets(list[i]), pixel);
+      for (const int stop = min(i + 8, quads); i < stop; ++i) {
+        const QuadOffsets offsets(list[i]);
+        const QuadWeights weights = state.add(entries, offsets, pixel);
+        add_colors<CHANNELS>(entries, offsets, weights, color);
+      }
     }
     if (state.last != state.kNone) last = base + entry_number(state.last) + 1;
     if (state.ended != state.kNone) work = base + entry_number(state.ended) + 1;
@@ -222,7 +135,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
   }
 
   if (pixel.inside) {
-    write_pixel<CHANNELS>(args, pixel, tile.camera, state.color, state.transmittance, last);
+    write_pixel<CHANNELS>(args, pixel, tile.camera, color, state.transmittance, last);
   }
   if (args.chunk.first > 0) return;
   work = __reduce_max_sync(kFullWarp, work);
@@ -275,11 +188,7 @@ void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput
   PackedRow* const rows = layout.rows(aux);
   float4* const colors = layout.colors(aux, in.n_channels);
   const TileOrder order = layout.order(in.grid, aux);
-  order.clear(stream);
-  const unsigned blocks = blocks_for(in.n_rows, kPackThreads) + blocks_for(order.unordered(), kPackThreads);
-  if (blocks > 0) {
-    launch_early("rasterize_fwd", prepare_kernel, {blocks, kPackThreads, stream}, in, rows, colors, order);
-  }
+  prepare("rasterize_fwd", in, rows, colors, order, stream);
   for (int first = 0; first < in.n_channels; first += 4) {
     const ForwardArguments args{rows,
                                 {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},

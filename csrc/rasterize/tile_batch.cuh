@@ -263,8 +263,10 @@ struct EntryBatch {
     }
   }
 
-  // Starts to copy entry `at` of a batch that nobody reads; row < 0 where there is none.
-  __device__ __forceinline__ void fetch(int buffer, const PackedRow* rows, const ChannelChunk& chunk,
+  // Starts to copy entry `at` of a batch that nobody reads; row < 0 where there is none. `chunk` is what
+  // copy_color() takes.
+  template <class Chunk>
+  __device__ __forceinline__ void fetch(int buffer, const PackedRow* rows, const Chunk& chunk,
                                         std::int32_t row, int at) {
     if (row < 0) return;
     auto* target = reinterpret_cast<float4*>(&entries[buffer][at]);

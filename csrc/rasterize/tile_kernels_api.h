@@ -4,6 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "importance/importance.h"
 #include "rasterize/rasterize.h"
 
 namespace blitzgs::cpu {
@@ -68,8 +69,9 @@ constexpr int partial_width(int n_channels, bool absgrad) { return kColor + n_ch
 
 template <class T>
 struct TileKernels {
-  std::int32_t (*forward)(const TileJob<T>&);        // returns the entries processed
-  void (*backward)(const TileJob<T>&, T* partials);  // writes n_entries partial gradients
+  std::int32_t (*forward)(const TileJob<T>&);                      // returns the entries processed
+  void (*backward)(const TileJob<T>&, T* partials);                // writes n_entries partial gradients
+  void (*contribute)(const TileJob<T>&, const ContributionSums&);  // adds to them, as other tiles do
 };
 
 // Defined in rasterize_avx2.cpp; call only where the processor has AVX2 and FMA.

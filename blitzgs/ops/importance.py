@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each Gaussian contributes to each view: the instrumented rasterisation, without colours."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from blitzgs.ops.project import Rows, project_rows
+
+# Units of a weight in 1, kContributionScale of csrc/importance/importance.h.
+UNITS = 1 << 32
+# Views that are projected at once.
+_VIEWS = 8
+_TILE_SIZE = 16
+
+
+def row_contributions(
+    means2d: Tensor,
+    conics: Tensor,
+    row_opacities: Tensor,
+    isect_rows: Tensor,
+    tile_offsets: Tensor,
+    *,
+    n_cameras: int,
+    width: int,
+    height: int,
+    tile_size: int = 16,
+    tile_begin: int = 0,
+    tile_end: int = -1,
+    n_rows: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Sum alpha T over the pixels at which each row is composited, and count these pixels.
+
+    Pixels are composited as by :func:`blitzgs.ops.rasterize.rasterize`, bit for bit. Sums are of integers, so
+    they do not depend on the order, and partial sums of several tile ranges add up to the whole.
+
+    Args:
+        means2d: [P, 2], pixels, float32 or (CPU) float64.
+        conics: inverse 2D covariances (a, b, c) [P, 3].
+        row_opacities: [P].
+        isect_rows: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
+        tile_offsets: int64 [B * T + 1], likewise.
+        n_cameras: number of views B.
+        width: of every view, pixels.
+        height: of every view, pixels.
+        tile_size: edge of a tile in pixels, as given to ``intersect``; 8, 16 or 32 on CUDA.
+        tile_begin: first tile to composite.
+        tile_end: end of the tiles to composite, -1 for all.
+        n_rows: int64 [1] on the device of the rows: only the first so many are there. None: all.
+
+    Returns:
+        Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest), and pixels int32 [P].
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes, a tile range outside the images, or a tile size that CUDA lacks.
+    """
+    weights, pixels = torch.ops.blitzgs.contributions(
+        means2d, conics, row_opacities, isect_rows, tile_offsets, n_cameras, width, height, tile_size,
+        tile_begin, tile_end, n_rows,
+    )  # fmt: skip
+    return weights, pixels
+
+
+@torch.no_grad()
+def contributions(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    eps2d: float = 0.3,
+    rasterize_mode: str = "classic",
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Tell what each Gaussian contributes to each view (paper §3.2), without shading a colour.
+
+    Over the pixels p of a view at which the renderer composites a Gaussian, with the renderer's own alpha and
+    transmittance T::
+
+        weight = sum of alpha_p T_p;    pixels = their number
+
+    Each alpha T enters as an integer number of 2^-32, so the sums are exact: on one device the result has the
+    same bits in every run. The arguments are those of :func:`blitzgs.rasterization`. Not differentiable.
+
+    Args:
+        means: [N, 3], float32, or (CPU) float64; the other tensors share its dtype and device.
+        quats: [N, 4] (w, x, y, z), need not be normalised.
+        scales: [N, 3] standard deviations (after the exponential).
+        opacities: [N] in [0, 1] (after the sigmoid).
+        viewmats: [C, 4, 4] world to camera, a rotation and a translation; any number of views.
+        Ks: [C, 3, 3] intrinsics in px.
+        width: of every view, px.
+        height: of every view, px.
+        near_plane: Gaussians have z > near_plane, world units.
+        far_plane: Gaussians have z <= far_plane, world units.
+        eps2d: variance added to both screen axes, px^2.
+        rasterize_mode: "classic" or "antialiased".
+
+    Returns:
+        weights float64 [C, N]; pixels int64 [C, N]; visible bool [C, N]: in depth range, and the box around
+        its alpha >= 1/255 overlaps the image (gsplat's radii > 0).
+
+    Raises:
+        ValueError: an unknown `rasterize_mode`.
+        RuntimeError: a wrong shape, dtype or value, by name.
+    """
+    if rasterize_mode not in ("classic", "antialiased"):
+        raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', got {rasterize_mode!r}")
+    shape = (len(viewmats), len(means))
+    weights = torch.zeros(shape, dtype=torch.float64, device=means.device)
+    pixels = torch.zeros(shape, dtype=torch.int64, device=means.device)
+    visible = torch.zeros(shape, dtype=torch.bool, device=means.device)
+    for begin in range(0, len(viewmats), _VIEWS):
+        views = slice(begin, begin + _VIEWS)
+        n_views = len(viewmats[views])
+        rows = project_rows(
+            means, quats, scales, opacities, None, viewmats[views], Ks[views], None, None, width, height,
+            _TILE_SIZE, 0, near_plane, far_plane, eps2d, 0.0, rasterize_mode == "antialiased", False,
+        )  # fmt: skip
+        row_weights, row_pixels = _of_rows(rows, n_views, width, height)
+        at = rows.camera_ids.long() + begin, rows.gaussian_ids.long()
+        weights[at] = row_weights.double() / UNITS
+        pixels[at] = row_pixels.long()
+        visible[at] = True
+    return weights, pixels, visible
+
+
+def _of_rows(rows: Rows, n_views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Return the weights and pixels of all rows of a projection."""
+    splats = rows.means2d, rows.conics, rows.opacities
+    grid = (n_views, width, height, _TILE_SIZE, 0, -1)
+    lists = torch.ops.blitzgs.intersect(
+        *splats, rows.depths, rows.camera_ids, None, *grid, int(rows.counts[2])
+    )
+    weights, pixels = torch.ops.blitzgs.contributions(*splats, *lists, *grid)
+    return weights, pixels
+
+
+@torch.library.register_fake("blitzgs::contributions")
+def _(means2d: Tensor, *_rest: object) -> tuple[Tensor, Tensor]:
+    n_rows = means2d.shape[0]
+    return means2d.new_empty(n_rows, dtype=torch.int64), means2d.new_empty(n_rows, dtype=torch.int32)

@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: Apache-2.0
+// What each row contributes to the image: the instrumented rasterisation. Compositing is that of
+// rasterize/rasterize.h, without colours; per row, over the pixels at which it is composited:
+//   weights = sum of round(2^32 alpha T)   int64 [P], alpha T to the nearest unit of 2^-32, ties to even
+//   pixels  = number of these pixels       int32 [P]
+//
+//   means2d [P, 2], conics [P, 3], opacities [P], isect_rows and tile_offsets from intersect  ->  the sums
+//   over the tiles [tile_begin, tile_end). Rows in no list get zeros.
+//
+// Exact: alpha T of a pixel has the bits with which the backend renders the pixel (same tile size), and the
+// sums are integers, so tile ranges, ranks, threads, atomics and repetition change no bit. An alpha T is at
+// least 1e-4 / 255, so it is never rounded to zero, and below 1, so a sum over 2^31 pixels fits. CPU and CUDA
+// agree to the rounding of alpha. O(entries processed x pixels of the splat).
+#pragma once
+#include <cstdint>
+
+#include "common/row_count.h"
+#include "common/stream.h"
+#include "math/tiles.h"
+
+namespace blitzgs {
+
+inline constexpr double kContributionScale = 4294967296.0;  // units in 1
+
+template <class T>
+struct ContributionInput {
+  const T* means2d;
+  const T* conics;
+  const T* opacities;
+  const std::int32_t* isect_rows;
+  const std::int64_t* tile_offsets;
+  std::int64_t n_rows;
+  TileGrid grid;
+  const std::int64_t* known_rows = nullptr;  // common/row_count.h; CUDA alone
+};
+
+struct ContributionSums {
+  std::int64_t* weights;
+  std::int32_t* pixels;
+};
+
+namespace cpu {
+template <class T>
+void contributions(const ContributionInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
+}
+namespace cuda {
+template <class T>
+void contributions(const ContributionInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
+}
+
+}  // namespace blitzgs

@@ -1,0 +1,183 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "importance/importance.h"
+
+#include <string>
+
+#include "common/launch.cuh"
+#include "rasterize/compositor.cuh"
+#include "rasterize/pack_rows.cuh"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+// A half-warp gathers what its pixels say of this many entries; then each lane adds one entry up.
+constexpr int kGroup = 16;
+constexpr int kEntryStride =
+    kHalfWarp + 4;  // words: lanes read quads of neighbouring entries without conflict
+// Half-warps of a warp write to different banks.
+constexpr int kGroupWords = kGroup * kEntryStride + 16;
+
+// Colours are not copied; their place in an entry holds what the tile contributes to its row.
+struct NoColors {};
+__device__ __forceinline__ void copy_color(float* shared, NoColors, std::int32_t) {
+  *reinterpret_cast<uint2*>(shared) = {0u, 0u};
+}
+
+// The sum of an entry over a tile of at most 2^10 pixels, each below 2^32 units, in two words that shared
+// memory adds atomically: the low kLowBits of each subtile's sum, and its high ones below the pixels' number.
+struct TileSum {
+  static constexpr int kLowBits = 22, kPixelShift = 20;
+
+  __device__ __forceinline__ static void add(Entry& entry, std::uint64_t weight, std::uint32_t pixels) {
+    auto* words = reinterpret_cast<std::uint32_t*>(entry.color);
+    atomicAdd(words, static_cast<std::uint32_t>(weight) & ((1u << kLowBits) - 1));
+    atomicAdd(words + 1, static_cast<std::uint32_t>(weight >> kLowBits) | pixels << kPixelShift);
+  }
+
+  __device__ __forceinline__ static void send(const Entry& entry, std::int32_t row,
+                                              const ContributionSums& sums) {
+    const uint2 words = *reinterpret_cast<const uint2*>(entry.color);
+    if (words.y == 0) return;  // an entry that is composited has at least a pixel
+    const std::uint64_t high = words.y & ((1u << kPixelShift) - 1);
+    atomicAdd(reinterpret_cast<unsigned long long*>(sums.weights + row),
+              static_cast<unsigned long long>((high << kLowBits) + words.x));
+    atomicAdd(sums.pixels + row, static_cast<std::int32_t>(words.y >> kPixelShift));
+  }
+};
+
+template <int TILE>
+struct ContributionShared {
+  EntryBatch<TILE, kForwardBatch<TILE>> batch;
+  __align__(16) std::uint32_t groups[Tile<TILE>::kSubtiles][kGroupWords];
+};
+
+struct ContributionArguments {
+  const PackedRow* rows;
+  const std::int32_t* isect_rows;
+  const std::int64_t* tile_offsets;
+  TileGrid grid;
+  TileOrder order;
+  ContributionSums sums;
+};
+
+// Adds up what the pixels of a subtile said of an entry.
+__device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& entry) {
+  std::uint64_t weight = 0;
+  std::uint32_t pixels = 0;
+#pragma unroll
+  for (int i = 0; i < kHalfWarp / 4; ++i) {
+    const uint4 four = reinterpret_cast<const uint4*>(words)[i];
+    for (const std::uint32_t units : {four.x, four.y, four.z, four.w}) {
+      weight += units;
+      pixels += units != 0;
+    }
+  }
+  if (pixels > 0) TileSum::add(entry, weight, pixels);
+}
+
+template <int TILE>
+__global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
+    contributions_kernel(const ContributionArguments args) {
+  constexpr int kBatch = kForwardBatch<TILE>;
+  extern __shared__ __align__(16) unsigned char shared_bytes[];
+  auto& shared = *reinterpret_cast<ContributionShared<TILE>*>(shared_bytes);
+  auto& batch = shared.batch;
+  const int thread = threadIdx.x, lane = thread % kHalfWarp;
+  wait_for_earlier_kernels();
+  const TilePlace tile = locate_tile<TILE>(args.grid, args.order.tile(static_cast<int>(blockIdx.x)));
+  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
+  const std::int64_t start = args.tile_offsets[tile.tile];
+  const int count = static_cast<int>(args.tile_offsets[tile.tile + 1] - start);
+  batch.init(thread);
+
+  Compositor state;
+  state.limit = pixel.inside ? kLog2Cut : INFINITY;
+  std::uint32_t* const group = shared.groups[pixel.subtile];
+  const auto row_at = [&](int at) {
+    return thread < kBatch && at < count ? args.isect_rows[start + at] : -1;
+  };
+  // `summed` is the row of the thread's entry in the batch before, whose sums are complete at the barrier.
+  std::int32_t row = row_at(thread), next_row = row_at(thread + kBatch), summed = -1;
+  int buffer = 0;
+  const auto send_sums = [&] {
+    if (summed >= 0) TileSum::send(batch.entries[buffer ^ 1][thread], summed, args.sums);
+    summed = -1;
+  };
+  batch.fetch(0, args.rows, NoColors{}, row, thread);
+  for (int base = 0; base < count; base += kBatch, buffer ^= 1) {
+    if (thread < kBatch) batch.place(buffer, row >= 0, tile, thread);
+    const bool all_done = __syncthreads_and(state.done());
+    send_sums();
+    if (all_done) break;
+    summed = row;
+    row = next_row;
+    batch.fetch(buffer ^ 1, args.rows, NoColors{}, row, thread);
+    next_row = row_at(base + 2 * kBatch + thread);
+    const unsigned done = __ballot_sync(kFullWarp, state.done()) >> (thread & kHalfWarp) & 0xffffu;
+    const int quads =
+        batch.template list<false, false>(buffer, pixel.subtile, lane, done == 0xffffu ? 0 : kBatch);
+    char* const entries = reinterpret_cast<char*>(batch.entries[buffer]);
+    const uint2* list = batch.quads(pixel.subtile);
+    for (int i = 0; i < quads && !__all_sync(kFullWarp, state.done()); i += kGroup / 4) {
+      const int filled = min(kGroup / 4, quads - i);
+      for (int quad = 0; quad < filled; ++quad) {
+        const QuadWeights weights = state.add(entries, QuadOffsets(list[i + quad]), pixel);
+#pragma unroll
+        for (int k = 0; k < 4; ++k) {
+          group[(4 * quad + k) * kEntryStride + lane] =
+              __float2uint_rn(weights.at[k] * static_cast<float>(kContributionScale));
+        }
+      }
+      __syncwarp();
+      if (lane < 4 * filled) {
+        const std::uint32_t offset = batch.lists[pixel.subtile][4 * i + lane];
+        sum_pixels(group + lane * kEntryStride, *reinterpret_cast<Entry*>(entries + offset));
+      }
+      __syncwarp();
+    }
+  }
+  __syncthreads();
+  send_sums();
+}
+
+template <int TILE>
+void launch_contributions(const ContributionArguments& args, CudaStream stream) {
+  const auto kernel = contributions_kernel<TILE>;
+  constexpr int kBytes = sizeof(ContributionShared<TILE>);
+  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "contributions");
+  launch_early("contributions", kernel,
+               {static_cast<unsigned>(args.order.n_tiles), TILE * TILE, stream, kBytes}, args);
+}
+
+}  // namespace
+
+template <>
+void contributions<float>(const ContributionInput<float>& in, const ContributionSums& sums,
+                          Workspace& workspace, CudaStream stream) {
+  const int size = in.grid.tile_size;
+  if (size != 8 && size != 16 && size != 32) {
+    throw std::runtime_error("blitzgs::contributions: tile_size must be 8, 16 or 32 on CUDA, got " +
+                             std::to_string(size));
+  }
+  check(cudaMemsetAsync(sums.weights, 0, in.n_rows * sizeof(*sums.weights), stream), "contributions");
+  check(cudaMemsetAsync(sums.pixels, 0, in.n_rows * sizeof(*sums.pixels), stream), "contributions");
+  const std::int64_t owned = in.grid.tile_end - in.grid.tile_begin;
+  if (owned == 0 || in.n_rows == 0) return;
+  const RasterizeInput<float> rows{in.means2d, in.conics,     in.opacities,    nullptr,
+                                   nullptr,    in.isect_rows, in.tile_offsets, in.n_rows,
+                                   0,          in.grid,       in.known_rows};
+  auto* packed = static_cast<PackedRow*>(workspace.allocate_bytes(in.n_rows * sizeof(PackedRow)));
+  const TileOrder order(in.grid, owned, workspace.allocate_bytes(TileOrder::bytes(in.grid, owned)));
+  prepare("contributions", rows, packed, nullptr, order, stream);
+  const ContributionArguments args{packed, in.isect_rows, in.tile_offsets, in.grid, order, sums};
+  if (size == 8) {
+    launch_contributions<8>(args, stream);
+  } else if (size == 16) {
+    launch_contributions<16>(args, stream);
+  } else {
+    launch_contributions<32>(args, stream);
+  }
+}
+
+}  // namespace blitzgs::cuda

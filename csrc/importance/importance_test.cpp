@@ -1,0 +1,80 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "importance/importance.h"
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "common/catch.h"
+#include "common/test_workspace.h"
+
+namespace {
+
+using namespace blitzgs;
+
+// Two round splats on an image of 20 x 12, in one list per tile of 16 x 16, the nearer one first.
+template <class T>
+struct Pair {
+  std::vector<T> means2d{T(9.5), T(6.5), T(12), T(6)}, conics{T(0.1), T(0), T(0.1), T(0.05), T(0), T(0.05)};
+  std::vector<T> opacities{T(0.999), T(0.7)};
+  std::vector<std::int32_t> rows{0, 1, 0, 1};
+  std::vector<std::int64_t> offsets{0, 2, 4}, weights{7, 7};
+  std::vector<std::int32_t> pixels{7, 7};
+  TestWorkspace workspace;
+
+  void survey(std::int64_t tile_begin, std::int64_t tile_end) {
+    const TileGrid grid = make_tile_grid(1, 20, 12, 16, tile_begin, tile_end);
+    cpu::contributions<T>(
+        {means2d.data(), conics.data(), opacities.data(), rows.data(), offsets.data(), 2, grid},
+        {weights.data(), pixels.data()}, workspace, nullptr);
+  }
+};
+
+double alpha_at(const Pair<double>& pair, int row, double x, double y) {
+  const double dx = x - pair.means2d[2 * row], dy = y - pair.means2d[2 * row + 1];
+  const double alpha =
+      std::min(0.99, pair.opacities[row] * std::exp(-0.5 * pair.conics[3 * row] * (dx * dx + dy * dy)));
+  return alpha >= 1.0 / 255.0 ? alpha : 0.0;
+}
+
+}  // namespace
+
+TEST_CASE("contributions are alpha T, summed over pixels in units of 2^-32") {
+  Pair<double> pair;
+  pair.survey(0, -1);
+  std::int64_t weights[2] = {0, 0};
+  std::int32_t pixels[2] = {0, 0};
+  for (int y = 0; y < 12; ++y) {
+    for (int x = 0; x < 20; ++x) {
+      const double near = alpha_at(pair, 0, x + 0.5, y + 0.5), far = alpha_at(pair, 1, x + 0.5, y + 0.5);
+      weights[0] += std::llrint(near * 4294967296.0);
+      weights[1] += std::llrint(far * (1 - near) * 4294967296.0);
+      pixels[0] += near > 0;
+      pixels[1] += far > 0;
+    }
+  }
+  for (int row = 0; row < 2; ++row) {
+    REQUIRE(pair.pixels[row] == pixels[row]);
+    // The exponential of one pixel or another may round to another unit.
+    REQUIRE(std::abs(pair.weights[row] - weights[row]) <= pixels[row]);
+  }
+}
+
+TEST_CASE("contributions of tile ranges add up") {
+  Pair<float> pair;
+  pair.survey(0, -1);
+  const std::vector<std::int64_t> weights = pair.weights;
+  const std::vector<std::int32_t> pixels = pair.pixels;
+  pair.survey(0, 1);
+  const std::vector<std::int64_t> left_weights = pair.weights;
+  const std::vector<std::int32_t> left_pixels = pair.pixels;
+  pair.survey(1, 2);
+  for (int row = 0; row < 2; ++row) {
+    REQUIRE(left_weights[row] + pair.weights[row] == weights[row]);
+    REQUIRE(left_pixels[row] + pair.pixels[row] == pixels[row]);
+    REQUIRE(left_pixels[row] > 0);
+    REQUIRE(pair.pixels[row] > 0);
+  }
+  pair.survey(1, 1);
+  REQUIRE(pair.weights == std::vector<std::int64_t>{0, 0});
+}

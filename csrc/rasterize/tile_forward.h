@@ -1,0 +1,257 @@
+// SPDX-License-Identifier: Apache-2.0
+// Compositing one tile, front to back, and what is made of it: the image, or the contributions of rows.
+// Compiled twice, plain and with AVX2; see tile_kernels.h.
+#pragma once
+#include <algorithm>
+#include <atomic>
+#include <bit>
+#include <cmath>
+#include <cstdint>
+
+#include "math/exp.h"
+#include "math/lanes.h"
+#include "rasterize/tile_kernels_api.h"
+
+namespace blitzgs::cpu {
+namespace {
+
+template <class Lanes>
+Lanes falloff(Lanes exponent) {
+  if constexpr (sizeof(typename Lanes::Scalar) == 4) {
+    return exp2_nonpositive(exponent);
+  } else {
+    return Lanes::make([&](int i) { return std::exp(exponent.v[i]); });
+  }
+}
+
+// What a splat does to each pixel row of a tile: the exponent at (dx, row) is
+// -(l11 dx + shift)^2 + minus_w2, and pixels [first, last] of the row may be reached.
+template <class T>
+struct RowSpans {
+  alignas(32) T dy[kMaxTileSize];
+  alignas(32) T shift[kMaxTileSize];
+  alignas(32) T minus_w2[kMaxTileSize];
+  alignas(32) std::int32_t first[kMaxTileSize];
+  alignas(32) std::int32_t last[kMaxTileSize];
+};
+
+// Fills spans and returns the set of rows with a pixel in reach, one bit each.
+template <class Lanes, class T>
+std::uint64_t find_spans(const SplatRow<T>& splat, const TileJob<T>& tile, RowSpans<T>& spans) {
+  const T top = static_cast<T>(tile.y0) + T(0.5);
+  const T low = splat.y - splat.half_height - top, high = splat.y + splat.half_height - top;
+  const T bottom = static_cast<T>(tile.height - 1);
+  const int row_begin = low > T(0) ? static_cast<int>(low < bottom ? low : bottom) / kLanes * kLanes : 0;
+  const int row_end = high >= T(0) ? static_cast<int>(high < bottom ? high : bottom) + 1 : 0;
+  const Lanes cut = Lanes::broadcast(splat.cut), zero = Lanes::zero();
+  const Lanes right = Lanes::broadcast(static_cast<T>(tile.width - 1));
+  const Lanes middle = Lanes::broadcast(splat.x - (static_cast<T>(tile.x0) + T(0.5)));
+  std::uint64_t rows = 0;
+  for (int row = row_begin; row < row_end; row += kLanes) {
+    const Lanes dy = Lanes::broadcast(top + static_cast<T>(row)) + Lanes::iota() - Lanes::broadcast(splat.y);
+    const Lanes w = Lanes::broadcast(splat.l22) * dy;
+    const Lanes w2 = w * w;
+    const Lanes rest = cut - w2;
+    const Lanes reach = Lanes::fma(Lanes::sqrt(Lanes::max(rest, zero)), Lanes::broadcast(splat.inv_l11),
+                                   Lanes::broadcast(splat.slack));
+    const Lanes centre = Lanes::fnma(Lanes::broadcast(splat.shear), dy, middle);
+    const Lanes first = Lanes::ceil(Lanes::max(centre - reach, zero));
+    const Lanes last = Lanes::floor(Lanes::min(centre + reach, right));
+    dy.store(spans.dy + row);
+    (Lanes::broadcast(splat.l21) * dy).store(spans.shift + row);
+    (zero - w2).store(spans.minus_w2 + row);
+    first.to_int().store(spans.first + row);
+    last.to_int().store(spans.last + row);
+    const auto reached = Lanes::greater_equal(last, first) & Lanes::greater_equal(rest, zero);
+    rows |= static_cast<std::uint64_t>(reached.bits()) << row;
+  }
+  return rows;
+}
+
+// D > 0 fixes the number of channels, 0 reads it from the tile.
+template <int D, class T>
+int channels(const TileJob<T>& tile) {
+  if constexpr (D > 0) return D;
+  return tile.n_channels;
+}
+
+template <int D, class T>
+const T* splat_color(const TileJob<T>& tile, std::int32_t row) {
+  if constexpr (D > 0 && D <= kPackedChannels) return tile.splats[row].color;
+  return tile.colors + static_cast<std::int64_t>(row) * channels<D>(tile);
+}
+
+template <class T>
+void pixel_centres(const TileJob<T>& tile, int stride, T* centres) {
+  for (int x = 0; x < stride; ++x) centres[x] = static_cast<T>(tile.x0 + x) + T(0.5);
+}
+
+template <class T>
+struct ForwardState {
+  PlaneLayout layout;
+  T *transmittance, *ended, *color, *centres;
+  std::int32_t* last;
+  std::uint64_t alive_rows = 0;
+  std::int32_t alive_in_row[kMaxTileSize] = {};
+};
+
+template <int D, class T>
+ForwardState<T> start_forward(const TileJob<T>& tile) {
+  const PlaneLayout layout(tile.tile_size);
+  const std::ptrdiff_t plane = layout.plane, used = plane * (2 + channels<D>(tile));
+  T* memory = tile.memory;
+  ForwardState<T> state{layout, memory, memory + plane, memory + 2 * plane, memory + used, tile.last_memory};
+  std::fill_n(memory, used, T(0));
+  std::fill_n(state.last, plane, 0);
+  for (int row = 0; row < tile.height; ++row) {
+    std::fill_n(state.transmittance + row * layout.stride, tile.width, T(1));
+    state.alive_in_row[row] = tile.width;
+    state.alive_rows |= std::uint64_t{1} << row;
+  }
+  pixel_centres(tile, layout.stride, state.centres);
+  return state;
+}
+
+// A running pixel has transmittance > 0 (it starts at 1 and stays above the minimum). One that ends moves it
+// to `ended`, and zero keeps it from compositing anything further.
+template <class T>
+void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
+  for (; bits; bits &= bits - 1) {
+    const int pixel = row * state.layout.stride + x + std::countr_zero(bits);
+    state.ended[pixel] = state.transmittance[pixel];
+    state.transmittance[pixel] = T(0);
+    if (--state.alive_in_row[row] == 0) state.alive_rows &= ~(std::uint64_t{1} << row);
+  }
+}
+
+// Composites a splat at eight pixels of a row and gives the sink their alpha T, zero where it is not drawn.
+template <class Lanes, class T, class Sink>
+inline void composite(const SplatRow<T>& splat, const RowSpans<T>& spans, std::int32_t entry, int row, int x,
+                      ForwardState<T>& state, Sink& sink) {
+  const int pixel = row * state.layout.stride + x;
+  const Lanes before = Lanes::load(state.transmittance + pixel);
+  const auto running = Lanes::greater(before, Lanes::zero());
+  if (!running.any()) return;
+  const Lanes dx = Lanes::load(state.centres + x) - Lanes::broadcast(splat.x);
+  const Lanes u = Lanes::fma(Lanes::broadcast(splat.l11), dx, Lanes::broadcast(spans.shift[row]));
+  const Lanes weight = falloff(Lanes::fnma(u, u, Lanes::broadcast(spans.minus_w2[row])));
+  const Lanes alpha = Lanes::min(Lanes::broadcast(T(kAlphaMax)), Lanes::broadcast(splat.opacity) * weight);
+  const auto touched = running & Lanes::greater_equal(alpha, Lanes::broadcast(T(kAlphaCut)));
+  const Lanes after = before * (Lanes::broadcast(T(1)) - alpha);
+  const auto drawn = touched & Lanes::greater_equal(after, Lanes::broadcast(T(kMinTransmittance)));
+  sink.add(Lanes::keep(drawn, alpha * before), pixel);
+  Lanes::select(drawn, after, before).store(state.transmittance + pixel);
+  std::int32_t* last = state.last + pixel;
+  Lanes::Int::select(drawn, Lanes::Int::broadcast(entry + 1), Lanes::Int::load(last)).store(last);
+  const auto ending = touched.and_not(drawn);
+  if (ending.any()) end_pixels(state, row, x, ending.bits());
+}
+
+template <int D, class T>
+void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
+  for (int row = 0; row < tile.height; ++row) {
+    for (int x = 0; x < tile.width; ++x) {
+      const int pixel = row * state.layout.stride + x;
+      const std::int64_t out = tile.first_pixel + static_cast<std::int64_t>(row) * tile.image_width + x;
+      const T running = state.transmittance[pixel];
+      const T rest = running > T(0) ? running : state.ended[pixel];
+      tile.out.transmittances[out] = rest;
+      tile.out.last_ids[out] = state.last[pixel];
+      T* render = tile.out.renders + out * channels<D>(tile);
+      for (int c = 0; c < channels<D>(tile); ++c) {
+        const T background = tile.background ? tile.background[c] : T(0);
+        render[c] = state.color[c * state.layout.plane + pixel] + rest * background;
+      }
+    }
+  }
+}
+
+// Lists name rows in no order that the hardware could foresee, so they are fetched some entries ahead. Both
+// loops write it out, because gcc drops calls of a function that does nothing but prefetch.
+constexpr std::int32_t kPrefetchDistance = 6;
+
+// Composites the tile's list and returns the number of entries processed. The sink gets begin(row), then
+// add(alpha T of eight pixels, first of them) for the pixels the splat may reach, then end(row).
+template <class Lanes, class T, class Sink>
+std::int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink& sink) {
+  RowSpans<T> spans;
+  std::int32_t entry = 0;
+  for (; entry < tile.n_entries && state.alive_rows; ++entry) {
+    __builtin_prefetch(tile.splats + tile.list[std::min(entry + kPrefetchDistance, tile.n_entries - 1)]);
+    const std::int32_t splat_row = tile.list[entry];
+    const SplatRow<T>& splat = tile.splats[splat_row];
+    sink.begin(splat_row);
+    std::uint64_t rows = find_spans<Lanes>(splat, tile, spans) & state.alive_rows;
+    for (; rows; rows &= rows - 1) {
+      const int row = std::countr_zero(rows);
+      for (int x = spans.first[row]; x <= spans.last[row]; x += kLanes) {
+        composite<Lanes>(splat, spans, entry, row, x, state, sink);
+      }
+    }
+    sink.end(splat_row);
+  }
+  return entry;
+}
+
+// Adds the colours of rows up in the planes of the pixels.
+template <class Lanes, int D, class T>
+struct ColorSink {
+  const TileJob<T>& tile;
+  T* planes;
+  std::ptrdiff_t plane;
+  const T* color = nullptr;
+
+  void begin(std::int32_t row) { color = splat_color<D>(tile, row); }
+  void add(Lanes share, int pixel) const {
+    for (int c = 0; c < channels<D>(tile); ++c) {
+      T* sum = planes + c * plane + pixel;
+      Lanes::fma(share, Lanes::broadcast(color[c]), Lanes::load(sum)).store(sum);
+    }
+  }
+  void end(std::int32_t) const {}
+};
+
+// Returns the number of entries processed.
+template <class Lanes, int D>
+std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
+  using T = typename Lanes::Scalar;
+  ForwardState<T> state = start_forward<D>(tile);
+  ColorSink<Lanes, D, T> sink{tile, state.color, state.layout.plane};
+  const std::int32_t entries = composite_list<Lanes>(tile, state, sink);
+  write_pixels<D>(tile, state);
+  return entries;
+}
+
+// Adds the contributions of rows up, in units of 2^-32: integers, so the order of tiles does not matter.
+template <class Lanes, class T>
+struct ContributionSink {
+  const ContributionSums& sums;
+  std::int64_t weight = 0;
+  std::int32_t pixels = 0;
+
+  void begin(std::int32_t) { weight = pixels = 0; }
+  void add(Lanes share, int) {
+    alignas(64) T shares[kLanes];
+    share.store(shares);
+    for (const T alpha_t : shares) {
+      weight += std::llrint(alpha_t * T(kContributionScale));
+      pixels += alpha_t > T(0);
+    }
+  }
+  void end(std::int32_t row) const {
+    if (pixels == 0) return;
+    std::atomic_ref(sums.weights[row]).fetch_add(weight, std::memory_order_relaxed);
+    std::atomic_ref(sums.pixels[row]).fetch_add(pixels, std::memory_order_relaxed);
+  }
+};
+
+template <class Lanes>
+void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const ContributionSums& sums) {
+  using T = typename Lanes::Scalar;
+  ForwardState<T> state = start_forward<0>(tile);
+  ContributionSink<Lanes, T> sink{sums};
+  composite_list<Lanes>(tile, state, sink);
+}
+
+}  // namespace
+}  // namespace blitzgs::cpu
