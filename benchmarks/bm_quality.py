@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""How good models become, and how soon: captures x recipes x seeds, beside gsplat's strategies.
+
+    python benchmarks/bm_quality.py --out RESULTS \
+        --capture park=DATA/park --capture "town=DATA/town --data.downscale=2" \
+        --recipe aerial=configs/aerial.yaml \
+        --recipe "classic=configs/aerial.yaml --model.antialiased=false" \
+        --recipe gsplat=gsplat-default-reset --recipe "mcmc=gsplat-mcmc --cap_max=2000000" \
+        --seeds 0 1 2 --gpus 4 --minutes 8
+
+A recipe is a configuration file or "defaults", with overrides; or one of gsplat's strategies, with options
+of its trainer (`benchmarks/opponents/gsplat_training.py`): gsplat-default (as in its wheel),
+gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) and gsplat-mcmc. A --plan
+holds the same in YAML:
+
+    captures: {park: DATA/park}
+    recipes: {aerial: configs/aerial.yaml, mcmc: gsplat-mcmc --cap_max=2000000}
+    seeds: [0, 1, 2]
+
+Every run is a process. Each GPU has one at a time; more (--per-gpu) leave the models as good, but times no
+longer compare, and the table says so. RESULTS/runs gets a JSON file as each run ends: the same command again
+skips the runs that are finished and repeats those that failed. quality.json holds all of them, quality.csv a
+line per evaluation, quality.md the tables, quality.png held-out PSNR against training time (with
+matplotlib). --collect adds the runs of other folders or of their quality.json, as when several machines did
+them, or to carry on elsewhere. Without a repository, BLITZGS_COMMIT names the commit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import quality_report
+import torch
+from harness import commit
+from quality_plan import RunSpec, parse_named, read_plan, runs_of
+from quality_run import describe, write
+
+EVALUATE_AT = (1_000, 2_000, 4_000, 7_000, 10_000, 15_000, 20_000)
+LOG_LINES = 12
+
+
+@dataclass
+class Job:
+    """A run in its process.
+
+    Attributes:
+        spec: what it trains.
+        slot: its GPU and place there.
+        process: doing it.
+        log: what it prints.
+    """
+
+    spec: RunSpec
+    slot: int
+    process: subprocess.Popen[bytes]
+    log: TextIO
+
+
+class Pool:
+    """Runs trainings side by side, one a slot."""
+
+    def __init__(self, out: Path, gpus: int, per_gpu: int) -> None:
+        """Share the GPUs, or without any the CPU, among `per_gpu` runs each."""
+        self.out, self.gpus, self.per_gpu = out, gpus, per_gpu
+        self.slots = list(range(max(gpus, 1) * per_gpu))
+        self.jobs: list[Job] = []
+        for folder in (quality_report.RUNS, "logs", "specs"):
+            (out / folder).mkdir(parents=True, exist_ok=True)
+
+    def start(self, spec: RunSpec) -> None:
+        """Start a run on a free slot."""
+        slot = self.slots.pop(0)
+        spec_path = self.out / "specs" / f"{spec.name}.json"
+        spec_path.write_text(json.dumps(dataclasses.asdict(spec)))
+        log = (self.out / "logs" / f"{spec.name}.txt").open("w")
+        worker = Path(__file__).with_name("quality_run.py")
+        root = str(worker.parents[1])
+        cores = max(1, (os.cpu_count() or 1) // (max(self.gpus, 1) * self.per_gpu))
+        environment = os.environ | {
+            "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
+            "PYTHONUNBUFFERED": "1",
+            "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(cores)),
+            "BLITZGS_COMMIT": commit(),
+        }
+        if self.gpus:
+            visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+            gpu = slot % self.gpus
+            environment["CUDA_VISIBLE_DEVICES"] = (
+                visible[gpu] if gpu < len(visible) and visible[gpu] else str(gpu)
+            )
+        command = [sys.executable, str(worker), str(spec_path), str(self.result_path(spec))]
+        process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+        self.jobs.append(Job(spec, slot, process, log))
+
+    def result_path(self, spec: RunSpec) -> Path:
+        """Return where a run's result goes."""
+        return self.out / quality_report.RUNS / f"{spec.name}.json"
+
+    def ended(self) -> list[Job]:
+        """Return the runs that have ended since the last call, their results complete."""
+        over = [job for job in self.jobs if job.process.poll() is not None]
+        for job in over:
+            job.log.close()
+            self.jobs.remove(job)
+            self.slots.append(job.slot)
+            self._complete(job)
+        return over
+
+    def _complete(self, job: Job) -> None:
+        """Add to the result what the run could not know; make one for a process that died without."""
+        path = self.result_path(job.spec)
+        result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+        if not result or (job.process.returncode != 0 and result["status"] == "done"):
+            tail = Path(job.log.name).read_text(errors="replace").splitlines()[-LOG_LINES:]
+            error = f"the process ended with status {job.process.returncode}: " + " | ".join(tail)
+            result = describe(job.spec) | {"status": "failed", "error": error}
+        write(path, result | {"per_gpu": self.per_gpu, "side_by_side": max(self.gpus, 1) * self.per_gpu})
+
+    def stop(self) -> None:
+        """End all runs that are still going, which leaves them to be done again."""
+        for job in self.jobs:
+            job.process.terminate()
+        for job in self.jobs:
+            job.process.wait()
+            job.log.close()
+
+
+def summary(result: dict[str, Any]) -> str:
+    """Return a run's result in a line."""
+    if result["status"] != "done":
+        return f"FAILED: {result['error']}"
+    last = result["evaluations"][-1]
+    metrics = last.get("test", last.get("train"))
+    return (
+        f"{metrics['psnr']:.2f} dB / {metrics['ssim']:.4f}, training views {last['train']['psnr']:.2f}, "
+        f"{result['seconds']:.1f} s, {result['gaussians']:,} Gaussians"
+    )
+
+
+def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
+    """Do the runs that are not done, and write the tables as each one ends."""
+    left = [spec for spec in specs if not quality_report.is_done(pool.out, spec.name)]
+    print(
+        f"{len(specs)} runs, {len(specs) - len(left)} of them done before; {len(pool.slots)} at a time",
+        flush=True,
+    )
+    begin, count, total = time.monotonic(), 0, len(left)
+    try:
+        while left or pool.jobs:
+            is_late = minutes is not None and time.monotonic() - begin > 60 * minutes
+            while left and pool.slots and not is_late:
+                # A result of an earlier try would look like this run's.
+                pool.result_path(left[0]).unlink(missing_ok=True)
+                pool.start(left.pop(0))
+            for job in pool.ended():
+                count += 1
+                result = json.loads(pool.result_path(job.spec).read_text())
+                print(
+                    f"[{count}/{total}, {time.monotonic() - begin:.0f} s] {job.spec.name}: {summary(result)}",
+                    flush=True,
+                )
+                quality_report.report(pool.out, plot=False)
+            if is_late and left and not pool.jobs:
+                print(
+                    f"{minutes:g} minutes are over: {len(left)} runs left; the same command continues",
+                    flush=True,
+                )
+                return
+            time.sleep(0.1)
+    finally:
+        pool.stop()
+
+
+def positive(text: str) -> int:
+    """Read a number of at least 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
+    return value
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the command line's parser."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
+    parser.add_argument("--capture", action="append", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
+    parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
+    parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: the plan's, or 0)")
+    parser.add_argument("--plan", type=Path, metavar="YAML", help="captures, recipes and seeds")
+    parser.add_argument(
+        "--evaluate-at",
+        type=positive,
+        nargs="*",
+        default=list(EVALUATE_AT),
+        metavar="IMAGES",
+        help="measure held-out views after so many images, and at the end (%(default)s)",
+    )
+    parser.add_argument(
+        "--lpips", type=Path, metavar="FILE", help="TorchScript module of LPIPS with its weights"
+    )
+    gpus = torch.cuda.device_count()
+    parser.add_argument(
+        "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
+    )
+    parser.add_argument("--per-gpu", type=positive, default=1, metavar="N", help="runs on each (%(default)s)")
+    parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
+    parser.add_argument(
+        "--collect",
+        type=Path,
+        nargs="*",
+        metavar="SOURCE",
+        help="add these runs; without recipes, report alone",
+    )
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark; returns the exit status: 1 when a planned run failed."""
+    parser = make_parser()
+    args = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    try:
+        plan = {"captures": {}, "recipes": {}} if args.plan is None else read_plan(args.plan)
+        captures = plan["captures"] | dict(map(parse_named, args.capture))
+        recipes = plan["recipes"] | dict(map(parse_named, args.recipe))
+        quality_report.collect(args.out, args.collect or [])
+        specs = []
+        if captures or recipes or args.collect is None:
+            device = "cuda" if args.gpus > 0 else "cpu"
+            seeds = args.seeds or plan.get("seeds") or [0]
+            specs = runs_of(captures, recipes, seeds, args.evaluate_at, args.lpips, device)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    work(specs, Pool(args.out, args.gpus, args.per_gpu), args.minutes)
+    print(quality_report.report(args.out))
+    wanted = {spec.name for spec in specs}
+    failed = [r for r in quality_report.read_runs(args.out / quality_report.RUNS) if r["status"] != "done"]
+    return int(any(run["name"] in wanted for run in failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

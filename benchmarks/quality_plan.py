@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `bm_quality.py` has to train: captures x recipes x seeds, from the command line and a YAML file."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from opponents.gsplat_training import STRATEGIES, GsplatOptions
+
+from blitzgs.training.config import Config
+from blitzgs.training.config_io import ConfigError, load_config, to_dict
+
+OPPONENT = "gsplat-"
+DEFAULTS = "defaults"
+SAFE = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+=")
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One training, as the process that does it gets it.
+
+    Attributes:
+        capture: its name.
+        data: overrides of the section `data`, the path among them.
+        recipe: its name.
+        source: a YAML file, "defaults", or "gsplat-" and one of gsplat's strategies.
+        overrides: "--section.field=value" of the configuration, or "--option=value" of the opponent.
+        seed: of the training.
+        evaluate_at: image counts at which held-out views are measured, beside the end.
+        lpips: TorchScript file, or None.
+        device: "cpu" or "cuda".
+    """
+
+    capture: str
+    data: list[str]
+    recipe: str
+    source: str
+    overrides: list[str]
+    seed: int
+    evaluate_at: list[int]
+    lpips: str | None
+    device: str
+
+    @property
+    def strategy(self) -> str | None:
+        """The opponent's strategy; None when BlitzGS trains."""
+        return self.source.removeprefix(OPPONENT) if self.source.startswith(OPPONENT) else None
+
+    def config(self) -> Config:
+        """Return the training's configuration; an opponent's has the capture alone."""
+        own = [] if self.strategy is not None else [*self.overrides, f"seed={self.seed}"]
+        log = ["log.tensorboard=false", "log.pictures=0", "schedule.checkpoint_every=0"]
+        log += ["schedule.evaluate_every=0", f"log.lpips_weights={json.dumps(self.lpips)}"]
+        path = None if self.strategy is not None or self.source == DEFAULTS else self.source
+        return load_config(path, [*own, *self.data, *log])
+
+    def options(self) -> GsplatOptions:
+        """Return the options of an opponent."""
+        assert self.strategy is not None
+        return GsplatOptions.of(self.strategy, parse_flags(self.overrides))
+
+    @property
+    def settings(self) -> str:
+        """A digest of what decides the result, but for the seed, the code and the place of the capture."""
+        values: dict[str, Any] = to_dict(self.config())
+        del values["log"], values["data"]["path"], values["seed"]
+        if self.strategy is not None:
+            values = {"data": values["data"], "strategy": self.strategy} | dataclasses.asdict(self.options())
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
+
+    @property
+    def name(self) -> str:
+        """Of the run's files."""
+        return f"{self.capture}.{self.recipe}.s{self.seed}.{self.settings}"
+
+
+def parse_flags(flags: Iterable[str]) -> dict[str, Any]:
+    """Return {"option": value} of "--option=value" texts, the values read as YAML.
+
+    Raises:
+        ValueError: a text without "=".
+    """
+    values = {}
+    for flag in flags:
+        name, equals, value = flag.lstrip("-").partition("=")
+        if not equals:
+            raise ValueError(f"'{flag}' is not an option: write --name=value")
+        values[name] = yaml.safe_load(value)
+    return values
+
+
+def parse_named(text: str) -> tuple[str, str]:
+    """Split "NAME=rest".
+
+    Raises:
+        ValueError: there is no name, or one that cannot be part of a file's name.
+    """
+    name, equals, rest = text.partition("=")
+    if not equals or not name or not set(name) <= SAFE or not rest.strip():
+        raise ValueError(f"'{text}': write NAME=..., with a name of letters, digits and _-+")
+    return name, rest
+
+
+def read_plan(path: Path) -> dict[str, Any]:
+    """Read a YAML plan: mappings `captures` and `recipes` (name: text) and a list `seeds`, each optional.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    try:
+        plan = yaml.safe_load(path.read_text()) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: not valid YAML: {error}") from error
+    if not isinstance(plan, dict) or (unknown := set(plan) - {"captures", "recipes", "seeds"}):
+        found = sorted(unknown) if isinstance(plan, dict) else type(plan).__name__
+        raise ValueError(f"{path}: a plan has captures, recipes and seeds, got {found}")
+    for key in ("captures", "recipes"):
+        for name, text in plan.setdefault(key, {}).items():
+            if not isinstance(text, str):
+                raise ValueError(f"{path}: {key}.{name}: must be text as on the command line, got {text!r}")
+            parse_named(f"{name}={text}")
+    return plan
+
+
+def runs_of(
+    captures: Mapping[str, str],
+    recipes: Mapping[str, str],
+    seeds: Sequence[int],
+    evaluate_at: Sequence[int],
+    lpips: Path | None,
+    device: str,
+) -> list[RunSpec]:
+    """Return every run, checked; all recipes and captures of one seed come before the next seed.
+
+    Args:
+        captures: name -> "DIR [--data.field=value ...]".
+        recipes: name -> "SOURCE [--field=value ...]".
+        seeds: of the trainings.
+        evaluate_at: see `RunSpec`.
+        lpips: TorchScript file, or None.
+        device: "cpu" or "cuda".
+
+    Raises:
+        ValueError: something is missing or cannot be used; names it.
+    """
+    if not captures or not recipes or not seeds:
+        raise ValueError("nothing to train: give at least one --capture, one --recipe and one seed")
+    specs = []
+    for seed in seeds:
+        for recipe, recipe_text in recipes.items():
+            source, *overrides = shlex.split(recipe_text)
+            for capture, capture_text in captures.items():
+                folder, *fields = shlex.split(capture_text)
+                if not Path(folder).is_dir():
+                    raise ValueError(f"capture {capture}: {folder} is not a folder")
+                spec = RunSpec(
+                    capture=capture,
+                    data=[f"data.path={json.dumps(str(Path(folder).resolve()))}", *fields],
+                    recipe=recipe,
+                    source=source,
+                    overrides=overrides,
+                    seed=seed,
+                    evaluate_at=sorted(set(evaluate_at)),
+                    lpips=None if lpips is None else str(lpips.resolve()),
+                    device=device,
+                )
+                check(spec)
+                specs.append(spec)
+    return specs
+
+
+def check(spec: RunSpec) -> None:
+    """Raise ValueError when a run cannot be configured."""
+    if spec.strategy is not None and spec.strategy not in STRATEGIES:
+        known = ", ".join(OPPONENT + name for name in STRATEGIES)
+        raise ValueError(f"recipe {spec.recipe}: there is no opponent {spec.source}; known are {known}")
+    try:
+        spec.config()
+        if spec.strategy is not None:
+            spec.options()
+    except ConfigError as error:
+        raise ValueError(f"recipe {spec.recipe} on capture {spec.capture}: {error}") from error

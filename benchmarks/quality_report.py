@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results of `bm_quality.py`: JSON, CSV, Markdown tables and a plot of all runs of a folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness import markdown_table
+from quality_run import write
+
+from blitzgs.training.evaluation import METRICS
+
+RUNS = "runs"
+Run = dict[str, Any]
+Group = tuple[str, str]  # capture, label of the recipe
+
+
+def read_runs(source: Path) -> list[Run]:
+    """Return the runs in a folder of results, of its `runs` folder or of one collected JSON file.
+
+    Raises:
+        ValueError: a file holds something else.
+        OSError: nothing is there.
+    """
+    if source.is_dir():
+        inner = source / RUNS if (source / RUNS).is_dir() else source
+        return [run for path in sorted(inner.glob("*.json")) for run in read_runs(path)]
+    try:
+        found = json.loads(source.read_text())
+        runs = found.get("runs", [found])
+        if not all({"name", "status", "capture", "recipe", "seed"} <= set(run) for run in runs):
+            raise KeyError("name")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{source} holds no results of bm_quality.py") from error
+    return runs
+
+
+def collect(out: Path, sources: Iterable[Path]) -> None:
+    """Copy the runs of other folders and files into `out`; a failed one never replaces a finished one."""
+    (out / RUNS).mkdir(parents=True, exist_ok=True)
+    for source in sources:
+        for run in read_runs(source):
+            path = out / RUNS / f"{run['name']}.json"
+            if run["status"] == "done" or not path.exists():
+                write(path, run)
+
+
+def is_done(out: Path, name: str) -> bool:
+    """Tell whether a run has been finished."""
+    path = out / RUNS / f"{name}.json"
+    return path.exists() and read_runs(path)[0]["status"] == "done"
+
+
+def report(out: Path, plot: bool = True) -> str:
+    """Write quality.json, quality.csv, quality.md and, where matplotlib is installed, quality.png into `out`.
+
+    Returns:
+        The Markdown.
+    """
+    runs = read_runs(out / RUNS)
+    done = [run for run in runs if run["status"] == "done"]
+    text = markdown(runs)
+    (out / "quality.json").write_text(json.dumps({"runs": runs}))
+    (out / "quality.md").write_text(text)
+    write_csv(out / "quality.csv", done)
+    if plot and done and not draw(out / "quality.png", done):
+        text += "\nNo plot: pip install matplotlib\n"
+    return text
+
+
+def labels(runs: Sequence[Run]) -> Callable[[Run], str]:
+    """Name the recipes; one that was trained with several settings gets each one's digest."""
+    settings: dict[Group, set[str]] = defaultdict(set)
+    for run in runs:
+        settings[run["capture"], run["recipe"]].add(run["settings"])
+
+    def label(run: Run) -> str:
+        several = len(settings[run["capture"], run["recipe"]]) > 1
+        return f"{run['recipe']} ({run['settings']})" if several else run["recipe"]
+
+    return label
+
+
+def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
+    """Put the seeds of a capture and a recipe together, by capture."""
+    label, groups = labels(runs), defaultdict(list)
+    for run in runs:
+        groups[run["capture"], label(run)].append(run)
+    return {key: groups[key] for key in sorted(groups, key=lambda key: key[0])}
+
+
+def markdown(runs: Sequence[Run]) -> str:
+    """Return a table for each capture, what they were measured with, and the runs that failed."""
+    done = [run for run in runs if run["status"] == "done"]
+    rows: dict[str, list[dict[str, str]]] = defaultdict(list)
+    for (capture, label), group in grouped(done).items():
+        rows[capture] += table_rows(label, group)
+    parts = ["# Quality\n", *(f"## {capture}\n\n{markdown_table(rows[capture])}\n" for capture in rows)]
+    if done:
+        parts.append(
+            'Medians over the seeds, the worst in brackets. Held-out views, unless "training" is said; gap: '
+            "training less held-out PSNR. Corrected: after the affine map of each view's colours to its "
+            "photograph's. Seconds of training alone, evaluations left out; ~: runs shared a GPU, so that "
+            "times do not compare. GB: most memory of the training. The gsplat recipes are gsplat's density "
+            "strategies over the renderer and loss of BlitzGS, with photographs already on the device.\n"
+        )
+        machines = {", ".join(f"{k} {v}" for k, v in run["environment"].items()) for run in done}
+        beside = {run.get("side_by_side", 1) for run in done}
+        commits = {run["commit"] for run in done}
+        parts.append(
+            f"Commit {', '.join(sorted(commits))}. {'; '.join(sorted(machines))}. Runs side by side on a "
+            f"host: up to {max(beside)}.\n"
+        )
+    failed = [f"- {run['name']}: {run['error']}" for run in runs if run["status"] != "done"]
+    if failed:
+        parts += ["## Failed\n", "\n".join(failed) + "\n"]
+    return "\n".join(parts)
+
+
+def table_rows(label: str, group: Sequence[Run]) -> list[dict[str, str]]:
+    """Return a row for each image count at which every seed measured its training views, too."""
+    counts = [{e["images"] for e in run["evaluations"] if "train" in e} for run in group]
+    return [
+        table_row(label, images, [(run, evaluation_at(run, images)) for run in group])
+        for images in sorted(set.intersection(*counts))
+    ]
+
+
+def evaluation_at(run: Run, images: int) -> dict[str, Any]:
+    """Return the evaluation of a run after so many images."""
+    return next(e for e in run["evaluations"] if e["images"] == images)
+
+
+def table_row(label: str, images: int, found: Sequence[tuple[Run, dict[str, Any]]]) -> dict[str, str]:
+    """Return the cells of some seeds at one image count."""
+    evaluations = [evaluation for _, evaluation in found]
+    ends = [run for run, evaluation in found if evaluation["images"] == run["images"]]
+    # A capture without held-out views is measured in its training views.
+    split = "test" if all("test" in e for e in evaluations) else "train"
+    seconds = spread([e["seconds"] for e in evaluations], "{:.1f}", max)
+    row = {"recipe": label, "images": f"{images:,}", "seeds": str(len(found))}
+    for metric, name, form in (
+        ("psnr", "PSNR", "{:.2f}"),
+        ("ssim", "SSIM", "{:.4f}"),
+        ("psnr_corrected", "corrected", "{:.2f}"),
+    ):
+        row[name] = spread([e[split][metric] for e in evaluations], form, min)
+    lpips = [e[split]["lpips"] for e in evaluations if "lpips" in e[split]]
+    row["LPIPS"] = spread(lpips, "{:.4f}", max)
+    row["training PSNR / SSIM"] = " / ".join(
+        form.format(statistics.median(e["train"][metric] for e in evaluations))
+        for metric, form in (("psnr", "{:.2f}"), ("ssim", "{:.4f}"))
+    )
+    gaps = [e["train"]["psnr"] - e[split]["psnr"] for e in evaluations]
+    row["gap"] = f"{statistics.median(gaps):.2f}" if split == "test" else ""
+    row["seconds"] = "~" * any(run.get("per_gpu", 1) > 1 for run, _ in found) + seconds
+    row["images/s"] = f"{statistics.median(images / max(e['seconds'], 1e-9) for e in evaluations):.0f}"
+    row["Gaussians"] = spread([e["gaussians"] / 1e6 for e in evaluations], "{:.3f} M", max)
+    row["peak"] = spread([run["peak_gaussians"] / 1e6 for run in ends], "{:.3f} M", max)
+    row["GB"] = spread([run["peak_memory_bytes"] / 1e9 for run in ends], "{:.2f}", max)
+    return row
+
+
+def spread(values: Sequence[float], form: str, worst: Callable[[Iterable[float]], float]) -> str:
+    """Return the median, and with several values the worst in brackets."""
+    if not values:
+        return ""
+    median = form.format(statistics.median(values))
+    return median if len(values) == 1 else f"{median} ({form.format(worst(values))})"
+
+
+def write_csv(path: Path, runs: Sequence[Run]) -> None:
+    """Write a line for each evaluation of each run."""
+    about = ("capture", "recipe", "settings", "seed", "commit", "per_gpu")
+    splits = [f"{split}_{metric}" for split in ("test", "train") for metric in METRICS]
+    head = [
+        *about,
+        "images",
+        "seconds",
+        "gaussians",
+        *splits,
+        "is_end",
+        "peak_gaussians",
+        "peak_memory_bytes",
+    ]
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, head, restval="")
+        writer.writeheader()
+        for run in runs:
+            for evaluation in run["evaluations"]:
+                row = {key: run.get(key, "") for key in about}
+                row |= {key: evaluation[key] for key in ("images", "seconds", "gaussians")}
+                for split in ("test", "train"):
+                    row |= {f"{split}_{key}": value for key, value in evaluation.get(split, {}).items()}
+                if evaluation["images"] == run["images"]:
+                    row |= {"is_end": 1, **{key: run[key] for key in ("peak_gaussians", "peak_memory_bytes")}}
+                writer.writerow(row)
+
+
+def draw(path: Path, runs: Sequence[Run]) -> bool:
+    """Plot the median held-out PSNR against the median training time; False without matplotlib."""
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    groups = grouped(runs)
+    captures, recipes = list(dict.fromkeys(c for c, _ in groups)), list(dict.fromkeys(r for _, r in groups))
+    figure, axes = pyplot.subplots(
+        1, len(captures), figsize=(5.5 * len(captures), 4.2), squeeze=False, layout="constrained"
+    )
+    for axis, capture in zip(axes[0], captures, strict=True):
+        for (where, label), group in groups.items():
+            if where != capture:
+                continue
+            seconds, psnr = curve(group)
+            style = "--" if group[0]["source"].startswith("gsplat-") else "-"
+            color = f"C{recipes.index(label) % 10}"
+            axis.plot(seconds, psnr, style, color=color, marker="o", markersize=3, label=label)
+        axis.set(xscale="log", xlabel="training time, s", ylabel="held-out PSNR, dB", title=capture)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+    return True
+
+
+def curve(group: Sequence[Run]) -> tuple[list[float], list[float]]:
+    """Return the medians over the seeds of seconds and PSNR at each image count that all have."""
+    counts = [{e["images"] for e in run["evaluations"]} for run in group]
+    seconds, psnr = [], []
+    for images in sorted(set.intersection(*counts)):
+        found = [evaluation_at(run, images) for run in group]
+        seconds.append(statistics.median(e["seconds"] for e in found))
+        psnr.append(statistics.median(e.get("test", e.get("train"))["psnr"] for e in found))
+    return seconds, psnr

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One training of `bm_quality.py`, in a process of its own: python benchmarks/quality_run.py SPEC RESULT.
+
+SPEC is a JSON file of a `quality_plan.RunSpec`; RESULT gets the figures, or the error.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from harness import commit, environment
+from opponents.gsplat_training import GsplatTrainer
+from quality_plan import RunSpec
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.training import run
+from blitzgs.training.evaluation import METRICS, evaluate, load_lpips
+from blitzgs.training.events.evaluate import measure
+from blitzgs.training.trainer import Trainer
+
+# Where gsplat's results are commonly quoted; training views are measured there, too, and at every end.
+QUOTED_STEPS = (7_000, 15_000)
+Measure = Callable[[Sequence[int]], dict[str, Any]]
+
+
+class Recorder:
+    """Measures a model several times while it is trained, and keeps the figures.
+
+    Memory is that of the training: what evaluations take does not count.
+    """
+
+    def __init__(
+        self, spec: RunSpec, quoted: Sequence[int], end: int, capture: Any, device: torch.device
+    ) -> None:
+        """Plan the evaluations.
+
+        Args:
+            spec: of the run.
+            quoted: image counts at which the training views are measured, too.
+            end: images of the whole training.
+            capture: whose views are measured.
+            device: the training's.
+        """
+        self.quoted = {images for images in quoted if images < end} | {end}
+        self.marks = sorted({images for images in spec.evaluate_at if images < end} | self.quoted)
+        self.evaluations: list[dict[str, Any]] = []
+        self.views: dict[str, float] = {}
+        self.peak_bytes = 0
+        self._capture, self._device = capture, device
+
+    def due(self, images: int) -> bool:
+        """Tell whether a planned evaluation has been reached, and drop those that have."""
+        if not self.marks or images < self.marks[0]:
+            return False
+        self.marks = [mark for mark in self.marks if mark > images]
+        return True
+
+    def record(self, images: int, seconds: float, gaussians: int, end: bool, measure: Measure) -> None:
+        """Measure held-out views, and training views where that was planned."""
+        self.peak_bytes = max(self.peak_bytes, run.peak_memory_bytes(self._device))
+        found: dict[str, Any] = {"images": images, "seconds": seconds, "gaussians": gaussians}
+        capture = self._capture
+        if capture.test:
+            metrics = measure(capture.test)
+            found["test"] = means_of(metrics)
+            self.views = {name: view["psnr"] for name, view in metrics["views"].items()}
+        if end or images in self.quoted or not capture.test:
+            found["train"] = means_of(measure(capture.train))
+        self.evaluations.append(found)
+        text = "  ".join(
+            f"{split} {found[split]['psnr']:.2f}" for split in ("test", "train") if split in found
+        )
+        print(f"{images:,} images, {seconds:.1f} s, {gaussians:,} Gaussians: {text}", flush=True)
+        if self._device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self._device)
+
+
+def means_of(metrics: dict[str, Any]) -> dict[str, float]:
+    """Return the mean of each metric over the views.
+
+    Raises:
+        ValueError: the model is broken, and a mean is not finite.
+    """
+    means = {name: float(metrics[name]) for name in METRICS if name in metrics}
+    if not all(torch.tensor(value).isfinite() for value in means.values()):
+        raise ValueError(f"the training diverged: {means}")
+    return means
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait for the GPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+class RecordedTrainer(Trainer):
+    """A trainer that measures on the way, and leaves no checkpoint."""
+
+    recorder: Recorder
+
+    def step(self, step: int) -> None:
+        """Take a step; measure where that was planned, before the schedule's events."""
+        super().step(step)
+        if step < self.state.schedule.steps and self.recorder.due(self.state.images_seen):
+            self._record(end=False)
+
+    def _finish(self) -> dict[str, Any]:
+        """Measure the trained model."""
+        self._record(end=True)
+        return {}
+
+    def _record(self, end: bool) -> None:
+        state = self.state
+        begin = time.monotonic()
+        synchronize(state.ranks.device)
+        # The clock of the run stands where the host was when it had queued the step.
+        seconds = state.progress.seconds + time.monotonic() - begin
+        with state.paused_clock():
+            self.recorder.record(
+                state.images_seen,
+                seconds,
+                len(state.table),
+                end,
+                lambda indices: measure(state, indices, None),
+            )
+
+
+def train_ours(spec: RunSpec) -> dict[str, Any]:
+    """Train with BlitzGS."""
+    config = spec.config()
+    ranks = Ranks.from_environment(spec.device)
+    capture, images = run.open_capture(config, ranks)
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = RecordedTrainer(config, capture, images, Path(folder), ranks)
+        schedule = trainer.state.schedule
+        recorder = Recorder(spec, (), schedule.iterations, capture, ranks.device)
+        trainer.recorder = recorder
+        if trainer.train() is None:
+            raise InterruptedError("stopped by a signal")
+    return figures(recorder, trainer.state.progress.peak_gaussians)
+
+
+def train_opponent(spec: RunSpec) -> dict[str, Any]:
+    """Train with one of gsplat's strategies."""
+    assert spec.strategy is not None
+    config, options = spec.config(), spec.options()
+    ranks = Ranks.from_environment(spec.device)
+    capture, images = run.open_capture(config, ranks)
+    trainer = GsplatTrainer(spec.strategy, options, capture, images, ranks.device, spec.seed)
+    lpips, owners = load_lpips(spec.lpips), TileOwners(ranks)
+
+    def measure_now(indices: Sequence[int]) -> dict[str, Any]:
+        table, how = trainer.table(), trainer.render_options
+        return evaluate(
+            table, trainer.views, capture.cameras, images, indices, how, None, owners, lpips=lpips
+        )
+
+    quoted = [options.scaled(step) for step in QUOTED_STEPS]
+    recorder, seconds = Recorder(spec, quoted, trainer.total, capture, ranks.device), 0.0
+    for mark in recorder.marks:
+        synchronize(ranks.device)
+        begin = time.monotonic()
+        trainer.train_to(mark)
+        synchronize(ranks.device)
+        seconds += time.monotonic() - begin
+        count = len(trainer.params["means"])
+        recorder.record(mark, seconds, count, mark == trainer.total, measure_now)
+    return figures(recorder, trainer.peak)
+
+
+def figures(recorder: Recorder, peak_gaussians: int) -> dict[str, Any]:
+    """Return what a finished run reports."""
+    last = recorder.evaluations[-1]
+    return {
+        "images": last["images"],
+        "seconds": last["seconds"],
+        "images_per_second": last["images"] / max(last["seconds"], 1e-9),
+        "gaussians": last["gaussians"],
+        "peak_gaussians": max(peak_gaussians, last["gaussians"]),
+        "peak_memory_bytes": recorder.peak_bytes,
+        "evaluations": recorder.evaluations,
+        "views": recorder.views,
+    }
+
+
+def describe(spec: RunSpec) -> dict[str, Any]:
+    """Return what a result says about its run, whether that ended well or not."""
+    return {
+        "name": spec.name,
+        "capture": spec.capture,
+        "recipe": spec.recipe,
+        "seed": spec.seed,
+        "settings": spec.settings,
+        "source": os.path.relpath(spec.source) if spec.source.endswith((".yaml", ".yml")) else spec.source,
+        "overrides": [*spec.data[1:], *spec.overrides],
+        "commit": commit(),
+    }
+
+
+def write(path: Path, result: dict[str, Any]) -> None:
+    """Write a result; a file that exists is complete."""
+    partial = path.with_suffix(".part")
+    partial.write_text(json.dumps(result))
+    partial.replace(path)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do one run; returns the exit status."""
+    spec_path, result_path = map(Path, arguments)
+    spec = RunSpec(**json.loads(spec_path.read_text()))
+    result = describe(spec)
+    begin = time.monotonic()
+    try:
+        found = train_ours(spec) if spec.strategy is None else train_opponent(spec)
+        result |= {"status": "done", "environment": environment(spec.device)} | found
+    except Exception as error:
+        traceback.print_exc()
+        result |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
+    result["wall_seconds"] = time.monotonic() - begin
+    write(result_path, result)
+    return 0 if result["status"] == "done" else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The quality benchmark: its runs, its tables, and the opponents it trains."""
+
+import csv
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+import bm_quality  # noqa: E402
+import quality_report  # noqa: E402
+import quality_run  # noqa: E402
+from opponents import relocation  # noqa: E402
+from opponents.gsplat_training import GsplatOptions, GsplatTrainer  # noqa: E402
+from quality_plan import RunSpec, runs_of  # noqa: E402
+
+from tests.helpers import DEVICES  # noqa: E402
+from tests.training.tiny import OVERRIDES, tiny_scene, write_tiny_capture  # noqa: E402
+
+FLAGS = " ".join(f"--{text}" for text in OVERRIDES)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("quality") / "capture"
+    write_tiny_capture(folder)
+    return folder
+
+
+def spec_of(capture, source, device="cpu", **changes) -> RunSpec:
+    (spec,) = runs_of({"tiny": str(capture)}, {"recipe": source}, [3], [40], None, device)
+    return replace(spec, **changes)
+
+
+def test_runs_are_done_once_and_a_failure_stops_no_other(tmp_path, capture, capsys):
+    out, missing = tmp_path / "out", tmp_path / "missing.txt"
+    flags = ["--out", str(out), "--gpus", "0", "--per-gpu", "2", "--evaluate-at", "40"]
+    flags += ["--capture", f"tiny={capture}", "--recipe", f"ours=defaults {FLAGS}"]
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(f"recipes: {{broken: defaults --data.split={missing}}}\nseeds: [3]\n")
+    assert bm_quality.main([*flags, "--plan", str(plan)]) == 1
+    printed = capsys.readouterr().out
+    assert "missing.txt" in printed and "| ours | 100 | 1 |" in printed
+    done, broken = sorted(quality_report.read_runs(out / "runs"), key=lambda run: run["status"])
+    assert done["status"] == "done" and [e["images"] for e in done["evaluations"]] == [40, 100]
+    first, last = done["evaluations"]
+    assert "train" not in first and last["train"]["psnr"] > 20 and last["test"]["ssim"] > 0.5
+    assert 0 < first["seconds"] < last["seconds"] == done["seconds"]
+    assert done["peak_gaussians"] >= done["gaussians"] > 0 and done["peak_memory_bytes"] > 0
+    assert list(done["views"].values()) == [pytest.approx(last["test"]["psnr"])]
+    assert broken["status"] == "failed" and "missing.txt" in broken["error"]
+
+    # The same again: what is done is not done twice. The budget of no time starts nothing.
+    written = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("tiny.ours*")}
+    assert bm_quality.main([*flags, "--seeds", "3"]) == 0
+    assert bm_quality.main([*flags, "--seeds", "3", "4", "--minutes", "0"]) == 0
+    assert "1 runs left" in capsys.readouterr().out
+    assert written == {path: path.stat().st_mtime_ns for path in (out / "runs").glob("tiny.ours*")}
+
+    # Elsewhere, from the one file: a failed run does not replace a finished one.
+    elsewhere = tmp_path / "elsewhere"
+    failed = tmp_path / "failed.json"
+    failed.write_text(json.dumps(done | {"status": "failed", "error": "no"}))
+    assert (
+        bm_quality.main(["--out", str(elsewhere), "--collect", str(out / "quality.json"), str(failed)]) == 0
+    )
+    assert quality_report.is_done(elsewhere, done["name"])
+    rows = list(csv.DictReader((elsewhere / "quality.csv").open()))
+    assert [row["images"] for row in rows] == ["40", "100"]
+    assert float(rows[1]["train_psnr"]) == last["train"]["psnr"] and rows[1]["is_end"] == "1"
+
+
+def test_bad_plans_name_what_is_wrong(tmp_path, capture, capsys):
+    def message(*flags):
+        with pytest.raises(SystemExit):
+            bm_quality.main(["--out", str(tmp_path), *flags])
+        return capsys.readouterr().err
+
+    where = ["--capture", f"tiny={capture}", "--recipe"]
+    assert "there is no opponent gsplat-best" in message(*where, "a=gsplat-best")
+    assert "unknown option iterations" in message(*where, "a=gsplat-mcmc --iterations=3")
+    assert "cap_max must be int, got 'many'" in message(*where, "a=gsplat-mcmc --cap_max=many")
+    assert "schedule.nothing" in message(*where, "a=defaults --schedule.nothing=1")
+    assert "'a/b=defaults': write NAME=" in message(*where, "a/b=defaults")
+    assert "is not a folder" in message("--capture", f"x={tmp_path}/none", "--recipe", "a=defaults")
+    assert "nothing to train" in message()
+
+
+def test_settings_tell_recipes_apart_but_not_seeds_or_places(capture):
+    one = spec_of(capture, "defaults")
+    assert one.settings == replace(one, seed=4, data=["data.path=elsewhere"]).settings
+    assert one.settings != spec_of(capture, "defaults --loss.ssim=0.3").settings
+    assert one.settings != spec_of(f"{capture} --data.downscale=2", "defaults").settings
+    mcmc = spec_of(capture, "gsplat-mcmc")
+    assert mcmc.settings != spec_of(capture, "gsplat-mcmc --cap_max=5").settings
+    assert mcmc.options() == GsplatOptions.of("mcmc", {"cap_max": 1_000_000})
+
+
+def fake_run(seed, psnr, seconds):
+    ends = {"psnr": psnr, "ssim": 0.9, "psnr_corrected": psnr + 1}
+    trained = {"psnr": psnr + 3, "ssim": 0.95, "psnr_corrected": psnr + 4}
+    return {
+        "name": f"a.b.s{seed}", "status": "done", "capture": "a", "recipe": "b", "seed": seed,
+        "settings": "0", "commit": "abc", "environment": {"device": "X"}, "source": "defaults",
+        "images": 20, "peak_gaussians": 3_000_000, "peak_memory_bytes": 5e9,
+        "evaluations": [{"images": 20, "seconds": seconds, "gaussians": 2_000_000, "test": ends,
+                         "train": trained}],
+    }  # fmt: skip
+
+
+def test_the_table_has_median_and_worst(tmp_path):
+    runs = [fake_run(0, 30.0, 10.0), fake_run(1, 31.0, 12.0), fake_run(2, 29.0, 11.0)]
+    (row,) = quality_report.table_rows("b", runs)
+    assert row["PSNR"] == "30.00 (29.00)" and row["corrected"] == "31.00 (30.00)"
+    assert row["seconds"] == "11.0 (12.0)" and row["images/s"] == "2" and row["gap"] == "3.00"
+    assert row["Gaussians"] == "2.000 M (2.000 M)" and row["GB"] == "5.00 (5.00)"
+    runs[1]["per_gpu"] = 2
+    assert quality_report.table_rows("b", runs)[0]["seconds"] == "~11.0 (12.0)"
+    assert quality_report.curve(runs) == ([11.0], [30.0])
+    assert "Commit abc." in quality_report.markdown(runs)
+    # The same recipe with other settings is another row.
+    runs.append(fake_run(0, 25.0, 10.0) | {"settings": "1"})
+    assert [label for _, label in quality_report.grouped(runs)] == ["b (0)", "b (1)"]
+
+
+def test_the_plot_is_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    assert quality_report.draw(tmp_path / "plot.png", [fake_run(0, 30.0, 10.0), fake_run(1, 31.0, 12.0)])
+    assert (tmp_path / "plot.png").stat().st_size > 1000
+
+
+def test_relocation_is_equation_9():
+    """Against the double sum of arXiv 2404.09591 in Python's integers and floats."""
+    g = torch.Generator().manual_seed(0)
+    opacities = torch.rand(60, generator=g) * 0.98 + 0.01
+    scales = torch.rand(60, 3, generator=g) + 0.1
+    ratios = torch.randint(1, 20, (60,), generator=g)
+    ratios[:3] = torch.tensor([1, 51, 400])
+    new_opacities, new_scales = relocation.compute_relocation(opacities, scales, ratios)
+    for i, (o, count) in enumerate(zip(opacities.double().tolist(), ratios.tolist(), strict=True)):
+        N = min(count, 51)
+        a = 1 - (1 - o) ** (1 / N)
+        total = sum(
+            math.comb(m - 1, k) * (-1) ** k * a ** (k + 1) / math.sqrt(k + 1)
+            for m in range(1, N + 1)
+            for k in range(m)
+        )
+        assert new_opacities[i].item() == pytest.approx(a, rel=1e-5)
+        torch.testing.assert_close(new_scales[i], scales[i] * (o / total), rtol=1e-5, atol=0)
+    # One part is the Gaussian itself; several that lie on one another let as much light through.
+    torch.testing.assert_close(new_scales[0], scales[0])
+    torch.testing.assert_close(
+        (1 - new_opacities) ** ratios.clamp(max=51), 1 - opacities, rtol=1e-4, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("strategy", ["default", "default-reset", "mcmc"])
+def test_gsplats_strategies_train(capture, strategy, device):
+    pytest.importorskip("gsplat")
+    # Times of 30,000 steps in 240: density from 4 on, every step; resets, where there are any, each 24.
+    source = f"gsplat-{strategy} --steps_scaler=0.008 "
+    source += "--cap_max=450" if strategy == "mcmc" else "--grow_grad2d=0.002"
+    result = quality_run.train_opponent(spec_of(capture, source, device))
+    # Quoted after 7,000 and 15,000 of 30,000 steps, beside those asked for.
+    assert [e["images"] for e in result["evaluations"]] == [40, 56, 120, 240]
+    quoted = [e["images"] for e in result["evaluations"] if "train" in e]
+    assert quoted == [56, 120, 240] and result["images"] == 240
+    start, end = result["evaluations"][0]["test"], result["evaluations"][-1]
+    assert end["train"]["psnr"] > start["psnr"] and end["train"]["psnr"] > 18
+    assert result["peak_gaussians"] >= result["gaussians"] != 400
+    assert strategy != "mcmc" or result["gaussians"] == 450
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_resets_are_where_gsplat_announces_them(reset):
+    pytest.importorskip("gsplat")
+    scene, images = tiny_scene()
+    options = GsplatOptions.of("default", {"steps_scaler": 0.008, "reset": reset})
+    trainer = GsplatTrainer("default", options, scene, images, torch.device("cpu"), seed=0)
+    trainer.train_to(24)
+    highest = trainer.params["opacities"].sigmoid().max().item()
+    assert highest > 0.1
+    trainer.train_to(25)
+    after = trainer.params["opacities"].sigmoid().max().item()
+    assert (after == pytest.approx(0.01, rel=1e-4)) == reset
+
+
+def test_the_scene_is_in_gsplats_unit():
+    """Eight cameras at distance 3 from an axis through the origin, all looking at the origin."""
+    scene, images = tiny_scene()
+    scene.offset = torch.zeros(3).numpy()
+    from opponents.gsplat_training import space_of
+
+    space = space_of(scene)
+    assert space.unit == pytest.approx(math.hypot(3, 2.5))
+    assert space.extent == pytest.approx(1.1 * 3 / math.hypot(3, 2.5))
