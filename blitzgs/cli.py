@@ -27,15 +27,26 @@ from blitzgs.scene import ply
 from blitzgs.scene.pictures import encode_image
 from blitzgs.scene.synth import command as synth
 from blitzgs.training import run
+from blitzgs.training.batches import PhotographError
 from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.config_io import load_config, to_dict
 from blitzgs.training.evaluation import evaluate, load_lpips, render_view
+from blitzgs.training.folder_checks import FolderError, locked
 from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.views import ViewSet, render_options
 
 # What a user can cause and mend: reported as a message. Anything else is ours and keeps its traceback.
-USER_ERRORS = (ValueError, OSError, ImportError, CheckpointError, MismatchError, NonFiniteError)
+USER_ERRORS = (
+    ValueError,
+    OSError,
+    ImportError,
+    CheckpointError,
+    FolderError,
+    MismatchError,
+    NonFiniteError,
+    PhotographError,
+)
 
 TRAIN_HELP = """\
 Train a model of a capture: a COLMAP model (DIR/sparse/0 and DIR/images) or a transforms.json.
@@ -45,8 +56,9 @@ Every field of the configuration is a flag, e.g.
 Times are counted in images; schedule.scale stretches the whole schedule. `blitzgs train --show-config` prints
 the resolved configuration and stops.
 
-RUN gets config.yaml, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. An interrupted run
-(Ctrl-C or SIGTERM) saves a checkpoint; the same command with --resume continues it exactly.
+RUN gets config.yaml, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. A checkpoint is
+written every 10 minutes (log.checkpoint_seconds) and when the run is interrupted (Ctrl-C, SIGTERM or SIGHUP);
+the same command with --resume continues from the newest, or starts anew and says so where there is none.
 
 Several processes share the work with torchrun --nproc-per-node=M train.py (the same flags). With --resume and
 --max-restarts=K, a job that loses a process continues from its last checkpoint.
@@ -182,8 +194,9 @@ def _train(args: argparse.Namespace) -> int:
     with Ranks.from_environment(
         args.device, job.timeout_seconds, cast(Transport, job.transport), job.share_gpus
     ) as ranks:
-        capture, images = run.open_capture(config, ranks)
-        summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
+        with locked(args.out, ranks):
+            capture, images = run.open_capture(config, ranks)
+            summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
         if summary is not None and ranks.rank == 0:
             _print_summary(summary, args.out)
     return 0

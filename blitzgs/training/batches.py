@@ -17,6 +17,10 @@ from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.views import VIEW_NUMBERS, ViewSet, unpack_views
 
 
+class PhotographError(RuntimeError):
+    """A photograph cannot be read; names the file."""
+
+
 class Images(Protocol):
     """What training reads of an image store (`blitzgs.scene.image_store.ImageStore`)."""
 

@@ -2,20 +2,22 @@
 """Checkpoints that survive crashes and load at any world size.
 
 A checkpoint is a folder: one safetensors file per rank with the columns of its shard, and `manifest.json`
-with the size and SHA-256 of each file and the training state. It is written to a temporary folder, synced to
-disk, and renamed, so a folder with the final name is complete; whether its bytes are still right is checked
-against the digests on loading. The folder must be on a file system that every rank sees.
+with the training state, the size and SHA-256 of each file, and the SHA-256 of its own content. It is written
+to a temporary folder, synced to disk, and renamed, so a folder with the final name is complete; whether its
+bytes are still right is checked against the digests on loading. The folder must be on a file system that
+every rank sees.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import re
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions
 from blitzgs.training.shard_file import file_digest, header_of, sync_folder, write_shard
 
-FORMAT = 1
+FORMAT = 2
 MANIFEST = "manifest.json"
 _NAME = re.compile(r"checkpoint_(\d{6})")
 _UNFINISHED = ".unfinished_"
@@ -111,9 +113,29 @@ def save(
     return directory / name
 
 
+@dataclass
+class Loaded:
+    """A checkpoint in memory.
+
+    Attributes:
+        columns: of this rank's shard.
+        state: what was saved with them.
+        name: of the checkpoint.
+        refused: why each newer one was not taken.
+    """
+
+    columns: dict[str, Tensor]
+    state: dict[str, Any]
+    name: str
+    refused: list[str]
+
+
 def load_latest(
-    directory: str | os.PathLike[str], ranks: Ranks, device: torch.device | str
-) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    directory: str | os.PathLike[str],
+    ranks: Ranks,
+    device: torch.device | str,
+    problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
+) -> Loaded | None:
     """Load this rank's share of the newest sound checkpoint.
 
     A damaged one is refused and the one before it tried; a warning then names each refused, why, and the one
@@ -123,9 +145,10 @@ def load_latest(
         directory: folder given to `save`.
         ranks: the job, of any world size.
         device: where the columns go.
+        problem: says what is wrong with a shard's content, or None.
 
     Returns:
-        The columns of this rank's shard and the state; None when there is no checkpoint at all.
+        The checkpoint; None when there is none at all.
 
     Raises:
         CheckpointError: checkpoints exist, but none is sound.
@@ -134,13 +157,16 @@ def load_latest(
     refused = []
     for name in reversed(found):
         try:
-            loaded = load(Path(directory) / name, ranks, device)
+            columns, state = load(Path(directory) / name, ranks, device)
+            wrong = [text for text in ranks.all_gather_object(problem(columns)) if text]
+            if wrong:
+                raise CheckpointError(f"checkpoint {Path(directory) / name} is refused: {'; '.join(wrong)}")
         except CheckpointError as error:
             refused.append(str(error))
             continue
         if refused and ranks.rank == 0:
             warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
-        return loaded
+        return Loaded(columns, state, name, refused)
     if refused:
         raise CheckpointError(f"no sound checkpoint in {directory}: {'; '.join(refused)}")
     return None
@@ -173,7 +199,7 @@ def load(
         # The files are shared out for checking, so that each is read for its digest once.
         for shard in manifest.shards[ranks.rank :: ranks.world_size]:
             _verify(path, shard)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         problem = str(error) or type(error).__name__
     problems = [text for text in ranks.all_gather_object(problem) if text]
     if problems or manifest is None:
@@ -220,9 +246,16 @@ def _read_manifest(path: Path) -> _Manifest:
         raise ValueError(f"{MANIFEST} is missing") from None
     except json.JSONDecodeError as error:
         raise ValueError(f"{MANIFEST} is not valid JSON ({error})") from error
-    if content["format"] != FORMAT:
-        raise ValueError(f"{MANIFEST} has format {content['format']}, this version reads format {FORMAT}")
+    if content["format"] not in (1, FORMAT):
+        raise ValueError(f"{MANIFEST} has format {content['format']}, this version reads 1 and {FORMAT}")
+    # Format 1 had no digest of the manifest.
+    if content["format"] != 1 and content.pop("sha256") != _digest(content):
+        raise ValueError(f"{MANIFEST} does not match its own SHA-256")
     return _Manifest([Shard(**shard) for shard in content["shards"]], content["state"])
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _verify(path: Path, shard: Shard) -> None:
@@ -249,8 +282,9 @@ def _finish(
         "shards": [asdict(shard) for shard in shards],
         "state": dict(state),
     }
+    content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
     with open(unfinished / MANIFEST, "w") as file:
-        json.dump(content, file, indent=1)
+        json.dump(content | {"sha256": _digest(content)}, file, indent=1)
         _reached("manifest written")
         file.flush()
         os.fsync(file.fileno())

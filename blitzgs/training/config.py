@@ -98,7 +98,7 @@ class ScheduleConfig:
             `densify_until`; 0: never.
         sh_every: the spherical-harmonics degree grows by one each time.
         position_decay: length of the exponential decay of the position learning rate.
-        checkpoint_every: 0 saves at the end only.
+        checkpoint_every: checkpoints at these times, besides those of `log.checkpoint_seconds`. 0: none.
         evaluate_every: 0 evaluates at the end only.
     """
 
@@ -217,6 +217,8 @@ class LogConfig:
         every: images between two log records.
         tensorboard: also write TensorBoard events (when the package is installed).
         pictures: side-by-side pictures written by an evaluation.
+        checkpoint_seconds: a checkpoint is written this long after the last one, so that whatever ends a run
+            costs no more than this. 0: never by the clock.
         keep_checkpoints: how many checkpoints stay on disk.
         lpips_weights: path of LPIPS weights for the evaluation, or null.
     """
@@ -224,6 +226,7 @@ class LogConfig:
     every: int = 100
     tensorboard: bool = True
     pictures: int = 8
+    checkpoint_seconds: float = 600.0
     keep_checkpoints: int = 3
     lpips_weights: str | None = None
 

@@ -17,6 +17,7 @@ from typing import Any, get_args
 import yaml
 
 from blitzgs.distributed.group import Transport
+from blitzgs.output import write_file
 from blitzgs.training.config import Config
 
 
@@ -65,7 +66,7 @@ def to_dict(config: Config) -> dict[str, Any]:
 
 def save_config(config: Config, path: Path) -> None:
     """Write the resolved configuration as YAML; `load_config` reads it back to the same object."""
-    path.write_text(yaml.safe_dump(to_dict(config), sort_keys=False))
+    write_file(path, yaml.safe_dump(to_dict(config), sort_keys=False))
 
 
 def config_hash(config: Config) -> str:

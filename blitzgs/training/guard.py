@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stops a run that went wrong, saying where: non-finite losses and parameters; and one asked to stop."""
+"""Stops a run that went wrong, saying where: non-finite losses and parameters."""
 
 from __future__ import annotations
 
 import math
-import signal
-import threading
-from collections.abc import Sequence
-from types import FrameType
+from collections.abc import Iterable, Sequence
 
 import torch
 
@@ -15,9 +12,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.pipeline import Frame
-
-# Ranks agree on stopping this often, in steps: agreeing costs them a synchronisation.
-STOP_INTERVAL = 16
 
 
 class NonFiniteError(RuntimeError):
@@ -66,7 +60,7 @@ def _check_loss(
 
 def _origin(table: GaussianTable, frame: Frame | None) -> str:
     """Say where the first non-finite value sits, walking from the parameters to the image."""
-    if (culprit := _bad_column(table)) is not None:
+    if (culprit := bad_column(table)) is not None:
         return culprit
     if frame is not None:
         for name in ("means2d", "conics", "depths", "opacities", "colors"):
@@ -80,11 +74,13 @@ def _origin(table: GaussianTable, frame: Frame | None) -> str:
     return "parameters and images are finite: it comes from op photometric"
 
 
-def _bad_column(table: GaussianTable) -> str | None:
+def bad_column(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> str | None:
+    """Name the first of some columns with a value that is not finite, and its Gaussians; None: all are."""
+    names = list(names)
     # A value that is not finite makes its column's sum so too: one pass, then a closer look if need be.
-    if bool(torch.stack([table[name].sum() for name in PARAMETERS]).isfinite().all()):
+    if bool(torch.stack([table[name].sum() for name in names]).isfinite().all()):
         return None
-    for name in PARAMETERS:
+    for name in names:
         finite = table[name].isfinite().flatten(1).all(1) if table[name].dim() > 1 else table[name].isfinite()
         if not bool(finite.all()):
             ids = table["id"][~finite]
@@ -94,45 +90,28 @@ def _bad_column(table: GaussianTable) -> str | None:
 
 
 def check_table(table: GaussianTable, step: int) -> None:
-    """Check all parameters.
+    """Check all parameters of this rank's Gaussians.
 
     Raises:
         NonFiniteError: names the step, the column and the Gaussians.
     """
-    if (culprit := _bad_column(table)) is not None:
+    if (culprit := bad_column(table)) is not None:
         raise NonFiniteError(
             f"step {step}: {culprit}. Lower the learning rates (optimiser.*) or resume from a checkpoint"
         )
 
 
-class StopRequest:
-    """Turns SIGTERM and SIGINT into a request that the loop honours between two steps."""
+def check_before_saving(table: GaussianTable, step: int, ranks: Ranks) -> None:
+    """Check every column that would be saved, of all ranks; each of them calls this.
 
-    def __init__(self) -> None:
-        self._signal: int | None = None
-        self._previous: dict[int, object] = {}
-
-    def __enter__(self) -> StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGINT):
-                self._previous[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self._signal is not None:
-            # Asked a second time: stop at once.
-            raise KeyboardInterrupt
-        self._signal = number
-
-    def agreed(self, step: int, ranks: Ranks) -> str | None:
-        """Return the name of the signal when all ranks stop now, after `step` steps; else None."""
-        number = self._signal or 0
-        if ranks.world_size > 1:
-            if step % STOP_INTERVAL:
-                return None
-            number = int(ranks.all_reduce(torch.tensor([number], device=ranks.device), "max"))
-        return signal.Signals(number).name if number else None
+    Raises:
+        NonFiniteError: on every rank, naming the step, the rank, the column and the Gaussians.
+    """
+    floats = [name for name in table if table[name].is_floating_point()]
+    found = ranks.all_gather_object(bad_column(table, floats))
+    culprits = [f"rank {rank}: {text}" for rank, text in enumerate(found) if text is not None]
+    if culprits:
+        raise NonFiniteError(
+            f"step {step}: {'; '.join(culprits)}. No checkpoint was written and the earlier ones are kept: "
+            "lower the learning rates (optimiser.*) and start again, or resume from the last one"
+        )

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import platform
 import resource
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from blitzgs.scene.images import ImageStore
 from blitzgs.training import checkpoint
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, from_dict, load_config, to_dict
+from blitzgs.training.guard import bad_column, check_before_saving
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.views import Space
@@ -30,8 +31,19 @@ CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
 EVALUATION = "evaluation"
-# Sections and fields that a resumed run may change: they decide nothing about the result.
-FREE_FIELDS = ("log", "ranks", "data.path", "data.cache_bytes", "data.threads", "data.prefetch")
+# Sections and fields that a resumed run may change: they decide nothing about the result beyond rounding.
+FREE_FIELDS = (
+    "log",
+    "ranks",
+    "data.path",
+    "data.cache_bytes",
+    "data.threads",
+    "data.prefetch",
+    "schedule.checkpoint_every",
+    "schedule.evaluate_every",
+)
+# Half precision changes the result by 1e-3.
+BOUND_FIELDS = ("ranks.half_exchange",)
 
 # Fields that may differ between the hosts of a job.
 HOST_FIELDS = ("data.path", "data.cache_bytes", "data.threads")
@@ -115,8 +127,8 @@ def check_capture(space: Space, capture: Capture, folder: Path) -> None:
         raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
 
 
-def check_alike(config: Config, capture: Capture, ranks: Ranks) -> None:
-    """Check that all ranks run the same code with the same configuration on the same capture.
+def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) -> None:
+    """Check that all ranks run the same code with the same configuration and flag on the same capture.
 
     Raises:
         MismatchError: on every rank, naming the field and the ranks.
@@ -129,7 +141,8 @@ def check_alike(config: Config, capture: Capture, ranks: Ranks) -> None:
         if name not in HOST_FIELDS
     }
     ranks.compare_across_ranks(
-        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture)} | fields
+        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture), "flag --resume": resume}
+        | fields
     )
 
 
@@ -162,29 +175,82 @@ def _flatten(fields: dict[str, Any], where: str = "") -> list[tuple[str, object]
 
 
 def save(
-    folder: Path, table: GaussianTable, progress: Progress, space: Space, config: Config, ranks: Ranks
-) -> None:
-    """Write a checkpoint of a run; rows that are behind stay behind, so that saving changes nothing."""
+    folder: Path,
+    table: GaussianTable,
+    progress: Progress,
+    space: Space,
+    config: Config,
+    ranks: Ranks,
+    run_id: str = "",
+) -> Path:
+    """Write a checkpoint of a run; rows that are behind stay behind, so that saving changes nothing.
+
+    Returns:
+        The checkpoint's folder.
+
+    Raises:
+        NonFiniteError: a value is not finite; nothing is written, and earlier checkpoints are kept.
+        CheckpointError: a rank could not write; earlier checkpoints are kept.
+    """
+    check_before_saving(table, progress.step, ranks)
     state = {
         "progress": dataclasses.asdict(progress),
         "space": dataclasses.asdict(space),
         "config": to_dict(config),
+        "run": run_id,
     }
-    checkpoint.save(folder / CHECKPOINTS, table.columns, state, ranks, config.log.keep_checkpoints)
+    return checkpoint.save(folder / CHECKPOINTS, table.columns, state, ranks, config.log.keep_checkpoints)
 
 
-def restore(folder: Path, ranks: Ranks) -> tuple[GaussianTable, Progress, Space, Config] | None:
-    """Read the newest sound checkpoint of a run; None when there is none."""
-    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, ranks.device)
+@dataclass
+class Restored:
+    """What a checkpoint of a run holds.
+
+    Attributes:
+        table: this rank's Gaussians.
+        progress: where the run stood.
+        space: how the trained world lies in the capture's.
+        config: of the run.
+        run_id: names the run in its log.
+        source: which checkpoint it is and why that one, in words.
+    """
+
+    table: GaussianTable
+    progress: Progress
+    space: Space
+    config: Config
+    run_id: str
+    source: str
+
+
+def restore(folder: Path, ranks: Ranks) -> Restored | None:
+    """Read the newest sound checkpoint of a run; None when there is none.
+
+    Raises:
+        CheckpointError: there are checkpoints, but none is sound.
+    """
+    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, ranks.device, _problem_of_columns)
     if loaded is None:
         return None
-    columns, state = loaded
-    space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
-    return GaussianTable(columns), Progress(**state["progress"]), space, from_dict(state["config"])
+    state = loaded.state
+    why = "the newest sound one" if loaded.refused else "the newest"
+    skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
+    return Restored(
+        GaussianTable(loaded.columns),
+        Progress(**state["progress"]),
+        Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])})),
+        from_dict(state["config"]),
+        state.get("run", ""),
+        f"{loaded.name} ({why}{skipped})",
+    )
+
+
+def _problem_of_columns(columns: dict[str, torch.Tensor]) -> str | None:
+    return bad_column(GaussianTable(columns))
 
 
 def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedModel:
-    """Open the newest model of a run for rendering.
+    """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
     Args:
         folder: of the run.
@@ -194,16 +260,30 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
     Raises:
         FileNotFoundError: the folder is not a run, or holds no checkpoint.
     """
-    if not (folder / CONFIG).exists():
-        raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG}")
+    if not (folder / CONFIG).exists() and not (folder / CHECKPOINTS).exists():
+        raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
     restored = restore(folder, ranks)
     if restored is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
-    table, progress, space, _ = restored
-    config = load_config(folder / CONFIG, [] if data is None else [f"data.path={json.dumps(data)}"])
-    optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), space.extent, ranks.device)
+    config, progress, table = restored.config, restored.progress, restored.table
+    if ranks.rank == 0:
+        _compare_with_file(config, folder / CONFIG)
+    if data is not None:
+        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=data))
+    optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, ranks.device)
     optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(config, progress, space, table)
+    return TrainedModel(config, progress, restored.space, table)
+
+
+def _compare_with_file(config: Config, path: Path) -> None:
+    """Say so when a run's configuration file is not what its checkpoint was trained with."""
+    try:
+        fields = _changed_fields(config, load_config(path))
+        what = f"differs in {', '.join(fields)}" if fields else ""
+    except ConfigError as error:
+        what = f"cannot be read ({error})"
+    if what:
+        warnings.warn(f"{path} {what}: what the checkpoint was trained with counts", stacklevel=3)
 
 
 def check_resumable(saved: Config, wanted: Config) -> None:
@@ -213,11 +293,21 @@ def check_resumable(saved: Config, wanted: Config) -> None:
         ConfigError: names the first field that differs.
     """
     for name, old, new in _differences(to_dict(saved), to_dict(wanted), ""):
-        if not any(name == free or name.startswith(free + ".") for free in FREE_FIELDS):
+        if not _is_free(name):
             raise ConfigError(
                 f"{name}: the checkpoint was trained with {old!r}, now {new!r}; "
                 "resume with the run's own configuration or start another run"
             )
+
+
+def _is_free(name: str) -> bool:
+    return name not in BOUND_FIELDS and any(
+        name == free or name.startswith(free + ".") for free in FREE_FIELDS
+    )
+
+
+def _changed_fields(saved: Config, found: Config) -> list[str]:
+    return [name for name, *_ in _differences(to_dict(saved), to_dict(found), "") if not _is_free(name)]
 
 
 def _differences(old: dict[str, Any], new: dict[str, Any], where: str) -> list[tuple[str, Any, Any]]:

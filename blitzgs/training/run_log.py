@@ -1,17 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run shows while it works: a progress bar (or plain lines), a JSONL file and TensorBoard events."""
+"""What a run shows while it works: a progress bar (or plain lines), a JSONL file and TensorBoard events.
+
+None of it may end a run: where the disk is full or the terminal has gone, a warning says so once, and the
+records wait for a while to be written later.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
-from collections.abc import Callable, Mapping
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from blitzgs.output import write_file
+
+LOG = "log.jsonl"
+BOARD = "tensorboard"
+# Records kept for a disk that is full; later ones push out the oldest.
+_MOST_WAITING = 10_000
 
 _SHOWN: dict[str, Callable[[float], str]] = {
     "loss": lambda value: f"loss {value:.4f}",
@@ -28,27 +42,33 @@ def _count(value: float) -> str:
 class RunLog:
     """Writes records of a run. Silent without a folder (the ranks other than 0)."""
 
-    def __init__(self, folder: Path | None, total: int, done: int, tensorboard: bool) -> None:
-        """Open the log.
+    def __init__(
+        self, folder: Path | None, total: int, done: int, tensorboard: bool, run_id: str = ""
+    ) -> None:
+        """Open the log. Records of this run that a resume makes again are dropped.
 
         Args:
             folder: of the run; appends to its `log.jsonl`. None: log nothing.
             total: images of the whole run.
             done: images seen before (a resumed run).
             tensorboard: also write events to `folder/tensorboard`, if the package is installed.
+            run_id: goes into every record.
         """
-        self._file: TextIO | None = None
-        self._board: Any = None
+        self._file: _JsonLines | None = None
+        self._board: _Board | None = None
         self._progress: Progress | None = None
         self._task = TaskID(0)
+        self._run_id = run_id
         self._total, self._first, self._started = total, done, time.monotonic()
         self.console = Console(quiet=folder is None, highlight=False)
         if folder is None:
             return
-        folder.mkdir(parents=True, exist_ok=True)
-        self._file = (folder / "log.jsonl").open("a", encoding="utf-8")
+        with _optional("log file"):
+            folder.mkdir(parents=True, exist_ok=True)
+            _drop_repeated(folder / LOG, run_id, done, total)
+        self._file = _JsonLines(folder / LOG)
         if tensorboard:
-            self._board = _summary_writer(folder / "tensorboard")
+            self._board = _Board(folder / BOARD, done)
         if self.console.is_terminal:
             self._progress = Progress(
                 TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
@@ -62,47 +82,145 @@ class RunLog:
 
     def scalars(self, t: int, values: Mapping[str, float]) -> None:
         """Record numbers at time `t` (images)."""
-        self._write({"t": t, **values})
+        self._write(t, values)
         if self._board is not None:
-            for name, value in values.items():
-                self._board.add_scalar(name, value, t)
+            self._board.add(t, values)
         text = "  ".join(_SHOWN[name](value) for name, value in values.items() if name in _SHOWN)
         if self._progress is not None:
             self._progress.update(self._task, completed=t, description=text)
         elif self._file is not None:
             rate = (time.monotonic() - self._started) / max(1, t - self._first)
             left = timedelta(seconds=round(rate * (self._total - t)))
-            self.console.print(f"{t:>7,}/{self._total:,} images  {text}  ETA {left}", soft_wrap=True)
+            self._print(f"{t:>7,}/{self._total:,} images  {text}  ETA {left}")
 
     def event(self, t: int, kind: str, values: Mapping[str, Any], text: str | None = None) -> None:
         """Record something that happened at time `t`; print `text` if given."""
-        self._write({"t": t, "event": kind, **values})
+        self._write(t, {"event": kind, **values})
         if self._board is not None:
-            for name, value in values.items():
-                if isinstance(value, (int, float)):
-                    self._board.add_scalar(f"{kind}/{name}", value, t)
+            numbers = {name: value for name, value in values.items() if isinstance(value, (int, float))}
+            self._board.add(t, {f"{kind}/{name}": value for name, value in numbers.items()})
         if text is not None:
-            self.console.print(f"{t:>7,} {text}", soft_wrap=True)
+            self._print(f"{t:>7,} {text}")
 
     def close(self) -> None:
         """Flush and end the progress display."""
         if self._progress is not None:
-            self._progress.stop()
+            with _optional("terminal"):
+                self._progress.stop()
         if self._board is not None:
             self._board.close()
         if self._file is not None:
             self._file.close()
             self._file = None
 
-    def _write(self, record: Mapping[str, Any]) -> None:
+    def _write(self, t: int, values: Mapping[str, Any]) -> None:
         if self._file is not None:
-            self._file.write(json.dumps(record) + "\n")
-            self._file.flush()
+            self._file.add({"t": t} | ({"run": self._run_id} if self._run_id else {}) | dict(values))
+
+    def _print(self, text: str) -> None:
+        with _optional("terminal"):
+            self.console.print(text, soft_wrap=True, markup=False, emoji=False)
 
 
-def _summary_writer(folder: Path) -> Any:
+class _JsonLines:
+    """A file of one JSON record a line; what the disk does not take waits in memory."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._waiting: deque[bytes] = deque(maxlen=_MOST_WAITING)
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        self._waiting.append(json.dumps(record).encode() + b"\n")
+        with _optional("log file"):
+            self._flush()
+
+    def close(self) -> None:
+        with _optional("log file"):
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._waiting:
+            return
+        # Opened each time: the file may have been on a disk that went away and came back.
+        with open(self._path, "ab", buffering=0) as file:
+            while self._waiting:
+                line = self._waiting[0]
+                written = file.write(line)
+                if written < len(line):
+                    # The rest follows when there is room; a reader skips a line that is torn for good.
+                    self._waiting[0] = line[written:]
+                    raise OSError("the disk is full")
+                self._waiting.popleft()
+
+
+class _Board:
+    """TensorBoard's events, as long as they can be written."""
+
+    def __init__(self, folder: Path, done: int) -> None:
+        self._folder, self._done = folder, done
+        self._writer: Any = None
+        self._open()
+
+    def add(self, t: int, values: Mapping[str, float]) -> None:
+        with _optional("TensorBoard"):
+            if self._writer is None:
+                self._open()
+            try:
+                for name, value in values.items():
+                    if self._writer is not None:
+                        self._writer.add_scalar(name, value, t)
+            except Exception:
+                # The writer's thread has ended with an error of its own; the next record gets a new one.
+                self._writer = None
+                raise
+
+    def close(self) -> None:
+        with _optional("TensorBoard"):
+            if self._writer is not None:
+                self._writer.close()
+
+    def _open(self) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            return
+        with _optional("TensorBoard"):
+            # Steps after `done` that an interrupted run has logged are made again.
+            self._writer = SummaryWriter(str(self._folder), purge_step=self._done + 1 if self._done else None)
+
+
+_warned: set[str] = set()
+
+
+@contextlib.contextmanager
+def _optional(what: str) -> Iterator[None]:
+    """Turn an error of the operating system into a warning, once for each kind of log."""
     try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder))
+        yield
+    except (OSError, ValueError, RuntimeError) as error:
+        if what not in _warned:
+            _warned.add(what)
+            with contextlib.suppress(OSError):
+                warnings.warn(
+                    f"{what}: {error}; training goes on, records may be missing there", stacklevel=4
+                )
+
+
+def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:
+    """Drop the records of run `run_id` that come after `done` images: the resumed run makes them again."""
+    if not run_id or not path.exists():
+        return
+    kept = []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    for line in lines:
+        try:
+            record = json.loads(line)
+            repeated = record.get("run") == run_id and (
+                record["t"] > done or (record["t"] == total and record.get("event") == "evaluation")
+            )
+        except (ValueError, LookupError, TypeError, AttributeError):
+            repeated = True  # torn by whatever ended the run
+        if not repeated:
+            kept.append(line + "\n")
+    if len(kept) < len(lines):
+        write_file(path, "".join(kept))

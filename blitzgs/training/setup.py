@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import secrets
 from pathlib import Path
 
 import torch
@@ -13,10 +14,12 @@ from blitzgs.model import GaussianTable
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run
+from blitzgs.training.agreement import SaveClock
 from blitzgs.training.batches import Images
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import save_config
 from blitzgs.training.evaluation import load_lpips
+from blitzgs.training.folder_checks import check_room, check_writable
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_log import RunLog
@@ -45,8 +48,10 @@ def set_up(
         FileExistsError: the folder holds a trained run and `resume` is not set.
         ConfigError: the run to resume was started with another configuration.
         MismatchError: the ranks differ in configuration, code or capture.
+        FolderError: a rank cannot write to the folder, or there is no room.
     """
-    run.check_alike(config, capture, ranks)
+    run.check_alike(config, capture, ranks, resume)
+    check_writable(folder, ranks)
     schedule = Schedule(config.schedule)
     space = Space.of(capture.offset, capture.extent)
     lpips = load_lpips(config.log.lpips_weights)
@@ -58,12 +63,13 @@ def set_up(
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks)
     else:
-        table, progress, saved_space, saved_config = restored
-        run.check_resumable(saved_config, config)
-        run.check_capture(saved_space, capture, folder)
+        table, progress = restored.table, restored.progress
+        run.check_resumable(restored.config, config)
+        run.check_capture(restored.space, capture, folder)
+    check_room(folder, table, ranks, config.population.max_gaussians)
     if ranks.rank == 0:
-        folder.mkdir(parents=True, exist_ok=True)
         save_config(config, folder / run.CONFIG)
+    run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     optimiser = LazyAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = TileOwners(ranks)
     length_unit = space.extent * config.loss.scale_reference
@@ -82,8 +88,18 @@ def set_up(
         stepper=Stepper(table, optimiser, owners, config.loss, length_unit, config.ranks.half_exchange),
         owners=owners,
         lpips=lpips,
+        run_id=run_id,
+        origin=_origin(restored, resume, folder),
+        save_clock=SaveClock(config.log.checkpoint_seconds),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
+
+
+def _origin(restored: run.Restored | None, resume: bool, folder: Path) -> str:
+    """Say where the run begins."""
+    if restored is not None:
+        return f"resumed from {restored.source} after {restored.progress.step:,} steps"
+    return f"nothing to resume in {folder}: starting anew" if resume else "new run"
 
 
 def first_gaussians(

@@ -16,6 +16,7 @@ from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions
 from blitzgs.scene.capture import Capture
+from blitzgs.training.agreement import SaveClock
 from blitzgs.training.batches import Images
 from blitzgs.training.config import Config
 from blitzgs.training.evaluation import Lpips
@@ -47,6 +48,9 @@ class TrainingState:
         stepper: takes the optimiser steps.
         owners: knows what tiles cost, and divides them.
         lpips: the perceptual metric, or None.
+        run_id: names the run in its log, over every resume.
+        origin: where the run begins, in words.
+        save_clock: says when the next checkpoint by wall time is due.
         log: where the run reports; silent until the loop opens the run's own.
     """
 
@@ -64,6 +68,9 @@ class TrainingState:
     stepper: Stepper
     owners: TileOwners
     lpips: Lpips | None
+    run_id: str
+    origin: str
+    save_clock: SaveClock
     log: RunLog
     _started: float = field(default_factory=time.monotonic)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,16 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.density_stats import density_stats_
+from blitzgs.output import write_file
 from blitzgs.pipeline import Frame
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run
-from blitzgs.training.batches import BatchLoader, Images
+from blitzgs.training.agreement import Agreement, StopRequest
+from blitzgs.training.batches import BatchLoader, Images, PhotographError
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash
 from blitzgs.training.events import evaluate, handle, save
-from blitzgs.training.guard import LossGuard, StopRequest, check_table
+from blitzgs.training.guard import LossGuard
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.setup import set_up
@@ -68,27 +71,46 @@ class Trainer:
 
         Raises:
             NonFiniteError: a loss or a parameter stopped being finite.
+            PhotographError: a photograph cannot be read; the steps before it are saved.
+            CheckpointError: the model could not be saved, although the run waited for room.
         """
         state, schedule, done = self.state, self.state.schedule, self.state.progress.step
         size = schedule.batch_size
         folder = state.folder if state.ranks.rank == 0 else None
-        state.log = RunLog(folder, schedule.iterations, done * size, state.config.log.tensorboard)
+        board = state.config.log.tensorboard
+        state.log = RunLog(folder, schedule.iterations, done * size, board, state.run_id)
         state.start_clock()
         try:
             with StopRequest() as stop:
+                agreement = Agreement(state.ranks, stop, state.save_clock)
                 self._announce()
                 for step in range(done + 1, schedule.steps + 1):
                     self.step(step)
                     for event in schedule.events((step - 1) * size, step * size):
                         handle(state, event)
-                    if step < schedule.steps and (name := stop.agreed(step, state.ranks)):
-                        save.run(state)
-                        text = f"stopped by {name}; continue with --resume"
-                        state.log.event(step * size, "stopped", {"signal": name}, text)
+                    if step == schedule.steps:
+                        break
+                    decision = agreement.after(step)
+                    if decision.signal is not None:
+                        self._stop(f"stopped by {decision.signal}; continue with --resume")
                         return None
+                    if decision.save:
+                        save.run(state)
             return self._finish()
+        except PhotographError as error:
+            if state.ranks.world_size > 1:
+                raise  # the other ranks are in the middle of the step and cannot save
+            self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
+            raise PhotographError(
+                f"{error}. The model so far is saved: put the photograph back and continue with --resume"
+            ) from error
         finally:
             self.close()
+
+    def _stop(self, text: str) -> None:
+        """Save where the run is, and say why it stops here."""
+        save.run_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
+        self.state.log.event(self.state.images_seen, "stopped", {"reason": text}, text)
 
     def close(self) -> None:
         """Stop loading batches and close the log."""
@@ -99,7 +121,10 @@ class Trainer:
         """Take one optimiser step (from 1), without the schedule's events."""
         state, config, schedule = self.state, self.state.config, self.state.schedule
         begin, end = (step - 1) * schedule.batch_size, step * schedule.batch_size
-        batch = self._loader.get(step - 1, schedule.steps)
+        try:
+            batch = self._loader.get(step - 1, schedule.steps)
+        except (OSError, ValueError) as error:
+            raise PhotographError(str(error)) from error
         degree = schedule.sh_degree(begin, config.model.sh_degree)
         frame, terms, sums = state.stepper.forward(step, render_options(config, state.space, degree), batch)
         names = [state.capture.cameras[i].name for i in batch.indices]
@@ -142,14 +167,17 @@ class Trainer:
         if ranks.world_size > 1:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"
         values = views | run.versions(ranks.device) | {"transport": ranks.transport}
-        state.log.event(state.images_seen, "start", values, text)
+        state.log.event(
+            state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
+        )
 
     def _finish(self) -> dict[str, Any]:
         """Save and evaluate the trained model; return and write the summary."""
-        state = self.state
+        state, step = self.state, self.state.progress.step
         state.catch_up()
-        check_table(state.table, state.progress.step)
-        save.run(state)
+        with StopRequest() as stop:
+            agreement = Agreement(state.ranks, stop, state.save_clock)
+            save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
         summary = evaluate.run(state) | {
             "images": state.images_seen,
             "seconds": state.progress.seconds,
@@ -158,8 +186,12 @@ class Trainer:
             "peak_gaussians": state.progress.peak_gaussians,
             "peak_memory_bytes": run.peak_memory_bytes(state.ranks.device),
             "config_hash": config_hash(state.config),
+            "run": state.run_id,
             "versions": run.versions(state.ranks.device),
         }
         if state.ranks.rank == 0:
-            (state.folder / run.SUMMARY).write_text(json.dumps(summary, indent=1))
+            try:
+                write_file(state.folder / run.SUMMARY, json.dumps(summary, indent=1))
+            except OSError as error:
+                warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)
         return summary

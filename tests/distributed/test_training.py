@@ -53,7 +53,7 @@ def records(folder):
 
 
 def sorted_table(folder):
-    table = run.restore(folder, Ranks())[0]
+    table = run.restore(folder, Ranks()).table
     order = table["id"].argsort()
     return {name: table[name][order] for name in table}
 
@@ -193,8 +193,7 @@ def assert_same_result(folder, expected):
 def test_sigterm_on_one_rank_saves_and_a_resume_finishes(capture, trained, tmp_path):
     flags = train_flags(capture, tmp_path)
     assert run_ranks(_train_and_stop, 2, flags, 12, join=False) == [0, 0]
-    _, progress, _, _ = run.restore(tmp_path, Ranks())
-    assert progress.step == 16  # where the ranks next agree
+    assert run.restore(tmp_path, Ranks()).progress.step == 16  # where the ranks next agree
     assert not (tmp_path / "summary.json").exists()
     # Another number of ranks may continue.
     assert run_ranks(_command, 3, flags, join=False) == [0, 0, 0]

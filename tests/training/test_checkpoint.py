@@ -54,22 +54,22 @@ def by_id(shards):
 def test_round_trip_and_format(tmp_path):
     columns, state = table(101), {"iteration": 7, "note": ["ä", 1.5, None]}
     path = checkpoint.save(tmp_path / "checkpoints", columns, state, ALONE)
-    loaded, loaded_state = checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu")
-    assert equal(loaded, columns)
-    assert loaded_state == state
+    loaded = checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu")
+    assert equal(loaded.columns, columns)
+    assert loaded.state == state and loaded.name == path.name
     # The shard is an ordinary safetensors file.
     assert equal(load_file(path / "shard_0000_of_0001.safetensors"), columns)
     assert checkpoint.load_latest(tmp_path / "nothing here", ALONE, "cpu") is None
     empty = table(0)
     checkpoint.save(tmp_path / "checkpoints", empty, state, ALONE)
-    assert equal(checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu")[0], empty)
+    assert equal(checkpoint.load_latest(tmp_path / "checkpoints", ALONE, "cpu").columns, empty)
 
 
 def test_keeps_the_last_k(tmp_path):
     for iteration in range(5):
         checkpoint.save(tmp_path, table(3, iteration), {"iteration": iteration}, ALONE, keep=2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000003", "checkpoint_000004"]
-    assert checkpoint.load_latest(tmp_path, ALONE, "cpu")[1] == {"iteration": 4}
+    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 4}
 
 
 def _flip_bit(path, offset):
@@ -97,9 +97,9 @@ def test_a_damaged_one_is_refused_by_name(tmp_path, damage, reason):
     with pytest.warns(
         UserWarning, match=f"checkpoint_000001 is damaged.*{reason}.*; using checkpoint_000000"
     ):
-        columns, state = checkpoint.load_latest(tmp_path, ALONE, "cpu")
-    assert state == {"iteration": 1}
-    assert equal(columns, table(50, 1))
+        loaded = checkpoint.load_latest(tmp_path, ALONE, "cpu")
+    assert loaded.state == {"iteration": 1}
+    assert equal(loaded.columns, table(50, 1))
     with pytest.raises(checkpoint.CheckpointError, match=f"checkpoint_000001 is damaged.*{reason}"):
         checkpoint.load(newest, ALONE, "cpu")
     # A new save does not reuse the damaged one's name.
@@ -146,10 +146,10 @@ def test_kill_at_any_point_of_a_save(tmp_path, point):
         assert process.exitcode == -signal.SIGKILL
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            columns, state = checkpoint.load_latest(directory, ALONE, "cpu")
+            loaded = checkpoint.load_latest(directory, ALONE, "cpu")
         complete = POINTS.index(point) >= POINTS.index("renamed")
-        assert state == {"iteration": 2 if complete else 1}
-        assert equal(columns, table(64, state["iteration"]))
+        assert loaded.state == {"iteration": 2 if complete else 1}
+        assert equal(loaded.columns, table(64, loaded.state["iteration"]))
         # The next save clears what was left behind.
         checkpoint.save(directory, table(4), {}, ALONE, keep=2)
         assert len(list(directory.iterdir())) == 2
@@ -176,7 +176,7 @@ def test_full_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(checkpoint.CheckpointError, match="GB are needed and 0.00 GB are free"):
         checkpoint.save(tmp_path, table(64), {}, ALONE)
-    assert checkpoint.load_latest(tmp_path, ALONE, "cpu")[1] == {"iteration": 0}
+    assert checkpoint.load_latest(tmp_path, ALONE, "cpu").state == {"iteration": 0}
 
 
 def test_bad_arguments(tmp_path):
@@ -198,7 +198,8 @@ def _save_shard(ranks, directory, sizes):
 
 
 def _load_shard(ranks, directory):
-    return checkpoint.load_latest(directory, ranks, "cpu")
+    loaded = checkpoint.load_latest(directory, ranks, "cpu")
+    return loaded.columns, loaded.state
 
 
 def _save_with_one_full_disk(ranks, directory, sizes):

@@ -49,4 +49,5 @@ def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -
         TileOwners(state.ranks),
         pictures=state.config.log.pictures,
         lpips=state.lpips,
+        optional_files=True,
     )

@@ -1,13 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event that writes a checkpoint."""
+"""The event that writes a checkpoint, and what happens where there is no room for one."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+
 from blitzgs.training import run as run_folder
+from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
 
+# A checkpoint that could not be written is tried again after this long, while training goes on.
+RETRY_SECONDS = 60.0
+# The last one is waited for: first this long, then twice as long each time.
+FIRST_WAIT_SECONDS = 1.0
+LONGEST_WAIT_SECONDS = 20.0
+# A run that ends at night waits until its user has seen the message.
+PATIENCE_SECONDS = 24 * 3600.0
+# torchrun kills a process 30 seconds after it was told to stop.
+STOPPING_PATIENCE_SECONDS = 15.0
+
 
 def run(state: TrainingState, event: Event | None = None) -> None:
-    """Write a checkpoint; pending optimiser steps stay pending, so that saving changes nothing."""
-    run_folder.save(state.folder, state.table, state.progress, state.space, state.config, state.ranks)
+    """Write a checkpoint; pending optimiser steps stay pending, so that saving changes nothing.
+
+    Where it cannot be written, the run goes on and tries again a minute later.
+
+    Raises:
+        NonFiniteError: a value is not finite; nothing is written, and earlier checkpoints are kept.
+    """
+    try:
+        _write(state)
+    except CheckpointError as error:
+        state.save_clock.restart(RETRY_SECONDS)
+        _report(state, error, f"Training goes on; trying again in {RETRY_SECONDS:.0f} s.")
+
+
+def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[], bool]) -> None:
+    """Write the checkpoint that a run ends with; where it cannot be written, wait and try again.
+
+    Args:
+        state: of the run.
+        patience_seconds: how long to wait.
+        gives_up: asked before each wait; the same answer on every rank.
+
+    Raises:
+        NonFiniteError: as for `run`.
+        CheckpointError: it could not be written in time.
+    """
+    waited, pause = 0.0, FIRST_WAIT_SECONDS
+    while True:
+        try:
+            _write(state)
+            return
+        except CheckpointError as error:
+            if waited >= patience_seconds or gives_up():
+                raise
+            left = f"{max(1, round((patience_seconds - waited) / 60)):,} minutes"
+            _report(
+                state,
+                error,
+                f"The model is still in memory: free some space. Trying again in {pause:.0f} s, for up to "
+                f"{left}; Ctrl-C gives it up.",
+            )
+        time.sleep(pause)
+        waited, pause = waited + pause, min(2 * pause, LONGEST_WAIT_SECONDS)
+
+
+def _write(state: TrainingState) -> None:
+    run_folder.save(
+        state.folder, state.table, state.progress, state.space, state.config, state.ranks, state.run_id
+    )
+    state.save_clock.restart()
+
+
+def _report(state: TrainingState, error: CheckpointError, what_next: str) -> None:
+    state.log.event(state.images_seen, "checkpoint failed", {"reason": str(error)}, f"{error} {what_next}")

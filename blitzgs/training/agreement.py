@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What interrupts the loop between two steps: a signal that asks to stop, and the clock that asks to save.
+
+Ranks may only act on either after the same step, so they agree on it: by one small reduction every few steps.
+torchrun kills a process 30 seconds after SIGTERM, so the number of steps follows from how long they take.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from dataclasses import dataclass
+from types import FrameType
+
+import torch
+
+from blitzgs.distributed.group import Ranks
+
+# The ranks agree at least this often: in steps, and in seconds as far as single steps allow.
+MOST_STEPS = 16
+MOST_SECONDS = 4.0
+
+_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+
+class StopRequest:
+    """Turns SIGTERM, SIGINT and SIGHUP into a request that the loop honours between two steps.
+
+    A second SIGINT raises KeyboardInterrupt at once. Where SIGHUP is ignored (`nohup`), it stays so.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._previous: dict[int, object] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._previous[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        # A closing session sends SIGHUP and SIGTERM together: only a key pressed twice means "at once".
+        if number == signal.SIGINT and self.number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.number = number
+
+
+class SaveClock:
+    """Says when the next checkpoint by wall time is due."""
+
+    def __init__(self, seconds: float) -> None:
+        """Start; `seconds` between two checkpoints, 0 for none."""
+        self._seconds = seconds or math.inf
+        self.restart()
+
+    def restart(self, seconds: float | None = None) -> None:
+        """Count from now on, to the usual time or another one."""
+        self._at = time.monotonic() + (self._seconds if seconds is None else seconds)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the time is over."""
+        return time.monotonic() >= self._at
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What all ranks do after a step.
+
+    Attributes:
+        signal: name of the signal that ends the run, or None.
+        save: whether a checkpoint is due.
+    """
+
+    signal: str | None
+    save: bool
+
+
+class Agreement:
+    """Tells every rank the same after the same step."""
+
+    def __init__(self, ranks: Ranks, stop: StopRequest, clock: SaveClock) -> None:
+        """Agree among `ranks` about the requests that any of them has noted."""
+        self._ranks, self._stop, self._clock = ranks, stop, clock
+        self._next = 0
+        self._last: tuple[int, float] | None = None
+
+    def after(self, step: int) -> Decision:
+        """Return what happens after `step`; every rank calls this after every step."""
+        if self._ranks.world_size == 1:
+            return self._decision(self._stop.number, self._clock.is_due)
+        if step < self._next:
+            return Decision(None, False)
+        return self.now(step)
+
+    def now(self, step: int) -> Decision:
+        """Agree at once, whatever the step; every rank calls this."""
+        now = time.monotonic()
+        # Unknown at first: the ranks agree again after the next step.
+        seconds = MOST_SECONDS
+        if self._last is not None and step > self._last[0]:
+            seconds = (now - self._last[1]) / (step - self._last[0])
+        values = torch.tensor(
+            [self._stop.number, self._clock.is_due, seconds], dtype=torch.float64, device=self._ranks.device
+        )
+        number, due, slowest = self._ranks.read(self._ranks.all_reduce(values, "max"))
+        interval = max(1, min(MOST_STEPS, int(MOST_SECONDS / max(slowest, 1e-9))))
+        self._next, self._last = (step // interval + 1) * interval, (step, time.monotonic())
+        return self._decision(int(number), due > 0)
+
+    @staticmethod
+    def _decision(number: int, due: bool) -> Decision:
+        return Decision(signal.Signals(number).name if number else None, due)

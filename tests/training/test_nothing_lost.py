@@ -1,0 +1,385 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever ends or disturbs a run, its model is kept; what a resume takes is sound and named."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+from blitzgs.cli import main
+from blitzgs.distributed.group import Ranks
+from blitzgs.training import checkpoint, run, run_log
+from blitzgs.training.agreement import Agreement, SaveClock, StopRequest
+from blitzgs.training.batches import PhotographError
+from blitzgs.training.events import save
+from blitzgs.training.folder_checks import FolderError, check_room, check_writable, locked
+from blitzgs.training.guard import NonFiniteError
+from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import RankError, run_ranks
+from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    run_log._warned.clear()
+    yield
+    torch.set_num_threads(before)
+
+
+def trainer(folder, *overrides, images=None, resume=False):
+    capture, own = tiny_scene()
+    return Trainer(tiny_config(*overrides), capture, images or own, folder, Ranks(), resume)
+
+
+def at_step(monkeypatch, number, action):
+    """Have `action(trainer)` happen after step `number`."""
+    step = Trainer.step
+
+    def changed(self, taken):
+        step(self, taken)
+        if taken == number:
+            action(self)
+
+    monkeypatch.setattr(Trainer, "step", changed)
+
+
+def checkpoints(folder):
+    return sorted(path.name for path in (folder / "checkpoints").glob("checkpoint_*"))
+
+
+def records(folder):
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+# Non-finite values never become the newest checkpoint.
+
+
+@pytest.mark.parametrize("column", ["means", "exp_avg_sq.sh", "grad_sum"])
+def test_what_is_not_finite_is_not_saved(tmp_path, monkeypatch, column):
+    def spoil(self):
+        self.state.table[column][7] = float("nan")
+
+    # The checkpoint at 39 images follows step 40; nothing else looks at the table between.
+    at_step(monkeypatch, 40, spoil)
+    running = trainer(tmp_path, "schedule.checkpoint_every=13", "log.every=1000")
+    message = rf"step 40: rank 0: column '{column}' is not finite in 1 Gaussians \(ids \d+\).*earlier ones"
+    with pytest.raises(NonFiniteError, match=message):
+        running.train()
+    assert checkpoints(tmp_path) == ["checkpoint_000000", "checkpoint_000001"]
+    assert run.restore(tmp_path, Ranks()).progress.step == 27
+
+
+def test_a_checkpoint_with_nan_is_not_resumed_from(tmp_path):
+    running = trainer(tmp_path, "schedule.iterations=30", "schedule.checkpoint_every=15")
+    running.train()
+    table = running.state.table
+    table["sh"][3] = float("nan")
+    newest = checkpoint.load_latest(tmp_path / "checkpoints", Ranks(), "cpu")
+    checkpoint.save(tmp_path / "checkpoints", table.columns, newest.state, Ranks())
+    with pytest.warns(UserWarning, match="is refused: column 'sh' is not finite.*; using checkpoint_000001"):
+        found = run.restore(tmp_path, Ranks())
+    assert found.source == "checkpoint_000001 (the newest sound one; 1 newer refused)"
+
+
+# Checkpoints by the clock, and all signals.
+
+
+def test_a_checkpoint_is_written_by_the_clock_by_default(tmp_path, monkeypatch):
+    assert tiny_config().log.checkpoint_seconds == 600
+
+    def ten_minutes_later(self):
+        self.state.save_clock.restart(0)
+
+    at_step(monkeypatch, 33, ten_minutes_later)
+    running = trainer(tmp_path)
+    steps = []
+    real = run.save
+    monkeypatch.setattr(run, "save", lambda *args: (steps.append(args[2].step), real(*args)))
+    running.train()
+    assert steps == [33, 100]
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
+def test_every_signal_saves(tmp_path, monkeypatch, number):
+    at_step(monkeypatch, 17, lambda self: os.kill(os.getpid(), number))
+    running = trainer(tmp_path)
+    assert running.train() is None
+    assert run.restore(tmp_path, Ranks()).progress.step == 17
+    assert signal.Signals(number).name in records(tmp_path)[-1]["reason"]
+
+
+def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopRequest() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert stop.number == 0
+            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop.number == signal.SIGTERM
+            os.kill(os.getpid(), signal.SIGINT)
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def _agreements(ranks, seconds):
+    stop, clock = StopRequest(), SaveClock(0)
+    agreement = Agreement(ranks, stop, clock)
+    decisions = []
+    for step in range(1, 60):
+        time.sleep(seconds)
+        if step == 20 and ranks.rank == 1:
+            stop.number = signal.SIGTERM
+        if step == 3 and ranks.rank == 0:
+            clock.restart(0)
+        decision = agreement.after(step)
+        if decision.save:
+            clock.restart()
+        decisions.append((decision.signal, decision.save))
+        if decision.signal:
+            break
+    return decisions
+
+
+@pytest.mark.parametrize(
+    ("seconds", "most", "stop_at", "save_at"), [(0.001, 4.0, 32, 16), (0.1, 0.25, 20, 4)]
+)
+def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, most, stop_at, save_at):
+    first, second = run_ranks(_agreements_within, 2, seconds, most)
+    assert first == second
+    assert [step for step, (_, saves) in enumerate(first, 1) if saves] == [save_at]
+    assert len(first) == stop_at and first[-1][0] == "SIGTERM"
+
+
+def _agreements_within(ranks, seconds, most):
+    from blitzgs.training import agreement
+
+    agreement.MOST_SECONDS = most
+    return _agreements(ranks, seconds)
+
+
+# Photographs, disks and terminals that go away.
+
+
+def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
+    whole = trainer(tmp_path / "whole")
+    whole.train()
+    capture, images = tiny_scene()
+    get = images.get
+
+    def gone(index):
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", f"/photos/{index:02}.png")
+
+    at_step(monkeypatch, 40, lambda self: setattr(images, "get", gone))
+    running = trainer(tmp_path / "cut", images=images)
+    with pytest.raises(PhotographError, match=r"/photos/0\d.png'.*put the photograph back.*--resume"):
+        running.train()
+    saved = run.restore(tmp_path / "cut", Ranks()).progress.step
+    assert 40 <= saved <= 44  # some batches were loaded ahead
+    images.get = get
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    resumed = trainer(tmp_path / "cut", resume=True)
+    resumed.train()
+    for name in whole.state.table:
+        assert torch.equal(resumed.state.table[name], whole.state.table[name]), name
+
+
+def fail_saves(monkeypatch, count, also=lambda: None):
+    """Let the next `count` checkpoints meet a full disk."""
+    left = [count]
+    real = checkpoint.write_shard
+
+    def write_shard(*args):
+        if left[0]:
+            left[0] -= 1
+            also()
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(*args)
+
+    monkeypatch.setattr(checkpoint, "write_shard", write_shard)
+
+
+def test_a_full_disk_in_the_middle_is_survived(tmp_path, monkeypatch, capsys):
+    fail_saves(monkeypatch, 1)
+    monkeypatch.setattr(save, "RETRY_SECONDS", 0.0)
+    summary = trainer(tmp_path, "schedule.checkpoint_every=50").train()
+    assert summary is not None
+    shown = capsys.readouterr().out.replace("\n", " ")
+    assert "was not saved" in shown and "Training goes on" in shown
+    assert len(checkpoints(tmp_path)) >= 2  # tried again at the next step, and the last one
+
+
+def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
+    fail_saves(monkeypatch, 2)
+    monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
+    assert trainer(tmp_path).train() is not None
+    shown = capsys.readouterr().out
+    assert shown.count("The model is still in memory: free some space") == 2
+    assert run.restore(tmp_path, Ranks()).progress.step == 100
+
+
+def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):
+    fail_saves(monkeypatch, 9, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
+    with pytest.raises(checkpoint.CheckpointError, match="the disk is full"):
+        trainer(tmp_path).train()
+
+
+def test_a_log_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch):
+    """A disk full for a while: records wait in memory, and TensorBoard gets another writer."""
+
+    class FullBoard:
+        def __init__(self, folder, purge_step=None):
+            Path(folder).mkdir(exist_ok=True)
+
+        def add_scalar(self, *args):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        def close(self):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    import torch.utils.tensorboard
+
+    monkeypatch.setattr(torch.utils.tensorboard, "SummaryWriter", FullBoard)
+    at_step(monkeypatch, 20, lambda self: (tmp_path / "log.jsonl").rename(tmp_path / "aside"))
+    at_step(monkeypatch, 20, lambda self: (tmp_path / "log.jsonl").mkdir())
+    at_step(monkeypatch, 50, lambda self: (tmp_path / "log.jsonl").rmdir())
+    with pytest.warns(UserWarning) as caught:
+        assert trainer(tmp_path, "log.tensorboard=true").train() is not None
+    texts = [str(warning.message) for warning in caught]
+    assert sum("TensorBoard" in text for text in texts) == 1
+    assert sum("log file" in text for text in texts) == 1
+    both = (tmp_path / "aside").read_text() + (tmp_path / "log.jsonl").read_text()
+    times = [record["t"] for record in map(json.loads, both.splitlines()) if "loss" in record]
+    assert times == [20, 40, 60, 80, 100]
+
+
+def test_an_evaluation_that_cannot_be_written_ends_nothing(tmp_path):
+    tmp_path.joinpath("evaluation").write_text("not a folder")
+    with pytest.warns(UserWarning, match="the evaluation could not write a file and goes on"):
+        assert trainer(tmp_path, "schedule.iterations=20").train()["psnr"] > 5
+
+
+def test_a_terminal_that_is_gone_ends_nothing(tmp_path, monkeypatch):
+    class Gone:
+        encoding = "utf-8"
+
+        def write(self, text):
+            raise OSError(errno.EIO, "Input/output error")
+
+        flush = write
+        isatty = staticmethod(lambda: False)
+
+    running = trainer(tmp_path)
+    monkeypatch.setattr(sys, "stdout", Gone())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert running.train() is not None
+
+
+# The folder is looked at before the work begins.
+
+
+def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FolderError, match=r"file/run cannot be written: rank 0 \(.*Not a directory"):
+        check_writable(tmp_path / "file" / "run", Ranks())
+    usage = type("Usage", (), {"free": 1000})
+    monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
+    with pytest.raises(FolderError, match=r"a checkpoint takes .* GB and 0.00 GB are free"):
+        trainer(tmp_path / "run")
+    monkeypatch.undo()
+    table = trainer(tmp_path / "run").state.table
+    with pytest.warns(UserWarning, match="two checkpoints of 9,000,000,000,000 Gaussians take"):
+        check_room(tmp_path, table, Ranks(), 9_000_000_000_000)
+    assert not list(tmp_path.rglob(".probe*"))
+
+
+def _check(ranks, folders):
+    check_writable(Path(folders[ranks.rank]), ranks)
+
+
+def test_every_rank_is_asked(tmp_path):
+    with pytest.raises(RankError) as failure:
+        run_ranks(_check, 2, [str(tmp_path / "a"), "/proc/nothing"])
+    for message in failure.value.messages.values():
+        assert "cannot be written: rank 1 (" in message
+    with pytest.raises(RankError) as failure:
+        run_ranks(_check, 2, [str(tmp_path / "a"), str(tmp_path / "b")])
+    for message in failure.value.messages.values():
+        assert "ranks 1 do not see what rank 0 writes" in message
+
+
+def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
+    from blitzgs.training import folder_checks
+
+    monkeypatch.setattr(folder_checks, "_LOCK_SECONDS", 0.1)
+    write_tiny_capture(tmp_path / "data")
+    out = tmp_path / "run"
+    program = (
+        "import sys, time; from pathlib import Path; from blitzgs.distributed.group import Ranks;"
+        "from blitzgs.training.folder_checks import locked\n"
+        f"with locked(Path({str(out)!r}), Ranks()):\n  print('in', flush=True); time.sleep(60)"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        assert holder.stdout.readline() == "in\n"
+        flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.iterations=2"]
+        command = ["train", "--data", str(tmp_path / "data"), "--out", str(out), *flags]
+        assert main(command) == 1
+        assert f"in use by another run (process {holder.pid} on " in capsys.readouterr().err
+        assert not (out / "log.jsonl").exists() and not (out / "config.yaml").exists()
+    finally:
+        holder.kill()
+        holder.wait()
+    assert main(command) == 0  # a lock does not outlive its process
+    with locked(out, Ranks()):
+        pass
+
+
+# Resuming says what it does, and the log holds every record once.
+
+
+def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypatch):
+    at_step(monkeypatch, 70, lambda self: (_ for _ in ()).throw(RuntimeError("killed")))
+    with pytest.raises(RuntimeError, match="killed"):
+        trainer(tmp_path, "schedule.checkpoint_every=50").train()
+    assert [r["t"] for r in records(tmp_path) if "loss" in r] == [20, 40, 60]
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"t": 61, "lo')  # torn
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    trainer(tmp_path, "schedule.checkpoint_every=50", resume=True).train()
+    trainer(tmp_path, "schedule.checkpoint_every=50", resume=True).train()  # the finished run once more
+    found = records(tmp_path)
+    assert [r["t"] for r in found if "loss" in r] == [20, 40, 60, 80, 100]
+    assert [r["t"] for r in found if r.get("event") == "evaluation"] == [100]
+    assert len({r["run"] for r in found}) == 1
+    origins = [r["origin"] for r in found if r.get("event") == "start"]
+    assert origins == [
+        "new run",
+        "resumed from checkpoint_000000 (the newest) after 51 steps",
+        f"resumed from {checkpoints(tmp_path)[-2]} (the newest) after 100 steps",
+    ]
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["run"] == found[0]["run"]
+
+
+def test_a_resume_of_nothing_says_so(tmp_path, capsys):
+    trainer(tmp_path, "schedule.iterations=2", resume=True).train()
+    assert f"nothing to resume in {tmp_path}: starting anew" in capsys.readouterr().out.replace("\n", "")
