@@ -191,24 +191,17 @@ def _forward(
     waiting: ExitStack,
 ) -> Frame | None:
     """Queue all of it, then wait for the numbers of rows; None: the room was too small, and has learnt."""
-    count, tiles = len(views), (0, -1) if share is None else share.composited
-    projection = _project(table, views, options, active, share, room, waiting)
-    splats, space, n_rows = projection.splats, projection.space, projection.n_rows
-    mark("project")
-    if share is not None and projection.route is not None:
-        splats = send(splats, projection.route, share.ranks)
-    mark("exchange")
-    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
-        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids, count,
-        views.width, views.height, options.tile_size, *tiles, projection.n_isects, n_rows,
-    )  # fmt: skip
-    mark("sort")
+    count, grid = len(views), tile_grid(views, options, share)
+    projection, splats, isect_rows, tile_offsets = list_rows(
+        table, views, options, active, share, room, mark, waiting
+    )
+    space, n_rows = projection.space, projection.n_rows
     backgrounds = _backgrounds(options.background, count, table.device)
     if space is not None:
         space.meet_colors()
     arguments = (
         splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, isect_rows, tile_offsets,
-        count, views.width, views.height, options.tile_size, *tiles,
+        *grid,
     )  # fmt: skip
     if space is None:
         *composited, zeros = torch.ops.blitzgs.rasterize_fwd(
@@ -247,6 +240,37 @@ def _forward(
         aux,
         gradients,
     )
+
+
+def list_rows(
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: ActiveRows | None,
+    share: Share | None,
+    room: RowRoom,
+    mark: Mark,
+    waiting: ExitStack,
+) -> tuple[Projection, Splats, Tensor, Tensor]:
+    """Queue projection, exchange and the tiles' lists of what was brought here: isect_rows, tile_offsets."""
+    projection = _project(table, views, options, active, share, room, waiting)
+    splats = projection.splats
+    mark("project")
+    if share is not None and projection.route is not None:
+        splats = send(splats, projection.route, share.ranks)
+    mark("exchange")
+    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
+        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
+        *tile_grid(views, options, share), projection.n_isects, projection.n_rows,
+    )  # fmt: skip
+    mark("sort")
+    return projection, splats, isect_rows, tile_offsets
+
+
+def tile_grid(views: Views, options: RenderOptions, share: Share | None) -> tuple[int, ...]:
+    """Return the tiles that this rank composites, as the ops take them."""
+    tiles = (0, -1) if share is None else share.composited
+    return (len(views), views.width, views.height, options.tile_size, *tiles)
 
 
 @lru_cache(maxsize=16)

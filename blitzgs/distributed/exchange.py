@@ -32,6 +32,7 @@ from blitzgs.distributed.ownership import TileRanges
 from blitzgs.distributed.rows import PeerSpace, Splats, Traffic
 from blitzgs.ops.route import route_count
 from blitzgs.ops.scatter import (
+    RUN,
     as_column,
     gather_rows,
     scatter_rows,
@@ -167,6 +168,34 @@ def send_back(gradients: Sequence[Tensor], route: Route, ranks: Ranks) -> list[T
         raise RuntimeError("send_back: the route's rows have not been sent")
     sums = sum_rows(returned, route.places, sent, len(route.masks), widths)
     return [part.reshape(-1, *g.shape[1:]) for part, g in zip(sums, gradients, strict=True)]
+
+
+def send_back_sums(sums: Tensor, route: Route, ranks: Ranks) -> Tensor:
+    """Return integer sums over the tiles of each rank to the owners of the rows, and add them up there.
+
+    Integers, so that the total depends on nothing but the rows.
+
+    Args:
+        sums: int64 [R, C], of the rows that arrived here.
+        route: of this rank's rows; they may have travelled either way.
+        ranks: the job.
+
+    Returns:
+        int64 [P, C], of this rank's own rows; zero for rows that touch no tile.
+    """
+    if route.places is None:
+        raise RuntimeError("send_back_sums: the route's rows have not been sent")
+    sent = route.traffic.sent
+    returned = ranks.all_to_all(sums, route.traffic.received, sent)
+    total = sums.new_zeros(len(route.masks), sums.shape[1])
+    lanes = torch.arange(RUN, device=sums.device)
+    for group, runs in zip(returned.split(sent), route.places.unbind(1), strict=True):
+        # A run of rows lies together: its first place, and which of the rows are there (csrc/scatter).
+        here = runs[:, None] >> (32 + lanes) & 1
+        at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
+        rows = here.flatten().nonzero().squeeze(1)
+        total.index_add_(0, rows, group[at.flatten()[rows]])
+    return total
 
 
 def exchange(splats: Splats, ranges: TileRanges, ranks: Ranks, half: bool = False) -> tuple[Splats, Route]:

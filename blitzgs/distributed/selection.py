@@ -22,6 +22,9 @@ _KEY_DIGITS = (11, 11, 10)
 _SCORE_DIGITS = (11, 10, 10)
 _ID_DIGITS = (13, 13, 13, 12, 12)
 _MANTISSA_BITS = 23
+# An integer weight as a key: its exponent, then all the bits behind the leading one.
+_WEIGHT_BITS = 56
+_WEIGHT_DIGITS = (12, 13, 13, 12, 12)
 
 
 def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor:
@@ -121,6 +124,69 @@ def mass_prefix(
     )
 
 
+def integer_mass_prefix(
+    weights: Tensor, ids: Tensor, fraction: float, ranks: Ranks, segments: Tensor, n_segments: int
+) -> Tensor:
+    """`mass_prefix` of integers, by descending weight, without the host: for the views of a sweep.
+
+    Args:
+        weights: int64 [N_rank], in [0, 2^57); a segment's sum must be below 2^62.
+        ids: int64 [N_rank], >= 0, unique over all ranks within a segment.
+        fraction: share of the total of all ranks, in [0, 1]; its decimal value counts, of at most 9 places.
+        ranks: the job.
+        segments: int64 [N_rank] in [0, n_segments).
+        n_segments: number of sets.
+
+    Returns:
+        bool [N_rank]; the same ids at every world size. The sums are exact. A set whose total is zero selects
+        nothing.
+
+    Raises:
+        ValueError: on every rank, when a weight of any rank is out of range, or for a fraction outside [0, 1]
+            or with more places.
+    """
+    share = Fraction(repr(float(fraction)))
+    if not 0 <= share <= 1 or share.denominator > 10**9:
+        raise ValueError(
+            f"integer_mass_prefix: fraction must be in [0, 1] with at most 9 decimals, got {fraction}"
+        )
+    totals = weights.new_zeros(n_segments + 1)
+    totals.index_add_(0, segments, weights)
+    totals[-1] = ((weights < 0) | (weights >> (_WEIGHT_BITS + 1) > 0)).sum()
+    ranks.all_reduce(totals)
+    if n_invalid := int(totals[-1]):
+        raise ValueError(f"integer_mass_prefix: {n_invalid} weights are negative or not below 2^57")
+    totals = totals[:-1]
+    # ceil(share total), without the product, which might overflow.
+    rest, of = share.denominator - share.numerator, share.denominator
+    missing = totals - totals // of * rest - totals % of * rest // of
+    keys = _descending_keys(weights)
+    threshold, left = _kth(keys, _WEIGHT_DIGITS, missing, segments, ranks, weights)
+    # Of the rows equal to the threshold, as many as make up for what is missing.
+    each = _weight_of_key(threshold)
+    return _with_ties(keys, ids, threshold, (left + each - 1) // each.clamp(min=1), segments, ranks)
+
+
+def _descending_keys(weights: Tensor) -> Tensor:
+    """Map int64 in [0, 2^57) to int64 in [0, 2^62) in reverse order; a key's first digits have few values."""
+    exponent = weights.double().log2().clamp(min=-1).floor().long()
+    # The rounded logarithm may be one too large, or one too small.
+    exponent -= (weights < (1 << exponent.clamp(min=0))).long()
+    exponent += (weights >> (exponent + 1).clamp(min=0) > 0).long() * (weights > 0)
+    mantissa = (weights << (_WEIGHT_BITS - exponent.clamp(min=0))) & ((1 << _WEIGHT_BITS) - 1)
+    ascending = torch.where(weights > 0, (exponent + 1 << _WEIGHT_BITS) | mantissa, 0)
+    return (1 << (_WEIGHT_BITS + 6)) - 1 - ascending
+
+
+def _weight_of_key(keys: Tensor) -> Tensor:
+    """Invert `_descending_keys`; -1, no key, gives 0."""
+    ascending = (1 << (_WEIGHT_BITS + 6)) - 1 - keys.clamp(min=0)
+    exponent = (ascending >> _WEIGHT_BITS) - 1
+    mantissa = (ascending & ((1 << _WEIGHT_BITS) - 1)) | (1 << _WEIGHT_BITS)
+    weight = mantissa >> (_WEIGHT_BITS - exponent.clamp(min=0))
+    return torch.where((keys >= 0) & (exponent >= 0), weight, 0)
+
+
 def _ordered_bits(keys: Tensor) -> Tensor:
     """Map float32 to int64 in [0, 2^32) with the same order; -0 equals 0."""
     bits = (keys + 0.0).view(torch.int32)
@@ -128,9 +194,14 @@ def _ordered_bits(keys: Tensor) -> Tensor:
 
 
 def _kth(
-    keys: Tensor, digits: tuple[int, ...], k: Tensor, segments: Tensor, ranks: Ranks
+    keys: Tensor,
+    digits: tuple[int, ...],
+    k: Tensor,
+    segments: Tensor,
+    ranks: Ranks,
+    weights: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Find the k-th smallest key of each segment.
+    """Find the k-th smallest key of each segment, where a row counts as often as its weight says.
 
     Args:
         keys: int64 [N_rank] >= 0, below 2^sum(digits).
@@ -138,14 +209,15 @@ def _kth(
         k: int64 [S], 1-based and at most the segment's size; 0 gives the threshold -1.
         segments: int64 [N_rank].
         ranks: the job.
+        weights: int64 [N_rank]; None: each row counts once.
 
     Returns:
-        threshold [S], and left [S]: how many of the rows equal to it belong to the k smallest.
+        threshold [S], and left [S]: what the rows equal to it have to contribute to the k.
     """
     left, prefix, shift = k.clone(), torch.zeros_like(k), sum(digits)
     for width in digits:
         shift -= width
-        counts = _histogram(keys, prefix, shift, width, segments, None, ranks)
+        counts = _histogram(keys, prefix, shift, width, segments, weights, ranks)
         ends = counts.cumsum(1)
         chosen = (ends < left[:, None]).sum(1).clamp(max=counts.shape[1] - 1)
         left = left - (ends - counts).gather(1, chosen[:, None]).squeeze(1)

@@ -120,7 +120,7 @@ def scores(units: Tensor, pixels: Tensor, visible: Tensor, ids: Tensor, eps: flo
     c_vis = torch.tensor(
         [top_mass(view, ids.tolist(), Fraction(99, 100)) for view in units.tolist()], dtype=torch.bool
     )
-    density = units.double() / 2.0**32 / (pixels + eps)
+    density = units.double() / 2.0**32 / (pixels.double() + eps)
     c_rad = visible.sum(0)
     score = torch.where(pixels > 0, density, torch.zeros_like(density)).sum(0)
-    return Scores(score, c_vis.sum(0) / (c_rad + phi_eps), c_rad, c_vis)
+    return Scores(score, c_vis.sum(0).double() / (c_rad.double() + phi_eps), c_rad, c_vis)

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The importance pass: one sweep over all training views that scores every Gaussian (paper §3.2).
+
+For view v and Gaussian i, w is the sum of alpha T over the pixels at which the renderer composites i, a is
+their number, c_rad tells whether i is visible, and c_vis whether it is in the smallest set, by descending w
+(ties by id), that holds 99 % of the view's total. Then::
+
+    score_i = sum over v with a > 0 of w / (a + SCORE_EPS)
+    phi_i   = (number of v with c_vis) / (number of v with c_rad + PHI_EPS)
+    cull_iv = not c_vis
+
+The views see the Gaussians of all ranks. All sums are integers, so every result has the same bits at any
+world size and for any division of the work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.selection import integer_mass_prefix
+from blitzgs.model import GaussianTable
+from blitzgs.ops.importance import UNITS
+from blitzgs.ops.project import RowRoom
+from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.survey import Survey, survey
+
+SCORE_EPS = 1e-6
+PHI_EPS = 0.1
+VIEW_MASS = 0.99
+# Columns of a table from the first pass on.
+PHI, CULL = "phi", "cull"
+_WORD = 32
+# A density w / (a + eps) < 1 counts in units of 2^-44, so that 2^19 views can be added up.
+_DENSITY_BITS = 44
+
+
+@dataclass(frozen=True)
+class ViewBatch:
+    """Views of one image size that are surveyed together.
+
+    Attributes:
+        columns: of the cull matrix, one for each view, ascending.
+        views: the same views.
+    """
+
+    columns: Sequence[int]
+    views: Views
+
+
+@dataclass(frozen=True)
+class Importance:
+    """What a sweep found of this rank's N Gaussians.
+
+    Attributes:
+        score: float32 [N], contribution per pixel, summed over the views.
+        phi: float32 [N], share of the views that see a Gaussian in which it counts, in [0, 1).
+        cull: int32 [N, ceil(V / 32)]; bit v % 32 of word v / 32 is set where the Gaussian does not count in
+            view v. Bits from V on are zero.
+    """
+
+    score: Tensor
+    phi: Tensor
+    cull: Tensor
+
+    def store(self, table: GaussianTable) -> None:
+        """Make phi and cull columns of the table, which then move with its rows."""
+        table[PHI] = self.phi
+        table[CULL] = self.cull
+
+
+def sweep(
+    table: GaussianTable,
+    batches: Iterable[ViewBatch],
+    n_views: int,
+    options: RenderOptions,
+    ranks: Ranks,
+    owners: TileOwners | None = None,
+) -> Importance:
+    """Score the Gaussians by what they contribute to V views. Collective: every rank calls it.
+
+    Args:
+        table: this rank's Gaussians, caught up.
+        batches: the views, each once, in the same batches on every rank.
+        n_views: V, columns of the cull matrix.
+        options: how the views are rendered.
+        ranks: the job.
+        owners: knows what tiles cost, to divide them well; the result does not depend on it.
+    """
+    sums = _Sums(len(table), n_views, table.device)
+    owners = owners or TileOwners(ranks)
+    room = RowRoom()
+    for batch in batches:
+        share = _share(batch, options, owners)
+        sums.add(survey(table, batch.views, options, share, room), batch.columns, table["id"], ranks)
+    return sums.result()
+
+
+def is_culled(cull: Tensor, column: int) -> Tensor:
+    """Return the column of a view, bool [N], of the packed matrix, int32 [N, words]."""
+    return (cull[:, column // _WORD] >> (column % _WORD) & 1).bool()
+
+
+def _share(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Share | None:
+    """Divide the tiles of a batch among the ranks; no loss looks beyond their borders."""
+    if owners.ranks.world_size == 1:
+        return None
+    views = batch.views
+    ranges = owners.divide(list(batch.columns), views.width, views.height, options.tile_size)
+    return Share(owners.ranks, ranges)
+
+
+class _Sums:
+    """What the views surveyed so far add up to, for N Gaussians."""
+
+    def __init__(self, count: int, n_views: int, device: torch.device) -> None:
+        self._density = torch.zeros(count, dtype=torch.int64, device=device)
+        self._seen = torch.zeros(count, dtype=torch.int32, device=device)
+        self._counted = torch.zeros(count, dtype=torch.int32, device=device)
+        self._cull = _all_culled(n_views, device).repeat(count, 1)
+
+    def add(self, found: Survey, columns: Sequence[int], ids: Tensor, ranks: Ranks) -> None:
+        """Add the rows of a batch of views."""
+        rows, weights = found.rows, found.weights
+        gaussians, views = rows.gaussian_ids.long(), rows.camera_ids.long()
+        density = weights.double() / UNITS / (found.pixels.double() + SCORE_EPS)
+        self._density.index_add_(0, gaussians, (density * 2.0**_DENSITY_BITS).round().long())
+        self._seen.index_add_(0, gaussians, (rows.radii > 0).any(1).int())
+        counts = integer_mass_prefix(weights, ids[gaussians], VIEW_MASS, ranks, views, len(columns))
+        self._counted.index_add_(0, gaussians, counts.int())
+        column = torch.tensor(columns, device=views.device)[views]
+        # The bits are set, each is cleared once: a difference. Words wrap as bits do.
+        bit = (torch.ones_like(column) << column % _WORD).int()
+        words = self._cull.shape[1]
+        self._cull.view(-1).index_add_(0, gaussians * words + column // _WORD, -bit * counts)
+
+    def result(self) -> Importance:
+        phi = self._counted.double() / (self._seen.double() + PHI_EPS)
+        score = self._density.double() * 2.0**-_DENSITY_BITS
+        return Importance(score.float(), phi.float(), self._cull)
+
+
+def _all_culled(n_views: int, device: torch.device) -> Tensor:
+    """Return the row of a Gaussian that counts in no view, int32 [1, words]."""
+    bits = torch.arange(-(-n_views // _WORD) * _WORD, device=device)
+    words = ((bits < n_views).long() << bits % _WORD).view(1, -1, _WORD).sum(2)
+    return words.where(words < 1 << 31, words - (1 << 32)).int()

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two pruning passes of the paper (§3.2): which Gaussians stay, the same at every world size."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.selection import mass_prefix, sampling_keys, smallest
+
+
+def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:
+    """Draw the Gaussians that pass 1 keeps: without replacement, with probability proportional to score.
+
+    The floor(keep N) smallest of -log(u) / score stay (exponential races, Efraimidis and Spirakis 2006),
+    where u depends on (seed, event, id) alone. A score of zero is kept only when all positive ones are.
+
+    Args:
+        score: float32 [N_rank], >= 0.
+        ids: int64 [N_rank], persistent.
+        keep: share of all ranks' N Gaussians, in [0, 1]; its decimal value counts.
+        seed: of the run.
+        event: number that differs between draws, such as the time of the pass.
+        ranks: the job; every rank calls this.
+
+    Returns:
+        bool [N_rank], the same ids at every world size.
+    """
+    total = ranks.all_reduce(torch.tensor(len(score), device=score.device))
+    count = math.floor(Fraction(repr(float(keep))) * int(total))
+    return smallest(sampling_keys(score, ids, seed, event), ids, count, ranks)
+
+
+def top_by_score(score: Tensor, ids: Tensor, mass: float, ranks: Ranks) -> Tensor:
+    """Choose the Gaussians whose scores pass 2 keeps: the smallest prefix, descending, that holds the mass.
+
+    Args:
+        score: float32 [N_rank], finite, >= 0.
+        ids: int64 [N_rank], persistent; they decide between equal scores.
+        mass: share of the total score of all ranks, in [0, 1].
+        ranks: the job; every rank calls this.
+
+    Returns:
+        bool [N_rank], the same ids at every world size.
+    """
+    return mass_prefix(score, ids, mass, ranks)

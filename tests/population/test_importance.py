@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sweep against brute force, and its bits over world sizes; the passes' draws against theory."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.distributed.selection import integer_mass_prefix
+from blitzgs.model import GaussianTable
+from blitzgs.ops.importance import contributions
+from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.population.importance import PHI_EPS, SCORE_EPS, ViewBatch, is_culled, sweep
+from blitzgs.population.pruning import sample_by_score, top_by_score
+from blitzgs.reference.importance import scores as by_definition
+from blitzgs.reference.importance import top_mass
+from blitzgs.survey import survey
+from tests.distributed.rank_harness import on_cuda, on_each_device, run_ranks
+from tests.helpers import DEVICES
+from tests.training.tiny import look_at_origin, random_gaussians
+
+ALONE = Ranks()
+OPTIONS = RenderOptions(sh_degree=0, near_plane=0.05, far_plane=100.0)
+N_VIEWS = 37  # two words of the cull matrix
+
+
+def cameras(count, device, width=64, height=48):
+    poses = [look_at_origin(np.array([3 * np.cos(a), 3 * np.sin(a), 1.5])) for a in np.linspace(0, 5, count)]
+    K = torch.tensor([[60.0, 0, 0.48 * width], [0, 61.0, 0.53 * height], [0, 0, 1]])
+    viewmats = torch.from_numpy(np.stack(poses)).float()
+    return Views(viewmats.to(device), K.repeat(count, 1, 1).to(device), width, height)
+
+
+def view_batches(device):
+    """37 views in batches of several lengths; every third is of another size."""
+    views, wide = cameras(N_VIEWS, device), cameras(N_VIEWS, device, 80, 40)
+    groups = [[i for i in range(N_VIEWS) if i % 3], [i for i in range(N_VIEWS) if i % 3 == 0]]
+    batches = []
+    for source, columns in zip((views, wide), groups, strict=True):
+        for begin in range(0, len(columns), 5):
+            some = columns[begin : begin + 5]
+            picked = Views(source.viewmats[some], source.Ks[some], source.width, source.height)
+            batches.append(ViewBatch(some, picked))
+    return batches
+
+
+def population(ranks, layout=(0,)):
+    """This rank's Gaussians: with some far outside, equal ones, faint ones, and ids in no order."""
+    table = random_gaussians(500)
+    table["means"][:20] += 50.0
+    table["means"][100:160] = table["means"][40:100]
+    table["scales"][100:160] = table["scales"][40:100]
+    table["opacities"][200:230] = -6.0
+    table["id"].copy_((table["id"] * 7919 + 5) % 100003)
+    mine = torch.tensor(layout)[torch.arange(len(table)) % len(layout)] == ranks.rank
+    table.keep(mine)
+    return GaussianTable({name: table[name].to(ranks.device) for name in table})
+
+
+def dense_survey(table):
+    """Units, pixels and visibility [V, N] of the views one by one."""
+    units = torch.zeros(N_VIEWS, len(table), dtype=torch.int64)
+    pixels, visible = torch.zeros_like(units), torch.zeros_like(units, dtype=torch.bool)
+    for batch in view_batches(table.device):
+        for k, column in enumerate(batch.columns):
+            one = slice(k, k + 1)
+            views = Views(
+                batch.views.viewmats[one], batch.views.Ks[one], batch.views.width, batch.views.height
+            )
+            found = survey(table, views, OPTIONS)
+            rows = found.rows.gaussian_ids.long().cpu()
+            units[column, rows], pixels[column, rows] = found.weights.cpu(), found.pixels.long().cpu()
+            visible[column, rows] = True
+    return units, pixels, visible
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_sweep_is_the_definition(device):
+    ranks = Ranks(device=torch.device(device))
+    table = population(ranks)
+    found = sweep(table, view_batches(device), N_VIEWS, OPTIONS, ranks)
+    expected = by_definition(*dense_survey(table), table["id"].cpu(), SCORE_EPS, PHI_EPS)
+    assert torch.allclose(found.score.cpu().double(), expected.score, rtol=1e-6, atol=1e-9)
+    assert torch.allclose(found.phi.cpu().double(), expected.phi, rtol=1e-6, atol=0)
+    culled = torch.stack([is_culled(found.cull, v) for v in range(N_VIEWS)]).cpu()
+    assert torch.equal(culled, ~expected.c_vis)
+    assert found.cull.shape == (500, 2) and not (found.cull[:, 1] >> 5).any()  # nothing from V on
+    assert 0.02 < culled.double().mean() < 0.98 and 0 == found.phi.min() < 0.5 < found.phi.max() < 1
+    assert not found.score[:20].any() and found.score[300:].min() > 0
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_survey_is_what_contributions_says(device):
+    """Up to the rounding of the activations; equal depths go by id here and by row there."""
+    table = population(Ranks(device=torch.device(device)))
+    table.permute(table["id"].argsort())
+    units, pixels, visible = dense_survey(table)
+    for batch in view_batches(device):
+        weights, counts, seen = contributions(
+            table["means"], table["quats"], table["scales"].exp(), table["opacities"].sigmoid(),
+            batch.views.viewmats, batch.views.Ks, batch.views.width, batch.views.height,
+            near_plane=OPTIONS.near_plane, far_plane=OPTIONS.far_plane,
+        )  # fmt: skip
+        for k, column in enumerate(batch.columns):
+            assert torch.equal(seen[k].cpu(), visible[column])
+            assert (counts[k].cpu() - pixels[column]).abs().max() <= 2
+            difference = weights[k].cpu() - units[column] / 2.0**32
+            assert difference.abs().max() <= 1e-5 * counts[k].max() + 0.02
+
+
+def layouts(world_size):
+    return {1: [0], 2: [0, 0, 0, 1], 3: [0, 2, 2], 4: [0, 3, 1, 0, 0, 3]}[world_size]
+
+
+def _sweep(ranks):
+    torch.set_num_threads(1)
+    table = population(ranks, layouts(ranks.world_size))
+    owners = TileOwners(ranks)
+    found = sweep(table, view_batches(ranks.device), N_VIEWS, OPTIONS, ranks, owners)
+    again = sweep(table, view_batches(ranks.device)[::-1], N_VIEWS, OPTIONS, ranks)
+    assert all(torch.equal(getattr(found, n), getattr(again, n)) for n in ("score", "phi", "cull"))
+    ids = table["id"]
+    kept = [
+        ids[sample_by_score(found.score, ids, 0.7, 3, 16000, ranks)],
+        ids[top_by_score(found.score, ids, 0.99, ranks)],
+    ]
+    return [t.cpu() for t in (ids, found.score, found.phi, found.cull, *kept)]
+
+
+@pytest.mark.parametrize("transport", ["auto", "collective"])
+@pytest.mark.parametrize(("world_size", "device"), [*on_each_device(2, 4), *on_cuda(3)])
+def test_the_same_bytes_at_every_world_size(world_size, device, transport):
+    if device == "cpu" and transport == "auto":
+        pytest.skip("ranks on CPUs share no memory")
+    ids, *expected = _sweep(Ranks(device=torch.device(device)))
+    answers = run_ranks(_sweep, world_size, device=device, transport=transport)
+    joined = [torch.cat(parts) for parts in zip(*answers, strict=True)]
+    order, reference = joined[0].argsort(), ids.argsort()
+    for got, want in zip(joined[1:4], expected[:3], strict=True):
+        assert torch.equal(got[order], want[reference])
+    for got, want in zip(joined[4:], expected[3:], strict=True):
+        assert torch.equal(got.sort().values, want.sort().values)
+    assert len(joined[4]) == 350 and 100 < len(joined[5]) < 480
+
+
+def test_pass_1_draws_in_proportion():
+    """The first draw has probability s / sum(s): chi-square over 4000 events."""
+    score = torch.tensor([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 0.0, 0.05])
+    ids = torch.tensor([5, 900, 3, 77, 12, 40, 8, 1 << 61])
+    draws = 4000
+    hits = torch.zeros(len(ids))
+    pairs = torch.zeros(len(ids))
+    for event in range(draws):
+        hits += sample_by_score(score, ids, 0.125, 11, event, ALONE)
+        pairs += sample_by_score(score, ids, 0.25, 11, event, ALONE)
+    p = (score / score.sum()).double()
+    expected = draws * p
+    positive = score > 0
+    assert hits.sum() == draws and hits[6] == 0
+    chi2 = ((hits - expected) ** 2 / expected)[positive].sum()
+    assert chi2 < 22.5  # 6 degrees of freedom, p = 0.001
+    # Drawn first, or second behind another.
+    others = p[:, None] * p / (1 - p)[:, None]
+    inclusion = p + others.sum(0) - others.diagonal()
+    deviation = (pairs - draws * inclusion) / (draws * inclusion * (1 - inclusion)).sqrt()
+    assert deviation[positive].abs().max() < 4 and pairs[6] == 0
+
+
+def test_pass_1_keeps_the_floor_and_zeros_last():
+    ids = torch.arange(10)
+    score = torch.zeros(10)
+    score[:4] = 1e-12
+    for keep, count in ((0.7, 7), (0.3, 3), (0.29, 2), (0.0, 0), (1.0, 10)):
+        kept = sample_by_score(score, ids, keep, 0, 1, ALONE)
+        assert kept.sum() == count
+        assert kept[:4].all() or not kept[4:].any()
+
+
+def test_pass_2_against_numpy():
+    g = torch.Generator().manual_seed(0)
+    score = (torch.randn(2000, generator=g) * 3).exp()
+    score[::7] = score[1::7][: len(score[::7])]  # ties
+    ids = torch.randperm(2000, generator=g)
+    kept = top_by_score(score, ids, 0.99, ALONE)
+    order = np.lexsort((ids.numpy(), -score.numpy()))
+    sums = score.numpy()[order].astype(np.longdouble).cumsum()
+    count = int(np.searchsorted(sums, np.longdouble("0.99") * sums[-1])) + 1
+    assert set(kept.nonzero().squeeze(1).tolist()) == set(order[:count].tolist())
+    assert 20 < count < 1900
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.5, 0.99, 1.0])
+def test_integer_cut_against_python(fraction):
+    g = torch.Generator().manual_seed(1)
+    weights = torch.cat(
+        [
+            torch.randint(0, 1 << 57, (300,), generator=g) >> torch.randint(0, 57, (300,), generator=g),
+            torch.tensor([(1 << 57) - 1, (1 << 53) + 1, 1 << 53, (1 << 53) - 1] * 3),
+            torch.full((50,), 1 << 40),
+            torch.zeros(20, dtype=torch.int64),
+        ]
+    )
+    ids = torch.randperm(len(weights), generator=g)
+    segments = torch.randint(0, 4, (len(weights),), generator=g)
+    segments[segments == 2] = 3  # segment 2 is empty
+    weights[segments == 1] = 0
+    chosen = integer_mass_prefix(weights, ids, fraction, ALONE, segments, 4)
+    for segment in (0, 1, 3):
+        here = segments == segment
+        expected = top_mass(weights[here].tolist(), ids[here].tolist(), Fraction(str(fraction)))
+        assert chosen[here].tolist() == expected
+    assert chosen.any() == (fraction > 0)
+
+
+def test_integer_cut_names_what_is_wrong():
+    one = torch.tensor([1 << 57])
+    with pytest.raises(ValueError, match="1 weights are negative or not below 2"):
+        integer_mass_prefix(one, one, 0.5, ALONE, torch.zeros(1, dtype=torch.int64), 1)
+    with pytest.raises(ValueError, match="at most 9 decimals, got 0.1234567890123"):
+        integer_mass_prefix(one, one, 0.1234567890123, ALONE, torch.zeros(1, dtype=torch.int64), 1)
