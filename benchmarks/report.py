@@ -57,7 +57,14 @@ COMMANDS = {
     "training": "python benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000",
     "photometric": "python benchmarks/bm_photometric.py",
     "accuracy": "python benchmarks/bm_accuracy.py",
+    "quality": (
+        "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
+        "--recipe aerial=configs/aerial.yaml --recipe gsplat=gsplat-default --seeds 0 1 2"
+    ),
 }
+# bm_quality.py takes no --json: it collects all of its runs in one file.
+COPIED = {"quality": "cp runs/quality/quality.json benchmarks/results/"}
+QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -186,6 +193,18 @@ def accuracy_lines(accuracy: Json) -> list[str]:
     return table(["option", "ms a view", "image error", "gradient error", "cut pixels"], rows)
 
 
+def quality_lines(quality: Json) -> list[str]:
+    """Held-out quality and training time at the end of each recipe, by capture."""
+    import quality_report  # needs the package, which the other tables do not
+
+    rows = []
+    done = [run for run in quality["runs"] if run["status"] == "done"]
+    for (capture, label), group in quality_report.grouped(done).items():
+        last = quality_report.table_rows(label, group)[-1]
+        rows.append([capture, *(last[column] for column in QUALITY_COLUMNS)])
+    return table(["capture", *QUALITY_COLUMNS], rows)
+
+
 def summary_lines(render: Json, step_1: Json, step_4: Json, exchange: Json) -> list[str]:
     """The README's table: one line for each kind of work."""
     rows = []
@@ -228,8 +247,19 @@ SECTIONS = {
     "training": Section(("training",), row_lines),
     "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
+    "quality": Section(("quality",), quality_lines),
     "summary": Section(("render", "step_1", "step_4", "exchange"), summary_lines),
 }
+
+
+def with_origin(name: str, file: Json) -> Json:
+    """Return a file with "command", "commit" and "environment", which collected runs have one by one."""
+    if "runs" not in file:
+        return file
+    done = [run for run in file["runs"] if run["status"] == "done"]
+    commits = " and ".join(sorted({run["commit"] for run in done})) or "unknown"
+    environment = done[0]["environment"] if done else {}
+    return {"command": COMMANDS[name], "commit": commits, "environment": environment} | file
 
 
 def load_results(folder: Path = RESULTS) -> Results:
@@ -242,7 +272,7 @@ def load_results(folder: Path = RESULTS) -> Results:
     for path in sorted(folder.glob("*.json")):
         if path.stem not in COMMANDS:
             raise ReportError(f"{path}: no table is made of it; known names: {', '.join(COMMANDS)}")
-        results[path.stem] = json.loads(path.read_text())
+        results[path.stem] = with_origin(path.stem, json.loads(path.read_text()))
         commit = results[path.stem].get("commit", "unknown")
         if commit == "unknown" or commit.endswith("+changes"):
             raise ReportError(
@@ -270,7 +300,15 @@ def section_lines(name: str, results: Results) -> list[str]:
     section = SECTIONS[name]
     missing = [file for file in section.files if file not in results]
     if missing:
-        commands = [f"{COMMANDS[file]} --json benchmarks/results/{file}.json" for file in missing]
+        commands = [
+            line
+            for file in missing
+            for line in (
+                [COMMANDS[file], COPIED[file]]
+                if file in COPIED
+                else [f"{COMMANDS[file]} --json benchmarks/results/{file}.json"]
+            )
+        ]
         return ["Not measured on the current code yet. The commands that measure it:", "",
                 *(f"    {command}" for command in commands)]  # fmt: skip
     files = [results[file] for file in section.files]

@@ -73,6 +73,36 @@ def results(tmp_path):
     return tmp_path
 
 
+def quality_run(seed, psnr):
+    measured = {"psnr": psnr, "ssim": 0.9, "psnr_corrected": psnr}
+    about = {
+        "capture": "park",
+        "recipe": "aerial",
+        "settings": "1",
+        "seed": seed,
+        "status": "done",
+        "commit": "abc",
+    }
+    end = {"images": 100, "seconds": 20.0, "gaussians": 2_000_000, "test": measured, "train": measured}
+    size = {"peak_gaussians": 3_000_000, "peak_memory_bytes": 4_000_000_000, "images": 100}
+    environment = {"processor": "P", "torch": "2.11", "device": "GPU", "cuda": "13"}
+    return about | size | {"name": f"park.aerial.{seed}", "evaluations": [end], "environment": environment}
+
+
+def test_quality_comes_from_its_collected_runs(results):
+    runs = [quality_run(0, 30.0), quality_run(1, 29.0), quality_run(2, 31.0)]
+    (results / "quality.json").write_text(json.dumps({"runs": runs}))
+    page = made(results, "quality")
+    assert (
+        "| park | aerial | 100 | 3 | 30.00 (29.00) | 0.9000 (0.9000) | 20.0 (20.0) | 2.000 M (2.000 M) |"
+        in page
+    )
+    runs[1]["commit"] = "def"
+    (results / "quality.json").write_text(json.dumps({"runs": runs}))
+    with pytest.raises(report.ReportError, match="is of commit abc and def"):
+        report.load_results(results)
+
+
 def made(folder, name):
     return report.render_page(PAGE.format(name), report.load_results(folder))
 

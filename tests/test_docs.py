@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""README and docs name only files, links, modules, configuration fields and commands that exist."""
+
+import importlib
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from blitzgs import cli
+from blitzgs.training.config import Config
+from blitzgs.training.config_io import load_config, to_dict
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
+FOLDERS = ("benchmarks", "blitzgs", "cmake", "configs", "csrc", "docs", "examples", "tests")
+# benchmarks/results is there only when something was measured.
+MADE_LATER = ("benchmarks/results/",)
+SHELL = ("sh", "bash")
+
+
+@cache
+def text_of(page):
+    return page.read_text()
+
+
+@cache
+def prose(page):
+    """The page without its code blocks."""
+    kept = FENCED.sub("", text_of(page))
+    return "\n".join(line for line in kept.split("\n") if not line.startswith("    "))
+
+
+def inline_code(page):
+    return re.findall(r"`([^`\n]+)`", prose(page))
+
+
+def code_blocks(page, languages):
+    return [body for _, language, body in FENCED.findall(text_of(page)) if language in languages]
+
+
+def anchors(page):
+    heads = re.findall(r"^#+ (.+)$", FENCED.sub("", text_of(page)), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links_lead_somewhere(name):
+    page = ROOT / name
+    for link in re.findall(r"\]\(([^)\s]+)\)", FENCED.sub("", text_of(page))):
+        if re.match(r"\w+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), f"{name} links to {link}, which does not exist"
+        assert target.is_relative_to(ROOT), f"{name} links to {link}, outside the repository"
+        if anchor:
+            assert anchor in anchors(target), f"{name} links to {link}; {path or name} has {anchors(target)}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_files_exist(name):
+    for code in inline_code(ROOT / name):
+        for word in code.split():
+            path = word.strip(',;:()"')
+            if not re.match(rf"({'|'.join(FOLDERS)})/", path) or path.startswith(MADE_LATER):
+                continue
+            pattern = re.sub(r"<\w+>", "*", path.rstrip("/"))
+            assert any(ROOT.glob(pattern)), f"{name} names {path}, which does not exist"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_modules_and_their_members_exist(name):
+    for code in inline_code(ROOT / name):
+        if not (match := re.match(r"(blitzgs(?:\.\w+)+)(\(|$)", code)):
+            continue
+        parts = match[1].split(".")
+        found = importlib.import_module(parts[0])
+        for i, part in enumerate(parts[1:], start=2):
+            try:
+                found = importlib.import_module(".".join(parts[:i]))
+            except ModuleNotFoundError:
+                assert hasattr(found, part), f"{name} names {match[1]}, but {found} has no {part}"
+                found = getattr(found, part)
+
+
+@cache
+def fields():
+    sections = to_dict(Config())
+    return {
+        f"{section}.{field}"
+        for section, value in sections.items()
+        if isinstance(value, dict)
+        for field in value
+    }
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_configuration_fields_exist(name):
+    sections = {field.split(".")[0] for field in fields()}
+    for code in inline_code(ROOT / name):
+        match = re.match(r"(?:--)?(?!\w+\.jsonl)(\w+\.\w+)(=|$)", code)
+        if match and match[1].split(".")[0] in sections:
+            assert match[1] in fields(), f"{name} names the field {match[1]}, which does not exist"
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.name)
+def test_configurations_parse(path):
+    load_config(path, [])
+
+
+def commands(page):
+    """Yield the command lines of a page: of its shell blocks, its indented blocks and its inline code."""
+    lines = [line for block in code_blocks(page, SHELL) for line in block.replace("\\\n", " ").split("\n")]
+    lines += re.findall(r"^    (\S.*)$", FENCED.sub("", text_of(page)), re.MULTILINE)
+    lines += inline_code(page)
+    for line in lines:
+        words = shlex.split(line, comments=True) if line.count("'") % 2 == 0 else line.split()
+        while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):  # variables for the command alone
+            del words[0]
+        if words and words[0] in ("blitzgs", "python", "torchrun", "make"):
+            yield words
+
+
+def check_blitzgs(words, folder, monkeypatch, capsys):
+    """Check a command by running it where there is no capture and no run: only its usage can be wrong."""
+    monkeypatch.chdir(folder)
+    (folder / "taken").write_text("")
+    words = [str(ROOT / word) if word.startswith("configs/") else word for word in words]
+    if words[0] == "train":
+        if "--resume" in words and "--config" not in words:
+            return
+        words.append("--show-config")
+    if words[0] == "synth":
+        words[1] = "taken"
+    status = cli.main(words)
+    error = capsys.readouterr().err
+    assert status == (0 if words[0] == "train" else 1), f"{shlex.join(words)}: {error}"
+
+
+def check_script(words):
+    script = ROOT / words[0]
+    assert script.is_file(), f"{words[0]} does not exist"
+    source = script.read_text() + (ROOT / "benchmarks" / "harness.py").read_text()
+    for word in words[1:]:
+        flag = word.split("=")[0]
+        if word.startswith("--") and "." not in flag:
+            assert f'"{flag}"' in source, f"{words[0]} has no flag {flag}"
+
+
+def check_make(words):
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for word in words:
+        if "=" not in word and not word.startswith("-"):
+            assert word in targets, f"make {word}: no such target"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_commands_are_used_rightly(name, tmp_path, monkeypatch, capsys):
+    for words in commands(ROOT / name):
+        program, *rest = words
+        if program == "torchrun":
+            while rest and rest[0].startswith("--") and rest[0] != "-m":
+                del rest[0]
+            program = "python"
+        if program == "python" and rest[:2] == ["-m", "blitzgs"]:
+            program, rest = "blitzgs", rest[2:]
+        if program == "python" and rest[:1] == ["train.py"]:
+            program, rest = "blitzgs", ["train", *rest[1:]]
+        # "..." and "COMMAND" stand for what the reader fills in.
+        if not rest or any("..." in word or "COMMAND" in word or "|" in word for word in rest):
+            continue
+        if program == "make":
+            check_make(rest)
+        elif program == "blitzgs":
+            if len(rest) > 1:
+                check_blitzgs(rest, tmp_path, monkeypatch, capsys)
+        elif rest[0].endswith(".py"):
+            check_script(rest)
+
+
+def test_the_python_example_of_the_readme_runs(tmp_path, monkeypatch):
+    import torch
+
+    from blitzgs.scene.ply import write_ply
+
+    example = next(block for block in code_blocks(ROOT / "README.md", ["python"]) if "read_ply" in block)
+    g = torch.Generator().manual_seed(0)
+    n = 50
+    write_ply(
+        tmp_path / "city.ply",
+        means=(40 * torch.randn(n, 3, generator=g)).double(),
+        quats=torch.randn(n, 4, generator=g),
+        scales=torch.full((n, 3), 1.0),
+        opacities=torch.full((n,), 3.0),
+        sh=torch.rand(n, 16, 3, generator=g),
+    )
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "demo").mkdir(parents=True)
+    (tmp_path / "city.ply").rename(tmp_path / "runs" / "demo" / "city.ply")
+    names = {}
+    exec(compile(example, "README.md", "exec"), names)
+    assert names["renders"].shape == (1, 600, 800, 3) and names["alphas"].max() > 0.9
+    assert (tmp_path / "from_above.png").stat().st_size > 10_000
