@@ -13,10 +13,13 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
+from blitzgs.population.importance import CULL, PHI
 from blitzgs.view.blocks import morton_order
 
 SPLIT_SHRINK = 1.6
 CHILDREN_OF_A_SPLIT = 2
+# Columns of the importance passes, once there are any, that children have of their parent.
+INHERITED = (PHI, CULL)
 _ID_MASK = (1 << 63) - 1
 
 
@@ -65,8 +68,9 @@ def densify(
 
     A candidate's mean gradient `grad_sum / grad_count` reaches the threshold. A small one gets a copy; a
     large one gives way to two children drawn from it, 1.6 times smaller. Children take their parent's level
-    (copy) or the next one (split), fresh moments, and an id that follows from the parent's id, `time` and the
-    child's slot alone, as do their random positions: the outcome does not depend on the order of the rows.
+    (copy) or the next one (split), its phi and cull row, fresh moments, and an id that follows from the
+    parent's id, `time` and the child's slot alone, as do their random positions: the outcome does not depend
+    on the order of the rows.
     Pruning applies to old and new rows; a new row has no screen radius yet.
 
     Args:
@@ -171,6 +175,7 @@ def _children(
         "birth": torch.full_like(table["birth"][rows], time),
         "level": torch.where(slots > 0, (level.int() + 1).clamp(max=level_count - 1), level).to(level.dtype),
     }
+    children |= {name: table[name].index_select(0, rows) for name in INHERITED if name in table}
     _shrink({name: column[len(clones) :] for name, column in children.items()}, seed, time)
     return children
 

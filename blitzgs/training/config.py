@@ -96,6 +96,8 @@ class ScheduleConfig:
         size_prune_after: density events later than this also prune by size.
         reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
             `densify_until`; 0: never.
+        t1, t2: the first and the second importance pass, where `population.importance` is set; 0: none. A
+            pass follows the density event of the same image.
         sh_every: the spherical-harmonics degree grows by one each time.
         position_decay: length of the exponential decay of the position learning rate.
         checkpoint_every: checkpoints at these times, besides those of `log.checkpoint_seconds`. 0: none.
@@ -110,6 +112,8 @@ class ScheduleConfig:
     densify_every: int = 100
     size_prune_after: int = 3_000
     reset_every: int = 0
+    t1: int = 7_500
+    t2: int = 16_000
     sh_every: int = 1_000
     position_decay: int = 30_000
     checkpoint_every: int = 0
@@ -162,7 +166,7 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class PopulationConfig:
-    """Density control: which Gaussians are cloned, split and pruned.
+    """Density control: which Gaussians are cloned, split and pruned, and the two importance passes.
 
     Attributes:
         grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
@@ -174,6 +178,14 @@ class PopulationConfig:
         prune_screen_radius: pixels; larger Gaussians are pruned after `schedule.size_prune_after`.
         prune_world_scale: relative to extent; Gaussians with a larger axis are pruned after the same time.
         max_gaussians: the population never exceeds this; the strongest candidates come first. 0: no cap.
+        importance: at `schedule.t1` and `schedule.t2` score all Gaussians by what they contribute to the
+            training views, and keep those that matter.
+        pass1_keep: share of the Gaussians that the first pass keeps, drawn by their scores; 1: all, the pass
+            then makes its signals alone.
+        pass2_mass: share of the total score that the second pass keeps, by the fewest Gaussians, of which
+            those below `min_opacity` go too; 1: all, as above.
+        phi: from the first pass on, weigh the gradients that density control adds up with phi, the share of
+            the views seeing a Gaussian in which it counts.
     """
 
     grad_threshold: float = 2e-4
@@ -184,6 +196,10 @@ class PopulationConfig:
     prune_screen_radius: float = 20.0
     prune_world_scale: float = 0.1
     max_gaussians: int = 0
+    importance: bool = False
+    pass1_keep: float = 0.7
+    pass2_mass: float = 0.99
+    phi: bool = True
 
 
 @dataclass(frozen=True)

@@ -211,6 +211,10 @@ def _check(config: Config) -> None:
             population.max_gaussians,
             "0 (no cap) or more",
         ),
+        (0 < population.pass1_keep <= 1, "population.pass1_keep", population.pass1_keep, "in (0, 1]"),
+        (0 < population.pass2_mass <= 1, "population.pass2_mass", population.pass2_mass, "in (0, 1]"),
+        (schedule.t1 >= 0, "schedule.t1", schedule.t1, "0 (none) or more"),
+        (schedule.t2 >= 0, "schedule.t2", schedule.t2, "0 (none) or more"),
         (
             config.ranks.transport in get_args(Transport),
             "ranks.transport",

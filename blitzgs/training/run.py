@@ -59,6 +59,7 @@ class Progress:
         level_count: octree levels K.
         peak_gaussians: most Gaussians so far.
         seconds: of training so far, without evaluations.
+        milestones: how many Gaussians there were at the points of the run that are named so.
     """
 
     step: int
@@ -66,6 +67,7 @@ class Progress:
     level_count: int
     peak_gaussians: int
     seconds: float
+    milestones: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
 @dataclass

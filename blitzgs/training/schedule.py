@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 
-EventKind = Literal["densify", "reset_opacities", "evaluate", "checkpoint"]
+EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "evaluate", "checkpoint"]
 # The columns of the learning-rate table.
 RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
@@ -55,6 +55,8 @@ class Schedule:
             ("densify", config.densify_from, config.densify_until, config.densify_every),
             # A reset follows the density event of the same image: what it caps has grown and been pruned.
             ("reset_opacities", config.reset_every, config.densify_until, config.reset_every),
+            ("pass_1", config.t1, config.t1 + 1, min(config.t1, 1)),
+            ("pass_2", config.t2, config.t2 + 1, min(config.t2, 1)),
             ("evaluate", config.evaluate_every, math.inf, config.evaluate_every),
             ("checkpoint", config.checkpoint_every, math.inf, config.checkpoint_every),
         ]

@@ -123,4 +123,11 @@ def first_gaussians(
     table.keep(torch.arange(count) % ranks.world_size == ranks.rank)
     table = GaussianTable({name: table[name].to(device) for name in table})
     table.permute(morton_order(table["means"]))
-    return table, Progress(step=0, sh_degree=0, level_count=levels.count, peak_gaussians=count, seconds=0.0)
+    return table, Progress(
+        step=0,
+        sh_degree=0,
+        level_count=levels.count,
+        peak_gaussians=count,
+        seconds=0.0,
+        milestones={"initial": count},
+    )

@@ -15,6 +15,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.ops.density_stats import density_stats_
 from blitzgs.output import write_file
 from blitzgs.pipeline import Frame
+from blitzgs.population.importance import PHI
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run
 from blitzgs.training.agreement import Agreement, StopRequest
@@ -154,6 +155,7 @@ class Trainer:
             views.width,
             views.height,
             float(len(views)),
+            table[PHI] if self.state.config.population.phi and PHI in table else None,
         )
 
     def _announce(self) -> None:

@@ -189,3 +189,21 @@ def test_decaying_opacities_takes_the_same_share_of_each():
     before = table["opacities"].double().sigmoid()
     decay_opacities(table, 0.2)
     torch.testing.assert_close(table["opacities"].double().sigmoid(), 0.8 * before, rtol=2e-6, atol=0)
+
+
+def test_children_have_their_parents_phi_and_cull_row():
+    table = random_table(300)
+    g = torch.Generator().manual_seed(5)
+    table["phi"] = torch.rand(300, generator=g)
+    table["cull"] = torch.randint(-(2**31), 2**31, (300, 3), generator=g).int()
+    parents = {int(i): row for row, i in enumerate(table["id"])}
+    phi, cull = table["phi"].clone(), table["cull"].clone()
+    rules = DensityRules(grad_threshold=2e-4, clone_scale=0.02, min_opacity=0.005)
+    report = densify(table, rules, time=TIME, step=STEP, seed=SEED, level_count=LEVELS, ranks=Ranks())
+    assert report.cloned > 5 and report.split > 5
+    born = (table["birth"] == TIME).nonzero().squeeze(1).tolist()
+    assert len(born) > 10
+    for row in range(len(table)):
+        origin = parents[int(table["parent" if row in born else "id"][row])]
+        assert table["phi"][row] == phi[origin]
+        assert torch.equal(table["cull"][row], cull[origin])

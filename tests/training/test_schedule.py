@@ -22,7 +22,7 @@ def test_paper_schedule_densifies_thirty_times_and_last_at_31000():
         iterations=90_000, batch_size=4, densify_from=2_000, densify_until=32_000, densify_every=1_000
     )
     schedule, steps = all_events(config)
-    times = [event.time for step in steps for event in step]
+    times = [event.time for step in steps for event in step if event.kind == "densify"]
     assert times == list(range(2_000, 32_000, 1_000))
     assert schedule.steps == 22_500
     for step, events in enumerate(steps):
@@ -35,7 +35,7 @@ def test_one_field_scales_every_time(scale):
         iterations=3_000, densify_from=50, densify_until=1_500, densify_every=10, scale=scale
     )
     schedule, steps = all_events(config)
-    times = [event.time for step in steps for event in step]
+    times = [event.time for step in steps for event in step if event.kind == "densify"]
     expected = sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
     assert times == expected
     assert schedule.steps == math.floor(3_000 * scale + 1e-6)
@@ -50,6 +50,29 @@ def test_events_do_not_depend_on_how_the_run_is_cut():
     pieces = [event for begin in range(0, 400, 3) for event in schedule.events(begin, min(begin + 3, 400))]
     assert pieces == whole
     assert [event.kind for event in whole if event.time == 50] == ["evaluate"]
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 3.0])
+def test_importance_passes_scale_and_follow_density_control(scale):
+    config = ScheduleConfig(
+        iterations=3_000,
+        densify_from=500,
+        densify_until=1_500,
+        densify_every=100,
+        t1=1_000,
+        t2=1_600,
+        scale=scale,
+    )
+    _, steps = all_events(config)
+    events = [(event.kind, event.time) for step in steps for event in step]
+    assert (
+        events.count(("pass_1", round(1_000 * scale))) == events.count(("pass_2", round(1_600 * scale))) == 1
+    )
+    assert [kind for kind, _ in events].count("pass_1") == [kind for kind, _ in events].count("pass_2") == 1
+    at = events.index(("pass_1", round(1_000 * scale)))
+    assert events[at - 1] == ("densify", round(1_000 * scale))
+    none = ScheduleConfig(iterations=3_000, t1=0, t2=0, densify_from=4_000)
+    assert not any(step for step in all_events(none)[1])
 
 
 def test_sh_degree_grows_in_the_step_that_contains_the_event():

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from blitzgs.training.events import densify, evaluate, reset_opacities, save
+from blitzgs.training.events import densify, evaluate, importance, reset_opacities, save
 from blitzgs.training.schedule import Event, EventKind
 from blitzgs.training.state import TrainingState
 
 HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
     "densify": densify.run,
     "reset_opacities": reset_opacities.run,
+    "pass_1": importance.run,
+    "pass_2": importance.run,
     "evaluate": evaluate.run,
     "checkpoint": save.run,
 }

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The importance sweep against forward renders of the same views, in the same run.
+
+    python benchmarks/bm_importance.py [--gaussians 4000000] [--views 32] [--batch 4] [--json FILE]
+
+The views advance over one synthetic square kilometre (`scenes.aerial`). "renders": `pipeline.forward` of all
+views in batches, with colours of degree 3; "survey": what each Gaussian contributes to them; "sweep": that,
+the exact 99 % cut of each view, scores, phi and the cull matrix. The last rows are the compositing kernels
+alone, for the first batch. Times are medians of wall time with the device idle before and after; the sweep
+should take no longer than the renders.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from harness import report
+from scenes import BenchmarkScene, aerial
+
+from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import GaussianTable
+from blitzgs.ops.project import RowRoom
+from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.population.importance import ViewBatch, sweep
+from blitzgs.survey import survey
+
+OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e6)
+
+
+def table_of(scene: BenchmarkScene) -> GaussianTable:
+    """Return the scene's Gaussians as a trainer has them."""
+    raw = scene.raw()
+    count, device = len(raw["means"]), raw["means"].device
+    rows = {name: raw[name].contiguous() for name in ("means", "quats", "scales", "opacities", "sh")}
+    return GaussianTable.create(
+        rows
+        | {
+            "last_step": torch.zeros(count, dtype=torch.int32, device=device),
+            "id": torch.arange(count, device=device),
+            "parent": torch.full((count,), -1, device=device),
+            "birth": torch.zeros(count, dtype=torch.int32, device=device),
+            "level": torch.zeros(count, dtype=torch.uint8, device=device),
+        }
+    )
+
+
+def batches_of(scene: BenchmarkScene, length: int) -> list[ViewBatch]:
+    """Return the scene's views, `length` at a time."""
+    count = len(scene.viewmats)
+    return [
+        ViewBatch(
+            list(range(begin, min(begin + length, count))),
+            Views(
+                scene.viewmats[begin : begin + length],
+                scene.Ks[begin : begin + length],
+                scene.width,
+                scene.height,
+            ),
+        )
+        for begin in range(0, count, length)
+    ]
+
+
+def median_ms(work: Callable[[], Any], repeats: int, device: torch.device) -> float:
+    """Return the median wall time of some work, milliseconds, after one round that is not counted."""
+    times = []
+    for _ in range(repeats + 1):
+        _wait(device)
+        begin = time.perf_counter()
+        work()
+        _wait(device)
+        times.append(1e3 * (time.perf_counter() - begin))
+    return statistics.median(times[1:])
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, Any]]:
+    """Time renders, survey and sweep of all views, and the compositing of the first batch."""
+    table, batches = table_of(scene), batches_of(scene, length)
+    ranks, room = Ranks(device=table.device), RowRoom()
+    n_views = len(scene.viewmats)
+
+    def renders() -> None:
+        for batch in batches:
+            pipeline.forward(table, batch.views, OPTIONS, room=room)
+
+    def surveys() -> None:
+        for batch in batches:
+            survey(table, batch.views, OPTIONS, room=room)
+
+    def sweeps() -> None:
+        sweep(table, batches, n_views, OPTIONS, ranks)
+
+    frame = pipeline.forward(table, batches[0].views, OPTIONS, room=room)
+    splats = frame.splats
+    grid = pipeline.tile_grid(batches[0].views, OPTIONS, None)
+    shapes = (splats.means2d, splats.conics, splats.opacities)
+    lists = (frame.isect_rows, frame.tile_offsets)
+
+    def composite() -> None:
+        torch.ops.blitzgs.rasterize_fwd(*shapes, splats.colors, None, *lists, *grid, None, False, False, None)
+
+    def contribute() -> None:
+        torch.ops.blitzgs.contributions(*shapes, *lists, *grid)
+
+    works = {"renders": renders, "survey": surveys, "sweep": sweeps}
+    kernels = {"rasterize_fwd, one batch": composite, "contributions, one batch": contribute}
+    times = {name: median_ms(work, repeats, table.device) for name, work in (works | kernels).items()}
+    rows = []
+    for name, ms in times.items():
+        views = n_views if name in works else len(batches[0].columns)
+        against = times["renders"] if name in works else times["rasterize_fwd, one batch"]
+        rows.append({"work": name, "ms": ms, "ms per view": ms / views, "relative": ms / against})
+    return rows
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gaussians", type=int, default=4_000_000)
+    parser.add_argument("--views", type=int, default=32)
+    parser.add_argument("--batch", type=int, default=4, help="views at a time")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--size", type=int, nargs=2, default=(1600, 1064), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    width, height = options.size
+    scene = aerial(options.gaussians, options.device, views=options.views, width=width, height=height)
+    with torch.no_grad():
+        rows = measure(scene, options.batch, options.repeats)
+    title = f"Importance sweep: {scene.name}, {options.views} views of {width} x {height}"
+    report(title, rows, options.json, options.device)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two importance passes: a sweep over the training views, and what is kept by its scores."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from blitzgs.population.importance import Importance, ViewBatch, sweep
+from blitzgs.population.pruning import sample_by_score, top_by_score
+from blitzgs.population.redistribution import redistribute
+from blitzgs.training.guard import check_table
+from blitzgs.training.schedule import Event
+from blitzgs.training.state import TrainingState
+
+# Views surveyed at once, at least: fewer would leave a GPU waiting for the host.
+LEAST_VIEWS = 4
+
+
+def run(state: TrainingState, event: Event) -> None:
+    """Score all Gaussians, store phi and the cull matrix, prune by the scores and deal the rows anew.
+
+    Raises:
+        NonFiniteError: a parameter is not finite.
+    """
+    if not state.config.population.importance:
+        return
+    state.catch_up()
+    check_table(state.table, state.progress.step)
+    found = sweep(
+        state.table,
+        view_batches(state),
+        len(state.capture.train),
+        state.render_options,
+        state.ranks,
+        state.owners,
+    )
+    found.store(state.table)
+    before = state.population()
+    state.table.keep(chosen(state, event, found))
+    after = state.population()
+    if redistribute(state.table, state.ranks, max_imbalance=0):
+        state.sort()
+    state.stepper.reindex()
+    progress = state.progress
+    milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
+    state.progress = dataclasses.replace(progress, milestones=milestones)
+    counts = {"before": before, "gaussians": after, "views": len(state.capture.train)}
+    state.log.event(event.time, event.kind, counts)
+
+
+def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
+    """Yield the training views by image size; a view's column is its place among the training views."""
+    by_size: dict[tuple[int, int], list[int]] = {}
+    for column, index in enumerate(state.capture.train):
+        by_size.setdefault(state.views.size([index]), []).append(column)
+    length = max(state.schedule.batch_size, LEAST_VIEWS)
+    for columns in by_size.values():
+        for begin in range(0, len(columns), length):
+            some = columns[begin : begin + length]
+            yield ViewBatch(some, state.views.pick([state.capture.train[column] for column in some]))
+
+
+def chosen(state: TrainingState, event: Event, found: Importance) -> Tensor:
+    """Mark the rows that a pass keeps, bool [N]; every rank calls this."""
+    population, table, ids = state.config.population, state.table, state.table["id"]
+    everyone = torch.ones_like(ids, dtype=torch.bool)
+    if event.kind == "pass_1":
+        if population.pass1_keep == 1:
+            return everyone
+        return sample_by_score(
+            found.score, ids, population.pass1_keep, state.config.seed, event.time, state.ranks
+        )
+    # Where nothing contributes to any view, there is no mass to keep a share of.
+    total = state.ranks.all_reduce(found.score.double().sum())
+    if population.pass2_mass == 1 or not total.item() > 0:
+        return everyone
+    least = population.min_opacity
+    opaque = table["opacities"] >= (math.log(least / (1.0 - least)) if least > 0 else -math.inf)
+    return top_by_score(found.score, ids, population.pass2_mass, state.ranks) & opaque

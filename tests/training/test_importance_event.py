@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The importance passes in a training: what they keep, what they leave behind, and their ablations."""
+
+import json
+import shutil
+
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.population.importance import CULL, PHI, is_culled
+from blitzgs.training import run
+from blitzgs.training.events import importance
+from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.training.test_trainer import assert_same_table, stop_at_step_50
+from tests.training.tiny import tiny_config, tiny_scene
+
+# Density events at 20, 40, 60 and 80; the passes after those at 40 and 80.
+PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80", "log.pictures=0")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def train(folder, *overrides, ranks=None, resume=False):
+    trainer = Trainer(tiny_config(*PASSES, *overrides), *tiny_scene(), folder, ranks or Ranks(), resume)
+    return trainer, trainer.train()
+
+
+def pass_events(folder):
+    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    return {r["event"]: r for r in records if str(r.get("event")).startswith("pass")}
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("run")
+    return folder, *train(folder)
+
+
+def test_what_the_passes_keep(whole_run):
+    folder, trainer, summary = whole_run
+    events = pass_events(folder)
+    first, second = events["pass_1"], events["pass_2"]
+    assert first["t"] == 40 and second["t"] == 80 and first["views"] == 7
+    assert first["gaussians"] == int(0.7 * first["before"])
+    assert second["gaussians"] < second["before"]
+    table = trainer.state.table
+    assert summary["gaussians"] == len(table) == second["gaussians"]
+    assert table[PHI].shape == (len(table),) and table[CULL].shape == (len(table), 1)
+    assert ((table[PHI] >= 0) & (table[PHI] < 1)).all()
+    assert trainer.state.progress.milestones == {
+        "initial": 400,
+        "before_pass_1": first["before"],
+        "after_pass_1": first["gaussians"],
+        "before_pass_2": second["before"],
+        "after_pass_2": second["gaussians"],
+    }
+    culled = torch.stack([is_culled(table[CULL], v) for v in range(7)])
+    assert culled.any() and not culled.all()
+
+
+def test_resume_is_exact_and_carries_the_columns(whole_run, tmp_path, monkeypatch):
+    """Stopped between the passes, when children have inherited phi."""
+    _, whole, _ = whole_run
+    stop_at_step_50(monkeypatch)
+    first, summary = train(tmp_path)
+    assert summary is None and PHI in first.state.table
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    second, _ = train(tmp_path, resume=True)
+    assert_same_table(second.state.table, whole.state.table)
+    assert second.state.progress.milestones == whole.state.progress.milestones
+    model = run.open_model(tmp_path, Ranks())
+    assert torch.equal(model.table[CULL], whole.state.table[CULL])
+
+
+def test_ablations_keep_the_signals(tmp_path):
+    trainer, _ = train(tmp_path / "a", "population.pass1_keep=1", "population.pass2_mass=1")
+    events = pass_events(tmp_path / "a")
+    for name in ("pass_1", "pass_2"):
+        assert events[name]["gaussians"] == events[name]["before"]
+    assert PHI in trainer.state.table
+    off, _ = train(tmp_path / "b", "population.importance=false")
+    assert PHI not in off.state.table and not pass_events(tmp_path / "b")
+
+
+def test_phi_weighs_the_gradients_from_the_first_pass_on(tmp_path):
+    sums = {}
+    for phi in ("true", "false"):
+        flags = [f"population.phi={phi}", "schedule.iterations=55", "population.pass1_keep=1"]
+        trainer, _ = train(tmp_path / phi, *flags)
+        sums[phi] = trainer.state.table
+    weighed, plain = sums["true"], sums["false"]
+    assert torch.equal(weighed["id"], plain["id"])  # density control at 40 came before
+    assert torch.allclose(weighed["grad_sum"], plain["grad_sum"] * plain[PHI], rtol=1e-5)
+    assert torch.equal(weighed["means"], plain["means"]) and torch.equal(weighed[PHI], plain[PHI])
+    assert plain["grad_sum"].max() > 0 and plain[PHI].std() > 0.01
+
+
+# Checkpoints before the first pass, too.
+EARLY = ("schedule.checkpoint_every=30", "log.keep_checkpoints=9")
+
+
+def _passes_from(ranks, folder):
+    """Both passes on a model that is dealt to the ranks; ids and what they have."""
+    torch.set_num_threads(1)
+    trainer = Trainer(tiny_config(*PASSES, *EARLY), *tiny_scene(), folder, ranks, resume=True)
+    state, out = trainer.state, []
+    for event in state.schedule.events(0, 100):
+        if event.kind.startswith("pass"):
+            importance.run(state, event)
+            table = state.table
+            out.append([table[name].cpu() for name in ("id", PHI, CULL, "means")])
+            sizes = [int(n) for n in ranks.all_gather(torch.tensor([len(table)], device=ranks.device))]
+            assert max(sizes) - min(sizes) <= 1  # dealt anew
+    trainer.close()
+    return out, state.progress.milestones
+
+
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 4))
+def test_passes_are_the_same_at_every_world_size(whole_run, tmp_path, world_size, device):
+    train(tmp_path, *EARLY)
+    for later in sorted((tmp_path / "checkpoints").glob("checkpoint_*"))[1:]:
+        shutil.rmtree(later)
+    expected, milestones = _passes_from(Ranks(device=torch.device(device)), tmp_path)
+    answers = run_ranks(_passes_from, world_size, tmp_path, device=device)
+    assert all(found == milestones for _, found in answers)
+    for k, want in enumerate(expected):
+        got = [torch.cat([out[k][c] for out, _ in answers]) for c in range(4)]
+        order, reference = got[0].argsort(), want[0].argsort()
+        for a, b in zip(got, want, strict=True):
+            assert torch.equal(a[order], b[reference])
