@@ -1,23 +1,24 @@
 // SPDX-License-Identifier: Apache-2.0
 // The active set of a step: which rows of the table some view may see, found without reading the others.
 //
-// The table is kept in Morton order, so 256 consecutive rows are neighbours: a block. A block's bounds hold
-// every place its Gaussians can be and every size they can have while their optimiser debt is pending: a row
-// that is not touched moves along a straight line, by at most m / sqrt(v) times the tail of the schedule
-// (lazy_adam.h), so its mean lies between two corners and its log scales between two values.
+// The table is kept in Morton order, so 256 consecutive rows are neighbours: a block. A block's bounds
+// contain every position and every size that its Gaussians can have while steps of the lazy optimiser are
+// pending: a row that no step touches moves along a straight line, by at most m / sqrt(v) times the tail of
+// the schedule (lazy_adam.h), so its mean lies between two corners and its log scales between two values.
 //
 // A box of means with axes up to sigma is dropped from a view iff it lies behind the near plane, beyond the
 // far plane, or beyond one image border by more than a splat can reach: half-width of alpha >= 1/255 is at
 // most sqrt(2 ln 255) sqrt(|J row|^2 sigma^2 + eps2d) pixels, with |J row| <= f / z max |row_x - u row_z|
-// over the clamped slopes u. Multiplied by z each is a linear inequality n . p + d + k sigma >= 0, which a
-// box fails only if its farthest corner does. Blocks are tested first, then the rows of the blocks that are
-// left, by the same inequalities on the row's own line. Blocks get twice the rounding slack, so the result is
-// the set of rows that pass their own test: it does not depend on how rows are grouped. For the same reason
-// the rows of a block need not be read where its box, with sigma = 0, satisfies all inequalities with slack
-// to spare: then all its rows pass. What is left to read are blocks across a view's border.
+// over the clamped slopes u. Multiplied by z, each condition is a linear inequality n . p + d + k sigma >= 0,
+// which a box fails only if its farthest corner does. Blocks are tested first. Then the rows of the remaining
+// blocks are tested by the same inequalities, each on the line along which it may move. Blocks get twice the
+// rounding slack, so a row that passes its own test is never lost with its block, and the result does not
+// depend on how rows are grouped. Where a block's box, with sigma = 0, satisfies all inequalities with slack
+// to spare, all of its rows pass and need not be read. Only the rows of blocks across a view's border are
+// read.
 //
-// Conservative: every row that projection would emit is in the set (tests/view/test_blocks.py).
-// O(N / 256 + rows of the blocks across a border + active rows) per view.
+// The test is conservative: every row that projection would project is in the set
+// (tests/view/test_blocks.py). O(N / 256 + rows of the blocks across a border + active rows) per view.
 #pragma once
 #include <cfloat>
 #include <cmath>
@@ -42,7 +43,7 @@ BLITZGS_HD int rows_in_block(std::int64_t rows, std::int64_t block) {
   return static_cast<int>(rest < kBlockRows ? rest : kBlockRows);
 }
 
-// Where rows are and where pending steps may take them. Moments null: nothing is pending.
+// Where rows are, and what decides where pending steps may move them. Moments null: no step is pending.
 struct BlockRows {
   const float *means, *scales;  // [N, 3], scales logarithmic
   const float *exp_avg_means, *exp_avg_sq_means, *exp_avg_scales, *exp_avg_sq_scales;
@@ -60,16 +61,17 @@ BLITZGS_HD SweptBox empty_box() {
   return {{FLT_MAX, FLT_MAX, FLT_MAX}, {-FLT_MAX, -FLT_MAX, -FLT_MAX}, 0.0f};
 }
 
-// The drift a row still has coming, enlarged by its rounding.
+// The drift of a row's pending steps, enlarged by its rounding.
 BLITZGS_HD float pending_drift(float m, float v, float tail) {
   return m == 0.0f || !(v > 0.0f) ? 0.0f : m / std::sqrt(v) * tail * 1.00001f;
 }
 
-// Everything a row can be. Rows that are not finite are never seen: they give an empty box.
+// The box that a row stays in while its steps are pending. A row that is not finite is never visible and
+// gives an empty box.
 BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, std::int64_t row) {
   SweptBox box = empty_box();
-  // All that hangs on the row alone is loaded before anything is computed: on the GPU it is then waited for
-  // together.
+  // Everything that is addressed by the row alone is loaded before anything is computed, so that a GPU waits
+  // once for all of these loads.
   const bool pending = rows.exp_avg_means != nullptr;
   const std::int32_t stand = pending ? rows.last_step[row] : 0;
   const std::int32_t behind = pending ? stand - rows.moment_step[row] : 0;
@@ -125,7 +127,7 @@ BLITZGS_HD SweptBox load_box(const float* bounds) {
   return {{bounds[0], bounds[1], bounds[2]}, {bounds[3], bounds[4], bounds[5]}, bounds[6]};
 }
 
-// n . p + d + k sigma >= 0 for whatever a view can see.
+// A half-space: n . p + d + k sigma >= 0 holds for every Gaussian that the view can see.
 struct CullPlane {
   float n[3], d, k;
 };
@@ -151,7 +153,8 @@ BLITZGS_HD CullPlane make_plane(const double* row, double offset, double factor,
   return plane;
 }
 
-// Largest |row - u row_z| over the clamped slopes u in [low, high]: convex in u, so at an end.
+// Largest |row - u row_z| over the clamped slopes u in [low, high]. It is convex in u, so it is attained at
+// an end.
 BLITZGS_HD double largest_gradient(const double* row, const double* row_z, double low, double high) {
   double squares[2] = {0, 0};
   for (int axis = 0; axis < 3; ++axis) {
@@ -188,12 +191,13 @@ BLITZGS_HD CullView make_cull_view(const CullCamera& camera, int view) {
   return cull;
 }
 
-// What a view sees of a box: maybe something of it, for sure all that is in it.
+// What a view sees of a box. some: the view may see a part of it. all: the view certainly sees all that is in
+// it.
 struct Sight {
   bool some, all;
 };
 
-// slack: share of each term that rounding may have eaten.
+// slack: the largest relative rounding error of each term.
 BLITZGS_HD Sight sight_of(const CullView& view, const SweptBox& box, float slack) {
   float centre[3], half[3];
   for (int axis = 0; axis < 3; ++axis) {
@@ -248,8 +252,8 @@ BLITZGS_HD std::uint32_t views_of_row(const CullView* views, int count, const Bl
   return mask;
 }
 
-// What is known before rows are listed: the views of each block, those of the rows of mixed blocks, and how
-// many rows of each block are active.
+// What the first kernels find, before rows are listed: the views of each block, the views of the rows of
+// mixed blocks, and how many rows of each block are active.
 struct CullPlan {
   BlockViews* blocks;    // [blocks_of(n)]
   std::uint32_t* masks;  // [n]
@@ -263,7 +267,7 @@ struct CullPlan {
         n(rows) {}
 };
 
-// The active rows and their views come first in lists of n.
+// Lists with room for n rows; the active rows and their views come first.
 struct ActiveList {
   std::int32_t *ids, *views, *count;  // [n], [n], [1]
 };

@@ -12,8 +12,9 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kWarps = kBlockRows / 32;
-constexpr int kGroup = kBlockRows;  // blocks whose active rows are added up: a thread each
-constexpr int kResident = 6;  // CUDA blocks of a row a thread that a multiprocessor holds, of any generation
+constexpr int kGroup = kBlockRows;  // blocks whose active rows are added up, one thread for each
+// How many CUDA blocks with a thread for each row fit into a multiprocessor of any supported GPU.
+constexpr int kResident = 6;
 
 __global__ void make_keys(const float* points, std::int64_t n, const MortonBounds* bounds,
                           std::int64_t* keys) {
@@ -21,7 +22,7 @@ __global__ void make_keys(const float* points, std::int64_t n, const MortonBound
   if (i < n) keys[i] = static_cast<std::int64_t>(morton_code(points + 3 * i, frame_of(*bounds)) >> 1);
 }
 
-// Items of a warp's lanes take neighbouring places in a list: one addition a warp. All lanes call.
+// Appends the items of a warp's lanes to a list, with one atomic addition for the warp. All lanes call this.
 __device__ void append(bool present, std::int32_t item, std::int32_t* list, std::int32_t* length) {
   const unsigned all = __ballot_sync(~0u, present);
   if (!all) return;
@@ -32,8 +33,8 @@ __device__ void append(bool present, std::int32_t item, std::int32_t* list, std:
   if (present) list[first + __popc(all & ((1u << lane) - 1))] = item;
 }
 
-// Rows ascend, so a block is listed where its first row is met; otherwise it is listed more often, which
-// costs time alone.
+// Lists a block at its first row, as rows ascend. If they did not, a block would be listed several times,
+// which would only cost time.
 __global__ void list_blocks(const std::int32_t* ids, std::int64_t n, std::int32_t* list,
                             std::int32_t* length) {
   wait_for_earlier_kernels();
@@ -42,7 +43,7 @@ __global__ void list_blocks(const std::int32_t* ids, std::int64_t n, std::int32_
   append(i < n && (i == 0 || ids[i - 1] / kBlockRows != block), block, list, length);
 }
 
-// The box around those of each kLanes neighbouring lanes.
+// The box around the boxes of each kLanes neighbouring lanes.
 template <int kLanes>
 __device__ __forceinline__ SweptBox box_around(SweptBox box) {
 #pragma unroll
@@ -58,10 +59,10 @@ __device__ __forceinline__ SweptBox box_around(SweptBox box) {
   return box;
 }
 
-// The blocks of the list in turn, a thread a row. list null: all blocks.
+// Each CUDA block handles blocks of the list in turn, one thread for each row. list null: all blocks.
 __global__ void __launch_bounds__(kBlockRows, kResident)
     update_bounds(const BlockRows rows, const std::int32_t* list, const std::int32_t* length, float* bounds) {
-  __shared__ SweptBox warps[2][kWarps];  // they take turns, so that one barrier is enough
+  __shared__ SweptBox warps[2][kWarps];  // used in alternation, so that one barrier is enough
   wait_for_earlier_kernels();
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const std::int64_t count = list ? *length : blocks_of(rows.n);
@@ -69,7 +70,7 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
   std::int64_t block = block_at(blockIdx.x), next;
   int turn = 0;
   for (std::int64_t i = blockIdx.x; i < count; i += gridDim.x, turn ^= 1, block = next) {
-    next = block_at(i + gridDim.x);  // it arrives while this one is worked on
+    next = block_at(i + gridDim.x);  // loaded while the present block is computed
     const bool present = threadIdx.x < rows_in_block(rows.n, block);
     const SweptBox row = present ? sweep_row(rows, block * kBlockRows + threadIdx.x) : empty_box();
     const SweptBox part = box_around<32>(row);
@@ -82,8 +83,8 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
   }
 }
 
-// One thread a block, a CUDA block a group. Lists the mixed blocks, in any order, and counts the active rows
-// of the others. Leaves the planes of the views for test_rows.
+// One thread for each block, one CUDA block for each group of blocks. Lists the mixed blocks, in any order,
+// counts the active rows of the others, and writes the planes of the views for test_rows.
 __global__ void test_blocks(const float* bounds, CullCamera camera, int views, const CullPlan plan,
                             std::int32_t* list, std::int32_t* length, std::int32_t* groups,
                             CullView* planes_out) {
@@ -107,7 +108,7 @@ __global__ void test_blocks(const float* bounds, CullCamera camera, int views, c
   append(is_mixed(seen), static_cast<std::int32_t>(block), list, length);
 }
 
-// Blocks of the list in turn, a thread a row.
+// Each CUDA block tests blocks of the list in turn, one thread for each row.
 __global__ void __launch_bounds__(kBlockRows, kResident)
     test_rows(const BlockRows rows, const CullView* planes, int views, const CullPlan plan,
               const std::int32_t* list, const std::int32_t* length, std::int32_t* groups) {
@@ -132,8 +133,8 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
   }
 }
 
-// The active rows before a block, from the groups before its own and the blocks before it there; all threads
-// call.
+// Returns the number of active rows before a block: those of earlier groups, and those of earlier blocks of
+// its own group. All threads call this.
 __device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* groups, std::int64_t block) {
   __shared__ std::int32_t parts[kWarps];
   const std::int64_t group = block / kGroup, near = group * kGroup + threadIdx.x;
@@ -146,7 +147,7 @@ __device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* gr
   return __reduce_add_sync(~0u, lane < kWarps ? parts[lane] : 0);
 }
 
-// A warp a block.
+// One warp for each block.
 __global__ void __launch_bounds__(kBlockRows)
     emit_rows(const CullPlan plan, const std::int32_t* groups, const ActiveList out) {
   wait_for_earlier_kernels();

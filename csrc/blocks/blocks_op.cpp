@@ -8,7 +8,7 @@
 namespace blitzgs {
 namespace {
 
-// The row columns, checked and kept alive for the call.
+// The columns of the table, checked, and kept alive during the call.
 struct HeldRows {
   std::vector<Tensor> held;
   BlockRows rows{};
@@ -89,7 +89,7 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, co
     check_dtype(op, "ids", *ids_in, ScalarType::Int);
     check_shape(op, "ids", *ids_in, {-1});
     ids = as_contiguous(*ids_in);
-    if (ids->size(0) == 0) return;  // it may have no address, which would mean all rows
+    if (ids->size(0) == 0) return;  // an empty tensor may have a null address, which would mean all rows
   }
   DeviceScope scope(bounds);
   backend::update_block_bounds(held.rows, data_or_null<std::int32_t>(ids), ids ? ids->size(0) : 0,

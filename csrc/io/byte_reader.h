@@ -15,8 +15,8 @@ namespace blitzgs::io {
 
 static_assert(std::endian::native == std::endian::little, "the binary formats are little endian");
 
-// What every reader throws: "<file>: <where>: <reason>". The reason may quote the file, so whatever is not
-// printable ASCII in it is shown as \xNN.
+// What every reader throws: "<file>: <where>: <reason>". The reason may quote the file, so bytes that are not
+// printable ASCII are shown as \xNN.
 class FormatError : public std::runtime_error {
  public:
   FormatError(const std::string& place, const std::string& reason);
@@ -50,7 +50,7 @@ class ByteReader {
 
   // Throws FormatError at the current offset.
   [[noreturn]] void fail(const std::string& reason) const;
-  // Throws when bytes are left over: the file is not what the reader takes it for.
+  // Throws when bytes are left over, because the file then has another format than the reader expects.
   void expect_end() const;
 
  private:

@@ -5,8 +5,8 @@
 // camera: x_camera = R(q) x_world + t with q = (w, x, y, z). Pixel (i, j) has its centre at (i + 0.5, j +
 // 0.5). Readers throw FormatError with the file, the byte offset (binary) or line (text) and the reason;
 // every count is checked against the bytes left before anything is allocated, so memory stays within a small
-// multiple of the file's size. Newer models also have rigs and frames files: each image's pose is in the
-// images file all the same, so those files are not needed.
+// multiple of the file's size. Newer models also have rigs and frames files; they are not needed, because the
+// images file still holds the pose of each image.
 #pragma once
 #include <cstdint>
 #include <iosfwd>
@@ -70,8 +70,8 @@ std::vector<ColmapCamera> read_cameras_text(std::istream& in, const std::string&
 ColmapImages read_images_text(std::istream& in, const std::string& name, bool with_points2d);
 ColmapPoints read_points_text(std::istream& in, const std::string& name, bool with_tracks);
 
-// Writers throw std::invalid_argument when columns disagree in length, and leave stream errors to the caller.
-// Text numbers are the shortest that read back to the same bits.
+// Writers throw std::invalid_argument when columns differ in length, and leave stream errors to the caller.
+// Numbers in text are as short as they can be and still read back to the same bits.
 void write_cameras_binary(std::ostream& out, const std::vector<ColmapCamera>& cameras);
 void write_images_binary(std::ostream& out, const ColmapImages& images);
 void write_points_binary(std::ostream& out, const ColmapPoints& points);
@@ -84,7 +84,7 @@ void write_points_text(std::ostream& out, const ColmapPoints& points);
 void check_columns(const std::vector<ColmapCamera>& cameras);
 void check_columns(const ColmapImages& images);
 void check_columns(const ColmapPoints& points);
-// Why a camera cannot be used, or an empty string.
+// Returns why a camera cannot be used, or an empty string.
 std::string camera_problem(const ColmapCamera& camera);
 
 }  // namespace blitzgs::io

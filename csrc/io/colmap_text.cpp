@@ -57,7 +57,7 @@ ColmapImages read_images_text(std::istream& in, const std::string& name, bool wi
     if (images.names.back().empty()) {
       reader.fail("image " + std::to_string(images.ids.back()) + " has no name");
     }
-    // The observations' line is there even when it is empty; only the last may be missing.
+    // Every image has a line of observations, which may be empty; only the last one may be missing.
     if (reader.next_line() && with_points2d) {
       while (reader.has_token()) {
         images.points2d.push_back(reader.number<double>("observation x"));

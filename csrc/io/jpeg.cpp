@@ -12,7 +12,7 @@ namespace {
 constexpr std::uint8_t kSof0 = 0xc0, kSof1 = 0xc1, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8, kEoi = 0xd9,
                        kSos = 0xda, kDri = 0xdd;
 
-// The code at the top of 16 bits: its length and symbol; length 0 is no code.
+// The code that the highest of 16 bits begin with: its length and its symbol. Length 0: no code begins so.
 struct Code {
   std::uint8_t length = 0;
   std::uint8_t symbol = 0;
@@ -111,7 +111,8 @@ class Checker {
       v_max_ = std::max(v_max_, component.v);
       components_.push_back(component);
     }
-    // A height of 0 is told after the first scan: such files are walked by their markers alone.
+    // A height of 0 means that the height follows after the first scan. Only the markers of such files are
+    // walked.
     sequential_ = sequential_ && width_ > 0 && height_ > 0;
   }
 
@@ -172,7 +173,7 @@ class Checker {
     }
   }
 
-  // Keeps at least 16 bits in hand; past a marker they are padding, which must not be used.
+  // Keeps at least 16 bits available. Behind a marker these are padding, which no code may use.
   void refill() {
     while (held_ <= 48) {
       std::uint64_t byte = 0;
@@ -202,7 +203,8 @@ class Checker {
     return code.symbol;
   }
 
-  // Fewer than eight bits may be left, and zeros that some cameras append.
+  // At the end of a scan fewer than eight bits may be left over, and then zero bytes, which some cameras
+  // append.
   void end_of_interval() {
     unsigned left = held_ - padding_;
     bits_ <<= left % 8;
@@ -236,9 +238,9 @@ class Checker {
   unsigned restart_interval_ = 0;
   bool sequential_ = false;
   unsigned scans_ = 0;
-  std::uint64_t bits_ = 0;  // the next bits, from the top
-  unsigned held_ = 0;       // how many, padding included
-  unsigned padding_ = 0;    // how many of the last are padding
+  std::uint64_t bits_ = 0;  // the next bits, highest first
+  unsigned held_ = 0;       // how many bits `bits_` holds, padding included
+  unsigned padding_ = 0;    // how many of the last of them are padding
 };
 
 }  // namespace

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Is a JPEG whole? Decoders conceal damage: they fill what is missing with grey and go on.
+// Checks that a JPEG is complete. Decoders conceal damage: they fill missing blocks with grey and go on.
 //
-// Walks the markers and, for sequential Huffman files (nearly all photographs), every code of the image data,
-// without computing pixels. Refused are: data that end before the last block, codes that no table has, blocks
-// of more than 64 coefficients, restart markers out of order, and bytes other than zeros left over where a
-// scan should be done. Of progressive and other files only the markers are walked, to the end marker. A
-// change that leaves a valid sequence of codes cannot be told from a photograph. O(bytes), about 150 MB/s.
+// The check walks the markers and, for sequential Huffman files (nearly all photographs), every code of the
+// image data, without computing pixels. It refuses data that end before the last block, codes that are in no
+// table, blocks of more than 64 coefficients, restart markers out of order, and bytes other than zeros after
+// the last block of a scan. In progressive and other files it walks the markers alone, up to the end marker.
+// Damage that leaves a valid sequence of codes cannot be detected. O(bytes), about 150 MB/s.
 #pragma once
 #include <cstdint>
 #include <span>

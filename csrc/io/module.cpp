@@ -45,7 +45,7 @@ std::vector<T> to_vector(const py::dict& columns, const char* name) {
   return std::vector<T>(column.data(), column.data() + column.size());
 }
 
-// Names are bytes to the file system: whatever is not UTF-8 in them survives in the way of os.fsdecode.
+// File names are bytes to the file system. Bytes that are not UTF-8 are kept as os.fsdecode keeps them.
 py::list to_names(const std::vector<std::string>& names) {
   py::list out;
   for (const std::string& name : names) {

@@ -249,7 +249,7 @@ PlyTable read_ply(std::istream& in, const std::string& name) {
   for (auto element = header.elements.begin(); element != vertex; ++element) {
     skip_element(reader, *element, header.encoding);
   }
-  // In text a value takes a digit and a separator, but the last needs no separator.
+  // In text a value takes at least a digit and a separator; the last one needs no separator.
   const bool ascii = header.encoding == Encoding::kAscii;
   const std::uint64_t min_bytes = ascii ? 2 * vertex->properties.size() - 1 : vertex->row_bytes();
   reader.check_count(vertex->count, min_bytes, "vertices");

@@ -102,7 +102,7 @@ void decode_qoi(std::span<const std::uint8_t> file, std::uint8_t* rgb) {
   const QoiSize size = qoi_size(file);
   const std::uint8_t* const begin = file.data();
   const std::uint8_t* at = begin + kHeader;
-  // A code has at most four bytes and eight follow the last one: one check a code is enough.
+  // A code has at most four bytes and eight bytes follow the last code, so one check for each code is enough.
   const std::uint8_t* const end = begin + file.size() - kEnd.size();
   std::uint8_t* const stop = rgb + 3 * std::size_t{size.width} * size.height;
   Recent recent;

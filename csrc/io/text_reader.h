@@ -25,7 +25,7 @@ class TextReader {
   // The next token of the line; throws naming `what` when the line has no more.
   std::string_view token(const char* what);
   bool has_token();
-  // What is left of the line, without surrounding blanks.
+  // The rest of the line, without surrounding blanks.
   std::string_view rest();
 
   template <class T>

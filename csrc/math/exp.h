@@ -5,11 +5,11 @@
 
 namespace blitzgs {
 
-// 2^x for x <= 0, relative error below 1.1e-7 (1 ulp). x below -126 counts as -126: smaller results are of
-// no use to anyone here. NaN stays NaN.
+// 2^x for x <= 0, relative error below 1.1e-7 (1 ulp). x below -126 counts as -126, because no kernel needs
+// smaller results. NaN stays NaN.
 //
-// x = n + f with n the nearest integer; 2^f by its minimax polynomial of degree 6 on [-1/2, 1/2] (relative
-// error 2e-9), then n added to the exponent bits.
+// x is split into n + f with n the nearest integer. A minimax polynomial of degree 6 gives 2^f on [-1/2, 1/2]
+// (relative error 2e-9), and n is added to the exponent bits.
 template <class Lanes>
 inline Lanes exp2_nonpositive(Lanes x) {
   const Lanes clamped = Lanes::max(Lanes::broadcast(-126.0f), x);

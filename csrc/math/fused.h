@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Products and sums whose rounding no compiler option decides.
+// Products and sums whose rounding does not depend on compiler options.
 #pragma once
 #include <cmath>
 
@@ -7,8 +7,8 @@
 
 namespace blitzgs {
 
-// a b + c. On a GPU the fused form is written out; on a CPU contraction is off, and fma() would be a library
-// call.
+// a b + c. On a GPU this is a fused multiply-add. On a CPU the compiler must not contract products (the build
+// says so), and fma() would be a library call.
 template <class T>
 BLITZGS_HD T mul_add(T a, T b, T c) {
 #ifdef __CUDA_ARCH__
@@ -18,7 +18,7 @@ BLITZGS_HD T mul_add(T a, T b, T c) {
 #endif
 }
 
-// A product that is added to something afterwards.
+// A product that will be added to something: the compiler may not fuse it with that addition.
 template <class T>
 BLITZGS_HD T mul(T a, T b) {
 #ifdef __CUDA_ARCH__

@@ -101,7 +101,7 @@ struct PlainLanes {
   friend PlainLanes operator/(PlainLanes a, PlainLanes b) {
     return make([&](int i) { return a.v[i] / b.v[i]; });
   }
-  // float64 has no vector twin whose bits it must match, and needs no library call here.
+  // float64 has no vector version whose bits it would have to match, so the plain expression does.
   static T fma1(T a, T b, T c) {
     if constexpr (sizeof(T) == 4) return std::fma(a, b, c);
     return a * b + c;

@@ -7,7 +7,8 @@
 
 namespace blitzgs {
 
-// A pinhole camera. Rows of the world-to-camera rotation; slopes x/z, y/z at which the Jacobian is clamped.
+// A pinhole camera: the rows of the world-to-camera rotation, the camera centre, and the slopes x/z and y/z
+// at which the Jacobian is clamped.
 template <class T>
 struct Camera {
   Vec3<T> row_x, row_y, row_z, translation, centre;
@@ -38,8 +39,8 @@ BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int he
   return camera;
 }
 
-// Where a mean lands. Computed in double: in float the rounding of the rotation alone moves a splat by
-// hundreds of ulps of its pixel position.
+// Where a mean is projected to. This is computed in double: in float, the rounding of the rotation alone
+// would move a splat by hundreds of ulps of its pixel position.
 struct ProjectedMean {
   double slope_x, slope_y, z, inverse_z;  // x/z, y/z, camera-space depth
 };
@@ -66,7 +67,7 @@ BLITZGS_HD void pixel_position(const Camera<T>& camera, const ProjectedMean& p, 
   mean2d[1] = T(mul_add(double(camera.fy), p.slope_y, double(camera.cy)));
 }
 
-// Rows of J W: how the pixel position answers to a world-space displacement at the clamped slopes.
+// Rows of J W: the derivative of the pixel position by the world-space position, at the clamped slopes.
 template <class T>
 struct PixelGradients {
   Vec3<T> gx, gy;
@@ -126,10 +127,10 @@ BLITZGS_HD Splat<T> make_splat(const PixelGradients<T>& g, const Columns3<T>& ax
   return s;
 }
 
-// The conic as it is stored. What a splat is along its axis hangs on ac - b^2, which rounding a, b and c
-// moves by up to ac / (ac - b^2) as many roundings: 1e-3 of it for a splat a hundred times longer than wide.
-// Among the floats next to a, some have a c beside them that keeps the determinant; b follows a, as the axis
-// has the direction (-b, a).
+// The conic as it is stored. The length of a splat along its axis depends on ac - b^2. Rounding a, b and c to
+// float changes that difference by up to ac / (ac - b^2) roundings, which is 1e-3 of it for a splat that is a
+// hundred times longer than wide. The function therefore tries floats next to a, scales b with a (the axis
+// has the direction (-b, a)), and keeps the pair for which some float c gives the determinant best.
 template <class T>
 BLITZGS_HD void store_conic(const Splat<T>& s, T* conic) {
   for (int i = 0; i < 3; ++i) conic[i] = s.conic[i];
@@ -155,7 +156,7 @@ BLITZGS_HD void store_conic(const Splat<T>& s, T* conic) {
   }
 }
 
-// sqrt(det Sigma / det Sigma'): the share of its peak that the blur leaves a splat in antialiased mode.
+// sqrt(det Sigma / det Sigma'): in antialiased mode, the factor by which the blur lowers the peak of a splat.
 template <class T>
 BLITZGS_HD T compensation(const Splat<T>& s) {
   return s.normal_length / s.root_det;
@@ -163,8 +164,8 @@ BLITZGS_HD T compensation(const Splat<T>& s) {
 
 // Gradients of the rows of M from those of the conic (b counted once) and of the compensation. With Q the
 // conic matrix, d(Sigma'^-1) = -Q dSigma' Q and d log det Sigma' = tr(Q dSigma'), so v_M = -2 (Q V + v / 2) Q
-// M. Multiplied out, Q M loses every digit for a splat a thousand times longer than wide; written as (m1 x n
-// + eps m0, n x m0 + eps m1) / det with n = m0 x m1 it loses none.
+// M. Computed as a matrix product, Q M loses every digit for a splat a thousand times longer than wide. The
+// form (m1 x n + eps m0, n x m0 + eps m1) / det with n = m0 x m1 loses none.
 template <class T>
 BLITZGS_HD void splat_vjp(const Splat<T>& s, const T* v_conic, T v_compensation, Vec3<T>* v_m0,
                           Vec3<T>* v_m1) {
@@ -178,7 +179,8 @@ BLITZGS_HD void splat_vjp(const Splat<T>& s, const T* v_conic, T v_compensation,
   *v_m0 = T(-2) * (xx * qm0 + xy * qm1);
   *v_m1 = T(-2) * (yx * qm0 + yy * qm1);
   if (v_compensation == T(0) || !(s.normal_length > T(0))) return;
-  // d|m0 x m1|; a splat seen exactly edge-on has no such derivative, and takes zero.
+  // The derivative of |m0 x m1|. It does not exist for a splat that is seen exactly edge-on; zero is used
+  // there.
   const T scale = v_compensation / (s.root_det * s.magnitude * s.normal_length);
   const Vec3<T> v_normal = scale * s.normal;
   *v_m0 = *v_m0 + cross(s.m1, v_normal);
@@ -226,7 +228,7 @@ BLITZGS_HD Vec3<T> pixel_gradients_vjp(const Camera<T>& camera, const ProjectedM
   return v;
 }
 
-// p = W mean + t: v_mean += W^T v_p, and the pose (null: not wanted) its share.
+// p = W mean + t: adds W^T v_p to v_mean, and the derivative by the pose to pose (null: not wanted).
 template <class T>
 BLITZGS_HD void camera_point_vjp(const Camera<T>& camera, const Vec3<T>& mean, const Vec3<T>& v_p,
                                  Vec3<T>* v_mean, PoseGradient<T>* pose) {

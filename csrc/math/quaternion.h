@@ -17,8 +17,8 @@ struct UnitQuaternion {
   T inverse_norm;  // 1 / |q| of the quaternion it came from; 0 when that was zero
 };
 
-// A zero quaternion gives the identity, whose gradient is defined as zero. The squares of very large or very
-// small components leave the range of float, so those are scaled by their largest component first.
+// A zero quaternion gives the identity, with a gradient of zero. The squares of very large or very small
+// components leave the range of float, so such quaternions are first divided by their largest component.
 template <class T>
 BLITZGS_HD UnitQuaternion<T> normalize_quaternion(const T* q) {
   T scale = T(1);
@@ -55,7 +55,7 @@ BLITZGS_HD void rotation_columns_vjp(const UnitQuaternion<T>& q, const Columns3<
       T(2) * (w * (v.z.x - v.x.z) + x * (v.x.y + v.y.x) + z * (v.y.z + v.z.y)) - T(4) * y * (v.x.x + v.z.z);
   const T v_z =
       T(2) * (w * (v.x.y - v.y.x) + x * (v.x.z + v.z.x) + y * (v.y.z + v.z.y)) - T(4) * z * (v.x.x + v.y.y);
-  // The unit quaternion does not change along itself.
+  // A change of q along itself does not change the unit quaternion, so that part of the gradient is removed.
   const T along = w * v_w + x * v_x + y * v_y + z * v_z;
   v_q[0] += q.inverse_norm * (v_w - along * w);
   v_q[1] += q.inverse_norm * (v_x - along * x);

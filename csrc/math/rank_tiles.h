@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which ranks a splat is of interest to: each composites a range of the flattened tiles of all cameras
+// Which ranks need a splat: each rank composites a range of the flattened tiles of all cameras
 // (math/tiles.h).
 #pragma once
 #include <cstdint>

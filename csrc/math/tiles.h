@@ -7,13 +7,13 @@
 // one of its pixel columns: per tile row the x-interval of the ellipse over the band of pixel centres is
 // found in closed form (the interval is widest at the clamped turning point), so the cost is O(tile rows).
 //
-// Conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q and the interval by some float
-// roundings, which covers the rounding of this test and of the rasterisers that evaluate q as
-// factor_conic() writes it. What is not listed therefore contributes nothing to the image. Not finite, not
-// convex (a <= 0 or c <= 0) or too faint (opacity < 1/255): no tiles.
+// The test is conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q, and the interval by
+// some float roundings. This covers the rounding of the test itself and of the rasterisers, which evaluate q
+// as factor_conic() writes it. A tile that is not listed therefore gets no contribution from the splat. A
+// splat that is not finite, not convex (a <= 0 or c <= 0) or too faint (opacity < 1/255) touches no tile.
 //
-// All contexts must count alike (a count from one kernel sizes the buffer of another), so no expression here
-// leaves the compiler a choice of contraction.
+// Every kernel must count the same tiles, because the count of one sizes the buffer of another. Expressions
+// here therefore leave the compiler no choice of contraction.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -49,7 +49,7 @@ BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int til
 
 namespace tiles {
 
-// NaN becomes the lower or the upper bound, as the name says.
+// Clamp a value; NaN becomes the lower bound in the first and the upper bound in the second.
 template <class T>
 BLITZGS_HD T clamp_nan_low(T value, T low, T high) {
   return value > low ? (value < high ? value : high) : low;
@@ -64,7 +64,7 @@ BLITZGS_HD bool finite(T value) {
   return value - value == T(0);
 }
 
-// x / size for x >= 0: a shift for a power of two, as tile sizes are.
+// x / size for x >= 0, as a shift where the size is a power of two, which tile sizes usually are.
 struct Divider {
   int size, shift;
 
@@ -79,8 +79,8 @@ struct Divider {
 }  // namespace tiles
 
 // conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2: never negative, and free of the cancellation that
-// ruins a dx^2 + 2 b dx dy + c dy^2 for thin splats. A conic whose rounding made it indefinite gets l22 = 0:
-// a splat that long is constant along its axis. The products of floats are exact in double.
+// ruins a dx^2 + 2 b dx dy + c dy^2 for thin splats. A conic that rounding made indefinite gets l22 = 0: a
+// splat that is so long is constant along its axis. The products of floats are exact in double.
 template <class T>
 struct ConicFactor {
   T l11, l21, l22;
@@ -128,7 +128,8 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
   ellipse->cut = mul_add(exact > T(0) ? exact : T(0), T(1.00002), T(2e-5));
   const ConicFactor<T> factor = factor_conic(conic);
   if (!(factor.l11 > T(0))) return false;
-  // a / det and c / det by one division, which in double is as dear as the rest of this function.
+  // One division serves a / det and c / det, because a division in double costs as much as the rest of this
+  // function.
   const double det = conic_determinant(conic);
   const double inverse = 1.0 / det;
   ellipse->inv_l11 = T(1) / factor.l11;
@@ -140,16 +141,16 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
   return tiles::finite(ellipse->shear) && tiles::finite(ellipse->inv_l11);
 }
 
-// First and last index of the pixel centres i + 0.5 in [low, high], within [0, size); empty: first > last.
-// A NaN bound does not bound.
+// First and last index of the pixel centres i + 0.5 in [low, high], within [0, size); empty: first > last. A
+// bound that is NaN is ignored.
 template <class T>
 BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
   *first = static_cast<int>(std::ceil(tiles::clamp_nan_low(low - T(0.5), T(0), static_cast<T>(size))));
   *last = static_cast<int>(std::floor(tiles::clamp_nan_high(high - T(0.5), T(-1), static_cast<T>(size - 1))));
 }
 
-// One end of the ellipse's interval over a band of rows, as x. side is -1 (left) or 1; dy is the height
-// within the band where that end reaches furthest.
+// Returns x at one end of the ellipse's interval over a band of rows. side is -1 for the left end and 1 for
+// the right one; dy is the height within the band at which that end lies furthest out.
 template <class T>
 BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
   constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
@@ -157,7 +158,7 @@ BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
   const T rest = mul_add(-w, w, e.cut);
   const T root = std::sqrt(rest > T(0) ? rest : T(0));
   const T middle = mul(-e.shear, dy);
-  // What rounding may have cost: of the terms added up, and of dy through the shear.
+  // Bounds the rounding of the terms that are added up, and of dy, which the shear multiplies.
   const T tilt = mul_add(std::fabs(e.shear), std::fabs(y), std::fabs(x));
   const T terms = mul_add(root, e.inv_l11, tilt + std::fabs(middle));
   const T end = x + mul_add(side * root, e.inv_l11, middle);
