@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from torch.utils import _pytree as pytree
+
 
 class Later:
     """A value that `LazyDict` works out when it is first read."""
@@ -85,3 +87,11 @@ class LazyDict(dict[str, Any]):
         for key in self:
             self[key]
         return super()
+
+
+# So that tree_map looks inside, as it does in plain dicts: a subclass of dict is a leaf to it.
+pytree.register_pytree_node(
+    LazyDict,
+    lambda values: (list(values.values()), list(values)),
+    lambda values, keys: dict(zip(keys, values, strict=True)),
+)

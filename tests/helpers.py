@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import blitzgs
 from blitzgs.ops.scatter import RowTables
 from blitzgs.reference import ReferenceImage, render
 
@@ -62,6 +63,11 @@ class Scene:
             self.width,
             self.height,
         )
+
+
+def rasterize_scene(scene: Scene, **options):
+    """Call `blitzgs.rasterization` for a scene; options override what it says."""
+    return blitzgs.rasterization(*scene.arguments(), **{"sh_degree": scene.sh_degree, **options})
 
 
 def random_scene(

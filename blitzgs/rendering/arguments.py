@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `blitzgs.rasterization` takes, checked by name and without its leading dimensions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from blitzgs.rendering.covariances import Decomposed, decompose
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+# Further arguments of gsplat's calls (1.5.3 and later) and their defaults, which alone are supported.
+GSPLAT_DEFAULTS: dict[str, Any] = {
+    "with_ut": False,
+    "with_eval3d": False,
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "rolling_shutter": None,
+    "viewmats_rs": None,
+    "ut_params": None,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
+}
+
+
+class Scene(NamedTuple):
+    """N Gaussians and the C views they are seen from.
+
+    Attributes:
+        means: [N, 3].
+        quats: [N, 4].
+        scales: [N, 3].
+        opacities: [N].
+        colors: SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone.
+        viewmats: [C, 4, 4].
+        Ks: [C, 3, 3].
+        covariances: given instead of quats and scales, which are then those of the decomposed ones.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor | None
+    viewmats: Tensor
+    Ks: Tensor
+    covariances: Decomposed | None = None
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """What a call renders: S scenes of N Gaussians and C views each, I = S C images.
+
+    Attributes:
+        scenes: the scenes, S >= 1. Of a call without a batch, the tensors of the caller themselves, so that a
+            leaf stays one.
+        colors: those of all scenes, as the caller gave them.
+        opacities: likewise.
+        sh_degree: degree of the SH that are evaluated; None: colours are values, or not rendered.
+        per_view: whether every view has colours of its own.
+        lead: the dimensions of the batch, and C.
+        raw: whether scales and opacities are before their activation.
+    """
+
+    scenes: tuple[Scene, ...]
+    colors: Tensor | None
+    opacities: Tensor
+    sh_degree: int | None
+    per_view: bool
+    lead: tuple[int, ...]
+    raw: bool = False
+
+    @property
+    def views(self) -> int:
+        """How many views C each scene is seen from."""
+        return self.lead[-1]
+
+    @property
+    def images(self) -> int:
+        """How many images I there are."""
+        return math.prod(self.lead)
+
+    @property
+    def count(self) -> int:
+        """How many Gaussians N a scene has."""
+        return self.opacities.shape[-1]
+
+
+def check_further(function: str, further: dict[str, Any]) -> None:
+    """Refuse what is no argument of gsplat's, and values of those that are but have no counterpart here.
+
+    Raises:
+        TypeError: an argument that gsplat does not have either.
+        ValueError: a value other than gsplat's default.
+    """
+    for name, value in further.items():
+        if name not in GSPLAT_DEFAULTS:
+            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}")
+        default = GSPLAT_DEFAULTS[name]
+        # gsplat's RollingShutterType.GLOBAL, an enumeration that only gsplat has.
+        shutter_is_global = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
+        if value is not None and value is not default and not shutter_is_global:
+            raise ValueError(f"blitzgs.{function} does not support {name}={value!r}; leave it out")
+
+
+def check_options(render_mode: str, rasterize_mode: str, camera_model: str, tile_size: int) -> None:
+    """Check the arguments that are no tensors.
+
+    Raises:
+        ValueError: one has an unknown value.
+    """
+    if render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
+    if rasterize_mode not in RASTERIZE_MODES:
+        raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', got {rasterize_mode!r}")
+    if camera_model != "pinhole":
+        raise ValueError(
+            f"blitzgs.rasterization does not support camera_model={camera_model!r}; leave it out"
+        )
+    if not 1 <= tile_size <= 64:
+        raise ValueError(f"tile_size must be 1 to 64 px, got {tile_size}")
+
+
+def check_tensors(tensors: dict[str, Any]) -> None:
+    """Check that tensors are such, by name.
+
+    Raises:
+        TypeError: one is an array of another library.
+    """
+    for name, value in tensors.items():
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+
+
+def gaussians_of(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    sh_degree: int | None,
+    with_colors: bool,
+) -> Gaussians:
+    """Check shapes and fold the dimensions of the batch into one.
+
+    Args:
+        means: as for `blitzgs.rasterization`, like the next seven.
+        quats: likewise.
+        scales: likewise.
+        opacities: likewise.
+        colors: likewise.
+        viewmats: likewise.
+        Ks: likewise.
+        sh_degree: likewise.
+        with_colors: whether colours are rendered.
+
+    Raises:
+        ValueError: a shape that does not fit, by name.
+    """
+    if means.dim() < 2 or viewmats.dim() < 3:
+        raise ValueError(
+            f"means must be [..., N, 3] and viewmats [..., C, 4, 4], got {list(means.shape)} and "
+            f"{list(viewmats.shape)}"
+        )
+    batch, N, C = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
+    _require("means", means, (*batch, N, 3), "[..., N, 3]")
+    _require("quats", quats, (*batch, N, 4), "[..., N, 4]")
+    _require("scales", scales, (*batch, N, 3), "[..., N, 3]")
+    _require("opacities", opacities, (*batch, N), "[..., N]")  # any other might broadcast
+    _require("viewmats", viewmats, (*batch, C, 4, 4), "[..., C, 4, 4]")
+    _require("Ks", Ks, (*batch, C, 3, 3), "[..., C, 3, 3]")
+    if colors is None and with_colors:
+        raise ValueError("colors may be None for the render modes D and ED alone")
+    per_view = colors is not None and _per_view(colors, batch, C, N, sh_degree)
+    colors = colors if with_colors else None
+    whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
+    return Gaussians(
+        _scenes(whole, batch),
+        colors,
+        opacities,
+        sh_degree if with_colors else None,
+        per_view,
+        (*batch, C),
+    )
+
+
+def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
+    if not batch:
+        return (whole,)
+    count = math.prod(batch)
+    if count == 0:
+        raise ValueError(f"the batch {[*batch]} is empty")
+    # One unbind each: its gradient is one stack, not a sum of tensors as large as the batch.
+    columns = (
+        [None] * count if t is None else t.reshape(count, *t.shape[len(batch) :]).unbind(0) for t in whole[:7]
+    )
+    return tuple(Scene(*tensors) for tensors in zip(*columns, strict=True))
+
+
+def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
+    """Return Gaussians whose quats and scales are those of covariances.
+
+    Args:
+        gaussians: with any quats and scales.
+        covars: as for `blitzgs.rasterization`.
+
+    Raises:
+        ValueError: the shape does not fit.
+    """
+    batch = gaussians.lead[:-1]
+    _require("covars", covars, (*batch, gaussians.count, 3, 3), "[..., N, 3, 3]")
+    scenes = []
+    for scene, own in zip(gaussians.scenes, covars.reshape(-1, *covars.shape[-3:]).unbind(0), strict=True):
+        found = decompose(own)
+        scenes.append(scene._replace(quats=found.quats, scales=found.scales, covariances=found))
+    return replace(gaussians, scenes=tuple(scenes))
+
+
+def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree: int | None) -> bool:
+    """Check the shape of colours; return whether each view has its own."""
+    wanted = "[..., N, D] or [..., C, N, D]"
+    shape = tuple(colors.shape[:-1])
+    if sh_degree is not None:
+        wanted = "SH coefficients [..., N, K, 3] or [..., C, N, K, 3] when sh_degree is given"
+        shape = tuple(colors.shape[:-2]) if colors.dim() > 2 and colors.shape[-1] == 3 else ()
+    if shape not in ((*batch, N), (*batch, C, N)) or colors.dim() < 2:
+        raise ValueError(
+            f"colors must be {wanted}, here with {[*batch]} before N = {N}, C = {C}, got {list(colors.shape)}"
+        )
+    if sh_degree is not None and (sh_degree + 1) ** 2 > colors.shape[-2]:
+        raise ValueError(
+            f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} SH coefficients, got {colors.shape[-2]}"
+        )
+    return shape != (*batch, N)
+
+
+def background_rows(backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str) -> Tensor | None:
+    """Return what lies behind each image, [I, D + depth], from [..., C, D].
+
+    Raises:
+        ValueError: the shape does not fit.
+    """
+    if backgrounds is None or "RGB" not in render_mode:
+        return None
+    assert gaussians.colors is not None
+    channels = gaussians.colors.shape[-1]
+    _require("backgrounds", backgrounds, (*gaussians.lead, channels), "[..., C, D]")
+    rows = backgrounds.reshape(gaussians.images, channels)
+    if render_mode == "RGB":
+        return rows
+    return torch.cat([rows, torch.zeros_like(rows[:, :1])], dim=1)
+
+
+def _require(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> None:
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name} must be {described} = {[*shape]}, got {list(tensor.shape)}")

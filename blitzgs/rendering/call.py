@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.rasterization`: gsplat's call for pinhole 3DGS, over the ops of BlitzGS."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from blitzgs.rendering.arguments import (
+    background_rows,
+    check_further,
+    check_options,
+    check_tensors,
+    gaussians_of,
+    with_covariances,
+)
+from blitzgs.rendering.groups import ProjectOptions
+from blitzgs.rendering.images import ImageOptions, render
+
+DEFAULT_TILE_SIZE = 16
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int | None = DEFAULT_TILE_SIZE,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    **further: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render N Gaussians into C pinhole views; the argument names, shapes and meta keys are gsplat's.
+
+    The image differs from gsplat 1.5.3's where BlitzGS defines it otherwise: alpha is capped at 0.99 (there:
+    0.999). Differentiable, once, in means, quats, scales, covars, opacities, colors, viewmats and
+    backgrounds; a second derivative is an error. Works under `torch.compile(fullgraph=True)`.
+
+    Leading dimensions `...`, the same for all, are a batch of independent scenes.
+
+    Args:
+        means: [..., N, 3] in world units, float32, or float64 on the CPU.
+        quats: [..., N, 4] (w, x, y, z), need not be normalised. Not read, and may be None, with `covars`.
+        scales: [..., N, 3] standard deviations (after the exponential). Likewise.
+        opacities: [..., N] in [0, 1] (after the sigmoid).
+        colors: with `sh_degree`, SH coefficients [..., N, K, 3], or per view [..., C, N, K, 3], which is
+            slower; otherwise values of any channel count, [..., N, D] or per view [..., C, N, D]. None for
+            the render modes D and ED.
+        viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
+        Ks: [..., C, 3, 3] intrinsics in px.
+        width: image width in px.
+        height: image height in px.
+        near_plane: Gaussians have z > near_plane, world units.
+        far_plane: Gaussians have z <= far_plane, world units.
+        radius_clip: drop splats that reach no further than this, px.
+        eps2d: variance added to both screen axes, px^2.
+        sh_degree: degree to evaluate, 0 to 3; None when `colors` holds values.
+        packed: whether meta's per-splat tensors hold only what is visible ([nnz, ...]) or all
+            ([..., C, N, ...], zero where invisible). The image is the same.
+        tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding; 8, 16
+            and 32 are fastest there.
+        backgrounds: [..., C, D] behind everything; None for zero. Depth channels have none.
+        render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
+        sparse_grad: whether means, quats and scales, and with `sh_degree` opacities and colors that are
+            leaves, get sparse gradients, over the visible Gaussians alone. Dense ones cost a pass over all N.
+        absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
+        rasterize_mode: "classic" or "antialiased".
+        channel_chunk: accepted and not needed: any channel count is rendered in one pass.
+        distributed: only False is supported.
+        camera_model: only "pinhole" is supported.
+        segmented: accepted and not needed: it selects a sort in gsplat, never the result.
+        covars: [..., N, 3, 3] covariances instead of quats and scales, of which the upper triangles are read.
+            Each is decomposed once, which costs more than the rest of the call: quats and scales are faster.
+        further: arguments of gsplat's that have no counterpart; only their defaults pass.
+
+    Returns:
+        Images [..., C, H, W, D] (depth last), alphas [..., C, H, W, 1], and meta: batch_ids, camera_ids,
+        gaussian_ids (None unless packed; ordered by image, then Gaussian), radii, means2d, depths, conics,
+        opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets (int64),
+        width, height, tile_size, n_batches, n_cameras. The image depends on means2d, conics, opacities and,
+        where depth is rendered, depths, so they take `retain_grad()`. Rows whose alpha is below 1/255 on all
+        pixels of the image are not there, though gsplat counts some of them as visible (0.1 % more).
+        `meta["non_finite"]` has what was not rendered because it is NaN or infinite: a dict of the indices of
+        Gaussians and views by argument. Meta is a `LazyDict`: what the image does not need is worked out when
+        it is first read.
+
+    Warns:
+        RuntimeWarning: an argument has values that are NaN or infinite (on CUDA found in every 32nd call).
+
+    Raises:
+        TypeError: an array of another library where a tensor is needed, or an argument that gsplat has not.
+        ValueError: an argument that is not supported or does not fit, by name.
+        RuntimeError: a wrong dtype that a kernel found.
+    """
+    check_further("rasterization", further)
+    tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
+    check_options(render_mode, rasterize_mode, camera_model, tile_size)
+    if distributed:
+        raise ValueError("blitzgs.rasterization does not support distributed=True; leave it out")
+    check_tensors({"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks})
+    if covars is not None:
+        check_tensors({"covars": covars})
+        # Their places are taken by what the covariances are decomposed into.
+        quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
+    check_tensors({"quats": quats, "scales": scales} | ({} if colors is None else {"colors": colors}))
+    assert quats is not None and scales is not None
+    gaussians = gaussians_of(
+        means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, "RGB" in render_mode
+    )
+    if sparse_grad and len(gaussians.lead) > 1:
+        raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
+    if covars is not None:
+        gaussians = with_covariances(gaussians, covars)
+    project = ProjectOptions(
+        width, height, tile_size, near_plane, far_plane, eps2d, radius_clip, rasterize_mode == "antialiased"
+    )
+    background = background_rows(backgrounds, gaussians, render_mode)
+    image = ImageOptions(render_mode, background, packed, sparse_grad, absgrad)
+    return render("rasterization", gaussians, project, image)

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussians given by covariances instead of rotations and scales.
+
+The kernels find what a view sees from rotations and scales, so each covariance is decomposed once, without
+gradients: those of an eigenvalue decomposition are infinite where two axes are alike. The shape of each row
+on the screen, which the image depends on, is then worked out from the covariance itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.ops.project import Rows
+
+
+@dataclass(frozen=True)
+class Decomposed:
+    """Covariances, and the rotations and scales they are of.
+
+    Attributes:
+        upper: [N, 6]: xx, xy, xz, yy, yz, zz, which gradients go to.
+        quats: [N, 4], of a constant.
+        scales: [N, 3], of a constant; NaN where a covariance is not finite.
+    """
+
+    upper: Tensor
+    quats: Tensor
+    scales: Tensor
+
+
+def decompose(covars: Tensor) -> Decomposed:
+    """Decompose covariances [N, 3, 3]; what lies below their diagonals is not read, as in gsplat."""
+    upper = covars[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    with torch.no_grad():
+        matrices = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3).double()
+        finite = matrices.isfinite().all(dim=(1, 2))
+        matrices = torch.where(finite[:, None, None], matrices, torch.eye(3, device=covars.device).double())
+        variances, axes = torch.linalg.eigh(matrices)
+        # A rotation keeps orientation; which way the axis of an eigenvector points says nothing.
+        axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
+        scales = variances.clamp(min=0).sqrt().masked_fill_(~finite[:, None], torch.nan)
+        return Decomposed(upper, _quaternions(axes).to(covars.dtype), scales.to(covars.dtype))
+
+
+def _quaternions(rotations: Tensor) -> Tensor:
+    """Return (w, x, y, z) [N, 4] of rotations [N, 3, 3], over the largest of the four (Shepperd 1978)."""
+    r = rotations
+    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    wx, wy, wz = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
+    xy, xz, yz = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
+    # Row i is 4 q_i q; the one with the largest q_i has the least rounding.
+    products = torch.stack(
+        [
+            torch.stack([1 + xx + yy + zz, wx, wy, wz], dim=1),
+            torch.stack([wx, 1 + xx - yy - zz, xy, xz], dim=1),
+            torch.stack([wy, xy, 1 - xx + yy - zz, yz], dim=1),
+            torch.stack([wz, xz, yz, 1 - xx - yy + zz], dim=1),
+        ],
+        dim=1,
+    )
+    best = products.diagonal(dim1=1, dim2=2).argmax(dim=1)
+    return torch.nn.functional.normalize(products[torch.arange(len(r), device=r.device), best], dim=1)
+
+
+def shaped_by(rows: Rows, arguments: tuple[Any, ...], decomposed: Decomposed) -> Rows:
+    """Return rows whose conics, and compensated opacities, come from covariances (docs/image.md).
+
+    In double, because the determinant of a covariance loses the digits of a thin splat.
+
+    Args:
+        rows: of the decomposed covariances.
+        arguments: of the op `project_count`, from means to raw.
+        decomposed: the covariances.
+    """
+    means, opacities, viewmats, Ks = (arguments[i].double() for i in (0, 3, 5, 6))
+    width, height, eps2d, antialiased = arguments[9], arguments[10], arguments[15], arguments[17]
+    views, ids = rows.camera_ids, rows.gaussian_ids
+    viewmats, Ks = viewmats.index_select(0, views), Ks.index_select(0, views)
+    rotations = viewmats[:, :3, :3]
+    points = torch.einsum("pij,pj->pi", rotations, means.index_select(0, ids)) + viewmats[:, :3, 3]
+    jacobians = _jacobians(points, Ks, width, height) @ rotations
+    upper = decomposed.upper.double().index_select(0, ids)
+    covars = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
+    on_screen = jacobians @ covars @ jacobians.mT
+    xx, xy, yy = on_screen[:, 0, 0], on_screen[:, 0, 1], on_screen[:, 1, 1]
+    before = xx * yy - xy * xy
+    after = (xx + eps2d) * (yy + eps2d) - xy * xy
+    conics = torch.stack([yy + eps2d, -xy, xx + eps2d], dim=1) / after[:, None]
+    rows = rows._replace(conics=conics.to(rows.conics.dtype))
+    if not antialiased:
+        return rows
+    share = (before / after).clamp(min=1e-30).sqrt()  # the root of zero has no derivative
+    compensated = (opacities.index_select(0, ids) * share).to(rows.opacities.dtype)
+    # A row without opacity is hidden: its colour is not finite.
+    return rows._replace(opacities=torch.where(rows.opacities == 0, rows.opacities, compensated))
+
+
+def _jacobians(points: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:
+    """Return d(pixel)/d(camera point) [P, 2, 3], slopes held within 0.15 images of the borders."""
+    x, y, z = points.unbind(dim=1)
+    fx, fy, cx, cy = Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]
+    u = torch.clamp(x / z, (-0.15 * width - cx) / fx, (1.15 * width - cx) / fx)
+    v = torch.clamp(y / z, (-0.15 * height - cy) / fy, (1.15 * height - cy) / fy)
+    zero = torch.zeros_like(z)
+    across = torch.stack([fx / z, zero, -fx * u / z], dim=1)
+    down = torch.stack([zero, fy / z, -fy * v / z], dim=1)
+    return torch.stack([across, down], dim=1)

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projection of any number of scenes and views: what one launch takes is projected together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.ops.project import Rows, differentiable_rows
+from blitzgs.rendering.arguments import Gaussians, Scene
+from blitzgs.rendering.covariances import Decomposed, shaped_by
+
+MOST_VIEWS = 32  # of one launch: a bit mask holds them
+
+
+@dataclass(frozen=True)
+class ProjectOptions:
+    """How rows are made; see `blitzgs.ops.project.project`."""
+
+    width: int
+    height: int
+    tile_size: int
+    near_plane: float
+    far_plane: float
+    eps2d: float
+    radius_clip: float
+    antialiased: bool
+
+
+@dataclass(frozen=True)
+class Group:
+    """Views of one scene that are projected together.
+
+    Attributes:
+        arguments: of the op, from means to raw.
+        first_image: number of its first view among the images of the call.
+        covariances: given instead of quats and scales; None: those were.
+    """
+
+    arguments: tuple[Any, ...]
+    first_image: int
+    covariances: Decomposed | None
+
+
+def groups_of(gaussians: Gaussians, options: ProjectOptions) -> list[Group]:
+    """Return what is projected together: one group for one scene of up to 32 views with common colours."""
+    groups = []
+    sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
+    most = 1 if sh_per_view else MOST_VIEWS
+    for s, scene in enumerate(gaussians.scenes):
+        # A split of nothing to be split would still cost the host a node of the graph.
+        views = [(scene.viewmats, scene.Ks)]
+        if gaussians.views > most:
+            views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
+        sh = _sh_of_views(gaussians, scene, len(views))
+        for part, (viewmats, Ks) in enumerate(views):
+            arguments = (
+                *scene[:4], sh[part], viewmats, Ks, None, None, options.width, options.height,
+                options.tile_size, gaussians.sh_degree or 0, options.near_plane, options.far_plane,
+                options.eps2d, options.radius_clip, options.antialiased, gaussians.raw,
+            )  # fmt: skip
+            groups.append(Group(arguments, s * gaussians.views + part * most, scene.covariances))
+    return groups
+
+
+def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Tensor | None]:
+    """Return the SH that each part of a scene's views is rendered with."""
+    if gaussians.sh_degree is None or scene.colors is None:
+        return (None,) * parts
+    return scene.colors.unbind(0) if gaussians.per_view else (scene.colors,) * parts
+
+
+def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rows | None) -> Rows:
+    """Return the rows of all images, those of a group after those of the groups before.
+
+    Args:
+        groups: what is projected.
+        sparse_grad: see `blitzgs.ops.project.project`.
+        ready: what the projection of the one group returned, if it is there already.
+
+    Returns:
+        Rows whose camera_ids number all images of the call. Of several groups, visible_ids and row_offsets
+        are those of the first.
+    """
+    parts = []
+    for group in groups:
+        rows = differentiable_rows(group.arguments, sparse_grad, ready)
+        if group.covariances is not None:
+            rows = shaped_by(rows, group.arguments, group.covariances)
+        parts.append(rows)
+    if len(parts) == 1:
+        return parts[0]
+    images = [rows.camera_ids + group.first_image for rows, group in zip(parts, groups, strict=True)]
+    joined = parts[0]._asdict()
+    for name in (
+        "gaussian_ids",
+        "means2d",
+        "conics",
+        "depths",
+        "opacities",
+        "colors",
+        "radii",
+        "tiles_touched",
+    ):
+        joined[name] = torch.cat([getattr(rows, name) for rows in parts])
+    joined["camera_ids"] = torch.cat(images)
+    joined["counts"] = torch.stack([rows.counts for rows in parts]).sum(dim=0)
+    return Rows(**joined)

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checked Gaussians to images: projected in groups, laid out, listed by tile and composited at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.ops.intersect import intersect
+from blitzgs.ops.project import Rows
+from blitzgs.ops.rasterize import rasterize
+from blitzgs.ops.render import Rendered, render_queued
+from blitzgs.rendering.arguments import Gaussians
+from blitzgs.rendering.finite import warn_of_non_finite
+from blitzgs.rendering.groups import Group, ProjectOptions, groups_of, project_groups
+from blitzgs.rendering.layout import Layout
+from blitzgs.rendering.meta import Lists, make_meta
+
+# What the CUDA kernels composite; for any other size, meta's lists are of the tiles asked for alone.
+CUDA_TILE_SIZES = (8, 16, 32)
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """What is composited of the rows, and what is told of them; see `blitzgs.rasterization`.
+
+    Attributes:
+        render_mode: what the channels are.
+        backgrounds: [I, channels] or None.
+        packed: whether `meta` has rows, else all Gaussians.
+        sparse_grad: whether gradients are sparse.
+        absgrad: whether the backward pass tells absolute gradients.
+    """
+
+    render_mode: str
+    backgrounds: Tensor | None
+    packed: bool
+    sparse_grad: bool
+    absgrad: bool
+
+
+def render(
+    function: str,
+    gaussians: Gaussians,
+    project: ProjectOptions,
+    image: ImageOptions,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render; returns what `blitzgs.rasterization` does.
+
+    Args:
+        function: name of the public call, for warnings.
+        gaussians: what is rendered.
+        project: how it is projected.
+        image: how it is composited.
+    """
+    compiling = torch.compiler.is_compiling()
+    by_value = gaussians.colors is not None and gaussians.sh_degree is None
+    hidden = _without_non_finite(gaussians) if by_value else gaussians
+    groups = groups_of(hidden, project)
+    ready = None
+    if len(groups) == 1 and groups[0].covariances is None and not by_value and not compiling:
+        ready = _queued(groups[0], gaussians, project, image)
+    rows = project_groups(groups, image.sparse_grad, None if ready is None else ready.rows)
+    layout = Layout(rows, gaussians.lead, gaussians.count, image.packed)
+    laid = _laid(layout, gaussians, project, image)
+    means2d, conics, opacities, depths = layout.take(*laid.values())
+    rendered = rows._replace(means2d=means2d, conics=conics, opacities=opacities, depths=depths)
+    lists, composited_lists = _lists(rendered, gaussians, project, ready)
+    renders, alphas = rasterize(
+        means2d, conics, opacities, _channels(rendered, layout, gaussians, image.render_mode),
+        composited_lists.rows, composited_lists.offsets, n_cameras=gaussians.images, width=project.width,
+        height=project.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
+        tell_absgrad=_absgrad_teller(layout, laid["means2d"]) if image.absgrad else None,
+        composited=None if ready is None else ready.composited,
+    )  # fmt: skip
+    if not compiling:
+        warn_of_non_finite(gaussians, layout, function)
+    size = (*gaussians.lead, project.height, project.width)
+    alphas = alphas[..., None]
+    if image.render_mode.endswith("ED"):
+        renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
+    if len(gaussians.lead) > 1:
+        renders, alphas = renders.view(*size, renders.shape[-1]), alphas.view(*size, 1)
+    return renders, alphas, make_meta(gaussians, layout, laid, lists)
+
+
+def _queued(
+    group: Group, gaussians: Gaussians, project: ProjectOptions, image: ImageOptions
+) -> Rendered | None:
+    """Have all of it queued on CUDA before the host knows how many rows there are, if that can be done."""
+    means = group.arguments[0]
+    # Hooks on saved tensors (checkpointing) want the same shapes each time, without room behind rows.
+    if (
+        not means.is_cuda
+        or project.tile_size not in CUDA_TILE_SIZES
+        or torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
+    ):
+        return None
+    inputs = [*group.arguments[:6], gaussians.colors]
+    differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
+    return render_queued(
+        group.arguments,
+        lambda rows: _channels_of_rows(rows, gaussians, image.render_mode),
+        image.backgrounds,
+        differentiable and not image.absgrad,
+    )
+
+
+def _laid(
+    layout: Layout, gaussians: Gaussians, project: ProjectOptions, image: ImageOptions
+) -> dict[str, Tensor]:
+    """Return what is rendered as it lies in meta."""
+    rows = layout.rows
+    means2d, conics, opacities, depths = layout.lay(rows.means2d, rows.conics, rows.opacities, rows.depths)
+    if not (image.packed or project.antialiased or image.sparse_grad):
+        given = gaussians.opacities.sigmoid() if gaussians.raw else gaussians.opacities
+        opacities = layout.lay_opacities(given)
+    return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
+
+
+def _lists(
+    rows: Rows, gaussians: Gaussians, project: ProjectOptions, ready: Rendered | None
+) -> tuple[Lists, Lists]:
+    """Return the tiles' lists for meta, and those that are composited."""
+    width, height, tile_size = project.width, project.height, project.tile_size
+    if ready is not None:
+        lists = Lists(ready.isect_rows, ready.tile_offsets, width, height, tile_size)
+        return lists, lists
+    splats = (rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids)
+    grid: dict[str, Any] = {"n_cameras": gaussians.images, "width": width, "height": height}
+    known = -1 if torch.compiler.is_compiling() else int(rows.counts[2])
+    lists = Lists(*intersect(*splats, tile_size=tile_size, n_isects=known, **grid), width, height, tile_size)
+    if not rows.means2d.is_cuda or tile_size in CUDA_TILE_SIZES:
+        return lists, lists
+    size = CUDA_TILE_SIZES[1]
+    return lists, Lists(*intersect(*splats, tile_size=size, **grid), width, height, size)
+
+
+def _without_non_finite(gaussians: Gaussians) -> Gaussians:
+    """Zero the opacity of Gaussians with a NaN or infinite value, so that it spreads to no pixel."""
+    scenes = []
+    for scene in gaussians.scenes:
+        assert scene.colors is not None
+        finite = scene.colors.detach().isfinite().all(dim=-1)
+        if finite.dim() == 2:
+            finite = finite.all(dim=0)
+        nothing = torch.full_like(scene.opacities, -torch.inf if gaussians.raw else 0.0)
+        scenes.append(scene._replace(opacities=torch.where(finite, scene.opacities, nothing)))
+    return replace(gaussians, scenes=tuple(scenes))
+
+
+def _channels(rows: Rows, layout: Layout, gaussians: Gaussians, render_mode: str) -> Tensor:
+    """Return what is composited, per row [P, D]."""
+    if gaussians.colors is None or gaussians.sh_degree is not None:
+        return _channels_of_rows(rows, gaussians, render_mode)
+    N = gaussians.count
+    scenes = layout.images if gaussians.per_view else layout.images // gaussians.views
+    of_all = len(gaussians.scenes) > 1 or gaussians.per_view
+    places = scenes * N + layout.gaussians if of_all else layout.gaussians
+    values = gaussians.colors.reshape(-1, gaussians.colors.shape[-1]).index_select(0, places)
+    return _with_depth(values, rows, render_mode)
+
+
+def _channels_of_rows(rows: Rows, gaussians: Gaussians, render_mode: str) -> Tensor:
+    """Return what is composited of rows that have all of it: depths, or colours of SH."""
+    if gaussians.colors is None:
+        return rows.depths[:, None]
+    return _with_depth(rows.colors, rows, render_mode)
+
+
+def _with_depth(values: Tensor, rows: Rows, render_mode: str) -> Tensor:
+    return values if render_mode == "RGB" else torch.cat([values, rows.depths[:, None]], dim=1)
+
+
+def _absgrad_teller(layout: Layout, means2d: Tensor) -> Any:
+    def tell(gradient: Tensor) -> None:
+        means2d.absgrad = layout.lay(gradient)[0]  # type: ignore[attr-defined]
+
+    return tell

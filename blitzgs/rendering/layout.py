@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a call's rows stand in `meta`: one after the other, or in [..., C, N, ...] of all Gaussians.
+
+The ops have rows by Gaussian, then view; packed, `meta` has them by image, then Gaussian. What `meta` shows
+of them lies on the way from the projection to the image, as in gsplat: rows are laid out, and what is
+rendered is taken from there, so that the tensors in `meta` get gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.ops.project import Rows
+
+
+class Layout:
+    """Where P rows stand in `meta`.
+
+    Attributes:
+        rows: the rows; their camera_ids number all images of the call, their gaussian_ids those of a scene.
+        packed: whether `meta` has rows, else all Gaussians.
+        places: int64 [P], where each row stands; None: rows stand as they are.
+        shape: dimensions before those of a row's values.
+    """
+
+    def __init__(self, rows: Rows, lead: tuple[int, ...], count: int, packed: bool) -> None:
+        """Lay rows out.
+
+        Args:
+            rows: as the attribute.
+            lead: dimensions of the batch, and C.
+            count: Gaussians N of a scene.
+            packed: whether `meta` has rows, else all Gaussians.
+        """
+        self.rows, self.packed = rows, packed
+        self._images: Tensor | None = None
+        self._gaussians: Tensor | None = None
+        self.places: Tensor | None = None
+        self.shape: tuple[int, ...] = tuple(rows.camera_ids.shape)
+        if not packed:
+            self.places = self.images * count + self.gaussians
+            self.shape = (*lead, count)
+        elif math.prod(lead) > 1:
+            order = torch.argsort(self.images, stable=True)
+            self.places = torch.empty_like(order)
+            self.places[order] = torch.arange(len(order), device=order.device)
+
+    # Made when first asked for; functools.cached_property takes a lock, which torch.compile cannot trace.
+    @property
+    def images(self) -> Tensor:
+        """The image of each row, int64 [P]."""
+        if self._images is None:
+            self._images = self.rows.camera_ids.long()
+        return self._images
+
+    @property
+    def gaussians(self) -> Tensor:
+        """The Gaussian of each row in its scene, int64 [P]."""
+        if self._gaussians is None:
+            self._gaussians = self.rows.gaussian_ids.long()
+        return self._gaussians
+
+    def lay(self, *values: Tensor) -> tuple[Tensor, ...]:
+        """Return rows' values [P, ...] as [*shape, ...]; zero where a view does not see a Gaussian."""
+        if self.places is None:
+            return values
+        laid: tuple[Tensor, ...] = _Lay.apply(self.places, self.shape, *values)  # type: ignore[no-untyped-call]
+        return laid
+
+    def take(self, *laid: Tensor) -> tuple[Tensor, ...]:
+        """Return what rows have of [*shape, ...]: [P, ...] each."""
+        if self.places is None:
+            return laid
+        taken: tuple[Tensor, ...] = _Take.apply(self.places, self.shape, *laid)  # type: ignore[no-untyped-call]
+        return taken
+
+    def lay_opacities(self, opacities: Tensor) -> Tensor:
+        """Return the rows' opacities as [..., C, N], and for what a view does not see those given, [..., N].
+
+        A row in it has no other opacity than its Gaussian (without compensation), as in gsplat.
+        """
+        (rows,) = self.lay(self.rows.opacities)
+        assert self.places is not None
+        unseen = torch.ones(self.shape, dtype=torch.bool, device=rows.device)
+        unseen.view(-1)[self.places] = False
+        return rows + unseen * opacities[..., None, :]
+
+
+def _laid(places: Tensor, shape: tuple[int, ...], values: Tensor) -> Tensor:
+    laid = values.new_zeros(*shape, *values.shape[1:])
+    laid.view(-1, *values.shape[1:]).index_copy_(0, places, values)
+    return laid
+
+
+def _taken(places: Tensor, shape: tuple[int, ...], laid: Tensor) -> Tensor:
+    return laid.reshape(-1, *laid.shape[len(shape) :]).index_select(0, places)
+
+
+class _Lay(torch.autograd.Function):
+    """Rows to where they stand; no two at one place, so the gradient is taken from there."""
+
+    @staticmethod
+    def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *values: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(places)
+        ctx.shape = shape
+        ctx.set_materialize_grads(False)
+        return tuple(_laid(places, shape, v) for v in values)
+
+    @staticmethod
+    def backward(ctx: Any, *v_laid: Tensor | None) -> Any:
+        (places,) = ctx.saved_tensors
+        return None, None, *(None if v is None else _taken(places, ctx.shape, v) for v in v_laid)
+
+
+class _Take(torch.autograd.Function):
+    """The inverse of `_Lay`."""
+
+    @staticmethod
+    def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *laid: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(places)
+        ctx.shape = shape
+        ctx.set_materialize_grads(False)
+        return tuple(_taken(places, shape, t) for t in laid)
+
+    @staticmethod
+    def backward(ctx: Any, *v_taken: Tensor | None) -> Any:
+        (places,) = ctx.saved_tensors
+        return None, None, *(None if v is None else _laid(places, ctx.shape, v) for v in v_taken)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `blitzgs.rasterization` tells besides its images: gsplat's `meta`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.lazy_dict import Later, LazyDict
+from blitzgs.rendering.arguments import Gaussians
+from blitzgs.rendering.finite import non_finite
+from blitzgs.rendering.layout import Layout
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Which rows the tiles of all images composite.
+
+    Attributes:
+        rows: int32, row indices; entries past the last offset mean nothing.
+        offsets: int64 [I T + 1].
+        width: of the images in px.
+        height: likewise.
+        tile_size: edge of a tile in px.
+    """
+
+    rows: Tensor
+    offsets: Tensor
+    width: int
+    height: int
+    tile_size: int
+
+    @property
+    def tiles_x(self) -> int:
+        """Tiles next to each other."""
+        return -(-self.width // self.tile_size)
+
+    @property
+    def tiles_y(self) -> int:
+        """Tiles below each other."""
+        return -(-self.height // self.tile_size)
+
+    def listed(self) -> Tensor:
+        """Return the rows without the entries that mean nothing: there are some where rows are hidden."""
+        if torch.compiler.is_compiling():  # they were counted
+            return self.rows
+        return self.rows[: int(self.offsets[-1])]
+
+
+def make_meta(gaussians: Gaussians, layout: Layout, laid: dict[str, Tensor], lists: Lists) -> dict[str, Any]:
+    """Return `meta`; what the image did not need is worked out when it is first read.
+
+    Under `torch.compile` it is a plain dict: what the caller does not read is not computed.
+
+    Args:
+        gaussians: the call's.
+        layout: of its rows.
+        laid: what is rendered, as it lies in `meta`.
+        lists: of the tiles.
+    """
+    rows, packed = layout.rows, layout.packed
+    views = gaussians.views
+
+    def flatten_ids() -> Tensor:
+        if layout.places is None:
+            return lists.listed()
+        return layout.places.index_select(0, lists.listed()).int()
+
+    entries: dict[str, Any] = {
+        "batch_ids": Later(lambda: layout.lay(layout.images // views)[0]) if packed else None,
+        "camera_ids": Later(lambda: layout.lay(layout.images % views)[0]) if packed else None,
+        "gaussian_ids": Later(lambda: layout.lay(layout.gaussians)[0]) if packed else None,
+        "radii": Later(lambda: layout.lay(rows.radii)[0]),
+        **laid,
+        "tile_width": lists.tiles_x,
+        "tile_height": lists.tiles_y,
+        "tiles_per_gauss": Later(lambda: layout.lay(rows.tiles_touched)[0]),
+        "isect_ids": Later(lambda: _isect_ids(layout, lists, gaussians.images)),
+        "flatten_ids": Later(flatten_ids),
+        "isect_offsets": Later(
+            lambda: lists.offsets[:-1].reshape(*gaussians.lead, lists.tiles_y, lists.tiles_x)
+        ),
+        "width": lists.width,
+        "height": lists.height,
+        "tile_size": lists.tile_size,
+        "n_batches": len(gaussians.scenes),
+        "n_cameras": views,
+    }
+    if torch.compiler.is_compiling():
+        return {key: value.compute() if isinstance(value, Later) else value for key, value in entries.items()}
+    entries["non_finite"] = Later(lambda: non_finite(gaussians))
+    return LazyDict(**entries)
+
+
+def _isect_ids(layout: Layout, lists: Lists, images: int) -> Tensor:
+    """Return gsplat's sort keys, int64: image | tile | float32 depth bits, from high to low."""
+    depths = layout.rows.depths.detach().index_select(0, lists.listed())
+    entries = torch.arange(len(depths), device=depths.device)
+    keys = torch.searchsorted(lists.offsets[1:], entries, right=True)
+    n_tiles = lists.tiles_x * lists.tiles_y
+    if images > 1:
+        keys = keys + keys // n_tiles * ((1 << n_tiles.bit_length()) - n_tiles)
+    return keys.bitwise_left_shift(32).bitwise_or(depths.float().view(torch.int32))

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What autograd, checkpointing and torch.compile may ask of `blitzgs.rasterization`."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+import torch.utils.checkpoint
+
+from blitzgs.ops.photometric import photometric_loss
+from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
+
+
+def second_derivative_of_a_gradient(scene):
+    image, _, _ = rasterize_scene(scene)
+    (gradient,) = torch.autograd.grad(image.square().sum(), scene.means, create_graph=True)
+    gradient.sum().backward()
+
+
+def second_derivative_of_a_linear_loss(scene):
+    image, alphas, _ = rasterize_scene(scene)
+    (gradient,) = torch.autograd.grad(image.sum() + alphas.sum(), scene.colors, create_graph=True)
+    torch.autograd.grad(gradient.sum(), scene.means)
+
+
+def hessian(scene):
+    def loss(means):
+        return rasterize_scene(replace(scene, means=means))[0].sum()
+
+    torch.autograd.functional.hessian(loss, scene.means.detach())
+
+
+def second_derivative_of_the_loss_function(scene):
+    image = torch.rand(1, 20, 20, 3, device=scene.means.device, requires_grad=True)
+    loss = photometric_loss(image, torch.zeros_like(image))
+    (gradient,) = torch.autograd.grad(loss.sum(), image, create_graph=True)
+    gradient.sum().backward()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    "differentiate_twice",
+    [
+        second_derivative_of_a_gradient,
+        second_derivative_of_a_linear_loss,
+        hessian,
+        second_derivative_of_the_loss_function,
+    ],
+)
+def test_a_second_derivative_is_refused(device, differentiate_twice):
+    scene = random_scene(n=6, width=8, height=8, device=device).leaves()
+    for _ in range(2):  # on CUDA the second call is queued
+        with pytest.raises(RuntimeError, match="has first derivatives only"):
+            differentiate_twice(scene)
+
+
+def test_a_gradient_with_a_graph_may_be_used_as_a_value():
+    scene = random_scene(n=20).leaves()
+    expected, created = (
+        torch.autograd.grad(rasterize_scene(scene)[0].square().sum(), scene.means, create_graph=graph)[0]
+        for graph in (False, True)
+    )
+    assert torch.equal(created, expected)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "RGB+ED"}], ids=str)
+def test_images_may_be_changed_in_place(device, options):
+    """As gsplat's trainer does with the pixels outside of a mask."""
+    scene = random_scene(n=40, device=device)
+    mask = torch.rand(2, 32, 40, generator=torch.Generator().manual_seed(0)).to(device) > 0.3
+    gradients = []
+    for in_place in (True, False):
+        leaves = scene.leaves()
+        renders, _, _ = rasterize_scene(leaves, **options)
+        if in_place:
+            renders[~mask] = 0
+        else:
+            renders = renders * mask[..., None]
+        renders.square().sum().backward()
+        gradients.append([getattr(leaves, name).grad for name in PARAMETERS])
+    for name, actual, expected in zip(PARAMETERS, *gradients, strict=True):
+        assert relative_error(actual, expected) < 1e-5, name
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "ED"}], ids=str)
+@pytest.mark.parametrize("with_sh", [True, False])
+def test_sparse_gradients_are_the_dense_ones(device, options, with_sh):
+    scene = random_scene(n=80, width=20, height=16, device=device)
+    scene.means[::2] *= 8.0  # some are seen by no view
+    if not with_sh:
+        scene.sh_degree, scene.colors = None, scene.colors[:, 0]
+    dense, sparse = scene.leaves(), scene.leaves()
+    for leaves, flag in ((dense, False), (sparse, True)):
+        rasterize_scene(leaves, sparse_grad=flag, **options)[0].square().sum().backward()
+    sparse_names = ["means", "quats", "scales"]
+    if with_sh and "render_mode" not in options:
+        sparse_names += ["opacities", "colors"]
+    for name in PARAMETERS:
+        expected, actual = getattr(dense, name).grad, getattr(sparse, name).grad
+        assert (actual is None) == (expected is None)
+        if actual is None:
+            continue
+        assert actual.is_sparse == (name in sparse_names), name
+        if actual.is_sparse:
+            assert actual.coalesce().values().shape[0] < 80
+            actual = actual.to_dense()
+        assert relative_error(actual, expected) < 1e-6, name
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_sparse_gradients_pass_what_was_made_of_opacities_and_colours(device):
+    """A sparse gradient can go neither through a sigmoid nor through a concatenation."""
+    scene = random_scene(n=30, device=device)
+    names = ("means", "quats", "scales")
+    results = []
+    for sparse in (False, True):
+        leaves = scene.leaves()
+        logits = scene.opacities.logit().requires_grad_()
+        dc, rest = (part.detach().clone().requires_grad_() for part in scene.colors.split([1, 15], dim=1))
+        called = replace(leaves, opacities=logits.sigmoid(), colors=torch.cat([dc, rest], 1))
+        rasterize_scene(called, sparse_grad=sparse)[0].square().sum().backward()
+        inputs = [*(getattr(leaves, name) for name in names), logits, dc, rest]
+        assert [x.grad.is_sparse for x in inputs] == [sparse] * 3 + [False] * 3
+        results.append([x.grad.to_dense() for x in inputs])
+    for actual, expected in zip(*results, strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "RGB+ED"}], ids=str)
+def test_checkpointing_recomputes_the_call(device, options):
+    scene = random_scene(n=60, device=device)
+    results = []
+    for call in (lambda f, *a: f(*a), partial(torch.utils.checkpoint.checkpoint, use_reentrant=False)):
+        for _ in range(3):  # on CUDA the room for rows is learnt from call to call
+            leaves = scene.leaves()
+            inputs = [getattr(leaves, name) for name in PARAMETERS]
+
+            def image(*values):
+                changed = replace(scene, **dict(zip(PARAMETERS, values, strict=True)))
+                return rasterize_scene(changed, **options)[0]
+
+            call(image, *inputs).square().sum().backward()
+        results.append([x.grad for x in inputs])
+    for name, actual, expected in zip(PARAMETERS, *results, strict=True):
+        assert relative_error(actual, expected) < 1e-5, name
+
+
+COMPILED = [{}, {"packed": False}, {"render_mode": "RGB+ED"}, {"rasterize_mode": "antialiased"}]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("options", COMPILED, ids=str)
+def test_one_graph_is_compiled_of_a_call(device, options):
+    torch._dynamo.reset()
+    scene = random_scene(n=40, device=device)
+
+    def call(scene):
+        renders, alphas, meta = rasterize_scene(scene, **options)
+        return renders, alphas, meta["means2d"], meta["radii"], meta["flatten_ids"]
+
+    def gradients(leaves, renders, alphas):
+        loss = renders.square().sum() + alphas.sum()
+        return torch.autograd.grad(loss, [getattr(leaves, name) for name in PARAMETERS])
+
+    leaves = scene.leaves()
+    eager = call(leaves)
+    compiled = torch.compile(call, fullgraph=True, backend="aot_eager")(leaves)
+    for actual, expected in zip(compiled, eager, strict=True):
+        assert torch.equal(actual, expected)
+    renders = compiled[0]
+    renders[:, :4] = 0  # may be changed in place here too
+    eager[0][:, :4] = 0
+    pairs = zip(gradients(leaves, *compiled[:2]), gradients(leaves, *eager[:2]), strict=True)
+    for name, (actual, expected) in zip(PARAMETERS, pairs, strict=True):
+        assert relative_error(actual, expected) < 1e-5, name
+
+
+def test_a_second_derivative_of_a_compiled_call_is_refused():
+    torch._dynamo.reset()
+    leaves = random_scene(n=20).leaves()
+    image = torch.compile(lambda s: rasterize_scene(s)[0], fullgraph=True, backend="aot_eager")(leaves)
+    with pytest.raises(RuntimeError, match="create_graph=False|double backward"):
+        (gradient,) = torch.autograd.grad(image.sum(), leaves.means, create_graph=True)
+        gradient.sum().backward()
+
+
+@pytest.mark.parametrize("options", [{"absgrad": True}, {"sparse_grad": True}], ids=str)
+def test_what_cannot_be_compiled_says_so(options):
+    torch._dynamo.reset()
+    leaves = random_scene(n=20).leaves()
+    with pytest.raises(Exception, match="not supported under torch.compile"):
+        torch.compile(lambda s: rasterize_scene(s, **options)[0], fullgraph=True, backend="aot_eager")(leaves)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`meta` of `blitzgs.rasterization`: gsplat's keys, order and gradients."""
+
+import pytest
+import torch
+from torch.utils._pytree import tree_map
+
+from tests.helpers import DEVICES, random_scene, rasterize_scene, reference_images, relative_error
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_absgrad_and_the_gradient_of_means2d(packed):
+    scene = random_scene(n=25, cameras=1, width=12, height=9, dtype=torch.float64).leaves()
+    renders, _, meta = rasterize_scene(scene, packed=packed, absgrad=True)
+    meta["means2d"].retain_grad()
+    reference = reference_images(scene)[0]
+    weights = torch.randn(9, 12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    (renders[0] * weights).sum().backward()
+    signed = torch.zeros(25, 2, dtype=torch.float64)
+    absolute = torch.zeros_like(signed)
+    for pixel in (reference.image * weights).sum(dim=-1).reshape(-1):
+        gradient = torch.autograd.grad(pixel, reference.splats.means2d, retain_graph=True)[0]
+        signed[reference.splats.ids] += gradient
+        absolute[reference.splats.ids] += gradient.abs()
+    actual, actual_absolute = meta["means2d"].grad, meta["means2d"].absgrad
+    rows = (meta["gaussian_ids"],) if packed else (slice(None),)
+    actual, actual_absolute = (t if packed else t[0] for t in (actual, actual_absolute))
+    assert relative_error(actual, signed[rows]) < 1e-10
+    assert relative_error(actual_absolute, absolute[rows]) < 1e-10
+
+
+def test_packed_and_dense_meta_say_the_same():
+    scene = random_scene(n=50, cameras=3)
+    scene.means[::2] *= 6.0  # some are seen by no view
+    image, alpha, packed = rasterize_scene(scene, packed=True)
+    dense_image, dense_alpha, dense = rasterize_scene(scene, packed=False)
+    assert torch.equal(image, dense_image) and torch.equal(alpha, dense_alpha)
+    cameras, gaussians = packed["camera_ids"], packed["gaussian_ids"]
+    assert 0 < len(cameras) < 150
+    assert dense["camera_ids"] is None and dense["gaussian_ids"] is None
+    for name, shape in {
+        "radii": (3, 50, 2),
+        "means2d": (3, 50, 2),
+        "depths": (3, 50),
+        "conics": (3, 50, 3),
+        "opacities": (3, 50),
+        "tiles_per_gauss": (3, 50),
+    }.items():
+        assert dense[name].shape == shape, name
+        assert torch.equal(dense[name][cameras, gaussians], packed[name]), name
+    rows = cameras * 50 + gaussians
+    assert torch.equal(dense["flatten_ids"].long(), rows[packed["flatten_ids"].long()])
+    assert torch.equal(dense["isect_ids"], packed["isect_ids"])
+    invisible = torch.ones(3, 50, dtype=torch.bool)
+    invisible[cameras, gaussians] = False
+    assert (dense["radii"][invisible] == 0).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_meta_may_be_changed_in_place(device):
+    scene = random_scene(n=40, device=device).leaves()
+    for _ in range(2):  # the second call has room for its rows
+        _, _, meta = rasterize_scene(scene)
+        for name in ("means2d", "conics", "depths", "opacities", "radii", "tiles_per_gauss"):
+            meta[name].mul_(2)
+    meta["means2d"].sum().backward()
+    assert scene.means.grad.any()
+
+
+def test_meta_read_late_is_differentiable_as_the_call_was():
+    scene = random_scene(n=20).leaves()
+    with torch.no_grad():
+        _, _, constant = rasterize_scene(scene, packed=False)
+    _, _, meta = rasterize_scene(scene, packed=False)
+    with torch.no_grad():
+        depths = meta["depths"]
+    assert depths.requires_grad and not constant["depths"].requires_grad
+    depths.sum().backward()
+    assert scene.means.grad.any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("packed", [False, True])
+def test_meta_lists_only_what_touches_a_tile(device, packed):
+    """Not Gaussians whose colour is not finite, for which there is room in the lists."""
+    scene = random_scene(n=90, cameras=2, width=50, height=37, device=device)
+    scene.colors[::3, 0] = float("nan")
+    _, _, meta = rasterize_scene(scene, packed=packed)
+    listed = int(meta["tiles_per_gauss"].sum())
+    assert 0 < listed == len(meta["flatten_ids"]) == len(meta["isect_ids"])
+    rows = meta["flatten_ids"].long()
+    gaussians = meta["gaussian_ids"][rows] if packed else rows % 90
+    assert (gaussians % 3 != 0).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_meta_lists_are_sorted_and_consistent(device):
+    scene = random_scene(n=90, cameras=2, width=50, height=37, device=device)
+    _, _, meta = rasterize_scene(scene, tile_size=8)
+    assert (meta["tile_width"], meta["tile_height"]) == (7, 5)
+    assert meta["isect_offsets"].shape == (2, 5, 7)
+    assert meta["tiles_per_gauss"].sum() == len(meta["flatten_ids"]) == len(meta["isect_ids"])
+    keys = meta["isect_ids"]
+    assert (keys[1:] >= keys[:-1]).all()
+    bits = (7 * 5).bit_length()
+    tile, camera = (keys >> 32) & ((1 << bits) - 1), keys >> (32 + bits)
+    assert torch.equal(camera, meta["camera_ids"][meta["flatten_ids"].long()])
+    starts = meta["isect_offsets"].reshape(2, -1)
+    for c in range(2):
+        for t in (0, 17, 34):
+            assert ((camera < c) | ((camera == c) & (tile < t))).sum() == starts[c, t]
+    for name in ("width", "height", "tile_size", "n_cameras"):
+        assert meta[name] == {"width": 50, "height": 37, "tile_size": 8, "n_cameras": 2}[name]
+
+
+LAID_OUT = ("means2d", "conics", "opacities", "depths")
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_packed_rows_stand_image_after_image(device):
+    scene = random_scene(n=70, cameras=3, device=device)
+    _, _, meta = rasterize_scene(scene)
+    views = []
+    for view in range(3):
+        one = random_scene(n=70, cameras=3, device=device)
+        one.viewmats, one.Ks = scene.viewmats[view, None], scene.Ks[view, None]
+        views.append(rasterize_scene(one)[2])
+    lengths = torch.tensor([len(one["gaussian_ids"]) for one in views])
+    assert torch.equal(meta["camera_ids"].cpu(), torch.arange(3).repeat_interleave(lengths))
+    assert not meta["batch_ids"].any() and len(meta["batch_ids"]) == len(meta["camera_ids"])
+    for name in ("gaussian_ids", "radii", "tiles_per_gauss", *LAID_OUT):
+        assert torch.equal(meta[name], torch.cat([one[name] for one in views])), name
+    starts = lengths.cumsum(0) - lengths
+    rows = [one["flatten_ids"] + start for one, start in zip(views, starts.tolist(), strict=True)]
+    assert torch.equal(meta["flatten_ids"], torch.cat(rows).int())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_what_is_rendered_gets_gradients(device, packed, cameras):
+    scene = random_scene(n=40, cameras=cameras, device=device).leaves()
+    renders, _, meta = rasterize_scene(scene, packed=packed, render_mode="RGB+D", absgrad=True)
+    gradients = torch.autograd.grad(
+        renders.square().sum(), [meta[name] for name in LAID_OUT], retain_graph=True
+    )
+    for name in LAID_OUT:
+        meta[name].retain_grad()
+    renders.square().sum().backward()
+    for name, gradient in zip(LAID_OUT, gradients, strict=True):
+        assert relative_error(meta[name].grad, gradient) < 1e-6, name
+        assert gradient.shape == meta[name].shape and gradient.any(), name
+    assert (meta["means2d"].absgrad >= meta["means2d"].grad.abs() * 0.999 - 1e-6).all()
+    if not packed:
+        _, _, rows = rasterize_scene(scene, packed=True)
+        for gradient in (*gradients, meta["means2d"].absgrad):
+            unseen = torch.ones(cameras, 40, dtype=torch.bool, device=device)
+            unseen[rows["camera_ids"], rows["gaussian_ids"]] = False
+            assert not gradient[unseen].any()
+
+
+def test_packed_and_dense_meta_have_the_same_gradients():
+    scene = random_scene(n=40, cameras=3, dtype=torch.float64).leaves()
+    found = []
+    for packed in (True, False):
+        renders, _, meta = rasterize_scene(scene, packed=packed, render_mode="RGB+D")
+        found.append(torch.autograd.grad(renders.square().sum(), [meta[name] for name in LAID_OUT]))
+        if packed:
+            places = meta["camera_ids"], meta["gaussian_ids"]
+    for name, rows, dense in zip(LAID_OUT, *found, strict=True):
+        assert relative_error(dense[places], rows) < 1e-12, name
+
+
+def test_dense_opacities_are_those_of_all_gaussians():
+    scene = random_scene(n=30, cameras=2).leaves()
+    scene.means.data[::2] *= 9.0  # some are seen by no view
+    _, _, meta = rasterize_scene(scene, packed=False)
+    assert torch.equal(meta["opacities"], scene.opacities.expand(2, 30))
+    meta["opacities"].sum().backward()
+    assert torch.equal(scene.opacities.grad, torch.full((30,), 2.0))
+
+
+def test_absgrad_needs_no_gradient_of_a_leaf():
+    scene = random_scene(n=30, cameras=1).leaves()
+    found = []
+    for differentiate in (
+        lambda loss: loss.backward(),
+        lambda loss: torch.autograd.grad(loss, scene.colors),
+        lambda loss: torch.autograd.grad(loss, scene.means),
+    ):
+        renders, _, meta = rasterize_scene(scene, absgrad=True)
+        differentiate(renders.square().sum())
+        found.append(meta["means2d"].absgrad)
+    assert found[0].any()
+    assert all(torch.equal(absolute, found[0]) for absolute in found)
+
+
+def test_tree_map_reaches_into_meta():
+    _, _, meta = rasterize_scene(random_scene(n=30))
+    doubled = tree_map(lambda value: value * 2 if isinstance(value, torch.Tensor) else value, meta)
+    assert type(doubled) is dict and doubled.keys() == meta.keys()
+    for name in ("radii", "isect_ids", "means2d"):
+        assert torch.equal(doubled[name], meta[name] * 2)
+    assert doubled["width"] == meta["width"]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"])
+def test_what_is_not_finite_is_named(device, name):
+    # A number of Gaussians of its own: on CUDA the first call with it looks.
+    n = 31 + ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"].index(name)
+    scene = random_scene(n=n, cameras=2, device=device)
+    seen = int(rasterize_scene(scene)[2]["gaussian_ids"][0])
+    at = 1 if name in ("viewmats", "Ks") else seen
+    getattr(scene, name)[at] = torch.nan
+    scene = select_after(scene, name)
+    with pytest.warns(RuntimeWarning, match=rf"NaN or infinite values in {name};"):
+        image, _, meta = rasterize_scene(scene)
+    assert image.isfinite().all()
+    assert {key: value.tolist() for key, value in meta["non_finite"].items()} == {name: [at]}
+
+
+def select_after(scene, name):
+    """Add a Gaussian that no view sees, for a number of Gaussians that no call has had."""
+    for key in ("means", "quats", "scales", "opacities", "colors"):
+        value = getattr(scene, key)
+        setattr(scene, key, torch.cat([value, value[:1] if key != "means" else value[:1] + 1e3]))
+        if key == name and getattr(scene, key)[-1].isnan().any():
+            getattr(scene, key)[-1] = 0.5
+    return scene
+
+
+def test_finite_input_is_not_warned_of(recwarn):
+    _, _, meta = rasterize_scene(random_scene(n=30))
+    assert meta["non_finite"] == {}
+    assert not [w for w in recwarn if "blitzgs" in str(w.message)]

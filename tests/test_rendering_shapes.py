@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Batches, any number of views, colours per view, covariances; what is refused."""
+
+import enum
+from dataclasses import replace
+
+import pytest
+import torch
+
+import blitzgs
+from blitzgs.reference.gaussians import covariance_factors
+from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
+
+PER_ROW = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")
+
+
+def batch_of(scenes):
+    """Stack scenes: a leading dimension for all tensors."""
+    stacked = {name: torch.stack([getattr(s, name) for s in scenes]) for name in (*PARAMETERS, "Ks")}
+    return replace(scenes[0], **stacked)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("colors", ["sh", "values", "values per view", "sh per view"])
+def test_a_batch_is_its_scenes(device, packed, colors):
+    scenes = [random_scene(n=40, cameras=2, seed=seed, device=device) for seed in range(3)]
+    generator = torch.Generator().manual_seed(4)
+    for scene in scenes:
+        lead = (2, 40) if colors.endswith("per view") else (40,)
+        if colors.startswith("values"):
+            scene.sh_degree, scene.colors = None, torch.rand(*lead, 4, generator=generator).to(device)
+        else:
+            scene.colors = torch.randn(*lead, 16, 3, generator=generator).to(device)
+    batch = batch_of(scenes).leaves()
+    backgrounds = torch.rand(3, 2, batch.colors.shape[-1], generator=generator).to(device)
+    renders, alphas, meta = rasterize_scene(
+        batch, packed=packed, backgrounds=backgrounds, render_mode="RGB+ED"
+    )
+    renders.square().sum().backward()
+    singles = []
+    for index, scene in enumerate(scenes):
+        leaves = scene.leaves()
+        singles.append(
+            rasterize_scene(leaves, packed=packed, backgrounds=backgrounds[index], render_mode="RGB+ED")
+        )
+        assert torch.equal(renders[index], singles[-1][0])
+        assert torch.equal(alphas[index], singles[-1][1])
+        singles[-1][0].square().sum().backward()
+        for name in PARAMETERS:
+            assert relative_error(getattr(batch, name).grad[index], getattr(leaves, name).grad) < 1e-4, name
+    together = torch.cat if packed else torch.stack
+    for name in PER_ROW + (("camera_ids", "gaussian_ids") if packed else ()):
+        assert torch.equal(meta[name], together([single[2][name] for single in singles])), name
+    assert meta["isect_offsets"].shape == (3, 2, 2, 3)
+    assert (meta["n_batches"], meta["n_cameras"]) == (3, 2)
+    if packed:
+        lengths = torch.tensor([len(single[2]["camera_ids"]) for single in singles])
+        assert torch.equal(meta["batch_ids"].cpu(), torch.arange(3).repeat_interleave(lengths))
+
+
+def test_a_batch_may_have_several_dimensions():
+    scenes = [random_scene(n=20, cameras=1, seed=seed) for seed in range(4)]
+    flat = batch_of(scenes)
+    folded = replace(flat, **{k: getattr(flat, k).unflatten(0, (2, 2)) for k in (*PARAMETERS, "Ks")})
+    for packed, rows in ((True, 1), (False, 4)):
+        expected, _, flat_meta = rasterize_scene(flat, packed=packed)
+        renders, alphas, meta = rasterize_scene(folded, packed=packed)
+        assert renders.shape == (2, 2, 1, 32, 40, 3) and alphas.shape == (2, 2, 1, 32, 40, 1)
+        assert torch.equal(renders.flatten(0, 1), expected)
+        assert meta["means2d"].dim() == rows + 1
+        assert torch.equal(meta["means2d"].reshape(-1, 2), flat_meta["means2d"].reshape(-1, 2))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("with_sh", [True, False])
+def test_any_number_of_views(device, with_sh):
+    scene = random_scene(n=30, cameras=70, width=9, height=8, device=device)
+    if not with_sh:
+        scene.sh_degree, scene.colors = None, scene.colors[:, 0].abs()
+    leaves = scene.leaves()
+    renders, _, meta = rasterize_scene(leaves)
+    renders.square().sum().backward()
+    assert renders.shape == (70, 8, 9, 3)
+    assert (meta["camera_ids"].diff() >= 0).all() and meta["camera_ids"].max() == 69
+    parts = scene.leaves()
+    for view in (slice(0, 32), slice(32, 64), slice(64, 70)):
+        some = replace(parts, viewmats=parts.viewmats[view], Ks=parts.Ks[view])
+        expected, _, _ = rasterize_scene(some)
+        assert torch.equal(renders[view], expected)
+        expected.square().sum().backward()
+    for name in PARAMETERS:
+        assert relative_error(getattr(leaves, name).grad, getattr(parts, name).grad) < 1e-4, name
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_sh_may_differ_from_view_to_view(device):
+    scene = random_scene(n=40, cameras=3, device=device)
+    per_view = torch.randn(3, 40, 16, 3, generator=torch.Generator().manual_seed(1)).to(device) * 0.4
+    leaves = replace(scene, colors=per_view).leaves()
+    renders, _, _ = rasterize_scene(leaves)
+    renders.square().sum().backward()
+    for view in range(3):
+        one = replace(
+            scene, colors=per_view[view], viewmats=scene.viewmats[view, None], Ks=scene.Ks[view, None]
+        )
+        one = one.leaves()
+        expected, _, _ = rasterize_scene(one)
+        assert torch.equal(renders[view], expected[0])
+        expected.square().sum().backward()
+        assert relative_error(leaves.colors.grad[view], one.colors.grad) < 1e-5
+
+
+@pytest.mark.parametrize("mode", ["D", "ED"])
+def test_depth_needs_no_colours(mode):
+    scene = random_scene(n=30)
+    expected, _, _ = rasterize_scene(scene, render_mode=mode)
+    scene.colors = None
+    for degree in (None, 3):
+        assert torch.equal(rasterize_scene(scene, render_mode=mode, sh_degree=degree)[0], expected)
+    with pytest.raises(ValueError, match="colors may be None for the render modes D and ED alone"):
+        rasterize_scene(scene)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+def test_covariances_are_rotations_and_scales(device, rasterize_mode):
+    dtype = torch.float64 if device == "cpu" else torch.float32
+    bound = 1e-10 if device == "cpu" else 1e-4
+    scene = random_scene(n=60, cameras=2, dtype=dtype, device=device)
+    scene.scales[:20] = scene.scales[:20, :1]  # round: any axes are eigenvectors
+    scene.scales[20:40, 1] = scene.scales[20:40, 0]
+    expected, given = scene.leaves(), scene.leaves()
+    factors = covariance_factors(expected.quats, expected.scales)
+    covars = factors @ factors.mT
+    covars.retain_grad()
+    image, alphas, _ = rasterize_scene(expected, rasterize_mode=rasterize_mode)
+    own = covars.detach().clone().requires_grad_()
+    given.quats = given.scales = None
+    renders, own_alphas, _ = rasterize_scene(given, covars=own, rasterize_mode=rasterize_mode)
+    assert relative_error(renders, image) < bound and relative_error(own_alphas, alphas) < bound
+    image.square().sum().backward()
+    renders.square().sum().backward()
+    for name in ("means", "opacities", "colors", "viewmats"):
+        assert relative_error(getattr(given, name).grad, getattr(expected, name).grad) < 10 * bound, name
+    assert not own.grad[:, [1, 2, 2], [0, 0, 1]].any()  # the lower triangle is not read
+    scales, quats = torch.autograd.grad(
+        covariance_factors(expected.quats, expected.scales).matmul(
+            covariance_factors(expected.quats, expected.scales).mT
+        ),
+        [expected.scales, expected.quats],
+        own.grad,
+    )
+    assert relative_error(scales, expected.scales.grad) < 10 * bound
+    assert relative_error(quats, expected.quats.grad) < 10 * bound
+
+
+def test_covariances_of_a_batch():
+    scenes = [random_scene(n=20, cameras=2, seed=seed) for seed in range(2)]
+    batch = batch_of(scenes)
+    factors = covariance_factors(batch.quats.flatten(0, 1), batch.scales.flatten(0, 1))
+    covars = (factors @ factors.mT).view(2, 20, 3, 3)
+    renders, _, _ = rasterize_scene(replace(batch, quats=None, scales=None), covars=covars)
+    assert relative_error(renders, rasterize_scene(batch)[0]) < 1e-4
+
+
+def test_a_covariance_that_is_not_finite_is_not_rendered():
+    scene = random_scene(n=20, cameras=1)
+    factors = covariance_factors(scene.quats, scene.scales)
+    covars = factors @ factors.mT
+    covars[3, 0, 1] = torch.nan
+    scene.opacities[3] = 0
+    expected, _, _ = rasterize_scene(scene, covars=covars)
+    scene.opacities[3] = 0.9
+    with pytest.warns(RuntimeWarning, match="values in covars;"):
+        image, _, meta = rasterize_scene(scene, covars=covars)
+    assert torch.equal(image, expected)
+    assert meta["non_finite"]["covars"].tolist() == [3]
+
+
+class RollingShutterType(enum.Enum):
+    """As gsplat has it."""
+
+    ROLLING_TOP_TO_BOTTOM = 0
+    GLOBAL = 4
+
+
+DEFAULTS = {
+    "packed": True,
+    "tile_size": None,
+    "channel_chunk": 32,
+    "segmented": False,
+    "camera_model": "pinhole",
+    "covars": None,
+    "with_ut": False,
+    "with_eval3d": False,
+    "return_normals": False,
+    "global_z_order": True,
+    "radial_coeffs": None,
+    "ftheta_coeffs": None,
+    "rolling_shutter": RollingShutterType.GLOBAL,
+    "viewmats_rs": None,
+    "extra_signals": None,
+}
+
+
+def test_the_defaults_of_gsplat_are_accepted():
+    scene = random_scene(n=10, cameras=1)
+    plain, _, meta = rasterize_scene(scene)
+    same, _, _ = rasterize_scene(scene, **DEFAULTS)
+    assert torch.equal(plain, same) and meta["tile_size"] == 16
+    assert torch.equal(rasterize_scene(scene, channel_chunk=8, segmented=True)[0], plain)
+
+
+@pytest.mark.parametrize("value", [False, None, "pinhole", True])
+def test_an_argument_that_gsplat_has_not_is_refused(value):
+    with pytest.raises(TypeError, match=r"rasterization\(\) got an unexpected keyword argument 'packd'"):
+        rasterize_scene(random_scene(n=10), packd=value)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"camera_model": "fisheye"}, "does not support camera_model='fisheye'"),
+        ({"with_ut": True}, "does not support with_ut=True"),
+        ({"global_z_order": False}, "does not support global_z_order=False"),
+        (
+            {"rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM},
+            "does not support rolling_shutter=<RollingShutterType.ROLLING_TOP_TO_BOTTOM",
+        ),
+        ({"radial_coeffs": torch.zeros(1)}, "does not support radial_coeffs="),
+        ({"covars": torch.zeros(4, 6)}, r"covars must be \[..., N, 3, 3\] = \[4, 3, 3\], got \[4, 6\]"),
+        ({"render_mode": "N"}, "render_mode must be one of"),
+        ({"rasterize_mode": "fast"}, "rasterize_mode must be"),
+        ({"tile_size": 65}, "tile_size must be 1 to 64 px, got 65"),
+        ({"sh_degree": None}, "colors must be"),
+        ({"sh_degree": 4}, "sh_degree 4 needs 25 SH coefficients, got 16"),
+        (
+            {"sh_degree": None, "colors": torch.zeros(3, 4)},
+            r"colors must be \[..., N, D\] or \[..., C, N, D\], here with \[\] before N = 4",
+        ),
+        ({"colors": torch.zeros(2, 4, 16, 3)}, r"colors must be SH coefficients"),
+        ({"means": torch.zeros(1, 4, 3)}, r"quats must be \[..., N, 4\] = \[1, 4, 4\], got \[4, 4\]"),
+        ({"quats": torch.zeros(4, 3)}, r"quats must be \[..., N, 4\]"),
+        ({"Ks": torch.zeros(3, 3)}, r"Ks must be \[..., C, 3, 3\]"),
+        ({"opacities": torch.zeros(1)}, r"opacities must be \[..., N\] = \[4\], got \[1\]"),
+        ({"opacities": torch.zeros(4, 1)}, r"opacities must be \[..., N\]"),
+        ({"backgrounds": torch.zeros(2, 3)}, r"backgrounds must be \[..., C, D\]"),
+    ],
+)
+def test_what_is_not_supported_is_refused_by_name(options, message):
+    scene = random_scene(n=4, cameras=1)
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height")
+    arguments = {**dict(zip(names, scene.arguments(), strict=True)), "sh_degree": 3, **options}
+    with pytest.raises(ValueError, match=message):
+        blitzgs.rasterization(**arguments)
+
+
+def test_an_array_of_another_library_is_refused_by_name():
+    means, quats, *rest = random_scene(n=4, cameras=1).arguments()
+    with pytest.raises(TypeError, match=r"quats must be a torch\.Tensor, got ndarray"):
+        blitzgs.rasterization(means, quats.numpy(), *rest, sh_degree=3)
