@@ -2,25 +2,24 @@
 // Dense Adam over an index list: a row that had no gradient for k steps is brought up to date when it is
 // next needed, in time that does not depend on k.
 //
-// Dense Adam (Kingma & Ba 2015), step t, gradient g:
-//   m = beta1 m + (1 - beta1) g     v = beta2 v + (1 - beta2) g^2
-//   p -= lr_t b_t m / (a_t sqrt(v) + eps)         b_t = 1 / (1 - beta1^t), a_t = 1 / sqrt(1 - beta2^t)
-// Without a gradient the moments only decay: j steps after a step P at which they are m and v, they are
-// m beta1^j and v beta2^j. Up to step s the parameter drifts by
-//   m sum over j = 1 .. s - P of mu_j rho_j / (rho_j sqrt(v) + eps),       t = P + j,
-//   rho_j = a_t beta2^(j/2),   mu_j = lr_t b_t / a_t q_0^j,   q_0 = beta1 / sqrt(beta2).
-// rho_j changes far more slowly than mu_j falls, so the sum is taken by the two-point Gauss rule of the
-// weights mu over rho: two places and weights with the weights' first four moments
-//   sum over j of mu_j rho_j^k = tail_k[P] - q_k^(s-P) tail_k[s],  k = 0 .. 3,
-// of tails that are tabulated once per schedule (adam_table.h). The rule is exact where eps is lost against
-// sqrt(v) (moment 0) and where it dominates (moment 1); in between, at its worst near eps = 3 sqrt(v), its
-// relative error is below half the square of rho's relative variance: 1e-9 of the drift in mid-schedule,
-// the rounding of float32 after some 200 single-view steps. Where that is not enough (earlier, and float64)
-// elements for which eps matters take the zero-gradient steps one by one, at most `explicit_steps` of them:
-// after those, q_0^j is below the rounding of the sum.
+// Dense Adam (Kingma & Ba 2015), step t, gradient g: m = beta1 m + (1 - beta1) g v = beta2 v + (1 - beta2)
+// g^2 p -= lr_t b_t m / (a_t sqrt(v) + eps) b_t = 1 / (1 - beta1^t), a_t = 1 / sqrt(1 - beta2^t) Without a
+// gradient the moments only decay: j steps after a step P at which they are m and v, they are m beta1^j and v
+// beta2^j. Up to step s the parameter drifts by m sum over j = 1 .. s - P of mu_j rho_j / (rho_j sqrt(v) +
+// eps), t = P + j, rho_j = a_t beta2^(j/2), mu_j = lr_t b_t / a_t q_0^j, q_0 = beta1 / sqrt(beta2). rho_j
+// changes far more slowly than mu_j falls, so the sum is taken by the two-point Gauss rule of the weights mu
+// over rho: two places and weights with the weights' first four moments sum over j of mu_j rho_j^k =
+// tail_k[P] - q_k^(s-P) tail_k[s], k = 0 .. 3, of tails that are tabulated once per schedule (adam_table.h).
+// The rule is exact where eps is lost against sqrt(v) (moment 0) and where it dominates (moment 1); in
+// between, at its worst near eps = 3 sqrt(v), its relative error is below half the square of rho's relative
+// variance: 1e-9 of the drift in mid-schedule, the rounding of float32 after some 200 single-view steps.
+// Where that is not exact enough (earlier steps, and float64), the elements for which eps matters take the
+// zero-gradient steps one by one. At most `explicit_steps` of them are needed, because q_0^j is below the
+// rounding of the sum after that.
 //
-// Two columns say where a row stands. `last_step`: its parameters. `moment_step` <= last_step: its moments,
-// which catching up reads and leaves alone (their decay is applied by the next step with a gradient).
+// Two columns say where a row stands: its parameters are those after step `last_step`, its moments those
+// after step `moment_step` <= last_step. Catching up reads the moments but does not write them; the next step
+// with a gradient applies their decay.
 //
 // Rows are independent and each element is computed the same way wherever it lies, so results do not depend
 // on the order of the list or on sharding. O(1) per element.
@@ -50,7 +49,8 @@ struct AdamArgs {
   AdamColumn<T> columns[kAdamColumns];
   const std::int32_t* ids;  // [n] rows, unique; null = row i is i
   std::int64_t n;
-  const std::int32_t* count;  // CUDA, catching up: how many of the n there are, on the device; null: all
+  const std::int32_t*
+      count;  // CUDA, catching up: how many of the n ids are valid, in device memory; null: all
   std::int32_t *last_step, *moment_step;  // [N]
   const double* table;                    // [S+1, kAdamTable]
   const float* lr_table;                  // [S+1, 6]
@@ -60,7 +60,8 @@ struct AdamArgs {
   bool sparse;  // plain sparse Adam: no decay, no drift
 
   BLITZGS_HD bool with_gradient() const { return columns[0].grad != nullptr; }
-  // Where parameters stand before the step with a gradient, if there is one.
+  // The step after which all listed parameters stand when they have caught up; a step with a gradient
+  // follows.
   BLITZGS_HD std::int32_t target() const { return with_gradient() ? step - 1 : step; }
   BLITZGS_HD const double* table_row(std::int32_t t) const {
     return table + static_cast<std::int64_t>(t) * kAdamTable;
@@ -73,12 +74,12 @@ struct alignas(4 * sizeof(T)) AdamRule {
   T place[2], weight[2];
 };
 
-// What parameters that stand at step `from` still owe at step `to`.
+// The drift from step `from` to step `to`, which parameters that stand at `from` still have to take.
 template <class T>
 struct AdamDebt {
   AdamRule<T> rules[kAdamGroups];
   std::int32_t from, to;
-  T explicit_up_to;  // sqrt(v) up to this: step by step; negative: the rules do for all
+  T explicit_up_to;  // elements with sqrt(v) up to this go step by step; negative: none
 };
 
 // Returns the rule of a group; `error` becomes a bound of its relative error if that is larger.
@@ -106,12 +107,13 @@ BLITZGS_HD AdamRule<T> adam_rule(const AdamArgs<T>& args, std::int32_t from, std
           {static_cast<T>(weights[0] * places[0]), static_cast<T>(weights[1] * places[1])}};
 }
 
-// The explicit_up_to of rules with errors up to this.
+// Returns explicit_up_to for rules whose relative errors are at most `error`.
 template <class T>
 BLITZGS_HD T adam_explicit_up_to(const AdamArgs<T>& args, std::int32_t from, std::int32_t to, double error) {
   const double rounding = sizeof(T) == 4 ? 5.9e-8 : 1.1e-16;
   if (!(error > 2 * rounding)) return T(-1);
-  // eps is lost against the smallest place * sqrt(v); a_t >= 1, and after explicit_steps nothing counts.
+  // Above the returned value eps is lost in the rounding of the smallest place * sqrt(v): a_t >= 1, and no
+  // step after explicit_steps contributes.
   const std::int32_t gap = to - from, reach = gap < args.explicit_steps ? gap : args.explicit_steps;
   return static_cast<T>(args.eps / (rounding * args.table_row(reach)[kRootPower]));
 }
@@ -145,8 +147,8 @@ BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const AdamDebt<T>& deb
   return drift;
 }
 
-// A root, and the reciprocal of a number that is zero or normal, to an ulp on CUDA: correctly rounded ones
-// would be most of an update's instructions there, and the ulp is lost in the update's own rounding.
+// A root, and the reciprocal of a number that is zero or normal. On CUDA they are exact to an ulp: correctly
+// rounded ones would be most of an update's instructions, and the ulp is lost in the update's own rounding.
 template <class T>
 BLITZGS_HD T adam_root(T x) {
 #ifdef __CUDA_ARCH__
@@ -177,7 +179,7 @@ BLITZGS_HD T adam_ruled_drift(const AdamRule<T>& rule, T m, T root, T eps) {
   return m == 0 ? T(0) : drift;
 }
 
-// What a parameter moves down by while its debt is paid; m and v at step debt.from.
+// The amount to subtract from a parameter when it catches up; m and v are the moments at step debt.from.
 template <class T>
 BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T v) {
   const T root = adam_root(v);
@@ -186,19 +188,19 @@ BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, int gr
   return adam_ruled_drift(debt.rules[group], m, root, static_cast<T>(args.eps));
 }
 
-// Whether a row drifts noticeably on its way to the target: explicit_steps after the moments' step, what is
-// left of the drift is below its rounding.
+// Whether a row drifts noticeably on its way to the target. explicit_steps after the moments' step, the rest
+// of the drift is below its rounding.
 template <class T>
 BLITZGS_HD bool adam_moves(const AdamArgs<T>& args, std::int32_t from, std::int32_t stand) {
   return from < args.target() && from - stand < args.explicit_steps;
 }
 
-// How one row's moments decay: from where they stand to where its parameters stand, and to the target.
+// By which factors one row's moments decay.
 template <class T>
 struct AdamRow {
-  std::int32_t from;  // where the parameters stand
-  T here1, here2;     // beta1^k, beta2^k to there
-  T then1, then2;     // to the target
+  std::int32_t from;  // the step at which the parameters stand
+  T here1, here2;     // beta1^k, beta2^k from the moments' step to `from`
+  T then1, then2;     // beta1^k, beta2^k from the moments' step to the target
   bool moves;         // see adam_moves
 };
 

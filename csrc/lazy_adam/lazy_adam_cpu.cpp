@@ -19,7 +19,8 @@ AdamRowUpdate<T> row_update() {
   return update_row<PlainLanes<T>, T>;
 }
 
-// Rows of a list lie scattered, so a row's state is fetched while the rows before it are updated.
+// The rows of a list are scattered in memory, so a row's state is prefetched while the rows before it are
+// updated.
 constexpr std::int64_t kPrefetchDistance = 3;
 
 template <class T>
@@ -34,7 +35,8 @@ void prefetch_row(const AdamArgs<T>& args, std::int64_t row) {
   }
 }
 
-// Few different steps owe: each thread works a debt out once for many rows.
+// Few different steps occur among the rows that are behind, so each thread computes a debt once for many
+// rows.
 template <class T>
 class DebtCache {
  public:

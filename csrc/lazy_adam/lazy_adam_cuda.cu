@@ -11,22 +11,23 @@ namespace blitzgs::cuda {
 
 namespace {
 
-// A row of SH degree 3 has 12 packs of SH, one quaternion and seven more numbers: a thread each.
+// A row of SH degree 3 has 12 packs of SH, one quaternion and seven more numbers; each gets a thread.
 constexpr int kRows = 16;  // rows per block
 constexpr int kThreads = kRows * (12 + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
 constexpr int kPrepareLanes = 8, kPrepareThreads = 64, kListThreads = 256;
 static_assert(kPrepareLanes > kAdamGroups);
 
-// What rows that catch up may need: all of a launch go to the same step, so it is worked out once instead of
-// once a row.
+// What rows need to catch up. All rows of a launch go to the same step, so it is computed once for each step
+// at which a row may stand, and not for each row.
 struct Prepared {
-  AdamDebt<float>* debts;  // [target], of parameters that stand at each step before
+  AdamDebt<float>* debts;  // [target], for parameters that stand at step 0, 1, ...
   Decay* decays;           // [target + 1], over each number of steps
-  bool* owing;             // whether there are any debtors
+  bool* owing;             // whether any row is behind
 };
 
-// kPrepareLanes lanes a step, one for each rule: it is a chain of divisions that this kernel takes.
+// kPrepareLanes lanes work on a step, one for each rule, because the kernel's time is that of a chain of
+// divisions.
 __global__ void __launch_bounds__(kPrepareThreads)
     prepare(const __grid_constant__ AdamArgs<float> args, const Prepared prepared) {
   wait_for_earlier_kernels();
@@ -52,11 +53,11 @@ __global__ void __launch_bounds__(kPrepareThreads)
 // A row that catches up by the rules of the step that it stands at.
 struct alignas(16) Debtor {
   std::int32_t row;   // -1: nothing to do
-  std::int32_t from;  // its parameters' step
-  Decay here;         // of its moments, to there
+  std::int32_t from;  // the step at which its parameters stand
+  Decay here;         // of its moments, up to that step
 };
 
-// Pays a debt that the rules do not do for; a warp for a row.
+// Lets a row catch up where the rules are not exact enough; a whole warp works on it.
 template <int Column>
 __device__ void pay_elements(const AdamArgs<float>& args, const AdamDebt<float>& debt, const Decay& here,
                              std::int64_t row) {
@@ -70,8 +71,9 @@ __device__ void pay_elements(const AdamArgs<float>& args, const AdamDebt<float>&
 
 __device__ std::int64_t listed(const AdamArgs<float>& args) { return args.count ? *args.count : args.n; }
 
-// Lists the debtors and notes that they will have paid. Those for whom the rules do not do, which only steps
-// early in a schedule have, pay at once, each by a whole warp.
+// Lists the rows that are behind and sets their last_step as if they had caught up already. Rows for which
+// the rules are not exact enough, which happens only early in a schedule, catch up here, each by a whole
+// warp.
 __global__ void __launch_bounds__(kListThreads)
     list_debtors(const __grid_constant__ AdamArgs<float> args, const Prepared prepared, Debtor* debtors) {
   wait_for_earlier_kernels();
@@ -107,12 +109,13 @@ __global__ void __launch_bounds__(kListThreads)
   }
 }
 
-// Calls update<Column, Width>(local row, pack) for what is a thread's to do in every kRows rows. ShPacks:
-// packs in an SH row; 0: as many as `sh_packs` says.
+// Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every kRows rows.
+// ShPacks: packs in an SH row; 0: as many as `sh_packs` says.
 template <int ShWidth, int ShPacks, class F>
 __device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
   const int packs = ShPacks ? ShPacks : sh_packs;
-  constexpr int kRound = ShPacks ? kRows * (ShPacks + 8) : kThreads;  // one round where the row fills it
+  // Where the number of packs is known, a single round handles all of them.
+  constexpr int kRound = ShPacks ? kRows * (ShPacks + 8) : kThreads;
   for (int item = threadIdx.x; item < kRows * (packs + 8); item += kRound) {
     const int rest = item - kRows * packs;
     if (rest < 0) {
@@ -149,7 +152,8 @@ __device__ __forceinline__ void pay_pack(const AdamArgs<float>& args, const Adam
   *reinterpret_cast<P*>(column.param + at) = p;
 }
 
-// A thread has the same part of every kRows-th debtor; who comes next is looked up while one pays.
+// A thread handles the same pack of every (gridDim.x * kRows)-th listed row, and loads the next list entry
+// while it updates the present row.
 template <int ShWidth, int ShPacks>
 __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
     catch_up_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
@@ -182,7 +186,8 @@ __device__ __forceinline__ void step_pack(const AdamArgs<float>& args, const Ada
   own.finish(column, step, make_decay(args, args.sparse ? 0 : args.target() - args.moment_step[row]), g);
 }
 
-// A block owns kRows rows of the list in all five columns, so their steps are read and written by it alone.
+// A block handles kRows rows of the list in all five columns, so no other block reads or writes their
+// last_step and moment_step.
 template <int ShWidth, int ShPacks>
 __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ AdamArgs<float> args) {
   __shared__ AdamStep<float> step;
@@ -212,7 +217,7 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
   launch_early("lazy_adam catch-up", prepare,
                {blocks_for(args.step + 1, kPrepareThreads / kPrepareLanes), kPrepareThreads, stream}, args,
                prepared);
-  // The device is filled once, as n may be far more than there are.
+  // As many blocks as the device runs at a time: n may be far more than the number of valid ids.
   const auto filled = [&](int items, int per_multiprocessor) {
     return std::min(blocks_for(args.n, items), unsigned(per_multiprocessor * multiprocessors()));
   };

@@ -22,13 +22,15 @@ struct alignas(4 * Width) Pack {
   float x[Width];
 };
 
-// The group of an element of a pack: of a pack over two groups, the last element alone has the second.
+// The learning-rate group of an element of a pack. In a pack that spans two groups, only the last element is
+// in the second one.
 template <int Column, int Width>
 __device__ constexpr int pack_group(int pack, int element) {
   return adam_group(Column, pack * Width + (element < Width - 1 ? 0 : element));
 }
 
-// Width elements of a row of a column: loaded first, so that many packs are in flight, and stepped later.
+// Width elements of a row of a column. They are loaded first, so that many loads are in flight, and updated
+// later.
 template <int Column, int Width>
 class StepPack {
  public:

@@ -9,7 +9,7 @@
 
 namespace blitzgs::cpu {
 
-// The elements that drift step by step; rare, and left to plain code.
+// The elements that catch up step by step are rare, so plain code handles them.
 template <class T>
 using ExplicitDrift = T (*)(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T root);
 
@@ -40,7 +40,7 @@ Lanes by_group(const int* groups, const F& value) {
   return Lanes::load(values);
 }
 
-// Returns the drift of eight elements; m and v where the parameters stand.
+// Returns the drift of eight elements; m and v are the moments at the step of the parameters.
 template <class Lanes, class T>
 Lanes drift_of(const AdamRowJob<T>& job, const int* groups, Lanes m, Lanes v) {
   const AdamDebt<T>& debt = *job.debt;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the ops that move parameters share: the optimiser's state and schedule, checked.
+// What the ops that move parameters share: the checked tensors of the optimiser's state and schedule.
 #pragma once
 #include <optional>
 #include <vector>

@@ -5,24 +5,25 @@
 //   ssim[b] = sum over the same of SSIM(x, y), Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5, zero
 //             padding, C1 = 0.01^2, C2 = 0.03^2
 //
-// x renders [B, H, W, 3]; y targets of the same shape, uint8 (value / 255) or the dtype of x; masks uint8
-// [B, H, W], 0 = excluded from the sums (a window centred elsewhere still sees the pixel as it is). The
-// caller divides by the number of pixels. Owned pixels are those of the tiles [tile_begin, tile_end) of the B
-// views, tile index (b * tiles_y + ty) * tiles_x + tx; the forward reads x up to 5 pixels beyond them.
+// x renders [B, H, W, 3]; y targets of the same shape, uint8 (value / 255) or the dtype of x; masks uint8 [B,
+// H, W], 0 = excluded from the sums (windows centred at other pixels still read the pixel). The caller
+// divides by the number of pixels. Owned pixels are those of the tiles [tile_begin, tile_end) of the B views,
+// tile index (b * tiles_y + ty) * tiles_x + tx; the forward reads x up to 5 pixels beyond them.
 //
 // v_renders = d(sum_b l1_weights[b] l1[b] + ssim_weights[b] ssim[b]) / dx for the sums over ALL tiles,
-// written for the owned pixels: the owners' gradients add up to the whole. Elsewhere v_renders is zero with
-// clear_rest, otherwise zero or not written. It reads x up to 10 pixels beyond the owned tiles. The
-// derivative of |x - y| at 0 is 0. With samples [B], the weights of view b are divided by samples[b]. In
-// passing, scale_reg[b] = scale_weight / max(visible[b], 1): the weight of the training loss's other term.
+// written for the owned pixels: the gradients of all owners together are the gradient of the whole. Elsewhere
+// v_renders is zero with clear_rest, otherwise zero or not written. It reads x up to 10 pixels beyond the
+// owned tiles. The derivative of |x - y| at 0 is 0. With samples [B], the weights of view b are divided by
+// samples[b]. The kernel also writes scale_reg[b] = scale_weight / max(visible[b], 1), the weight of the
+// training loss's other term.
 //
-// With e = mean(x) - mean(y), P = E[x^2 + y^2], Q = E[(x - y)^2] under the window, SSIM is computed as
-//   (1 - e^2 / A) (1 - V / S),  A = mean(x)^2 + mean(y)^2 + C1,
-//   V = Q - e^2 (variance of x - y),  S = P - mean(x)^2 - mean(y)^2 + C2,
-// the textbook quotient rearranged: it needs four windowed quantities rather than five and stays accurate in
-// flat regions, where var(x) + var(y) cancels. Separable windows: O(22 B H W) multiply-adds a quantity.
-// Sums are left in parts, double [B, K, 2], each a sum over a fixed block of pixels in a fixed order, zero
-// where a part has no pixel; report/report.h adds them up. Repeatable for any number of threads.
+// With e = mean(x) - mean(y), P = E[x^2 + y^2], Q = E[(x - y)^2] under the window, SSIM is computed as (1 -
+// e^2 / A) (1 - V / S), A = mean(x)^2 + mean(y)^2 + C1, V = Q - e^2 (variance of x - y), S = P - mean(x)^2 -
+// mean(y)^2 + C2, the textbook quotient rearranged: it needs four windowed quantities rather than five and
+// stays accurate in flat regions, where var(x) + var(y) cancels. Separable windows: O(22 B H W) multiply-adds
+// a quantity. The sums are written in parts, double [B, K, 2]: each part is the sum over a fixed block of
+// pixels in a fixed order, and zero where the block has no pixel. report/report.h adds the parts up. The
+// result repeats bit for bit for any number of threads.
 #pragma once
 #include <cstdint>
 
@@ -37,7 +38,7 @@ constexpr int kSsimTaps = 2 * kSsimRadius + 1;
 template <class T>
 struct PhotometricArgs {
   const T* renders;
-  const T* targets;  // or
+  const T* targets;  // null where the targets are uint8
   const std::uint8_t* targets_u8;
   const std::uint8_t* masks;    // null: all pixels count
   const T* l1_weights;          // [B]; null: no gradient
@@ -72,7 +73,7 @@ BLITZGS_HD OwnedColumns owned_columns(const PhotometricArgs<T>& args, std::int64
           static_cast<int>(to < args.width ? to : args.width)};
 }
 
-// Of a view, from l1_weights or ssim_weights.
+// The weight of a view: an entry of l1_weights or ssim_weights, divided by the view's samples.
 template <class T>
 BLITZGS_HD T weight_of(const PhotometricArgs<T>& args, const T* weights, std::int64_t view) {
   return args.samples ? weights[view] / args.samples[view] : weights[view];
@@ -90,7 +91,7 @@ struct SsimTerms {
   T value, by_mean, by_p, by_q;
 };
 
-// On the GPU within 1 ulp; of normal numbers.
+// The reciprocal of a normal number; on a GPU to within 1 ulp.
 template <class T>
 BLITZGS_HD T reciprocal(T x) {
 #ifdef __CUDA_ARCH__

@@ -24,7 +24,7 @@ namespace blitzgs::cuda {
 
 namespace {
 
-// Of one round; two take turns.
+// Shared memory of one round; two rounds alternate.
 struct Shared {
   float inputs[4][kRows][3][kInPitch];    // 1 -> 2
   float maps[3][kRows][3][kMidPitch];     // 2 -> 3
@@ -32,16 +32,16 @@ struct Shared {
   float results[3][kRows][3][kOutPitch];  // 4 -> 5
 };
 
-// Rows above a strip's first at which it starts to read, and the round of its first window. Chosen so that
-// sums are added in the same order with and without a gradient.
+// How many rows above its first row a strip starts to read, and the round of its first window. They are
+// chosen so that sums are added in the same order with and without a gradient.
 template <bool kGradient>
 constexpr int kLead = kGradient ? 2 * kSsimRadius : kSsimRadius + 1;
 constexpr int kWindowRound = 2;
 constexpr int kOutRound = 5;
 static_assert(kRows * kOutRound == 4 * kSsimRadius);
 
-// Steps come in two forms. The plain one is for rounds whose rows all exist and are owned whole, without a
-// mask: nearly all of them.
+// Each step has two forms. The plain form serves rounds whose rows all exist and are owned as a whole,
+// without a mask; nearly all rounds are of this kind.
 template <bool kBytes, bool kGradient, bool kSums>
 class StripWalk {
  public:
@@ -90,7 +90,7 @@ class StripWalk {
       }
       if (round >= kWindowRound + 1 && round < rounds + 1) {
         const int top = row - kRows - kSsimRadius;
-        // Without sums, and beyond the strip, it does not matter who owns a row.
+        // Without sums, and for rows beyond the strip, ownership does not matter.
         const bool simple = !args_.masks && (kSums && top + kRows > strip_.begin && top < strip_.end
                                                  ? plain(top)
                                                  : top >= 0 && top + kRows <= args_.height);
@@ -108,7 +108,7 @@ class StripWalk {
     }
   }
 
-  // Where the sums go: part [blockIdx.x] of the strip's.
+  // The index of the part that takes this block's sums: part blockIdx.x of its strip.
   __device__ __forceinline__ std::int64_t part(const Launch& launch) const {
     return (std::int64_t{strip_.view} * launch.view_strips + strip_.index) * gridDim.x + blockIdx.x;
   }
@@ -116,7 +116,7 @@ class StripWalk {
   float l1_sum = 0, ssim_sum = 0;
 
  private:
-  // Whether the rows from `top` on are all in the strip and owned whole, without a mask.
+  // Whether all rows of the round from `top` on are in the strip and owned as a whole, without a mask.
   __device__ __forceinline__ bool plain(int top) const {
     return !args_.masks && top >= whole_.begin && top + kRows <= whole_.end;
   }
@@ -164,7 +164,7 @@ class StripWalk {
     }
   }
 
-  // Windows centred on the rows from `top` on.
+  // Computes the windows centred on the rows of the round from `top` on.
   template <bool kPlain>
   __device__ __forceinline__ void windows(Shared& shared, int top) {
     if (threadIdx.x >= kRows * 3 * kMidGroups) return;
@@ -225,7 +225,7 @@ class StripWalk {
     }
   }
 
-  // Rows from `top` on.
+  // Handles the rows of the round from `top` on.
   template <bool kPlain>
   __device__ __forceinline__ void write_gradient(const Shared& shared, int top) {
     if (local_ >= width_) return;
@@ -259,7 +259,7 @@ class StripWalk {
   const std::int64_t image_;
   const int channel_, local_;  // of this thread's column: channels interleaved, as in memory
   bool has_column_, in_core_, has_map_column_ = false;
-  std::int64_t next_, out_;  // what this thread reads and writes next
+  std::int64_t next_, out_;  // the elements that this thread reads and writes next
   float ssim_weight_ = 0, l1_weight_ = 0;
   float x_[kRows];
   Target<kBytes> y_[kRows];
@@ -267,7 +267,7 @@ class StripWalk {
   float map_pending_[3][kPending] = {};
 };
 
-// Zeros the parts of the strips that there are not.
+// Zeroes the parts of strips that a view does not have, because it has fewer strips than others.
 __device__ void clear_parts(const PhotometricArgs<float>& args, const Launch& launch) {
   const int rows = static_cast<int>(args.views) * launch.view_strips;
   for (int i = blockIdx.y; i < rows; i += gridDim.y) {
@@ -303,10 +303,11 @@ __global__ void __launch_bounds__(kThreads, 2)
 
 int cut(int rows, int rows_per_strip) { return (rows + rows_per_strip - 1) / rows_per_strip; }
 
-// Blocks side by side.
+// How many blocks cover the width of an image.
 int block_columns(const PhotometricArgs<float>& args) { return (args.width + kOut - 1) / kOut; }
 
-// Cuts the owned rows into strips: whole waves of blocks, with few rows read twice.
+// Cuts the owned rows into strips so that the blocks fill whole waves of the device and few rows are read
+// twice.
 Launch cut_strips(const PhotometricArgs<float>& args) {
   Launch result{};
   result.view_strips = 1;

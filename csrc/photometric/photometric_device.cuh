@@ -11,8 +11,8 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kOut = 64;                      // pixels of a block's row
-constexpr int kMid = kOut + 2 * kSsimRadius;  // windows that see them
-constexpr int kIn = kMid + 2 * kSsimRadius;   // pixels that those see
+constexpr int kMid = kOut + 2 * kSsimRadius;  // windows that contain these pixels
+constexpr int kIn = kMid + 2 * kSsimRadius;   // pixels that these windows contain
 constexpr int kRows = 4;                      // rows per round
 constexpr int kMidGroups = (kMid + 3) / 4;    // horizontal items of a row and channel: four windows each
 constexpr int kOutGroups = kOut / 4;
@@ -49,7 +49,7 @@ __device__ inline Strip strip_of(const Launch& launch, int height, int index) {
   return strip;
 }
 
-// Strips of a view; none of one without owned pixels.
+// The number of strips of a view; a view without owned pixels has none.
 __device__ inline int strips_of(const Launch& launch, int view) {
   const int place = view - launch.first_view;
   if (place < 0 || view > launch.last_view) return 0;
@@ -57,7 +57,7 @@ __device__ inline int strips_of(const Launch& launch, int view) {
   return min(place == 0 ? launch.first_strips : launch.view_strips, launch.strips - before);
 }
 
-// The strip's rows whose pixels are all owned.
+// The rows of a strip whose pixels are all owned.
 __device__ inline Strip whole_rows(const PhotometricArgs<float>& args, const Strip& strip) {
   const std::int64_t first = std::int64_t{strip.view} * args.tiles_x * args.tiles_y;
   const std::int64_t begin = max(args.tile_begin - first, std::int64_t{0});
@@ -74,7 +74,8 @@ __device__ inline bool owns_pixel(const PhotometricArgs<float>& args, int view, 
   return column >= owned.begin && column < owned.end;
 }
 
-// Targets stay as they were loaded until they are used: a conversion next to its load would wait for it.
+// Targets stay in the type in which they were loaded until they are used: a conversion right behind the load
+// would wait for it.
 template <bool kBytes>
 using Target = std::conditional_t<kBytes, std::uint8_t, float>;
 
@@ -87,9 +88,11 @@ __device__ __forceinline__ const Target<kBytes>* targets_of(const PhotometricArg
   }
 }
 
-// Rounded before it is subtracted: contracted into the difference, equal pixels would not cancel.
+// The value is rounded before it is subtracted. If the compiler contracted the product into the difference,
+// equal pixels would not cancel.
 __device__ __forceinline__ float target_value(std::uint8_t target) {
-  const float value = __uint_as_float(0x4b000000u | target) - 8388608.0f;  // a conversion by other units
+  // The integer becomes a float through its bits, because conversion instructions are slow.
+  const float value = __uint_as_float(0x4b000000u | target) - 8388608.0f;
   return __fmul_rn(value, 1.0f / 255.0f);
 }
 __device__ __forceinline__ float target_value(float target) { return target; }
@@ -123,7 +126,7 @@ __device__ __forceinline__ void convolve4(const float (&window)[kSsimTaps], cons
   }
 }
 
-// Where a horizontal item of a round lies; `pixel` is the first of its four.
+// The place of a horizontal item of a round; `pixel` is the first of its four pixels.
 struct Item {
   int row, channel, pixel;
 };

@@ -24,7 +24,7 @@ struct PhotometricOutputs {
   std::optional<Tensor> parts, v_renders, scale_reg;
 };
 
-// The weights of what is differentiated.
+// The weights of the terms whose gradient is wanted.
 struct PhotometricWeights {
   const Tensor& l1;
   const Tensor& ssim;

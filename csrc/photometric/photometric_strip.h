@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// One strip of rows on the CPU. Compiled twice, for the baseline and for AVX2, from the same element-wise
-// loops, so both give the same bits. Everything here has internal linkage: the two never mix.
+// One strip of rows on the CPU. The file is compiled twice, for the baseline and for AVX2, from the same
+// element-wise loops, so both give the same bits. Everything here has internal linkage, so that the linker
+// cannot mix the two.
 //
 // Rows stream downwards: an input row is convolved horizontally into a ring of 11 rows; the ring convolved
 // vertically gives the windows of the row 5 above; their derivatives go through a second ring and give the
@@ -102,7 +103,7 @@ class PhotometricStrip {
     for (int q = 0; q < 4; ++q) convolve_row(args_.window, padded_rows_[q], count_, ring1_[q][slot(row)]);
   }
 
-  // Vertical pass of one quantity around a centre row.
+  // Convolves one quantity vertically around a centre row.
   void gather(T* const (&ring)[kSsimTaps], int centre, T* out) const {
     const T* rows[kSsimTaps];
     for (int k = 0; k < kSsimTaps; ++k) rows[k] = ring[slot(centre - kSsimRadius + k)];
@@ -122,7 +123,8 @@ class PhotometricStrip {
     }
   }
 
-  // windows_[0] becomes the SSIM of each pixel, padded rows 4..6 its derivatives, weighted and masked.
+  // Writes the SSIM of each pixel to windows_[0], and its derivatives, weighted and masked, to padded rows 4
+  // to 6.
   void compute_windows(std::int64_t view, int centre) {
     for (int q = 0; q < 4; ++q) gather(ring1_[q], centre, windows_[q]);
     T *w0 = windows_[0], *w1 = windows_[1], *w2 = windows_[2], *w3 = windows_[3];
@@ -213,7 +215,7 @@ class PhotometricStrip {
   T* ring2_[3][kSsimTaps];
 };
 
-// The listed strips; sums[2 s] and sums[2 s + 1] take the sums of strip s.
+// Runs the listed strips; sums[2 s] and sums[2 s + 1] take the sums of strip s.
 template <class T>
 void run_photometric_strips(const PhotometricArgs<T>& args, const std::int64_t* strips, std::int64_t begin,
                             std::int64_t end, double* sums) {
