@@ -8,8 +8,9 @@
 
 namespace blitzgs {
 
-// Uninitialised arrays of one length in one piece of scratch memory, each where any type may begin: the host
-// spends microseconds on each piece, while the device waits for the launch after it.
+// Uninitialised arrays of one length in one piece of scratch memory, each aligned for any type. They share a
+// piece because the host spends microseconds on allocating each, while the device waits for the launch behind
+// it.
 template <class... T>
 std::tuple<T*...> allocate_arrays(std::int64_t length, Workspace& workspace) {
   constexpr std::size_t kAlignment = 256;

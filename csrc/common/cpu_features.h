@@ -4,8 +4,8 @@
 
 namespace blitzgs {
 
-// AVX2 and FMA, where the processor has them. BLITZGS_NO_AVX2 in the environment (read once) forbids them:
-// the plain code gives the same bits, which a test relies on.
+// Whether to use AVX2 and FMA: true where the processor has them, unless BLITZGS_NO_AVX2 is set in the
+// environment (read once). The plain code gives the same bits, and a test compares both.
 bool use_avx2();
 
 }  // namespace blitzgs

@@ -18,7 +18,7 @@ inline void check(cudaError_t status, const char* what) {
 
 inline void check_launch(const char* kernel) { check(cudaGetLastError(), kernel); }
 
-// Blocks for n items; callers skip the launch when n is 0.
+// The number of blocks for n items; callers skip the launch when n is 0.
 inline unsigned blocks_for(std::int64_t n, int threads) {
   return static_cast<unsigned>((n + threads - 1) / threads);
 }

@@ -1,23 +1,23 @@
 // SPDX-License-Identifier: Apache-2.0
-// Launches without the gap between two kernels of a stream, 1.2 to 2.5 us otherwise (sm_90 and later:
-// programmatic dependent launch). A kernel launched by launch_early is placed once all blocks of the one in
-// front of it have ended, while that one's memory is still being flushed, and waits for the rest on the
-// device. What it owes for that, and why no more is needed:
+// Launches that avoid the gap of 1.2 to 2.5 us between two kernels of a stream (programmatic dependent
+// launch, sm_90 and later). The device places a kernel that was launched by launch_early when all blocks of
+// the kernel before it have ended, while that kernel's memory is still being flushed; the new kernel waits
+// for the rest on the device. The rules for such kernels, and why they suffice:
 //
 // - Each of its blocks calls wait_for_earlier_kernels() before its first access to global memory, reads and
-//   writes alike, and before any return: what it would overwrite may still be read. In front of the call
-//   stands at most what touches registers, shared memory and parameters.
-// - The call returns when the kernel in front has ended and its writes are visible. That one waited itself,
-//   or was launched plainly and then began after all before it had ended: so everything in front has ended.
-//   Memory given back to the allocator and reused in stream order is therefore as safe as ever.
-// - Only the launches of two neighbouring kernels overlap. Plain launches, copies and events begin or are
-//   reached when the kernel in front has ended; through an event, another stream sees no less.
+//   writes alike, and before any return: an earlier kernel may still read what this one would overwrite.
+//   Before the call a block touches registers, shared memory and parameters only.
+// - The call returns when the kernel before it has ended and its writes are visible. That kernel called
+//   wait_for_earlier_kernels() itself, or was launched plainly and so began after all earlier kernels had
+//   ended. Hence all earlier kernels have ended, and memory that was given back to the allocator and reused
+//   in stream order is as safe as without early launches.
+// - Only two neighbouring kernels overlap. Plain launches, copies and events wait until the kernel before
+//   them has ended, and so does another stream that waits for such an event.
 // - No kernel lets the next one in before its own blocks end (griddepcontrol.launch_dependents). A waiting
-//   block holds a place, so one that spins for another GPU or stream (peers_cuda.cu) must not let its
-//   successor in; and the others are slower for it: what is placed while blocks still run is spread unevenly
-//   over the multiprocessors (docs/performance.md).
-// - Kernels of other libraries stay as they are; launched plainly, they wait for all in front, as the call
-//   does for them.
+//   block occupies a multiprocessor, so a kernel that spins for another GPU or stream must not let its
+//   successor in. Other kernels would only lose by it: blocks that are placed while others still run are
+//   spread unevenly over the multiprocessors (docs/decisions/launch-earlier.md).
+// - Kernels of other libraries are launched plainly; they wait for all earlier kernels by themselves.
 #pragma once
 #include <array>
 #include <atomic>
@@ -28,15 +28,16 @@
 
 namespace blitzgs::cuda {
 
-// The first thing that a kernel does that is launched by launch_early.
+// A kernel that is launched by launch_early calls this first.
 __device__ __forceinline__ void wait_for_earlier_kernels() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
 
-// Whether kernels wait on the current device. Asked of the code that it runs, not of the device: code for an
-// older one, translated when it is loaded, does not. All kernels are compiled for the same architectures.
+// Whether kernels wait on the current device. This depends on the code that the device runs and not on the
+// device: code that was compiled for an older device and translated when it was loaded does not wait. All
+// kernels are compiled for the same architectures, so asking one of them is enough.
 inline bool kernels_wait(const void* kernel) {
   enum : signed char { kUnknown, kNo, kYes };
   static std::array<std::atomic<signed char>, 64> known{};  // by device
@@ -60,7 +61,7 @@ struct LaunchShape {
   std::size_t shared_bytes = 0;
 };
 
-// Launches a kernel that waits; `what` is named where it fails.
+// Launches a kernel that calls wait_for_earlier_kernels(). A failure names `what`.
 template <class... Parameters>
 void launch_early(const char* what, void (*kernel)(Parameters...), const LaunchShape& shape,
                   const std::type_identity_t<Parameters>&... arguments) {

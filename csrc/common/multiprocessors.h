@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// For launches that fill the device once.
+// The number of multiprocessors, for launches with as many blocks as run at a time.
 #pragma once
 #include "common/cuda_check.h"
 
 namespace blitzgs::cuda {
 
-// Of the current device.
+// The number of multiprocessors of the current device.
 inline int multiprocessors() {
   int device = 0, count = 0;
   check(cudaGetDevice(&device), "multiprocessors");

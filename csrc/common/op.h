@@ -51,8 +51,8 @@ inline std::string shape_of(const Tensor& tensor) {
   return text.str();
 }
 
-// shape: one entry per dimension, -1 for any size. The text is made when it is needed alone: a step checks
-// some two hundred tensors while the GPU waits for its next kernel.
+// shape: one entry per dimension, -1 for any size. The message is only made when a check fails, because a
+// step checks some two hundred tensors while the GPU waits for its next kernel.
 inline void check_shape(const char* op, const char* name, const Tensor& tensor,
                         std::initializer_list<std::int64_t> shape) {
   bool ok = tensor.dim() == static_cast<std::int64_t>(shape.size());
@@ -89,12 +89,13 @@ inline void check_floating(const char* op, const char* name, const Tensor& tenso
 #endif
 }
 
-// Asked first: the call into torch, which finds the op by name, takes microseconds.
+// Most tensors are contiguous, and the call into torch, which finds the op by name, takes microseconds; so
+// this asks first.
 inline Tensor as_contiguous(const Tensor& tensor) {
   return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
 }
 
-// By the shortest way into torch: a step allocates some sixty tensors.
+// Calls torch by its shortest way, because a step allocates some sixty tensors.
 inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& shape,
                          std::optional<ScalarType> dtype = std::nullopt) {
   const auto rank = static_cast<std::int64_t>(shape.size());
@@ -124,8 +125,8 @@ const T* data_or_null(const std::optional<Tensor>& tensor) {
   return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
 }
 
-// How many entries at most a list of `room` has of which the first count [1] are set (all without a count).
-// Nobody waits: a count on the GPU is read by the kernels themselves.
+// The most entries that a list of length `room` may have, of which the first count [1] are valid (without a
+// count: all). The host does not wait for a count on the GPU; the kernels read it.
 inline std::int64_t most_listed(const char* op, const std::optional<Tensor>& count, std::int64_t room) {
   if (!count) return room;
   check_dtype(op, "the count of a list", *count, ScalarType::Int);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows whose number only the device knows. An op that the host queues before it knows how many rows were made
-// gets columns with room for n_rows and, where the ops before it have left it, the number of rows that are
-// there: the first *known ones. What lies behind them is undefined memory and is not read as a row. A number
-// that is not in [0, n_rows] counts as 0: there was too little room, and the caller throws the result away.
+// Rows whose number only the device knows. The host queues an op before it knows how many rows the ops before
+// it make. The op gets columns with room for n_rows rows and a pointer to their number in device memory: the
+// first *known rows are valid. The memory behind them is undefined and is not read as rows. A number outside
+// [0, n_rows] counts as 0: there was too little room, and the caller discards the result.
 #pragma once
 #include <cstdint>
 
@@ -10,7 +10,7 @@
 
 namespace blitzgs {
 
-// known: null where all n_rows are there. On the device it is read behind wait_for_earlier_kernels().
+// known: null if all n_rows rows are valid. Kernels read it after wait_for_earlier_kernels().
 BLITZGS_HD std::int64_t rows_there(std::int64_t n_rows, const std::int64_t* known) {
   if (!known) return n_rows;
   const std::int64_t there = *known;

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The optional argument n_rows of an op, int64 [1]: how many of the rows that its columns have room for are
-// there (row_count.h).
+// The optional argument n_rows of an op, int64 [1]: how many rows of its columns are valid (row_count.h).
 #pragma once
 #include <optional>
 
@@ -10,8 +9,9 @@
 namespace blitzgs {
 
 struct RowCount {
-  std::int64_t n_rows;             // at most
-  const std::int64_t* known_rows;  // null: exactly; else read by the kernels, for nobody waits
+  std::int64_t n_rows;  // at most
+  const std::int64_t*
+      known_rows;  // null: all n_rows; otherwise the kernels read it, and the host does not wait
 };
 
 inline RowCount checked_row_count(const char* op, const std::optional<Tensor>& n_rows, const Tensor& rows) {

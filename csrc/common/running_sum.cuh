@@ -18,17 +18,17 @@ __device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
   return value;
 }
 
-// What the blocks before a block add up to, each block a sum in [0, 2^62). A block publishes its own sum,
-// adds up those of its predecessors back to one that already knows the sum up to and including itself, and
-// publishes that: nobody waits for a second launch. Blocks are numbered in the order in which they start, so
-// all predecessors of one that waits run or have run.
+// The sum over all blocks before a block, where each block has a sum in [0, 2^62). A block publishes its own
+// sum. It then adds up the sums of its predecessors, backwards, until it meets one that has published the sum
+// up to and including itself, and publishes its own such sum. No second launch is needed. Blocks are numbered
+// in the order in which they start, so all predecessors of a block that waits run or have run.
 class RunningSum {
  public:
-  // zeros: one for each block and one more.
+  // zeros: one word for each block and one more, all zero.
   explicit RunningSum(std::uint64_t* zeros) : turn_(zeros), states_(zeros + 1) {}
 
-  // The block's number; called by all its threads, and a barrier for them. Once, or again when what is before
-  // the last number is known: a block that does so stands for several.
+  // Returns the block's number. All of its threads call this, and it is a barrier for them. A block may call
+  // it again when it knows the sum before its last number; it then does the work of several blocks.
   __device__ int take_turn() const {
     __shared__ int turn;
     if (threadIdx.x == 0) turn = static_cast<int>(Word(*turn_).fetch_add(1, ::cuda::memory_order_relaxed));
@@ -36,7 +36,8 @@ class RunningSum {
     return turn;
   }
 
-  // Called by all threads of a block, each looking at one predecessor at a time; a barrier for them.
+  // Returns the sum before a block. All threads of the block call this, each looks at one predecessor at a
+  // time, and it is a barrier for them.
   template <int kThreads>
   __device__ std::int64_t sum_before(int block, std::int64_t own) const {
     __shared__ std::int64_t parts[kThreads / 32];
@@ -46,7 +47,7 @@ class RunningSum {
     std::int64_t sum = 0;
     for (int end = block; end > 0; end -= kThreads) {
       const int at = end - 1 - static_cast<int>(threadIdx.x);
-      std::uint64_t state = kThrough;  // in front of the first block there is nothing
+      std::uint64_t state = kThrough;  // before the first block the sum is 0
       do {
         if (at >= 0) state = Word(states_[at]).load(::cuda::memory_order_relaxed);
       } while (__any_sync(kFullWarp, state < kOwn));
@@ -72,8 +73,8 @@ class RunningSum {
 
  private:
   using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
-  // In the two high bits, what the rest is: the block's own sum, or that of all blocks through this one.
-  // State and sum are one word, so no fence orders them.
+  // The two high bits say what the rest is: the block's own sum, or the sum up to and including this block.
+  // Both are in one word, so no fence is needed to order them.
   static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kThrough = std::uint64_t{2} << 62;
 
   __device__ static std::int64_t value(std::uint64_t state) {

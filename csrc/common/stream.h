@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The one difference between the signatures of a CPU kernel and its CUDA twin: where the work is queued,
-// and where scratch memory comes from. No torch here.
+// What the signatures of CPU and CUDA kernels need in common: the stream in which work is queued, and the
+// source of scratch memory. No torch here.
 #pragma once
 #include <cstddef>
 #include <cstdint>

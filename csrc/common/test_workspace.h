@@ -12,11 +12,11 @@ namespace blitzgs {
 class TestWorkspace final : public Workspace {
  public:
   void* allocate_bytes(std::size_t bytes) override {
-    // Exactly as long as asked, so that AddressSanitizer sees the first byte beyond.
+    // Allocations have exactly the requested length, so that AddressSanitizer notices the first byte beyond.
     held_.push_back(std::make_unique<std::byte[]>(bytes));
     return held_.back().get();
   }
-  // What was allocated last; null before that.
+  // Returns the last allocation; null before the first.
   void* last() const { return held_.empty() ? nullptr : held_.back().get(); }
 
  private:

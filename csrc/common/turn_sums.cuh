@@ -1,35 +1,35 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the blocks of a launch that take turns found in the turns before one, while they run.
+// The sum over all earlier turns, for blocks of a launch that take turns, while they run.
 #pragma once
 #include "common/running_sum.cuh"
 
 namespace blitzgs::cuda {
 
-// Each turn has a sum in [0, 2^62). The first block to ask gets no turn: a warp of it adds the sums up, in
-// order, for all others, each of which looks at a single word. That takes longer than looking back as with
-// RunningSum, but nothing of the blocks' time while they have something else to do between publishing and
-// asking. Turns are numbered as they are asked for, so whoever waits for those before waits for blocks that
-// run.
+// Each turn has a sum in [0, 2^62). The first block that asks gets no turn: one of its warps adds the sums
+// up, in order, for all other blocks, each of which reads a single word. The result arrives later than with
+// RunningSum, but it costs the blocks no time if they have other work between publishing their sum and asking
+// for the sum before them. Turns are numbered in the order in which they are asked for, so a block that waits
+// for earlier turns waits for blocks that run.
 class TurnSums {
  public:
-  // zeros: one for each turn and one more.
+  // zeros: one word for each turn and one more, all zero.
   explicit TurnSums(std::uint64_t* zeros) : asked_(zeros), states_(zeros + 1) {}
 
-  // For one thread of a block: its next turn, or -1: add_up() is all that is left to do for its first warp. A
-  // turn that was taken holds up those behind it until it is published.
+  // Called by one thread of a block: returns its next turn, or -1, in which case the block's first warp must
+  // call add_up() and nothing else. Later turns wait until a turn that was taken is published.
   __device__ int next() const {
     return static_cast<int>(Word(*asked_).fetch_add(1, ::cuda::memory_order_relaxed)) - 1;
   }
-  // The same for all threads of a block, and a barrier for them.
+  // The same, called by all threads of a block, and a barrier for them.
   __device__ int first() const {
     __shared__ int turn;
     if (threadIdx.x == 0) turn = next();
     __syncthreads();
     return turn;
   }
-  // By one thread.
+  // Publishes the sum of a turn; called by one thread.
   __device__ void publish(int turn, std::int64_t own) const { set(turn, kOwn, own); }
-  // By one thread: the sum of the turns before, for which it waits.
+  // Waits for the sum of all earlier turns and returns it; called by one thread.
   __device__ std::int64_t before(int turn) const {
     std::uint64_t state;
     do state = look(turn);
@@ -37,9 +37,9 @@ class TurnSums {
     return value(state);
   }
 
-  // By one warp. Turns [0, n) are all taken some time.
+  // Adds up the sums of turns [0, n), all of which are taken at some time; called by one warp.
   __device__ void add_up(int n) const {
-    constexpr int kEach = 4;  // turns that a lane looks at
+    constexpr int kEach = 4;  // turns that a lane reads at a time
     const int lane = threadIdx.x % 32;
     std::int64_t sum = 0;
     for (int done = 0; done < n;) {
@@ -55,7 +55,7 @@ class TurnSums {
         ready = k + 1;
         own += value(states[k]);
       }
-      // Those behind the first that is not there yet have to wait for it.
+      // Turns behind the first one that is not published yet have to wait for it.
       const unsigned short_of = __ballot_sync(kFullWarp, ready < kEach);
       const int last = short_of ? __ffs(short_of) - 1 : 31;
       if (lane > last) own = 0;
@@ -74,8 +74,8 @@ class TurnSums {
 
  private:
   using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
-  // In the two high bits, what the rest is: the turn's own sum, or that of all before it. State and sum are
-  // one word, so no fence orders them.
+  // The two high bits say what the rest is: the turn's own sum, or the sum of all earlier turns. Both are in
+  // one word, so no fence is needed to order them.
   static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kBefore = std::uint64_t{2} << 62;
 
   __device__ static std::int64_t value(std::uint64_t state) {

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Zeros for a few counters, between kernels that are launched early: a memset there brings both gaps back.
+// Zeroes a few counters between kernels that are launched early. A memset there would bring back the gaps
+// before and behind it.
 #pragma once
 #include <cstdint>
 

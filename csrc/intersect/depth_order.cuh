@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows by (depth, id): a radix sort of keys of up to 27 bits in three passes. A key is the depth's place
-// among all floats, counted from the smallest depth there is. Where 27 bits hold more than that, the view
-// goes in front: rows of different views need no order among them, and have fewer equal keys then. Where they
-// hold less (more than a factor of 65536 between the nearest and the farthest) the low bits are left out, and
-// rows whose keys are equal are compared by depth as well as by id.
+// Sorts rows by (depth, id): a radix sort of keys of up to 27 bits in three passes. A key is the depth's
+// place among all floats, counted from the smallest depth of the call. If 27 bits are more than that needs,
+// the remaining high bits hold the view: rows of different views need no order among each other, and fewer
+// keys are then equal. If 27 bits are too few (more than a factor of 65536 between the nearest and the
+// farthest depth), the low bits are left out, and rows with equal keys are compared by depth as well as by
+// id.
 #pragma once
 #include <cstdint>
 
@@ -18,7 +19,7 @@ inline constexpr int kRangeBlocks = kDepthThreads, kRangeThreads = 512;
 inline constexpr int kTieItems = 4, kTieRows = kDepthThreads * kTieItems;
 inline constexpr int kShortRun = 16;  // rows of equal keys that one thread orders
 
-// Floats in the order of unsigned integers.
+// Maps floats to unsigned integers of the same order.
 __device__ __forceinline__ std::uint32_t ordered_bits(float depth) {
   const std::uint32_t bits = __float_as_uint(depth);
   return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
@@ -27,7 +28,7 @@ __device__ __forceinline__ std::uint32_t ordered_bits(float depth) {
 struct DepthRange {
   std::uint32_t low, high;
 
-  // Called by a whole block: the union of its threads' ranges, to all of them.
+  // Returns the union of the ranges of a block's threads to each of them; all of them call this.
   template <int kThreads>
   __device__ DepthRange of_block() const {
     __shared__ DepthRange warps[kThreads / 32];
@@ -40,9 +41,9 @@ struct DepthRange {
   }
 };
 
-// How keys are made of depths, once for all kernels.
+// How keys are made of depths, for all kernels.
 struct DepthDigits {
-  int dropped, view_shift, width;  // bits left out of the depth, below the view, and of a digit
+  int dropped, view_shift, width;  // numbers of bits: left out of the depth, below the view, of a digit
   std::uint32_t view_mask;
 
   __device__ DepthDigits(const DepthRange& range, int n_views) {
@@ -61,7 +62,8 @@ struct DepthDigits {
   }
 };
 
-// The range of the depths by block, and zeros for the kernels that follow: one launch before all others.
+// The first launch: finds the range of each block's depths, and zeroes the counters of the kernels that
+// follow.
 __global__ void __launch_bounds__(kRangeThreads)
     range_kernel(const IntersectInput<float> in, DepthRange* ranges, uint4* zeros, std::int64_t n_zeros) {
   wait_for_earlier_kernels();
@@ -79,7 +81,8 @@ __global__ void __launch_bounds__(kRangeThreads)
   if (threadIdx.x == 0) ranges[blockIdx.x] = range;
 }
 
-// Sort keys, their digits' histograms, and what the rows touch. As many blocks as run at a time.
+// Writes sort keys, the histograms of their digits, and which tiles the rows touch. Launched with as many
+// blocks as run at a time.
 __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
     depth_keys_kernel(const IntersectInput<float> in, const DepthRange* ranges, std::uint32_t* keys,
                       Touched* touched, std::uint64_t* histograms, int* dropped_bits, int* width,
@@ -87,9 +90,10 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
   __shared__ std::uint32_t counts[kDepthPasses][kDepthBins];
   for (int bin = threadIdx.x; bin < kDepthPasses * kDepthBins; bin += kDepthThreads) counts[0][bin] = 0;
   wait_for_earlier_kernels();
-  // Less than 2^31; a 64-bit loop takes registers that are not there.
+  // The number is below 2^31, and a 64-bit loop counter would need more registers than there are.
   const auto n = static_cast<std::uint32_t>(rows_there(in));
-  const DepthRange range = ranges[threadIdx.x].of_block<kDepthThreads>();  // and a barrier
+  const DepthRange range =
+      ranges[threadIdx.x].of_block<kDepthThreads>();  // also a barrier for the zeroed counters
   const DepthDigits digits(range, in.grid.n_cameras);
   if (blockIdx.x == 0 && threadIdx.x == 0) {
     *dropped_bits = digits.dropped;
@@ -124,7 +128,8 @@ struct RowOrder {
     return ids ? ids[a] < ids[b] : a < b;
   }
 
-  // By a whole block: bitonic, with every comparison upwards, so that rows behind the last need not exist.
+  // A bitonic sort by a whole block. Every comparison orders upwards, so rows behind the last one need not
+  // exist.
   __device__ void sort(std::int32_t* rows, std::int64_t n) const {
     for (std::int64_t size = 2; size < 2 * n; size *= 2) {
       for (std::int64_t step = size / 2; step > 0; step /= 2) {
@@ -145,7 +150,8 @@ struct RowOrder {
   }
 };
 
-// Orders each run of equal keys: a thread the usual handful, its block the others, one by one.
+// Orders each run of equal keys. One thread orders a run of a few rows, which is the usual case; its block
+// orders longer runs together, one after the other.
 __global__ void __launch_bounds__(kDepthThreads)
     order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows, const std::int64_t* n_rows,
                       RowOrder order, const int* dropped_bits) {

@@ -2,20 +2,20 @@
 // Intersection: which rows each tile composites, front to back.
 //
 // Row p (a splat in camera camera_ids[p]) is listed in tile t of that camera iff for_each_tile() of
-// math/tiles.h visits it. Within a tile the rows are ordered by (depth, id); without ids by (depth, row).
-// -0 and 0 are different depths; a NaN depth lists nothing defined.
+// math/tiles.h visits it. Within a tile the rows are ordered by (depth, id); without ids by (depth, row). -0
+// and 0 are different depths; lists are undefined if a depth is NaN.
 //
 //   means2d [P, 2] pixels, conics [P, 3], opacities [P], depths [P], camera_ids int32 [P], ids int64 [P] or
 //   null  ->  isect_rows int32 [I] row indices, tile_offsets int64 [B*T + 1] with T = tiles_y * tiles_x:
 //   tile t's list is isect_rows[tile_offsets[t] .. tile_offsets[t + 1]). Tiles that grid does not own have
 //   empty lists.
 //
-// known_rows: null, or how many of the rows are there (common/row_count.h; CUDA alone).
+// known_rows: null, or the number of rows in device memory (common/row_count.h; CUDA alone).
 //
-// capacity is the length of isect_rows; entries from tile_offsets[B*T] on are left unspecified. Where there
-// are more entries than that, the CPU kernel returns their number and writes no list (the op then fails with
-// both numbers); the CUDA kernel, which nobody waits for, lists the first in depth order, and what it writes
-// is consistent.
+// capacity is the length of isect_rows; entries from tile_offsets[B*T] on are left unspecified. If there are
+// more entries than that, the CPU kernel returns their number and writes no list, and the op fails with both
+// numbers. The host does not wait for the CUDA kernel, which then lists the first entries in depth order; its
+// lists and offsets are consistent.
 //
 // Deterministic: the lists depend on the rows alone, never on threads. Row order need not follow depth.
 // O(P) for the radix sort, O(tile rows) for the tests, O(I) to write. Counts are 64-bit; P and

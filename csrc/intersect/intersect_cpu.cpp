@@ -12,7 +12,7 @@
 namespace blitzgs::cpu {
 namespace {
 
-// Tiles [first, first + count) of one tile row, counted from grid.tile_begin, which a row touches.
+// The tiles of one tile row that a row touches: [first, first + count), counted from grid.tile_begin.
 struct Span {
   std::int32_t row;
   std::int32_t count;
@@ -28,7 +28,7 @@ struct Keyed {
   std::int32_t row;
 };
 
-// Integers in the order of the floats.
+// Maps floats to unsigned integers of the same order.
 template <class T>
 KeyOf<T> depth_key(T depth) {
   using Key = KeyOf<T>;
@@ -51,7 +51,7 @@ void for_each_span(const IntersectInput<T>& in, std::int32_t row, const F& f) {
                     });
 }
 
-// [0, n) in `pieces` parts of nearly equal length.
+// Where a piece begins when [0, n) is cut into `pieces` parts of nearly equal length.
 std::int64_t piece_start(std::int64_t n, int pieces, int piece) { return n * piece / pieces; }
 
 template <class F>
@@ -61,7 +61,7 @@ void parallel_pieces(int pieces, const F& f) {
   });
 }
 
-// One stable counting pass on 11 bits; false, and nothing moved, when all keys agree on them.
+// One stable counting pass on 11 bits. Returns false and moves nothing when all keys have the same 11 bits.
 template <class Key>
 bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, std::int64_t n, int shift) {
   constexpr int kBuckets = 1 << 11;
@@ -93,7 +93,7 @@ bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, std::int64_t n, int shif
   return true;
 }
 
-// The row order of equal depths is already theirs; with ids, each run of equal depths is put in id order.
+// The sort has kept rows of equal depth in row order; this puts each run of equal depths in the order of ids.
 template <class Key>
 void order_ties(Keyed<Key>* rows, std::int64_t n, const std::int64_t* ids) {
   for (std::int64_t begin = 0; begin < n;) {
@@ -125,7 +125,7 @@ const Keyed<KeyOf<T>>* sort_rows(const IntersectInput<T>& in, Workspace& workspa
   return rows;
 }
 
-// As many pieces as threads, fewer where a count per tile and piece would take too much memory.
+// As many pieces as threads, or fewer where a counter for each tile and piece would take too much memory.
 int choose_pieces(std::int64_t n_tiles) {
   constexpr std::int64_t kMostCounts = 1 << 25;
   return static_cast<int>(
@@ -158,7 +158,7 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
   const std::int64_t n_tiles = grid.tile_end - grid.tile_begin;
   const auto* rows = sort_rows(in, workspace);
 
-  // Each piece of the depth order notes its spans and counts them per tile ...
+  // First, each piece of the depth order notes its spans and counts them per tile.
   const int pieces = choose_pieces(n_tiles);
   auto* places = workspace.allocate<std::int64_t>(n_tiles * pieces);
   std::vector<std::vector<Span>> spans(pieces);
@@ -169,7 +169,7 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
     const std::int64_t end = piece_start(in.n_rows, pieces, piece + 1);
     spans[piece].reserve(2 * (end - begin));
     for (std::int64_t i = begin; i < end; ++i) {
-      // Depth order jumps about in memory: fetch a few rows ahead.
+      // Rows in depth order are scattered in memory, so a few rows are prefetched.
       const std::int64_t ahead = rows[std::min(i + 8, end - 1)].row;
       __builtin_prefetch(in.means2d + 2 * ahead);
       __builtin_prefetch(in.conics + 3 * ahead);
@@ -182,7 +182,7 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
     }
   });
 
-  // ... which gives every piece its place in every list ...
+  // These counts give every piece its place in every list.
   std::int64_t place = 0;
   std::fill_n(tile_offsets, grid.tile_begin, 0);
   for (std::int64_t tile = 0; tile < n_tiles; ++tile) {
@@ -196,7 +196,7 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
   std::fill_n(tile_offsets + grid.tile_end, grid.count() + 1 - grid.tile_end, place);
   if (place > capacity) return place;
 
-  // ... and the pieces write their parts.
+  // Then each piece writes its part of every list.
   parallel_pieces(pieces, [&](int piece) {
     std::int64_t* next = places + n_tiles * piece;
     for (const Span& span : spans[piece]) {

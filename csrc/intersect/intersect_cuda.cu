@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows are sorted by depth once (depth_order.cuh); their entries are written in that order with the tile as
-// a key, 16 bits where the tiles of the launch fit, and a stable radix sort over just the bits in use brings
-// each tile's entries together without disturbing their order. Which tiles a row touches is found once, in
-// row order, and kept in 16 bytes: those of all rows fit into the L2 cache, where depth order gathers them.
-// Compiled without FMA contraction (cmake/cuda.cmake), as the projection is: both count the same tiles.
+// Rows are sorted by depth once (depth_order.cuh). Their entries are written in that order with the tile as a
+// key, of 16 bits where the tiles of the launch fit. A stable radix sort over the bits in use then brings
+// each tile's entries together and keeps their order. Which tiles a row touches is found once, in row order,
+// and kept in 16 bytes, so that the data of all rows fit into the L2 cache when they are gathered in depth
+// order. This file is compiled without FMA contraction (cmake/cuda.cmake), as the projection is, because both
+// must count the same tiles.
 #include <cub/device/device_reduce.cuh>
 
 #include <algorithm>
@@ -23,9 +24,10 @@ namespace {
 
 using Input = IntersectInput<float>;
 constexpr int kThreads = 256;
-constexpr int kEmitItems = 4, kEmitRows = kThreads * kEmitItems;  // rows of a thread and of a block
+constexpr int kEmitItems = 4, kEmitRows = kThreads * kEmitItems;  // rows that a thread and a block handle
 
-// The digits that tiles are sorted by, as many and as narrow as hold the number of tiles.
+// The digits by which tiles are sorted: as few passes as the number of tiles needs, with digits as narrow as
+// these allow.
 struct TileDigits {
   static constexpr int kBits = 8, kBins = 1 << kBits, kMost = 4;
   int passes = 1, width = 1;
@@ -50,20 +52,22 @@ __global__ void count_kernel(const Input in, std::int32_t* counts) {
   counts[i] = i < rows_there(in) ? find_touched(in.grid, load_splat(in, i)).count() : 0;
 }
 
-// Writes the entries of a warp's rows, a row a lane, from `turn` on; start: of the lane's row behind `turn`.
+// Writes the entries of a warp's rows, one row for each lane. The warp's entries begin at `turn`, the lane's
+// at `turn` + `start`.
 template <class Key>
 __device__ __forceinline__ void write_entries(const Input& in, const Touched* all_touched, std::int32_t row,
                                               const Touched& touched, std::int32_t start, std::int64_t turn,
                                               std::int64_t capacity, Key* keys, std::int32_t* entries,
                                               const TileDigits& digits, std::uint32_t* counts) {
   const int lane = threadIdx.x % 32;
-  // Of compact rows each lane writes every 32nd entry, whosever it is.
+  // The lanes share all entries of compact rows: each writes every 32nd entry, whichever lane's row it
+  // belongs to.
   const std::int32_t count = touched.compact() ? touched.count() : 0;
   const std::int32_t until = sum_of_lanes_until(count, lane), total = __shfl_sync(kFullWarp, until, 31);
   const std::int32_t begin = until - count;
   for (std::int32_t first = 0; first < total; first += 32) {
     const std::int32_t entry = first + lane;
-    int source = 0;  // the last row that begins there or before
+    int source = 0;  // the last lane whose entries begin at `entry` or before
 #pragma unroll
     for (int step = 16; step > 0; step /= 2) {
       if (__shfl_sync(kFullWarp, begin, source + step) <= entry) source += step;
@@ -79,7 +83,7 @@ __device__ __forceinline__ void write_entries(const Input& in, const Touched* al
       digits.count(tile, counts);
     }
   }
-  // The other rows are walked by all lanes together.
+  // All lanes walk the tiles of each other row together.
   for (unsigned left = __ballot_sync(kFullWarp, !touched.compact()); left; left &= left - 1) {
     const int source = __ffs(left) - 1;
     const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
@@ -109,8 +113,8 @@ __device__ __forceinline__ void write_entries(const Input& in, const Touched* al
   }
 }
 
-// Entries in depth order, their number and the histograms of their tiles' digits. Blocks take kEmitRows rows
-// each, a warp 32 times kEmitItems of them in a row.
+// Writes the entries in depth order, their number, and the histograms of their tiles' digits. A block handles
+// kEmitRows rows, a warp 32 * kEmitItems consecutive ones.
 template <class Key>
 __global__ void __launch_bounds__(kThreads, 4)
     emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows,
@@ -133,7 +137,7 @@ __global__ void __launch_bounds__(kThreads, 4)
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) touched[k] = row[k] >= 0 ? all_touched[row[k]] : Touched{};
 
-  std::int32_t start[kEmitItems];  // of each row, in its warp's turn
+  std::int32_t start[kEmitItems];  // where each row's entries begin, counted from its warp's first entry
   std::int64_t turn[kEmitItems], warp_sum = 0;
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
@@ -162,7 +166,7 @@ __global__ void __launch_bounds__(kThreads, 4)
   add_counts(counts, digits.passes * TileDigits::kBins, histograms);
 }
 
-// tile_offsets[t] = first entry whose tile is >= t, a tile a warp.
+// tile_offsets[t] = the first entry whose tile is >= t. One warp for each tile.
 template <class Key>
 __global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entries, TileGrid grid,
                                     std::int64_t* tile_offsets) {
@@ -172,7 +176,7 @@ __global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entri
   if (tile > grid.count()) return;
   const std::int64_t wanted = (tile < grid.tile_end ? tile : grid.tile_end) - grid.tile_begin;
   std::int64_t low = 0, high = wanted <= 0 ? 0 : *n_entries;
-  while (low < high) {  // the lanes look at the ends of 32 parts
+  while (low < high) {  // each lane looks at the end of one of 32 parts
     const std::int64_t part = (high - low + 31) / 32, at = low + (lane + 1) * part - 1;
     const bool less = at < high && static_cast<std::int64_t>(keys[at]) < wanted;
     low += __popc(__ballot_sync(kFullWarp, less)) * part;
@@ -181,18 +185,18 @@ __global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entri
   if (lane == 0) tile_offsets[tile] = low;
 }
 
-// What a call needs besides the arrays of its rows and entries.
+// The scratch memory of a call, apart from the arrays of its rows and entries.
 template <class State>
 struct Counters {
   unsigned depth_blocks, tile_blocks, emit_blocks;
-  // All zero when the first kernel has run, but for the ranges, which it writes.
+  // The first kernel zeroes all of this but the ranges, which it writes.
   std::uint64_t *depth_histograms, *tile_histograms, *running, *turns;
   std::int64_t *n_rows, *n_entries;
   int *dropped_bits, *width;
   State *depth_states, *tile_states;
   DepthRange* ranges;
   uint4* begin;
-  std::int64_t n_zeros;  // of 16 bytes
+  std::int64_t n_zeros;  // in units of 16 bytes
 
   Counters(const Input& in, std::int64_t capacity, const TileDigits& digits, Workspace& workspace)
       : depth_blocks(blocks_for(in.n_rows, kSweepTile)),
@@ -321,7 +325,7 @@ std::int64_t intersect<float>(const Input& in, std::int64_t capacity, std::int32
           "intersect");
     return capacity;
   }
-  // 30 bits count what a call with 32-bit states has.
+  // 32-bit states leave 30 bits for counts.
   const bool small = in.n_rows < (1 << 30) && capacity < (1 << 30);
   const auto list = [&](auto key, auto state) {
     list_rows<decltype(key), decltype(state)>(in, capacity, isect_rows, tile_offsets, workspace, stream);

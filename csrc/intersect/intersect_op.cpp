@@ -71,7 +71,8 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
       count = backend::intersect(in, capacity, mutable_data<std::int32_t>(rows),
                                  mutable_data<std::int64_t>(offsets), scope.workspace, scope.stream);
     } catch (const std::exception& error) {
-      // What fails here is memory: the lists are the one thing whose size nobody asked for.
+      // An error here means that memory ran out: the length of the lists follows from the splats, not from an
+      // argument, so the message states it.
       STD_TORCH_CHECK(false, "blitzgs::intersect: listing ", capacity, " intersections of ", n_rows,
                       " rows failed; it takes about ", capacity * 20 / 1000000, " MB. Render fewer views at ",
                       "once, in smaller images, or with a larger radius_clip. Cause: ", error.what());

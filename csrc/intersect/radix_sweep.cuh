@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// One pass of a stable radix sort in one launch: pairs of a key and a value go to where a digit of the key
-// wants them. How often each digit occurs was counted before, by the kernel that wrote the keys; what the
-// blocks before a block hold of each digit is added up while they run (decoupled look-back), several
-// predecessors at a time: with a few hundred blocks, all of them running at once, the look-back is what a
-// pass would otherwise wait for. The number of pairs is read on the device.
+// One pass of a stable radix sort in one launch: each pair of a key and a value moves to the place that a
+// digit of its key gives it. The kernel that wrote the keys has counted how often each digit occurs. Each
+// block adds up what the blocks before it hold of each digit while they run (decoupled look-back). It looks
+// at several predecessors at a time, because a pass has only a few hundred blocks, which all run at once, and
+// would otherwise spend most of its time looking back. The number of pairs is read from device memory.
 #pragma once
 #include <algorithm>
 #include <cstdint>
@@ -16,9 +16,9 @@
 namespace blitzgs::cuda {
 
 inline constexpr int kSweepThreads = 512, kSweepItems = 16, kSweepTile = kSweepThreads * kSweepItems;
-inline constexpr int kSweepWindow = 4;  // predecessors looked at together
+inline constexpr int kSweepWindow = 4;  // predecessors that are looked at together
 
-// State: an unsigned integer whose two high bits say what the rest counts, so n_items < 2^30 for 32 bits.
+// State: an unsigned integer. Its two high bits say what the other bits count, so n_items < 2^30 for 32 bits.
 template <class Key, class State>
 struct SweepPass {
   const Key* keys;
@@ -27,14 +27,14 @@ struct SweepPass {
   std::int32_t* sorted_values;
   const std::int64_t* n_items;
   const std::uint64_t* histogram;  // [bins] of this digit
-  std::uint64_t* turn;             // zero before
-  State* states;                   // [blocks, bins] zeros before
-  int index;                       // of this digit, the lowest is 0
-  int width;                       // bits of all digits
-  const int* known_width;          // null, or their width where only the device knows it
+  std::uint64_t* turn;             // must be zero before the launch
+  State* states;                   // [blocks, bins], must be zeros before the launch
+  int index;                       // of this digit; the lowest digit has index 0
+  int width;                       // bits of each digit
+  const int* known_width;          // null, or the width in device memory, where the host does not know it
 };
 
-// Adds the counts of a block to those of all; called by all its threads.
+// Adds the counts of a block to those of the whole launch; called by all its threads.
 __device__ __forceinline__ void add_counts(const std::uint32_t* counts, int bins, std::uint64_t* histogram) {
   using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
   for (int bin = threadIdx.x; bin < bins; bin += blockDim.x) {
@@ -42,7 +42,7 @@ __device__ __forceinline__ void add_counts(const std::uint32_t* counts, int bins
   }
 }
 
-// What the blocks before `block` hold of one bin, whose state in block 0 is states[0].
+// Returns how many items the blocks before `block` have in one bin; states[0] is the bin's state in block 0.
 template <int kBins, class State>
 __device__ __forceinline__ State count_before(const State* states, unsigned block) {
   using Word = ::cuda::atomic_ref<const State, ::cuda::thread_scope_device>;
@@ -52,7 +52,7 @@ __device__ __forceinline__ State count_before(const State* states, unsigned bloc
     State seen[kSweepWindow];
 #pragma unroll
     for (int k = 0; k < kSweepWindow; ++k) {
-      seen[k] = State{2} << (kBits - 2);  // in front of the first block there is nothing
+      seen[k] = State{2} << (kBits - 2);  // before the first block the sum is 0
       if (end > k) seen[k] = Word(states[(end - 1 - k) * kBins]).load(::cuda::memory_order_relaxed);
     }
 #pragma unroll
@@ -67,7 +67,8 @@ __device__ __forceinline__ State count_before(const State* states, unsigned bloc
   return sum;
 }
 
-// The lanes whose low bits are those of this lane. In PTX, as the compiler spends 7 instructions a bit.
+// Returns the lanes whose values have the same low bits as this lane's. It is written in PTX because the
+// compiler spends 7 instructions on each bit.
 template <int kBits>
 __device__ __forceinline__ unsigned lanes_with_same(unsigned value) {
   unsigned lanes = kFullWarp;
@@ -89,21 +90,23 @@ template <int kBits, class Key, class State>
 __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass<Key, State> pass) {
   constexpr int kBins = 1 << kBits, kWarps = kSweepThreads / 32;
   static_assert(kBins <= kSweepThreads);
-  // The flags of a state: this block's own count, or that of all blocks through this one.
+  // The flags of a state: the rest is this block's own count, or the count of all blocks up to and including
+  // this one.
   constexpr State kOwn = State{1} << (8 * sizeof(State) - 2), kThrough = kOwn << 1;
   extern __shared__ std::int32_t staged_values[];
   auto* const staged_keys = reinterpret_cast<Key*>(staged_values + kSweepTile);
-  // [warps, bins] of each warp; the keys take their place.
+  // [warps, bins], the counts of each warp; the keys reuse this memory later.
   auto* const counts = reinterpret_cast<std::uint32_t*>(staged_values + kSweepTile);
   __shared__ State targets[kBins], sums_everywhere[kWarps];
   __shared__ std::uint32_t sums_here[kWarps];
   __shared__ unsigned turn;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  const int bin = threadIdx.x;  // of threads that have one
+  const int bin = threadIdx.x;  // valid in threads below the number of bins
   for (int i = lane; i < kBins; i += 32) counts[warp * kBins + i] = 0;
   wait_for_earlier_kernels();
   if (threadIdx.x == 0) {
-    using Turn = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;  // predecessors have started
+    using Turn = ::cuda::atomic_ref<std::uint64_t,
+                                    ::cuda::thread_scope_device>;  // blocks with a smaller turn have started
     turn = static_cast<unsigned>(Turn(*pass.turn).fetch_add(1, ::cuda::memory_order_relaxed));
   }
   const State everywhere = bin < kBins ? static_cast<State>(pass.histogram[bin]) : 0;
@@ -116,8 +119,8 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   if (first >= n) return;
   const int n_here = n - first < kSweepTile ? static_cast<int>(n - first) : kSweepTile;
 
-  // A warp's pairs follow each other, so that equal digits keep their order. What is behind the last pair
-  // has the largest digit and is dropped at the end.
+  // A warp handles consecutive pairs, so that equal digits keep their order. Items behind the last pair get
+  // the largest digit and are dropped at the end.
   const int begin = warp * 32 * kSweepItems + lane;
   Key keys[kSweepItems];
 #pragma unroll
@@ -157,7 +160,7 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   __syncthreads();
   State target = until_everywhere - everywhere;
   if (bin < kBins) {
-    std::uint32_t start = until_here - here;  // of the bin in this block
+    std::uint32_t start = until_here - here;  // where the bin begins among this block's pairs
     for (int w = 0; w < warp; ++w) {
       start += sums_here[w];
       target += sums_everywhere[w];
@@ -191,8 +194,9 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) staged_values[places[k]] = values[k];
   __syncthreads();
+  // Neighbouring threads write pairs of one digit to neighbouring places.
 #pragma unroll
-  for (int k = 0; k < kSweepItems; ++k) {  // neighbouring threads write a digit's pairs
+  for (int k = 0; k < kSweepItems; ++k) {
     const int at = threadIdx.x + k * kSweepThreads;
     if (at >= n_here) break;
     const Key key = staged_keys[at];

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which tiles a row touches, found once and kept in 16 bytes. Include it only where contraction is off
-// (cmake/cuda.cmake): the projection counts the same tiles.
+// Which tiles a row touches, found once and kept in 16 bytes. Only files that are compiled without
+// contraction may include this (cmake/cuda.cmake), because the projection must count the same tiles.
 #pragma once
 #include "common/running_sum.cuh"
 #include "intersect/intersect.h"
@@ -22,7 +22,8 @@ __device__ __forceinline__ Splat load_splat(const IntersectInput<float>& in, std
   const float2 mean = reinterpret_cast<const float2*>(in.means2d)[row];
   const float* const conic = in.conics + 3 * row;
   const Splat s{{mean.x, mean.y}, {conic[0], conic[1], conic[2]}, in.opacities[row], in.camera_ids[row]};
-  // All are waited for together here: left to itself the compiler puts each load behind the tests before it.
+  // This makes the thread wait for all loads together. Otherwise the compiler moves each load behind the
+  // tests before it.
   asm volatile("" ::"f"(s.mean[0]), "f"(s.mean[1]), "f"(s.conic[0]), "f"(s.conic[1]), "f"(s.conic[2]),
                "f"(s.opacity), "r"(s.camera));
   return s;
@@ -41,9 +42,10 @@ __device__ __forceinline__ void for_each_owned(const TileGrid& grid, const Splat
                     });
 }
 
-// The owned tiles that a row touches. Compact: tile `first` (from tile_begin on) and up to twelve tile rows,
-// a byte each: in the low half the number of tiles, in the high half 8 + their shift against the first row's.
-// Other shapes have first = kWalk, and the number of tiles in rows[0].
+// The owned tiles that a row touches. The compact form is tile `first` (counted from tile_begin) and up to
+// twelve tile rows of a byte each: the low half of the byte is the number of tiles, the high half 8 + the
+// shift of the first of them against that of the first tile row. Other shapes have first = kWalk, and their
+// number of tiles in rows[0].
 struct alignas(16) Touched {
   static constexpr std::uint32_t kWalk = ~0u;
   static constexpr int kWords = 3;
@@ -59,10 +61,11 @@ struct alignas(16) Touched {
 
   __device__ bool compact() const { return first != kWalk; }
 
-  // Tile k < count() of a compact row, from tile_begin on.
+  // Returns tile k < count() of a compact row, counted from tile_begin.
   __device__ std::uint32_t tile(std::uint32_t k, std::uint32_t tiles_x) const {
     std::uint32_t start = first, word = rows[0];
-    std::uint32_t through = (word & kCounts) * kOnes;  // byte j: the tiles in rows 0 to j of the word
+    // Byte j of `through` is the number of tiles in rows 0 to j of the word.
+    std::uint32_t through = (word & kCounts) * kOnes;
 #pragma unroll
     for (int i = 1; i < kWords; ++i) {
       if (k < through >> 24) break;
@@ -71,13 +74,14 @@ struct alignas(16) Touched {
       word = rows[i];
       through = (word & kCounts) * kOnes;
     }
-    // The first byte that counts more than k; no byte borrows from the next, as they are at most 60.
+    // Finds the first byte that counts more than k. Bytes are at most 60, so the subtraction does not borrow
+    // between them.
     const std::uint32_t reached = ((through | kHighBits) - (k + 1) * kOnes) & kHighBits;
     const int bit = (__ffs(reached) - 1) & 24;
     return start + (bit >> 3) * tiles_x + (word >> (bit + 4) & 15u) - 8 + k - (through << 8 >> bit & 255u);
   }
 
-  // That of another lane; called by whole warps.
+  // Returns the value of another lane; called by whole warps.
   __device__ Touched of_lane(int lane) const {
     Touched other{__shfl_sync(kFullWarp, first, lane), {}};
     for (int k = 0; k < kWords; ++k) other.rows[k] = __shfl_sync(kFullWarp, rows[k], lane);
