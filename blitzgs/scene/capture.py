@@ -25,7 +25,7 @@ from blitzgs.scene.ply import read_points
 from blitzgs.scene.splits import split_views
 from blitzgs.scene.undistort import Rectification, rectify
 
-# Pixels: SSIM looks at windows of 11, and what is much smaller shows nothing to train on.
+# In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
 _SAMPLED_POINTS = 2000
@@ -152,7 +152,7 @@ def load_capture(
 
 
 def _warn_of_blind_views(cameras: list[Camera], points: Float64) -> None:
-    """Say so when most views see no point: a model of another world, or axes of another convention."""
+    """Warn when most views see no point: it may be another world's model, or have another axis convention."""
     sample = points[:: max(1, len(points) // _SAMPLED_POINTS)]
     blind = [camera.name for camera in cameras if not sees_any(camera, sample)]
     if 2 * len(blind) > len(cameras):
@@ -288,7 +288,7 @@ def _camera(
     if lens not in plans:
         plans[lens] = rectify(lens, policy)
     plan = plans[lens]
-    # Images that came downscaled from images_N count as such: only what is left is done on the fly.
+    # Images from images_N are downscaled already; only the rest of the factor is applied while decoding.
     already = max(1.0, view.lens.width / width) if downscale > 1 else 1.0
     left = downscale / already if downscale / already > 1.01 else 1.0
     size = downscaled_size(plan.width, plan.height, left)

@@ -23,9 +23,9 @@ class ImageFinder:
         self._mapping = _mega_nerf_mapping(root)
 
     def find_all(self, names: Sequence[str], lenses: Sequence[Lens], downscale: float) -> list[Path]:
-        """The file of each name: from images_N when every image is there at the right size.
+        """Return the file of each name, from images_N when all images are in it at the right size.
 
-        A path that does not exist is returned for an image that is nowhere.
+        For an image that is found nowhere the returned path does not exist.
         """
         if downscale > 1 and float(downscale).is_integer():
             folder = self.root / f"{self.images}_{int(downscale)}"

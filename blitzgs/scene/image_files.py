@@ -118,10 +118,10 @@ def _imdecode(data: bytes, flags: int, name: str) -> UInt8:
 
 
 def read_whole(path: Path) -> bytes:
-    """The bytes of an image file; refused where a decoder would conceal what is missing or damaged.
+    """Return the bytes of an image file; refuse one whose damage a decoder would conceal.
 
-    Decoders show the part of a JPEG that is lost as grey, without an error, so its codes are walked here.
-    What leaves a valid sequence of codes (most changes of a single bit) cannot be told from a photograph.
+    Decoders show the lost part of a JPEG as grey, without an error, so this function walks the codes of the
+    file. Damage that leaves a valid sequence of codes (most changes of a single bit) cannot be detected.
 
     Raises:
         ValueError: the file is truncated or damaged; names it, the byte offset and the reason.

@@ -2,11 +2,11 @@
 """The images of a capture: kept compressed in memory under a budget, decoded ahead by a thread pool.
 
 Two bounded caches, both dropping what was used longest ago: compressed images and decoded ones. The
-compressed form is the file itself where the file is the image. Where it is not (it must be undistorted or
-downscaled), that is done once and the result kept as QOI, which is lossless: for an image of 1.9 megapixels
-decoding it takes 16 ms at full size and 1 ms at a quarter, where decoding, undistorting and averaging the
-JPEG again takes 22 and 16 ms, and PNG 46 and 3 ms. Nothing is written to disk. What comes out depends neither
-on budgets nor on threads or order.
+compressed form is the file itself if the file needs no work. An image that must be undistorted or downscaled
+is made once and kept as QOI, which is lossless: for an image of 1.9 megapixels decoding it takes 16 ms at
+full size and 1 ms at a quarter, where decoding, undistorting and averaging the JPEG again takes 22 and 16 ms,
+and PNG 46 and 3 ms. Nothing is written to disk. The images do not depend on budgets, threads or the order of
+calls.
 """
 
 from __future__ import annotations
@@ -163,10 +163,10 @@ class ImageStore:
         return found.result() if isinstance(found, Future) else found
 
     def _submit(self, kind: str, index: int) -> UInt8 | Future[UInt8]:
-        """What is decoded, or will be."""
+        """The images that are decoded or will be."""
         key = (kind, index)
-        # What is no longer pending is decoded: both are looked up under one lock, or a thread held up between
-        # the two would have it decoded again.
+        # An image that is no longer pending is decoded. Both lists are looked up under one lock; otherwise a
+        # thread that is delayed between the two look-ups would decode the image again.
         with self._pending_lock:
             if key in self._pending:
                 return self._pending[key]
@@ -246,7 +246,7 @@ class ImageStore:
         return pixels
 
     def _maps_of(self, plan: Rectification) -> _Maps:
-        """Few are kept: those of a 12-megapixel image take 100 MB."""
+        """Only a few maps are kept, because those of a 12-megapixel image take 100 MB."""
         with self._maps_lock:
             if plan not in self._maps:
                 columns, rows, seen = plan.maps()

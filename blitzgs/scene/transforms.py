@@ -112,7 +112,8 @@ def _read_pose(matrix: object) -> Float64:
         raise ValueError(f"transform_matrix must be 4 x 4, got the shape {camera_to_world.shape}")
     pose = np.eye(4)
     rotation = camera_to_world[:3, :3] * np.array([1.0, -1.0, -1.0])
-    rotation = rotation / np.linalg.norm(rotation, axis=0)  # some exporters leave the scale of the rig in
+    # Some exporters do not remove the scale of the rig.
+    rotation = rotation / np.linalg.norm(rotation, axis=0)
     if np.isfinite(rotation).all() and not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
         raise ValueError("transform_matrix is not a rotation and a translation")
     pose[:3, :3] = rotation.T

@@ -124,10 +124,11 @@ def _inside(lens: Lens, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> npt.NDArray
 def _seen(
     lens: Lens, x: npt.NDArray[Any], y: npt.NDArray[Any], axis: tuple[int, int]
 ) -> npt.NDArray[np.bool_]:
-    """Which directions of a grid land inside the image, without those that a polynomial folds back into it.
+    """Return which directions of a grid fall inside the image, without those that are folded back into it.
 
     x, y are their pixels, [rows, columns] of the grid; `axis` is the row and column of the optical axis.
-    Beyond a fold the image is mirrored, and what is connected to the axis without crossing one was seen.
+    Beyond a fold the image would be mirrored, so only directions that are connected to the axis without
+    crossing a fold count as seen.
     """
     seen = _inside(lens, x, y)
     with np.errstate(invalid="ignore"):
@@ -162,7 +163,7 @@ def _inner_rectangle(seen: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
 
 
 def _trim(plan: Rectification) -> Rectification:
-    """Give up border pixels that the grid was too coarse to tell were not seen."""
+    """Drop border pixels that were not seen, which the coarse grid did not show."""
     x0, y0, width, height = plan.x0, plan.y0, plan.width, plan.height
     while min(width, height) >= _MIN_SIDE:
         plan = Rectification(plan.lens, width, height, x0, y0, has_invalid=False)

@@ -29,10 +29,10 @@ def morton_order(means: Tensor) -> Tensor:
 
 
 class BlockIndex:
-    """Bounds of blocks of 256 consecutive rows of one table, kept true while an optimiser moves the rows.
+    """Bounds of blocks of 256 consecutive rows of one table, kept up to date while an optimiser moves them.
 
     Build a new index whenever rows were added, removed or reordered; sort the table by `morton_order` first,
-    or blocks are large and nothing is saved (the active set is right in any order).
+    or blocks are large and save no work (the active set is right in any order).
     """
 
     def __init__(self, table: GaussianTable, schedule: Tensor | None = None) -> None:
@@ -41,7 +41,7 @@ class BlockIndex:
         Args:
             table: the rows.
             schedule: of the lazy optimiser, from `blitzgs.ops.lazy_adam.schedule_table`, when steps may be
-                pending; None: rows stand where they are.
+                pending; None: rows do not move by themselves.
         """
         self._schedule = schedule
         count = -(-len(table) // BLOCK_ROWS)
@@ -59,7 +59,7 @@ class BlockIndex:
         far_plane: float,
         eps2d: float = 0.3,
     ) -> ActiveRows:
-        """Return the rows that may show and their views.
+        """Return the rows that the views may see, and the views of each.
 
         The result depends on each row's own state alone, neither on the order of the rows nor on how they are
         divided among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
@@ -72,7 +72,7 @@ class BlockIndex:
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:
         """Take note that the optimiser stepped the rows `ids` (int32 [U]; None: any row may have changed).
 
-        Catching rows up needs no update: the bounds hold all that a row can become by it.
+        Catching up needs no update, because the bounds contain the whole drift of rows that are behind.
         """
         update_block_bounds_(self._bounds, ids, table["means"], table["scales"], self._pending(table))
 

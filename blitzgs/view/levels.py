@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Octree levels: how fine a Gaussian may be to be worth seeing from a distance (paper Eq. 1)."""
+"""Octree levels: how fine a Gaussian may be to be resolvable from a distance (paper Eq. 1)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Levels:
         """Return the largest distance from which `level` is resolvable.
 
         Eq. 1 rounds log_f(d_0 / d) to the nearest integer, which reaches l up to d = d_0 f^(1/2 - l). Level 0
-        is resolvable from everywhere.
+        is resolvable from any distance.
         """
         return math.inf if level == 0 else self.reference_distance * self.fork ** (0.5 - level)
 
