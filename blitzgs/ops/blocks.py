@@ -14,7 +14,7 @@ BLOCK_ROWS = 256
 
 
 class PendingSteps(NamedTuple):
-    """Optimiser state that says where rows may still drift to before they are caught up.
+    """Optimiser state that bounds how far rows may drift when they catch up.
 
     Attributes:
         exp_avg_means: first moment of the means, float32 [N, 3].
@@ -36,9 +36,9 @@ class PendingSteps(NamedTuple):
 
 
 class ActiveRows(NamedTuple):
-    """The rows that some view may see: the first `length` of lists with room for all N.
+    """The rows that some view may see: the first `length` entries of lists with room for all N.
 
-    Nobody has waited for the length, so ops that take the lists take it with them.
+    The length stays on the device, so that the host need not wait; ops that take the lists take it too.
 
     Attributes:
         ids: int32 [N], ascending.
@@ -51,7 +51,7 @@ class ActiveRows(NamedTuple):
     length: Tensor
 
     def listed(self) -> tuple[Tensor, Tensor]:
-        """Return the rows there are and their views, int32 [A] each; waits for the device."""
+        """Return the active rows and their views, int32 [A] each; waits for the device."""
         length = int(self.length)
         return self.ids[:length], self.views[:length]
 
@@ -83,7 +83,7 @@ def update_block_bounds_(
         ids: int32 [U], rows that changed.
         means: float32 [N, 3].
         scales: float32 [N, 3], logarithms of the standard deviations.
-        pending: where rows may drift before they are caught up; None: they stay.
+        pending: bounds how far rows may drift when they catch up; None: rows do not drift.
 
     Raises:
         RuntimeError: wrong shapes or dtypes.
@@ -104,10 +104,11 @@ def cull_blocks(
     eps2d: float = 0.3,
     pending: PendingSteps | None = None,
 ) -> ActiveRows:
-    """Return the rows that may show in at least one of B views, without reading those of blocks outside.
+    """Return the rows that at least one of B views may see, without reading the rows of blocks outside.
 
-    Conservative: every row that projection would emit is in the set, whatever of its pending steps has been
-    taken by then. Only rows that provably miss a view are dropped from it (csrc/blocks/blocks.h).
+    The set is conservative: it contains every row that projection would project, no matter how many of its
+    pending steps have been applied by then. Only rows that provably miss a view are dropped from it
+    (csrc/blocks/blocks.h).
 
     Args:
         bounds: from `update_block_bounds_`, of the same rows.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Counter-based random numbers: a draw depends on its key alone, not on the rank or on what came before."""
+"""Counter-based random numbers: a draw depends on its key alone, not on the rank or on earlier draws."""
 
 from __future__ import annotations
 

@@ -36,11 +36,13 @@ def density_stats_(
         max_radii: [N], pixels, dtype of `grad_sum`.
         visible_ids: int32 [U], Gaussians with rows, each once.
         row_offsets: int32 [U + 1], the rows of each.
-        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel; rows may be apart.
+        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel; rows may lie apart
+            in memory.
         conics: [P, 3], inverse 2D covariances (a, b, c).
         width: image width in pixels.
         height: image height in pixels.
-        weight: turns the gradient of the step's loss into that of one view's: B when it is a mean over B.
+        weight: factor from the gradient of the step's loss to the gradient of one view's loss: B when the
+            step's loss is a mean over B views.
         phi: [N], factor of each Gaussian's gradient; None = 1.
 
     Raises:

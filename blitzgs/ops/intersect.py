@@ -43,23 +43,23 @@ def intersect(
         row_opacities: [P], in [0, 1].
         depths: sort keys [P], the z of each row in its view.
         camera_ids: int32 [P], the view of each row.
-        ids: int64 [P] that decide between equal depths, or None: the row order does.
+        ids: int64 [P] that order rows of equal depth; None: the row order does.
         n_cameras: number of views B.
         width: of every view, pixels.
         height: of every view, pixels.
         tile_size: edge of a tile in pixels, 1 to 64.
         tile_begin: first owned tile; tiles outside [tile_begin, tile_end) get empty lists.
         tile_end: end of the owned tiles, -1 for all.
-        n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``),
-            -1 to have them counted. Where there are more, CUDA lists the first so many, by depth.
-        n_rows: int64 [1] on the device of the rows: only the first so many of the P rows are there, the
-            others are never read. It lets CUDA be queued before the host knows the number. None: all; a
-            number that is not in [0, P] counts as 0.
+        n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``), -1 to
+            have them counted. If there are more, CUDA lists the first ``n_isects`` by depth.
+        n_rows: int64 [1] on the device of the rows: only the first ``n_rows`` of the P rows are valid, the
+            others are never read. With it, the host can queue the CUDA op before it knows the number. None:
+            all rows; a number outside [0, P] counts as 0.
 
     Returns:
         ``isect_rows`` int32 [I] row indices and ``tile_offsets`` int64 [B * T + 1]: tile t composites
         ``isect_rows[tile_offsets[t]:tile_offsets[t + 1]]``. I is ``n_isects`` when that was given; entries
-        past ``tile_offsets[-1]`` mean nothing.
+        past ``tile_offsets[-1]`` are undefined.
 
     Raises:
         RuntimeError: wrong shapes, dtypes or devices, a tile range outside the image, 2^31 rows or tiles or

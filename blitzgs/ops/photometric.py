@@ -22,7 +22,8 @@ def photometric_loss(
     Args:
         renders: x [B, H, W, 3], float32 (CPU also float64), nominal range [0, 1].
         targets: y [B, H, W, 3], uint8 (value / 255) or the dtype of `renders`.
-        masks: [B, H, W], bool or uint8, 0 = excluded; windows centred elsewhere still see such a pixel.
+        masks: [B, H, W], bool or uint8, 0 = excluded; windows centred at other pixels still read such a
+            pixel.
         ssim_weight: w in [0, 1].
 
     Returns:

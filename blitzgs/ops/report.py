@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a step tells the host, put together in one launch: the loss's sums, and what tiles cost."""
+"""What a step reports to the host, written in one launch: the loss's sums and the costs of tiles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def report_(
 ) -> None:
     """Write one rank's report into all targets: the sums of all ranks [M, 2, B], then the tiles' work.
 
-    Of a target only what is this rank's is written.
+    Only this rank's part of each target is written.
 
     Args:
         parts: float64 [B, K, 2], of `blitzgs.ops.photometric.photometric_fwd_bwd`; None: no views.
@@ -29,7 +29,7 @@ def report_(
         tiles: this rank's [first, one past last).
         rank: whose report it is.
         n_ranks: M.
-        targets: float32 [2 M B + T] each, on this device or memory of others that it can reach.
+        targets: float32 [2 M B + T] each, on this device or in memory of other devices that it can reach.
 
     Raises:
         RuntimeError: wrong shapes or dtypes.

@@ -14,7 +14,7 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 def voxel_keys(points: Tensor, origin: Sequence[float], voxel_size: float) -> Tensor:
     """Return the voxel of each point: ``x | y << 21 | z << 42`` with ``floor((p - origin) / voxel_size)``.
 
-    Cells are clamped to [0, 2^21); equal keys mean the same voxel (METHOD §2).
+    Cells are clamped to [0, 2^21); equal keys mean the same voxel.
 
     Args:
         points: positions [N, 3], float32 or float64, any unit.

@@ -70,7 +70,7 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class LodConfig:
-    """The octree of the initial Gaussians (METHOD: multi-resolution voxels of the SfM cloud).
+    """The octree of the initial Gaussians: multi-resolution voxels of the SfM cloud.
 
     Attributes:
         fork: ratio f of the voxel sizes of neighbouring levels.
