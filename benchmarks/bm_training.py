@@ -29,9 +29,9 @@ from harness import markdown_table, report
 from torch.profiler import ProfilerActivity, profile
 
 from blitzgs.distributed.group import Ranks, Transport
-from blitzgs.training import run
 from blitzgs.training.config_io import load_config
 from blitzgs.training.events import densify
+from blitzgs.training.inputs import open_capture
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
@@ -195,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ) as ranks,
         tempfile.TemporaryDirectory() as folder,
     ):
-        capture, images = run.open_capture(config, ranks)
+        capture, images = open_capture(config, ranks)
         trainer = MeasuredTrainer(config, capture, images, Path(folder), ranks)
         trainer.begin(before)
         times, use = trainer.timed(args.steps), None

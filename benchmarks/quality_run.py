@@ -26,6 +26,7 @@ from blitzgs.distributed.ownership import TileOwners
 from blitzgs.training import run
 from blitzgs.training.evaluation import METRICS, evaluate, load_lpips
 from blitzgs.training.events.evaluate import measure
+from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 
 # Where gsplat's results are commonly quoted; training views are measured there, too, and at every end.
@@ -139,7 +140,7 @@ def train_ours(spec: RunSpec) -> dict[str, Any]:
     """Train with BlitzGS."""
     config = spec.config()
     ranks = Ranks.from_environment(spec.device)
-    capture, images = run.open_capture(config, ranks)
+    capture, images = open_capture(config, ranks)
     with tempfile.TemporaryDirectory() as folder:
         trainer = RecordedTrainer(config, capture, images, Path(folder), ranks)
         schedule = trainer.state.schedule
@@ -155,7 +156,7 @@ def train_opponent(spec: RunSpec) -> dict[str, Any]:
     assert spec.strategy is not None
     config, options = spec.config(), spec.options()
     ranks = Ranks.from_environment(spec.device)
-    capture, images = run.open_capture(config, ranks)
+    capture, images = open_capture(config, ranks)
     trainer = GsplatTrainer(spec.strategy, options, capture, images, ranks.device, spec.seed)
     lpips, owners = load_lpips(spec.lpips), TileOwners(ranks)
 

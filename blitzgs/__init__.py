@@ -14,9 +14,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if TYPE_CHECKING:
     from blitzgs.ops.importance import contributions
     from blitzgs.rendering import rasterization
+    from blitzgs.training.run_folder import open_run
 
 __version__ = "0.1.0"
-__all__ = ["contributions", "rasterization"]
+__all__ = ["contributions", "open_run", "rasterization"]
 
 
 def __getattr__(name: str) -> Any:
@@ -25,6 +26,10 @@ def __getattr__(name: str) -> Any:
         from blitzgs.rendering import rasterization
 
         return rasterization
+    if name == "open_run":
+        from blitzgs.training.run_folder import open_run
+
+        return open_run
     if name == "contributions":
         from blitzgs.ops.importance import contributions
 

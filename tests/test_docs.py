@@ -187,7 +187,7 @@ def test_commands_are_used_rightly(name, tmp_path, monkeypatch, capsys):
 def test_the_python_example_of_the_readme_runs(tmp_path, monkeypatch):
     import torch
 
-    from blitzgs.scene.ply import write_ply
+    from blitzgs.formats.ply import write_ply
 
     example = next(block for block in code_blocks(ROOT / "README.md", ["python"]) if "read_ply" in block)
     g = torch.Generator().manual_seed(0)

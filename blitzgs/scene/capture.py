@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from blitzgs.formats.ply import read_points
 from blitzgs.scene import colmap, transforms
 from blitzgs.scene.cameras import Camera, Float64, camera_centers, downscaled_size, scaled_matrix, sees_any
 from blitzgs.scene.files import ImageFinder, find_mask
 from blitzgs.scene.image_files import ImageHeader, read_header
 from blitzgs.scene.lens import Lens
-from blitzgs.scene.ply import read_points
 from blitzgs.scene.splits import split_views
 from blitzgs.scene.undistort import Rectification, rectify
 
@@ -29,6 +29,9 @@ from blitzgs.scene.undistort import Rectification, rectify
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
 _SAMPLED_POINTS = 2000
+# Cameras closer together than this share of the points' distance are in one place, up to rounding: the
+# parallax between them is far below a pixel.
+_LEAST_SPREAD = 1e-6
 
 
 @dataclass(eq=False)
@@ -54,6 +57,10 @@ class Capture:
     """INRIA's: 1.1 x the largest distance of a training camera from their mean centre, in world units."""
     has_alpha: bool
     """Whether some image has an alpha channel; `ImageStore` composites it over its background."""
+
+
+class MissingImagesError(FileNotFoundError):
+    """Images that a capture names are not on disk."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +109,11 @@ def load_capture(
         undistort: what to do where a distorted image does not fill the pinhole image: "crop" or "mask".
         exif: "auto" turns an image by its EXIF orientation only where its stored size does not fit the camera
             and the turned one does (COLMAP itself ignores the tag); "apply" and "ignore" do as they say.
-        allow_missing: drop views whose image is not on disk, with a warning, instead of failing.
+        allow_missing: drop views whose image is not on disk, with a warning, instead of failing. The world's
+            origin, the extent and the split stay those of all views with a pose.
 
     Raises:
-        FileNotFoundError: nothing to load, or images are missing on disk.
+        FileNotFoundError: nothing to load, or images are missing on disk (`MissingImagesError`).
         ValueError: a file is damaged, or sizes, poses or options make no sense.
     """
     root = Path(path)
@@ -118,19 +126,26 @@ def load_capture(
         if value not in allowed:
             raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
     views, points = _read_views(root, images, downscale)
-    views = _existing(_with_finite_poses(views), root, images, allow_missing)
-    views.sort(key=lambda view: view.name)
+    views = sorted(_with_finite_poses(views), key=lambda view: view.name)
+    # Of all views: a photograph that is lost later moves neither the world nor the other views' split.
+    centers = camera_centers(np.stack([view.world_to_camera for view in views]))
+    offset = centers.mean(axis=0)
+    train, test = _split(views, root, split)
+    train_centers = centers[train] - offset
+    kept = _existing(views, root, images, allow_missing)
+    place = {index: position for position, index in enumerate(kept)}
+    views = [views[index] for index in kept]
+    train, test = ([place[index] for index in part if index in place] for part in (train, test))
+    if not train:
+        raise MissingImagesError(f"{root}: no image of a training view is on disk")
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # headers may lie on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
     mask_folder = _mask_folder(root, masks)
-    offset = camera_centers(np.stack([v.world_to_camera for v in views])).mean(axis=0)
     plans: dict[Lens, Rectification] = {}
     cameras = [
         _camera(view, header, offset, downscale, undistort, exif, mask_folder, plans)
         for view, header in zip(views, headers, strict=True)
     ]
-    train, test = _split(views, root, split)
-    centers = camera_centers(np.stack([c.world_to_camera for c in cameras]))
     points = _finite_points(points)
     if len(points.positions) == 0:
         points = _random_points(cameras, offset)
@@ -146,7 +161,7 @@ def load_capture(
         offset=offset,
         train=train,
         test=test,
-        extent=_extent(centers[train], points.positions),
+        extent=_extent(train_centers, points.positions),
         has_alpha=any(header.has_alpha for header in headers),
     )
 
@@ -240,20 +255,21 @@ def _with_finite_poses(views: list[_View]) -> list[_View]:
     return finite
 
 
-def _existing(views: list[_View], root: Path, images: str, allow_missing: bool) -> list[_View]:
+def _existing(views: list[_View], root: Path, images: str, allow_missing: bool) -> list[int]:
+    """Indices of the views whose image is on disk."""
     exists = [view.path.is_file() for view in views]
     missing = [view.name for view, there in zip(views, exists, strict=True) if not there]
+    found = [index for index, there in enumerate(exists) if there]
     if not missing:
-        return views
+        return found
     shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
     message = f"{len(missing)} of {len(views)} images are not in {root / images}: {shown}"
     if not allow_missing or len(missing) == len(views):
-        raise FileNotFoundError(
-            f"{message}; check the images folder, or load with allow_missing=True "
-            "(--data.allow_missing=true) to drop them"
+        raise MissingImagesError(
+            f"{message}; check the images folder, or leave those views out with allow_missing"
         )
     warnings.warn(f"{message}; dropped", stacklevel=3)
-    return [view for view, there in zip(views, exists, strict=True) if there]
+    return found
 
 
 def _mask_folder(root: Path, masks: str | bool | None) -> Path | None:
@@ -363,6 +379,10 @@ def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_
         np.einsum("nij,nj->i", across, centers) + 1e-6 * centers.mean(axis=0),
     )
     half = 0.35 * float(np.linalg.norm(centers - target, axis=1).mean())
+    if half <= _LEAST_SPREAD * (1 + float(np.abs(offset).max())):
+        raise ValueError(
+            "the capture has no points, and its cameras are all in one place: nothing says where the scene is"
+        )
     random = np.random.default_rng(0)
     positions = target + offset + random.uniform(-half, half, (count, 3))
     return _Points(positions, random.integers(0, 256, (count, 3), dtype=np.uint8))
@@ -370,11 +390,10 @@ def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_
 
 def _extent(centers: Float64, points: Float64) -> float:
     extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if extent > 0:
+    distance = float(np.median(np.linalg.norm(points - centers[0], axis=1)))
+    if extent > _LEAST_SPREAD * distance:
         return extent
-    if len(points) == 0:
-        return 1.0
-    extent = float(np.median(np.linalg.norm(points - centers[0], axis=1)))
+    extent = distance
     warnings.warn(
         f"all training cameras are in one place: extent is the points' median distance, {extent:g}",
         stacklevel=3,

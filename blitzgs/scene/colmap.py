@@ -7,38 +7,20 @@ Poses map world to camera: x_camera = R(q) x_world + t with q = (w, x, y, z); pi
 
 from __future__ import annotations
 
-import importlib
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from types import ModuleType
+from blitzgs.formats.native import native_io
 
 Float64 = npt.NDArray[np.float64]
 FILES = ("cameras", "images", "points3D")
-
-
-@cache
-def native_io() -> ModuleType:
-    """Import the compiled readers and writers (`blitzgs._lib._io`).
-
-    Raises:
-        ImportError: the module was not built for this Python; says how to build it.
-    """
-    try:
-        module = importlib.import_module("blitzgs._lib._io")
-    except ImportError as error:
-        raise ImportError(
-            f"the host I/O module of blitzgs is missing for this Python ({error}); run `pip install .`, or "
-            "`make build` in a checkout (`make io` where the kernels are built already)"
-        ) from error
-    return module
 
 
 def _empty(dtype: str, *shape: int) -> Any:
@@ -151,9 +133,9 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
             raise FileNotFoundError(f"{path} is missing: {folder} is not a complete COLMAP sparse model")
     io = native_io()
     return ColmapModel(
-        [ColmapCamera(*row) for row in io.read_cameras(str(paths["cameras"]))],
-        ColmapImages(**io.read_images(str(paths["images"]), points2d)),
-        ColmapPoints(**io.read_points(str(paths["points3D"]), tracks)),
+        [ColmapCamera(*row) for row in io.read_cameras(os.fsencode(paths["cameras"]))],
+        ColmapImages(**io.read_images(os.fsencode(paths["images"]), points2d)),
+        ColmapPoints(**io.read_points(os.fsencode(paths["points3D"]), tracks)),
     )
 
 
@@ -168,9 +150,9 @@ def write_model(folder: Path | str, model: ColmapModel, *, text: bool = False) -
     suffix = ".txt" if text else ".bin"
     io = native_io()
     rows = [(c.id, c.model, c.width, c.height, [float(p) for p in c.params]) for c in model.cameras]
-    io.write_cameras(str(folder / f"cameras{suffix}"), rows)
-    io.write_images(str(folder / f"images{suffix}"), _columns(model.images))
-    io.write_points(str(folder / f"points3D{suffix}"), _columns(model.points))
+    io.write_cameras(os.fsencode(folder / f"cameras{suffix}"), rows)
+    io.write_images(os.fsencode(folder / f"images{suffix}"), _columns(model.images))
+    io.write_points(os.fsencode(folder / f"points3D{suffix}"), _columns(model.points))
 
 
 def _columns(table: ColmapImages | ColmapPoints) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.scene.colmap import native_io
+from blitzgs.formats.native import native_io
 
 UInt8 = npt.NDArray[np.uint8]
 
@@ -128,7 +129,7 @@ def read_whole(path: Path) -> bytes:
     """
     data = path.read_bytes()
     if data[:2] == b"\xff\xd8":
-        native_io().check_jpeg(data, str(path))
+        native_io().check_jpeg(data, os.fsencode(path))
     return data
 
 

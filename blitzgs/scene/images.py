@@ -26,9 +26,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from blitzgs.formats.native import native_io
 from blitzgs.scene.cameras import Camera
 from blitzgs.scene.capture import Capture
-from blitzgs.scene.colmap import native_io
 from blitzgs.scene.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
 from blitzgs.scene.undistort import Rectification
 

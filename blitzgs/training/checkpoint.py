@@ -17,7 +17,8 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -220,7 +221,7 @@ def _reached(point: str) -> None:
 def _read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
     sizes = [shard.rows for shard in shards]
     if len(shards) == ranks.world_size:
-        with safe_open(path / shards[ranks.rank].file, "pt") as file:
+        with _opened(path / shards[ranks.rank].file) as file:
             return {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
     positions = [global_positions(sizes, index) for index in range(len(shards))]
     count = len(range(ranks.rank, sum(sizes), ranks.world_size))
@@ -233,10 +234,20 @@ def _read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.dev
         if len(chosen) == 0:
             continue
         target = (order[chosen] // ranks.world_size).to(device)
-        with safe_open(path / shard.file, "pt") as file:
+        with _opened(path / shard.file) as file:
             for name, column in columns.items():
                 column[target] = file.get_tensor(name)[chosen].to(device)
     return columns
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a safetensors file, whatever bytes its path is made of."""
+    with open(path, "rb") as file:
+        is_text = os.fsencode(path).decode(errors="replace") == str(path)
+        # The package takes UTF-8 alone.
+        with safe_open(path if is_text else f"/proc/self/fd/{file.fileno()}", "pt") as shard:
+            yield shard
 
 
 def _read_manifest(path: Path) -> _Manifest:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import platform
 import resource
 import warnings
@@ -17,8 +16,6 @@ import torch
 import blitzgs
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
-from blitzgs.scene.capture import Capture, load_capture
-from blitzgs.scene.images import ImageStore
 from blitzgs.training import checkpoint
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, from_dict, load_config, to_dict
@@ -31,11 +28,13 @@ CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
 EVALUATION = "evaluation"
-# Sections and fields that a resumed run may change: they decide nothing about the result beyond rounding.
+# Sections and fields that a resumed run may change: they decide nothing about the result beyond rounding, but
+# for `data.allow_missing`, without which a run whose photograph is lost could not go on.
 FREE_FIELDS = (
     "log",
     "ranks",
     "data.path",
+    "data.allow_missing",
     "data.cache_bytes",
     "data.threads",
     "data.prefetch",
@@ -44,9 +43,6 @@ FREE_FIELDS = (
 )
 # Half precision changes the result by 1e-3.
 BOUND_FIELDS = ("ranks.half_exchange",)
-
-# Fields that may differ between the hosts of a job.
-HOST_FIELDS = ("data.path", "data.cache_bytes", "data.threads")
 
 
 @dataclass(frozen=True)
@@ -85,95 +81,6 @@ class TrainedModel:
     progress: Progress
     space: Space
     table: GaussianTable
-
-
-def open_capture(config: Config, ranks: Ranks) -> tuple[Capture, ImageStore]:
-    """Load the capture that a configuration names, and open its images.
-
-    The processes of one host share the budget for images in memory.
-
-    Raises:
-        ConfigError: `data.path` is not set.
-        FileNotFoundError, ValueError: the capture is incomplete or damaged.
-    """
-    data = config.data
-    if not data.path:
-        raise ConfigError("data.path: no capture given; use --data DIR")
-    capture = load_capture(
-        data.path,
-        images=data.images,
-        downscale=data.downscale,
-        split=data.split,
-        masks=data.masks,
-        undistort=data.undistort,
-        exif=data.exif,
-        allow_missing=data.allow_missing,
-    )
-    budget = data.cache_bytes // ranks.local_world_size
-    return capture, ImageStore(capture, budget, data.threads, background=config.model.background)
-
-
-def input_files(capture: Capture) -> list[Path]:
-    """The photographs and masks of a capture, which no command may overwrite."""
-    images = [camera.image_path for camera in capture.cameras]
-    return images + [camera.mask_path for camera in capture.cameras if camera.mask_path is not None]
-
-
-def check_capture(space: Space, capture: Capture, folder: Path) -> None:
-    """Check that a capture is the one that the run in `folder` was trained on.
-
-    Raises:
-        ValueError: its cameras lie elsewhere.
-    """
-    if Space.of(capture.offset, capture.extent) != space:
-        raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
-
-
-def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) -> None:
-    """Check that all ranks run the same code with the same configuration and flag on the same capture.
-
-    Raises:
-        MismatchError: on every rank, naming the field and the ranks.
-    """
-    if ranks.world_size == 1:
-        return
-    fields = {
-        f"configuration field {name}": value
-        for name, value in _flatten(to_dict(config))
-        if name not in HOST_FIELDS
-    }
-    ranks.compare_across_ranks(
-        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture), "flag --resume": resume}
-        | fields
-    )
-
-
-def code_fingerprint() -> str:
-    """Version of the package and a digest of its sources and kernels."""
-    digest = hashlib.sha256()
-    root = Path(blitzgs.__file__).parent
-    for path in sorted([*root.rglob("*.py"), *root.glob("_lib/libblitzgs_*.so")]):
-        digest.update(str(path.relative_to(root)).encode())
-        digest.update(path.read_bytes())
-    return f"{blitzgs.__version__}+{digest.hexdigest()[:12]}"
-
-
-def capture_fingerprint(capture: Capture) -> str:
-    """Digest of the cameras, the points and the split."""
-    digest = hashlib.sha256()
-    for camera in capture.cameras:
-        digest.update(f"{camera.name} {camera.width} {camera.height}".encode())
-        digest.update(camera.K.tobytes() + camera.world_to_camera.tobytes())
-    digest.update(capture.points.tobytes() + capture.colors.tobytes())
-    digest.update(repr((capture.train, capture.test)).encode())
-    return digest.hexdigest()[:12]
-
-
-def _flatten(fields: dict[str, Any], where: str = "") -> list[tuple[str, object]]:
-    flat: list[tuple[str, object]] = []
-    for name, value in fields.items():
-        flat += _flatten(value, f"{where}{name}.") if isinstance(value, dict) else [(where + name, value)]
-    return flat
 
 
 def save(
@@ -251,6 +158,16 @@ def _problem_of_columns(columns: dict[str, torch.Tensor]) -> str | None:
     return bad_column(GaussianTable(columns))
 
 
+def check_is_run(folder: Path) -> None:
+    """Check that a folder looks like a run.
+
+    Raises:
+        FileNotFoundError: it has neither a configuration nor checkpoints.
+    """
+    if not (folder / CONFIG).exists() and not (folder / CHECKPOINTS).exists():
+        raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
+
+
 def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedModel:
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
@@ -262,8 +179,7 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
     Raises:
         FileNotFoundError: the folder is not a run, or holds no checkpoint.
     """
-    if not (folder / CONFIG).exists() and not (folder / CHECKPOINTS).exists():
-        raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
+    check_is_run(folder)
     restored = restore(folder, ranks)
     if restored is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")

@@ -20,8 +20,10 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import save_config
 from blitzgs.training.evaluation import load_lpips
 from blitzgs.training.folder_checks import check_room, check_writable
+from blitzgs.training.inputs import check_alike, check_capture
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
+from blitzgs.training.run_cameras import CAMERAS, save_cameras
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.state import TrainingState
@@ -50,7 +52,7 @@ def set_up(
         MismatchError: the ranks differ in configuration, code or capture.
         FolderError: a rank cannot write to the folder, or there is no room.
     """
-    run.check_alike(config, capture, ranks, resume)
+    check_alike(config, capture, ranks, resume)
     check_writable(folder, ranks)
     schedule = Schedule(config.schedule)
     space = Space.of(capture.offset, capture.extent)
@@ -65,10 +67,12 @@ def set_up(
     else:
         table, progress = restored.table, restored.progress
         run.check_resumable(restored.config, config)
-        run.check_capture(restored.space, capture, folder)
+        check_capture(restored.space, capture, folder)
     check_room(folder, table, ranks, config.population.max_gaussians)
     if ranks.rank == 0:
         save_config(config, folder / run.CONFIG)
+        if restored is None or not (folder / CAMERAS).exists():
+            save_cameras(folder, capture)
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     optimiser = LazyAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = TileOwners(ranks)

@@ -271,6 +271,21 @@ def test_one_camera_gets_an_extent_from_the_points(tmp_path):
     assert (capture.train, capture.test) == ([0], [])
 
 
+def test_a_rotating_camera_is_in_one_place_whatever_rounding_says(tmp_path):
+    """Poses around one point leave camera centres that differ by rounding alone."""
+
+    def rotate_only(model):
+        rotations = colmap.world_to_camera(model.images)[:, :3, :3]
+        model.images.translations = -rotations @ np.array([3.0, -2.0, 9.0]) + 1e-15
+
+    folder = write_capture(tmp_path, NAMES)
+    edit_model(folder, rotate_only)
+    with pytest.warns(UserWarning, match="all training cameras are in one place"):
+        capture = load_capture(folder)
+    distances = np.linalg.norm(capture.points, axis=1)
+    assert 0.5 * np.median(distances) < capture.extent < 2 * np.median(distances)
+
+
 def test_scaling_the_world_by_a_power_of_two_scales_everything_exactly(tmp_path):
     first = load_capture(write_capture(tmp_path, NAMES))
 

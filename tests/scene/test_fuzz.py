@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from blitzgs.scene import colmap
+from blitzgs.formats.native import native_io
+from blitzgs.formats.ply import read_ply
 from blitzgs.scene.image_files import decode_rgb, read_header, read_whole
-from blitzgs.scene.ply import read_ply
+from tests.formats.test_ply import gaussians, inria_file
 from tests.scene.helpers import reconstruction, smooth_image, write_image
-from tests.scene.test_ply import gaussians, inria_file
 
 SETTINGS = settings(max_examples=150, deadline=None, derandomize=True)
 
@@ -38,12 +38,12 @@ def damage(data: bytes, cut: float, flips: list[tuple[float, int]]) -> bytes:
 
 
 READERS = {
-    "cameras.bin": colmap.native_io().read_cameras,
-    "images.bin": lambda path: colmap.native_io().read_images(path, True),
-    "points3D.bin": lambda path: colmap.native_io().read_points(path, True),
-    "cameras.txt": colmap.native_io().read_cameras,
-    "images.txt": lambda path: colmap.native_io().read_images(path, True),
-    "points3D.txt": lambda path: colmap.native_io().read_points(path, True),
+    "cameras.bin": native_io().read_cameras,
+    "images.bin": lambda path: native_io().read_images(path, True),
+    "points3D.bin": lambda path: native_io().read_points(path, True),
+    "cameras.txt": native_io().read_cameras,
+    "images.txt": lambda path: native_io().read_images(path, True),
+    "points3D.txt": lambda path: native_io().read_points(path, True),
     "model.ply": read_ply,
     "photo.jpg": lambda path: (read_header(Path(path)), decode_rgb(read_whole(Path(path)), path)),
 }

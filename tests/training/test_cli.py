@@ -16,8 +16,8 @@ import torch
 
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.ply import read_ply
 from blitzgs.scene.capture import load_capture
-from blitzgs.scene.ply import read_ply
 from blitzgs.training import run
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, write_tiny_capture
 

@@ -39,6 +39,8 @@ class Camera:
     height: int
     K: np.ndarray
     world_to_camera: np.ndarray
+    image_path: Path = Path("/nowhere")
+    mask_path: Path | None = None
 
 
 @dataclass

@@ -18,7 +18,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.scene.colmap import native_io
+from blitzgs.formats.native import native_io
+from blitzgs.output import new_file
 
 _REST_TO_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 
@@ -50,7 +51,7 @@ def _property_names(coefficients: int) -> list[str]:
 
 
 def _read_table(path: Path) -> tuple[list[str], npt.NDArray[np.void]]:
-    comments, properties, count, rows = native_io().read_ply(str(path))
+    comments, properties, count, rows = native_io().read_ply(os.fsencode(path))
     return comments, np.frombuffer(rows, dtype=np.dtype(properties), count=count)
 
 
@@ -120,7 +121,7 @@ def write_ply(
 
     Raises:
         ValueError: shapes disagree.
-        OSError: the file cannot be written; what was at `path` is still there.
+        OSError: the file cannot be written, or `path` is no regular file; what was there is still there.
     """
     n, k = len(means), sh.shape[1] if sh.ndim == 3 else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
@@ -143,15 +144,13 @@ def write_ply(
     rows[:, -4:] = _array(quats)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        native_io().write_ply(
-            str(partial), comments or [], [(name, "f4") for name in names], n, rows.view(np.uint8)
-        )
-        os.replace(partial, path)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
+    properties = [(name, "f4") for name in names]
+    with new_file(path) as partial:
+        try:
+            native_io().write_ply(os.fsencode(partial), comments or [], properties, n, rows.view(np.uint8))
+        except OSError as error:
+            reason = str(error).rpartition(": ")[2]
+            raise OSError(f"{path} cannot be written: {reason}") from error
 
 
 def _array(tensor: Tensor) -> npt.NDArray[np.float32]:

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: `blitzgs train | eval | render | export | synth`, one file per command."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import sys
+import warnings
+from collections.abc import Sequence
+
+from rich.console import Console
+
+from blitzgs import __version__
+from blitzgs.cli import evaluate, export, render, train
+from blitzgs.cli.arguments import add_command
+from blitzgs.distributed.group import MismatchError
+from blitzgs.scene.synth import command as synth
+from blitzgs.training.batches import PhotographError
+from blitzgs.training.checkpoint import CheckpointError
+from blitzgs.training.folder_checks import FolderError
+from blitzgs.training.guard import NonFiniteError
+
+# What a user can cause and mend: reported as a message. Anything else is ours and keeps its traceback.
+USER_ERRORS = (
+    ValueError,
+    OSError,
+    ImportError,
+    CheckpointError,
+    FolderError,
+    MismatchError,
+    NonFiniteError,
+    PhotographError,
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status (1: failed, 2: wrong usage, 130: Ctrl-C)."""
+    # A file name may hold bytes that are no UTF-8: they are printed escaped.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    parser = _parser()
+    args, rest = parser.parse_known_args(arguments)
+    if rest and not (args.command == "train" and all(text.startswith("--") and "=" in text for text in rest)):
+        hint = " (configuration fields are written --section.field=value)" if args.command == "train" else ""
+        args.parser.error(f"unrecognized arguments: {' '.join(rest)}{hint}")
+    args.overrides = rest
+    # A warning of ours is about the user's data, not about the line of code that noticed.
+    warnings.formatwarning = lambda message, *_, **__: f"blitzgs {args.command}: warning: {message}\n"
+    try:
+        status: int = args.run(args)
+    except USER_ERRORS as error:
+        Console(stderr=True, highlight=False, emoji=False).print(
+            f"blitzgs {args.command}: {_message(error)}", style="red", markup=False, soft_wrap=True
+        )
+        return 1
+    except KeyboardInterrupt:
+        print(f"blitzgs {args.command}: interrupted", file=sys.stderr)
+        return 130
+    return status
+
+
+def _message(error: Exception) -> str:
+    """The error's text; for one of the operating system, the file and what is wrong with it."""
+    if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
+        return str(error)
+    if isinstance(error, FileExistsError):
+        return f"{error.filename} is a file where a folder is needed: choose another name"
+    return f"{error.filename}: {error.strerror}"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="blitzgs", description="City-scale 3D Gaussian Splatting.")
+    parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for command in (train, evaluate, render, export):
+        command.add_to(commands)
+    city = add_command(commands, "synth", synth.run, "generate a synthetic city to train on")
+    synth.add_arguments(city)
+    return parser

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the commands' parsers have in common."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+Commands = argparse._SubParsersAction  # argparse has no public name for it
+
+
+def add_command(
+    commands: Commands[argparse.ArgumentParser],
+    name: str,
+    function: Callable[[argparse.Namespace], int],
+    summary: str,
+    description: str | None = None,
+) -> argparse.ArgumentParser:
+    """Add a command that calls `function` with its arguments and exits with what it returns."""
+    parser = commands.add_parser(
+        name,
+        help=summary,
+        description=description or summary[0].upper() + summary[1:] + ".",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=function, parser=parser)
+    return parser
+
+
+def add_run(parser: argparse.ArgumentParser) -> None:
+    """Add the folder of a run."""
+    parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a run")
+
+
+def add_capture(parser: argparse.ArgumentParser) -> None:
+    """Add where the capture of a run is now."""
+    parser.add_argument("--data", metavar="DIR", help="where the capture is now (default: where it was)")
+
+
+def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> None:
+    """Add the choice of a device."""
+    parser.add_argument(
+        "--device", default="auto", help="auto (a GPU when there is one), cpu, cuda or cuda:N (%(default)s)"
+    )
+    if shares_gpus:
+        parser.add_argument(
+            "--share-gpus", action="store_true", help="with torchrun: let ranks share too few GPUs (slow)"
+        )

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs eval`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_run
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.progress import image_progress
+from blitzgs.training import run as run_folder
+from blitzgs.training.evaluation import evaluate, load_lpips
+from blitzgs.training.inputs import check_capture, open_capture
+from blitzgs.training.run_cameras import input_files
+from blitzgs.training.views import ViewSet, render_options
+
+
+def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = add_command(commands, "eval", run, "measure the held-out views of a run")
+    add_run(parser)
+    add_capture(parser)
+    add_device(parser, shares_gpus=True)
+    parser.add_argument("--split", choices=("test", "train"), default="test", help="views (%(default)s)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="default: RUN/evaluation/SPLIT")
+    parser.add_argument(
+        "--pictures", type=int, default=8, metavar="N", help="side-by-side pictures (%(default)s)"
+    )
+    parser.add_argument("--lpips", metavar="FILE", help="TorchScript module of LPIPS with its weights")
+    parser.add_argument(
+        "--allow-missing", action="store_true", help="leave out views whose photograph is missing"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure the views of a run; returns the exit status."""
+    with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
+        model = run_folder.open_model(args.folder, ranks, args.data)
+        config = model.config
+        if args.allow_missing:
+            data = dataclasses.replace(config.data, allow_missing=True)
+            config = dataclasses.replace(config, data=data)
+        capture, images = open_capture(config, ranks, "--allow-missing")
+        check_capture(model.space, capture, args.folder)
+        if not getattr(capture, args.split):
+            raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
+        with image_progress("Comparing", ranks.rank == 0) as report:
+            result = evaluate(
+                model.table,
+                ViewSet(list(capture.cameras), model.space, ranks.device),
+                capture.cameras,
+                images,
+                getattr(capture, args.split),
+                render_options(config, model.space, model.progress.sh_degree),
+                args.out or args.folder / run_folder.EVALUATION / args.split,
+                TileOwners(ranks),
+                pictures=args.pictures,
+                lpips=load_lpips(args.lpips),
+                report=report,
+                inputs=input_files(capture),
+            )
+        if ranks.rank == 0:
+            print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
+    return 0

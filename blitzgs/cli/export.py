@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs export`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_run
+from blitzgs.distributed.group import Ranks
+from blitzgs.training.export import COORDINATES, Exported, export_ply, without_antialiasing
+from blitzgs.training.run_folder import open_run
+
+HELP = """\
+Write the model of a run as a PLY file in INRIA's layout, which most viewers read.
+
+Georeferenced models are written around their own origin, because the file's float32 numbers cannot hold large
+coordinates; the offset is in the header (`comment offset X Y Z`) and in FILE.offset.json.
+
+A model trained with model.antialiased is marked `comment SplatRenderMode: mip`. For a viewer that does not
+know the mark, --classic bakes the compensation into the opacities as far as that is possible.
+"""
+
+
+def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    summary = "write the model of a run to a file other programs read"
+    parser = add_command(commands, "export", run, summary, HELP)
+    add_run(parser)
+    add_device(parser)
+    parser.add_argument("--ply", type=Path, required=True, metavar="FILE", help="file to write")
+    parser.add_argument(
+        "--coordinates",
+        choices=COORDINATES,
+        default="auto",
+        help="the capture's coordinates, or those around the model's origin; auto: the former where float32 "
+        "holds them (%(default)s)",
+    )
+    parser.add_argument(
+        "--classic", action="store_true", help="for viewers without antialiasing: bake what can be baked"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Export the model of a run; returns the exit status."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise ValueError("export writes one file from one process: run it without torchrun")
+    with Ranks.from_environment(args.device) as ranks:
+        folder = open_run(args.folder)
+        model = folder.model(ranks.device)
+        antialiased = model.config.model.antialiased
+        if args.classic and antialiased:
+            stored = folder.cameras()
+            model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
+        args.ply.parent.mkdir(parents=True, exist_ok=True)
+        exported = export_ply(model, args.ply, args.coordinates)
+    print(f"{args.ply}: {len(model):,} Gaussians, {args.ply.stat().st_size / 1e6:.1f} MB")
+    _explain(exported, antialiased, args)
+    return 0
+
+
+def _explain(exported: Exported, antialiased: bool, args: argparse.Namespace) -> None:
+    """Say what a viewer has to know."""
+    if exported.offset is not None:
+        x, y, z = exported.offset
+        print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {exported.sidecar} says")
+    elif args.coordinates == "capture":
+        print(f"coordinates are rounded by up to {exported.rounding:.3g}")
+    if antialiased and args.classic:
+        print("antialiasing is baked into the opacities: right at the training views' distance, else nearly")
+    elif antialiased:
+        print(
+            "the model is antialiased (comment SplatRenderMode: mip): viewers that do not know this show it "
+            "too opaque; for those, export with --classic",
+            file=sys.stderr,
+        )

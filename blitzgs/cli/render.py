@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs render`."""
+
+from __future__ import annotations
+
+import argparse
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_run
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.output import OutputFolder
+from blitzgs.progress import image_progress
+from blitzgs.scene.pictures import encode_image
+from blitzgs.training import run as run_folder
+from blitzgs.training.evaluation import render_view
+from blitzgs.training.inputs import check_capture, open_capture
+from blitzgs.training.run_cameras import CAMERAS, RunCameras, input_files, load_cameras
+from blitzgs.training.views import CameraLike, ViewSet, render_options
+
+
+def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = add_command(
+        commands, "render", run, "render the views of a run to files; photographs are not needed"
+    )
+    add_run(parser)
+    parser.add_argument("--data", metavar="DIR", help="take the cameras from this capture, not from the run")
+    add_device(parser, shares_gpus=True)
+    parser.add_argument(
+        "--split", choices=("test", "train", "all"), default="test", help="views (%(default)s)"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the images")
+    parser.add_argument(
+        "--raw",
+        action="store_true",
+        help="write float32 arrays [H, W, 3] as .npy, not clamped, instead of PNG",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render the views of a run; returns the exit status."""
+    with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
+        model = run_folder.open_model(args.folder, ranks, args.data)
+        stored = _cameras(args, model, ranks)
+        cameras: Sequence[CameraLike] = stored.cameras
+        indices = range(len(cameras)) if args.split == "all" else getattr(stored, args.split)
+        views = ViewSet(list(cameras), model.space, ranks.device)
+        options = render_options(model.config, model.space, model.progress.sh_degree)
+        owners = TileOwners(ranks)
+        output = OutputFolder(args.out, stored.inputs)
+        # Of all views, so that a view's file has the same name whichever split is rendered.
+        paths = output.paths([camera.name for camera in cameras], ".npy" if args.raw else ".png")
+        args.out.mkdir(parents=True, exist_ok=True)
+        with image_progress("Rendering", ranks.rank == 0) as report:
+            for position, index in enumerate(indices):
+                # The ranks take turns at writing.
+                render = render_view(model.table, views, index, options, owners, position % ranks.world_size)
+                report(position + 1, len(indices))
+                if render is None:
+                    continue
+                output.write(paths[index], _npy(render) if args.raw else encode_image(render, ".png"))
+        if ranks.rank == 0:
+            print(f"{args.out}: {len(indices)} images")
+    return 0
+
+
+def _cameras(args: argparse.Namespace, model: run_folder.TrainedModel, ranks: Ranks) -> RunCameras:
+    """The cameras that the run has stored; those of the capture where one is given or none are stored."""
+    if args.data is None and (args.folder / CAMERAS).exists():
+        return load_cameras(args.folder)
+    capture, images = open_capture(model.config, ranks)
+    images.close()
+    check_capture(model.space, capture, args.folder)
+    return RunCameras(capture.cameras, capture.train, capture.test, input_files(capture))
+
+
+def _npy(render: Tensor) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, render.cpu().numpy())
+    return buffer.getvalue()

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs train`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+from typing import cast
+
+from rich.console import Console
+from rich.table import Table
+
+from blitzgs.cli.arguments import Commands, add_command, add_device
+from blitzgs.distributed.group import Ranks, Transport
+from blitzgs.training import run as run_folder
+from blitzgs.training.config import Config
+from blitzgs.training.config_io import ConfigError, load_config, to_dict
+from blitzgs.training.folder_checks import locked
+from blitzgs.training.inputs import open_capture
+from blitzgs.training.trainer import Trainer
+
+HELP = """\
+Train a model of a capture: a COLMAP model (DIR/sparse/0 and DIR/images) or a transforms.json.
+
+Every field of the configuration is a flag, e.g.
+  blitzgs train --config configs/aerial.yaml --data DIR --out RUN --data.downscale=2 --schedule.scale=0.5
+Times are counted in images; schedule.scale stretches the whole schedule. `blitzgs train --show-config` prints
+the resolved configuration and stops.
+
+RUN gets config.yaml, cameras.json, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. A
+checkpoint is written every 10 minutes (log.checkpoint_seconds) and when the run is interrupted (Ctrl-C,
+SIGTERM or SIGHUP); the same command with --resume continues from the newest, or starts anew and says so where
+there is none.
+
+Several processes share the work with torchrun --nproc-per-node=M train.py (the same flags). With --resume and
+--max-restarts=K, a job that loses a process continues from its last checkpoint.
+"""
+
+
+def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = add_command(commands, "train", run, "train a model of a capture", HELP)
+    parser.add_argument(
+        "--config", type=Path, metavar="YAML", help="configuration file (default: the defaults)"
+    )
+    parser.add_argument("--data", metavar="DIR", help="the capture (or --data.path=DIR)")
+    parser.add_argument("--out", type=Path, metavar="RUN", help="folder of the run")
+    parser.add_argument(
+        "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
+    )
+    parser.add_argument(
+        "--show-config", action="store_true", help="print the resolved configuration and stop"
+    )
+    add_device(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train; returns the exit status."""
+    config = _config(args)
+    if args.show_config:
+        print(json.dumps(to_dict(config), indent=1))
+        return 0
+    if args.out is None:
+        args.parser.error("the following arguments are required: --out")
+    job = config.ranks
+    with Ranks.from_environment(
+        args.device, job.timeout_seconds, cast(Transport, job.transport), job.share_gpus
+    ) as ranks:
+        with locked(args.out, ranks):
+            capture, images = open_capture(config, ranks)
+            summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
+        if summary is not None and ranks.rank == 0:
+            _print_summary(summary, args.out)
+    return 0
+
+
+def _config(args: argparse.Namespace) -> Config:
+    source = args.config
+    own = args.out / run_folder.CONFIG if args.out is not None else None
+    if args.resume and source is None and own is not None and own.exists():
+        source = own
+    if not args.resume and source is not None and own is not None and own.exists() and own.samefile(source):
+        raise ConfigError(
+            f"{source} would be overwritten by the new run's resolved configuration: choose another --out"
+        )
+    config = load_config(source, args.overrides)
+    if args.data is not None:
+        # Not by way of YAML, which knows only some of the characters that a path may have.
+        config = dataclasses.replace(
+            config, data=dataclasses.replace(config.data, path=str(Path(args.data).resolve()))
+        )
+    return config
+
+
+def _print_summary(summary: dict[str, object], folder: Path) -> None:
+    console, table = Console(emoji=False), Table(show_header=False)
+    # A path as it is: brackets and colons in it mean nothing.
+    console.print(str(folder), markup=False, highlight=False, soft_wrap=True)
+    for name, value in summary.items():
+        if isinstance(value, (int, float)):
+            table.add_row(name, f"{value:,.4f}" if isinstance(value, float) else f"{value:,}")
+    console.print(table)

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run is made from: the capture, and the check that all ranks have the same one."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import blitzgs
+from blitzgs.distributed.group import Ranks
+from blitzgs.scene.capture import Capture, MissingImagesError, load_capture
+from blitzgs.scene.images import ImageStore
+from blitzgs.training.config import Config
+from blitzgs.training.config_io import ConfigError, to_dict
+from blitzgs.training.views import Space
+
+# Fields that may differ between the hosts of a job.
+HOST_FIELDS = ("data.path", "data.cache_bytes", "data.threads")
+
+
+def open_capture(
+    config: Config, ranks: Ranks, remedy: str = "--data.allow_missing=true"
+) -> tuple[Capture, ImageStore]:
+    """Load the capture that a configuration names, and open its images.
+
+    The processes of one host share the budget for images in memory.
+
+    Args:
+        config: of the run.
+        ranks: the job.
+        remedy: the caller's flag that leaves out views without a photograph.
+
+    Raises:
+        ConfigError: `data.path` is not set.
+        FileNotFoundError, ValueError: the capture is incomplete or damaged.
+    """
+    data = config.data
+    if not data.path:
+        raise ConfigError("data.path: no capture given; use --data DIR")
+    try:
+        capture = load_capture(
+            data.path,
+            images=data.images,
+            downscale=data.downscale,
+            split=data.split,
+            masks=data.masks,
+            undistort=data.undistort,
+            exif=data.exif,
+            allow_missing=data.allow_missing,
+        )
+    except MissingImagesError as error:
+        raise MissingImagesError(f"{error} ({remedy})") from error
+    budget = data.cache_bytes // ranks.local_world_size
+    return capture, ImageStore(capture, budget, data.threads, background=config.model.background)
+
+
+def check_capture(space: Space, capture: Capture, folder: Path) -> None:
+    """Check that a capture is the one that the run in `folder` was trained on.
+
+    Raises:
+        ValueError: its cameras lie elsewhere.
+    """
+    if Space.of(capture.offset, capture.extent) != space:
+        raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
+
+
+def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) -> None:
+    """Check that all ranks run the same code with the same configuration and flag on the same capture.
+
+    Raises:
+        MismatchError: on every rank, naming the field and the ranks.
+    """
+    if ranks.world_size == 1:
+        return
+    fields = {
+        f"configuration field {name}": value
+        for name, value in _flatten(to_dict(config))
+        if name not in HOST_FIELDS
+    }
+    ranks.compare_across_ranks(
+        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture), "flag --resume": resume}
+        | fields
+    )
+
+
+def code_fingerprint() -> str:
+    """Version of the package and a digest of its sources and kernels."""
+    digest = hashlib.sha256()
+    root = Path(blitzgs.__file__).parent
+    for path in sorted([*root.rglob("*.py"), *root.glob("_lib/libblitzgs_*.so")]):
+        digest.update(str(path.relative_to(root)).encode())
+        digest.update(path.read_bytes())
+    return f"{blitzgs.__version__}+{digest.hexdigest()[:12]}"
+
+
+def capture_fingerprint(capture: Capture) -> str:
+    """Digest of the cameras, the points and the split."""
+    digest = hashlib.sha256()
+    for camera in capture.cameras:
+        digest.update(f"{camera.name} {camera.width} {camera.height}".encode())
+        digest.update(camera.K.tobytes() + camera.world_to_camera.tobytes())
+    digest.update(capture.points.tobytes() + capture.colors.tobytes())
+    digest.update(repr((capture.train, capture.test)).encode())
+    return digest.hexdigest()[:12]
+
+
+def _flatten(fields: dict[str, Any], where: str = "") -> list[tuple[str, object]]:
+    flat: list[tuple[str, object]] = []
+    for name, value in fields.items():
+        flat += _flatten(value, f"{where}{name}.") if isinstance(value, dict) else [(where + name, value)]
+    return flat

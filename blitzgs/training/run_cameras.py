@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cameras of a run as a file in its folder, so that rendering needs neither capture nor photographs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from blitzgs.output import write_file
+from blitzgs.scene.capture import Capture
+from blitzgs.training.views import CameraLike
+
+CAMERAS = "cameras.json"
+_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class RunCamera:
+    """A pinhole camera; what rendering reads of `blitzgs.scene.cameras.Camera`.
+
+    Attributes:
+        name: of the image.
+        width: pixels.
+        height: pixels.
+        K: intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+        world_to_camera: rigid pose, float64 [4, 4], of the capture's world moved by minus the run's offset.
+    """
+
+    name: str
+    width: int
+    height: int
+    K: npt.NDArray[np.float64]
+    world_to_camera: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RunCameras:
+    """All cameras of a run.
+
+    Attributes:
+        cameras: in the order of the capture.
+        train: indices of those trained on.
+        test: indices of those held out.
+        inputs: where the photographs and masks lay.
+    """
+
+    cameras: Sequence[CameraLike]
+    train: list[int]
+    test: list[int]
+    inputs: list[Path]
+
+
+def save_cameras(folder: Path, capture: Capture) -> None:
+    """Write the cameras of a capture into the folder of a run."""
+    views = [
+        {
+            "name": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "K": np.asarray(camera.K).tolist(),
+            "world_to_camera": np.asarray(camera.world_to_camera).tolist(),
+        }
+        for camera in capture.cameras
+    ]
+    content = {
+        "version": _VERSION,
+        "train": list(capture.train),
+        "test": list(capture.test),
+        "inputs": [str(path.absolute()) for path in input_files(capture)],
+        "cameras": views,
+    }
+    write_file(folder / CAMERAS, json.dumps(content))
+
+
+def load_cameras(folder: Path) -> RunCameras:
+    """Read the cameras of a run.
+
+    Raises:
+        FileNotFoundError: the run was made before runs had this file.
+        ValueError: the file is damaged.
+    """
+    path = folder / CAMERAS
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["version"] != _VERSION:
+            raise ValueError(f"version {content['version']}, this program reads {_VERSION}")
+        cameras = [
+            RunCamera(
+                str(view["name"]),
+                int(view["width"]),
+                int(view["height"]),
+                _matrix(view["K"], 3),
+                _matrix(view["world_to_camera"], 4),
+            )
+            for view in content["cameras"]
+        ]
+        train, test = _indices(content["train"], len(cameras)), _indices(content["test"], len(cameras))
+        return RunCameras(cameras, train, test, [Path(text) for text in content["inputs"]])
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged ({error}): give the capture with --data DIR instead") from error
+
+
+def input_files(capture: Capture) -> list[Path]:
+    """The photographs and masks of a capture, which no command may overwrite."""
+    images = [camera.image_path for camera in capture.cameras]
+    return images + [camera.mask_path for camera in capture.cameras if camera.mask_path is not None]
+
+
+def _matrix(rows: object, size: int) -> npt.NDArray[np.float64]:
+    matrix = np.array(rows, dtype=np.float64)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise ValueError(f"a matrix is not {size} x {size} finite numbers")
+    return matrix
+
+
+def _indices(values: Sequence[int], count: int) -> list[int]:
+    indices = [int(value) for value in values]
+    if any(not 0 <= index < count for index in indices):
+        raise ValueError("a view of the split does not exist")
+    return indices

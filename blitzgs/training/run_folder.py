@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads a finished run, without the trainer: configuration, log, figures, cameras and the model.
+
+run = blitzgs.open_run("runs/city")
+model = run.model("cuda")
+image = model.render(run.cameras().cameras[0])     # float32 [H, W, 3]
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import PARAMETERS
+from blitzgs.rendering import rasterization
+from blitzgs.training import run
+from blitzgs.training.config import Config
+from blitzgs.training.config_io import load_config
+from blitzgs.training.run_cameras import RunCamera, RunCameras, load_cameras
+from blitzgs.training.run_log import LOG
+from blitzgs.training.views import CameraLike, Space, render_options, viewmat
+
+
+@dataclass(frozen=True)
+class Model:
+    """N trained Gaussians before activation, without optimiser state; lengths in trained units.
+
+    A trained position is (capture position - space.offset) / space.unit.
+
+    Attributes:
+        means: float32 [N, 3].
+        quats: float32 [N, 4], w, x, y, z, not normalised.
+        scales: float32 [N, 3], logarithms.
+        opacities: float32 [N], logits.
+        sh: float32 [N, K, 3].
+        space: how the trained world lies in the capture's.
+        sh_degree: that is evaluated.
+        config: of the run.
+        images_seen: how long it was trained.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    space: Space
+    sh_degree: int
+    config: Config
+    images_seen: int
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @torch.no_grad()
+    def render(self, camera: CameraLike) -> Tensor:
+        """Render a view as the run's own evaluation does.
+
+        Args:
+            camera: any pinhole camera whose pose is of the re-centred world, as `RunFolder.cameras` and
+                `camera` give them.
+
+        Returns:
+            float32 [H, W, 3] on the model's device, not clamped.
+        """
+        images, _ = self.splat([camera], antialiased=self.config.model.antialiased)
+        return images[0]
+
+    def splat(self, cameras: list[CameraLike], antialiased: bool) -> tuple[Tensor, Any]:
+        """Call `blitzgs.rasterization` for cameras of one size; return its images and meta."""
+        options = render_options(self.config, self.space, self.sh_degree)
+        device = self.means.device
+        poses = np.stack([viewmat(camera, self.space) for camera in cameras])
+        background = torch.tensor([options.background] * len(cameras), device=device)
+        images, _, meta = rasterization(
+            self.means,
+            self.quats,
+            self.scales.exp(),
+            self.opacities.sigmoid(),
+            self.sh,
+            torch.from_numpy(poses).float().to(device),
+            torch.from_numpy(np.stack([camera.K for camera in cameras])).float().to(device),
+            cameras[0].width,
+            cameras[0].height,
+            near_plane=options.near_plane,
+            far_plane=options.far_plane,
+            eps2d=options.eps2d,
+            sh_degree=self.sh_degree,
+            backgrounds=background,
+            rasterize_mode="antialiased" if antialiased else "classic",
+        )
+        return images, meta
+
+    def camera(
+        self, K: np.ndarray, world_to_camera: np.ndarray, width: int, height: int, name: str = "view"
+    ) -> RunCamera:
+        """Return a camera for `render` from a pose in the capture's own world.
+
+        Args:
+            K: intrinsics in pixels, [3, 3].
+            world_to_camera: rigid pose, [4, 4].
+            width: pixels.
+            height: pixels.
+            name: of the view.
+        """
+        pose = np.array(world_to_camera, dtype=np.float64)
+        pose[:3, 3] += pose[:3, :3] @ np.array(self.space.offset)
+        return RunCamera(name, width, height, np.array(K, dtype=np.float64), pose)
+
+
+class RunFolder:
+    """The folder that `blitzgs train --out` made."""
+
+    def __init__(self, path: Path | str) -> None:
+        """Note the folder.
+
+        Raises:
+            FileNotFoundError: it is not a run.
+        """
+        self.path = Path(path)
+        run.check_is_run(self.path)
+
+    def config(self) -> Config:
+        """The configuration in the folder."""
+        return load_config(self.path / run.CONFIG)
+
+    def summary(self) -> dict[str, Any]:
+        """The figures of the finished run; empty until it is finished."""
+        return self._json(self.path / run.SUMMARY)
+
+    def log(self) -> list[dict[str, Any]]:
+        """The records of the log, oldest first; lines torn by whatever ended the run are left out."""
+        path, records = self.path / LOG, []
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
+            try:
+                records.append(json.loads(line))
+            except ValueError:
+                continue
+        return records
+
+    def metrics(self) -> dict[str, dict[str, Any]]:
+        """The evaluations: images seen or split -> metrics, with those of each view under "views"."""
+        files = sorted((self.path / run.EVALUATION).glob("*/metrics.json"))
+        return {file.parent.name: self._json(file) for file in files}
+
+    def cameras(self) -> RunCameras:
+        """The cameras that the run was trained and measured with; see `run_cameras.load_cameras`."""
+        return load_cameras(self.path)
+
+    def model(self, device: torch.device | str = "cpu") -> Model:
+        """The newest sound model.
+
+        The optimiser's moments are read with it, applied where steps are pending, and dropped before the
+        model goes to `device`.
+
+        Raises:
+            FileNotFoundError: there is no checkpoint yet.
+            CheckpointError: none of the checkpoints is sound.
+        """
+        found = run.open_model(self.path, Ranks())
+        columns = {name: found.table[name].to(device) for name in PARAMETERS}
+        return Model(
+            **columns,
+            space=found.space,
+            sh_degree=found.progress.sh_degree,
+            config=found.config,
+            images_seen=found.progress.step * found.config.schedule.batch_size,
+        )
+
+    @staticmethod
+    def _json(path: Path) -> dict[str, Any]:
+        try:
+            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+        return content
+
+
+def open_run(path: Path | str) -> RunFolder:
+    """Open the folder of a run for reading; see `RunFolder`.
+
+    Raises:
+        FileNotFoundError: the folder is not a run.
+    """
+    return RunFolder(path)

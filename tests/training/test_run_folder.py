@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs are read, rendered and exported without trainer, capture or photographs."""
+
+import dataclasses
+import json
+import math
+import os
+import random
+import shutil
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import blitzgs
+from blitzgs.cli import main
+from blitzgs.distributed.group import Ranks
+from blitzgs.formats.ply import read_ply
+from blitzgs.training import checkpoint, run
+from blitzgs.training.export import export_ply, without_antialiasing
+from blitzgs.training.trainer import Trainer
+from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A capture and a short run of it, through the command line."""
+    torch.set_num_threads(1)
+    data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
+    write_tiny_capture(data)
+    flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.4"]
+    assert main(["train", "--data", str(data), "--out", str(folder), *flags]) == 0
+    return data, folder
+
+
+@pytest.fixture
+def copy(trained, tmp_path):
+    """The same, to be changed."""
+    shutil.copytree(trained[0], tmp_path / "data")
+    shutil.copytree(trained[1], tmp_path / "run")
+    return tmp_path / "data", tmp_path / "run"
+
+
+def antialiased_model(tmp_path):
+    config = tiny_config("model.antialiased=true", "schedule.scale=0.4")
+    Trainer(config, *tiny_scene(), tmp_path / "aa", Ranks()).train()
+    return blitzgs.open_run(tmp_path / "aa")
+
+
+def test_a_run_is_read_without_the_trainer(trained):
+    program = (
+        "import sys, blitzgs; run = blitzgs.open_run(sys.argv[1]); model = run.model();"
+        "image = model.render(run.cameras().cameras[0]); print(tuple(image.shape));"
+        "print([name for name in sys.modules if 'trainer' in name or 'scene.images' in name])"
+    )
+    done = subprocess.run([sys.executable, "-c", program, trained[1]], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["(32, 48, 3)", "[]"]
+
+
+def test_what_a_run_folder_holds(trained, tmp_path):
+    folder = blitzgs.open_run(trained[1])
+    summary = folder.summary()
+    assert folder.config().schedule.scale == 0.4
+    assert folder.metrics()["000040"]["psnr"] == summary["psnr"]
+    assert [r["t"] for r in folder.log() if "loss" in r] == [20, 40]
+    model, stored = folder.model(), folder.cameras()
+    assert len(model) == summary["gaussians"] and model.images_seen == 40
+    assert len(stored.train) == 7 and [stored.cameras[i].name for i in stored.test] == ["00.png"]
+    assert main(["render", str(trained[1]), "--raw", "--split", "all", "--out", str(tmp_path)]) == 0
+    for camera in stored.cameras:
+        expected = np.load(tmp_path / camera.name.replace(".png", ".npy"))
+        torch.testing.assert_close(model.render(camera), torch.from_numpy(expected), rtol=0, atol=1e-5)
+    # The same view from its pose in the capture's own world.
+    moved = np.array(stored.cameras[3].world_to_camera)
+    moved[:3, 3] -= moved[:3, :3] @ np.array(model.space.offset)
+    again = model.camera(stored.cameras[3].K, moved, 48, 32)
+    torch.testing.assert_close(model.render(again), model.render(stored.cameras[3]), rtol=0, atol=1e-4)
+    with pytest.raises(FileNotFoundError, match="is not a run"):
+        blitzgs.open_run(tmp_path)
+
+
+def test_render_and_export_need_no_photographs(copy, tmp_path):
+    data, folder = copy
+    shutil.rmtree(data)
+    shutil.rmtree(tmp_path / "gone", ignore_errors=True)
+    config = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(config.replace("capture", "nowhere"))
+    assert main(["render", str(folder), "--split", "all", "--out", str(tmp_path / "out")]) == 0
+    assert len(list((tmp_path / "out").iterdir())) == 8
+    assert main(["export", str(folder), "--ply", str(tmp_path / "m.ply")]) == 0
+
+
+def test_a_lost_photograph_costs_its_view_alone(copy, tmp_path, capsys):
+    data, folder = copy
+    whole = json.loads((folder / "evaluation" / "000040" / "metrics.json").read_text())
+    for name in ("01.png", "05.png"):  # of training views: the split and the world stay as they were
+        (data / "images" / name).unlink()
+    flags = ["--data", str(data)]
+    assert main(["eval", str(folder), *flags]) == 1
+    assert "05.png" in (message := capsys.readouterr().err) and "(--allow-missing)" in message
+    assert main(["eval", str(folder), *flags, "--allow-missing", "--split", "train"]) == 0
+    capsys.readouterr()
+    assert main(["eval", str(folder), *flags, "--allow-missing"]) == 0
+    assert json.loads(capsys.readouterr().out)["psnr"] == whole["psnr"]
+    resume = ["train", "--out", str(folder), "--resume", *flags]
+    assert main(resume) == 1
+    assert "--data.allow_missing=true" in capsys.readouterr().err
+    assert main([*resume, "--data.allow_missing=true"]) == 0
+
+
+def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, capsys):
+    _, folder = copy
+    for damage in ("", "{", '{"version": 2}', '{"version": 1, "cameras": [{}]}', "[]"):
+        (folder / "cameras.json").write_text(damage)
+        assert main(["render", str(folder), "--out", str(tmp_path / "out")]) == 1
+        assert "cameras.json is damaged" in (message := capsys.readouterr().err) and "--data" in message
+
+
+# The configuration that a model was trained with counts.
+
+
+@pytest.mark.parametrize("content", ["", "model: {sh_degree: 0}\n", "loss: [", None])
+def test_the_checkpoints_own_configuration_wins(copy, tmp_path, capsys, content):
+    data, folder = copy
+    expected = json.loads((folder / "summary.json").read_text())["psnr"]
+    if content is None:
+        (folder / "config.yaml").unlink()
+    else:
+        (folder / "config.yaml").write_text(content)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert main(["eval", str(folder), "--data", str(data), "--out", str(tmp_path / "out")]) == 0
+    assert json.loads(capsys.readouterr().out)["psnr"] == expected
+    assert any("what the checkpoint was trained with counts" in str(w.message) for w in caught)
+
+
+def test_what_a_resume_may_change(trained, tmp_path):
+    saved = run.restore(trained[1], Ranks()).config
+    schedule = dataclasses.replace(saved.schedule, evaluate_every=7, checkpoint_every=9)
+    run.check_resumable(saved, dataclasses.replace(saved, schedule=schedule))
+    half = dataclasses.replace(saved, ranks=dataclasses.replace(saved.ranks, half_exchange=True))
+    with pytest.raises(
+        ValueError, match="ranks.half_exchange: the checkpoint was trained with False, now True"
+    ):
+        run.check_resumable(saved, half)
+
+
+def test_no_flipped_bit_of_a_manifest_passes(tmp_path):
+    columns = {"means": torch.randn(5, 3), "id": torch.arange(5)}
+    state = {"progress": {"step": 12, "seconds": 1.5}, "config": {"seed": 0, "scale": 1e-3, "ok": True}}
+    path = checkpoint.save(tmp_path, columns, state, Ranks())
+    manifest = path / "manifest.json"
+    good = manifest.read_bytes()
+    choice, passed = random.Random(5), 0
+    for _ in range(600):
+        data = bytearray(good)
+        data[choice.randrange(len(data))] ^= 1 << choice.randrange(8)
+        manifest.write_bytes(data)
+        try:
+            loaded, found = checkpoint.load(path, Ranks(), "cpu")
+        except checkpoint.CheckpointError:
+            continue
+        passed += 1  # white space
+        assert found == state and torch.equal(loaded["means"], columns["means"])
+    assert passed < 120
+
+
+# Exports.
+
+
+def test_georeferenced_models_are_exported_around_their_origin(trained, tmp_path, capsys):
+    model = blitzgs.open_run(trained[1]).model()
+    far = dataclasses.replace(model, space=dataclasses.replace(model.space, offset=(5e5, 4.6e6, 120.0)))
+    exported = export_ply(far, tmp_path / "far.ply")
+    assert exported.offset == (5e5, 4.6e6, 120.0)
+    found = read_ply(tmp_path / "far.ply")
+    assert "comment offset 500000.0 4600000.0 120.0" in found.comments
+    torch.testing.assert_close(found.means, model.means * model.space.unit)
+    sidecar = json.loads((tmp_path / "far.ply.offset.json").read_text())
+    assert sidecar["file"] == "far.ply" and sidecar["offset"] == [5e5, 4.6e6, 120.0]
+    # Asked for, the coordinates are written as they are, and the loss is known.
+    rounded = export_ply(far, tmp_path / "rounded.ply", "capture")
+    assert rounded.offset is None and rounded.rounding == 0.25
+    error = (read_ply(tmp_path / "rounded.ply").means.double()[:, 1] - 4.6e6).float() - found.means[:, 1]
+    assert 0.1 < error.abs().max() <= 0.25
+    near = export_ply(model, tmp_path / "near.ply")
+    assert near.offset is None and not (tmp_path / "near.ply.offset.json").exists()
+    flags = ["--coordinates", "centred"]
+    assert main(["export", str(trained[1]), "--ply", str(tmp_path / "c.ply"), *flags]) == 0
+    assert "c.ply.offset.json says" in capsys.readouterr().out
+
+
+def test_antialiased_models_are_marked_and_can_be_baked(tmp_path, capsys):
+    folder = antialiased_model(tmp_path)
+    model, stored = folder.model(), folder.cameras()
+    assert main(["export", str(folder.path), "--ply", str(tmp_path / "aa.ply")]) == 0
+    assert "comment SplatRenderMode: mip" in read_ply(tmp_path / "aa.ply").comments
+    assert "--classic" in capsys.readouterr().err
+    assert main(["export", str(folder.path), "--ply", str(tmp_path / "classic.ply"), "--classic"]) == 0
+    classic = read_ply(tmp_path / "classic.ply")
+    assert not any("SplatRenderMode" in comment for comment in classic.comments)
+    # A viewer without antialiasing shows the baked model far closer to what was trained.
+    train = [stored.cameras[i] for i in stored.train]
+    baked = without_antialiasing(model, train)
+    torch.testing.assert_close(classic.opacities, baked.opacities)
+    errors = {"marked": 0.0, "baked": 0.0}
+    for camera in stored.cameras:
+        wanted = model.render(camera)
+        errors["marked"] += (model.splat([camera], antialiased=False)[0][0] - wanted).square().mean().item()
+        errors["baked"] += (baked.render(camera) - wanted).square().mean().item()
+    gain = 10 * math.log10(errors["marked"] / errors["baked"])
+    assert gain > 3, errors
+
+
+@pytest.mark.parametrize("kind", ["link", "device"])
+def test_export_replaces_regular_files_only(trained, tmp_path, capsys, kind):
+    path = tmp_path / "model.ply"
+    if kind == "link":
+        (tmp_path / "target").write_text("precious")
+        path.symlink_to(tmp_path / "target")
+    else:
+        os.mkfifo(path)
+    before = path.lstat()
+    assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
+    assert "which is not overwritten" in capsys.readouterr().err
+    after = path.lstat()
+    assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)
+    assert kind == "device" or (tmp_path / "target").read_text() == "precious"
+
+
+# Paths with any characters.
+
+
+@pytest.mark.parametrize(
+    "name", ["emoji 🏙", "bytes \udcff\udcfe", "[/b]", ":x: [red]", "a: b # {c}", "astral 𝔸", "quote \"'"]
+)
+def test_any_path_works(trained, tmp_path, capfd, name):
+    data, out = tmp_path / f"data {name}", tmp_path / f"run {name}"
+    shutil.copytree(trained[0], data)
+    flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.02"]
+    assert main(["train", "--data", str(data), "--out", str(out), *flags]) == 0
+    printed = capfd.readouterr().out
+    assert "psnr" in printed
+    assert name.encode(errors="backslashreplace").decode() in printed
+    for command in (
+        ["eval", str(out)],
+        ["render", str(out), "--out", str(tmp_path / f"r {name}")],
+        ["export", str(out), "--ply", str(tmp_path / f"{name.replace('/', '')}.ply")],
+        ["train", "--out", str(out), "--resume"],
+    ):
+        assert main(command) == 0, capfd.readouterr().err
