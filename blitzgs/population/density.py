@@ -13,7 +13,9 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
+from blitzgs.population.candidates import Candidates, Veto, spawn_features
 from blitzgs.population.importance import CULL, PHI
+from blitzgs.population.lineage import Births, Cause, Lineage
 from blitzgs.view.blocks import morton_order
 
 SPLIT_SHRINK = 1.6
@@ -46,12 +48,13 @@ class DensityRules:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What an event did on this rank; `held_back` candidates did not grow because of the cap."""
+    """What an event did on this rank; `held_back` candidates did not grow because of the cap or the veto."""
 
     cloned: int
     split: int
     pruned: int
     held_back: int
+    vetoed: int = 0
 
 
 def densify(
@@ -63,6 +66,9 @@ def densify(
     seed: int,
     level_count: int,
     ranks: Ranks,
+    extent: float = 1.0,
+    veto: Veto | None = None,
+    lineage: Lineage | None = None,
 ) -> DensityReport:
     """Run one density event on a table whose rows have all been caught up, and reset its statistics.
 
@@ -81,27 +87,39 @@ def densify(
         seed: of the run.
         level_count: number of octree levels K; children stay below.
         ranks: whose tables together make the population; every rank calls this.
+        extent: of the scene, in the unit of the means; for the candidates' features alone.
+        veto: tells which candidates do not grow; None: all do.
+        lineage: logs births and deaths, or None.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = gradient >= rules.grad_threshold
-    wanted = candidates.sum()
+    wanted, vetoed = candidates.sum(), 0
+    small = table["scales"].amax(dim=1) <= math.log(rules.clone_scale)
+    if veto is not None:
+        rows = candidates.nonzero().squeeze(1)
+        is_split = ~small[rows]
+        features = spawn_features(table, rows, is_split, time, extent, level_count)
+        rejected = rows[veto(Candidates(table["id"][rows], is_split, features, time), ranks)]
+        candidates[rejected], vetoed = False, len(rejected)
     if rules.max_gaussians is not None:
         candidates = _within_cap(candidates, gradient, table["id"], rules.max_gaussians, ranks)
-    small = table["scales"].amax(dim=1) <= math.log(rules.clone_scale)
     clones = (candidates & small).nonzero().squeeze(1)
     splits = (candidates & ~small).nonzero().squeeze(1)
     new = _children(table, clones, splits, time, seed, level_count)
     new["last_step"] = torch.full_like(new["birth"], step)
-    staying = ~_superfluous(table.columns, table["max_radii"], rules)
-    staying[splits] = False
-    fine = ~_superfluous(new, None, rules)
-    rows = torch.cat((staying.nonzero().squeeze(1), len(table) + fine.nonzero().squeeze(1)))
+    causes = _causes(table.columns, table["max_radii"], rules)
+    causes[splits] = Cause.SPLIT
+    causes = torch.cat((causes, _causes(new, None, rules)))
+    rows = (causes == 0).nonzero().squeeze(1)
+    if lineage is not None:
+        _log(lineage, table, new, (clones, splits), causes, time, step, extent, level_count)
     grown = len(clones) + len(splits)
     report = DensityReport(
         cloned=len(clones),
         split=len(splits),
         pruned=len(table) + grown - len(rows),
         held_back=int(wanted) - grown,
+        vetoed=vetoed,
     )
     means = torch.cat((table["means"], new["means"])).index_select(0, rows)
     table.renew(rows[morton_order(means)], new)
@@ -204,12 +222,34 @@ def rotations(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
-def _superfluous(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRules) -> Tensor:
-    """Mask of the rows to prune: too transparent, or too large on screen or in the world."""
+def _causes(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRules) -> Tensor:
+    """Tell why rows have to go: `Cause.OPACITY`, else `Cause.SIZE` (screen or world); 0: they stay."""
     logit = math.log(rules.min_opacity / (1.0 - rules.min_opacity)) if rules.min_opacity > 0 else -math.inf
-    mask = rows["opacities"] < logit
+    causes = torch.zeros_like(rows["level"])
     if rules.max_scale is not None:
-        mask = mask | (rows["scales"].amax(dim=1) > math.log(rules.max_scale))
+        causes[rows["scales"].amax(dim=1) > math.log(rules.max_scale)] = Cause.SIZE
     if radii is not None and rules.max_screen_radius is not None:
-        mask = mask | (radii > rules.max_screen_radius)
-    return mask
+        causes[radii > rules.max_screen_radius] = Cause.SIZE
+    causes[rows["opacities"] < logit] = Cause.OPACITY
+    return causes
+
+
+def _log(
+    lineage: Lineage,
+    table: GaussianTable,
+    new: dict[str, Tensor],
+    parents: tuple[Tensor, Tensor],
+    causes: Tensor,
+    time: int,
+    step: int,
+    extent: float,
+    level_count: int,
+) -> None:
+    """Log an event, before its rows are taken out and its statistics reset."""
+    clones, splits = parents
+    rows = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
+    is_split = torch.arange(len(rows), device=rows.device) >= len(clones)
+    features = spawn_features(table, rows, is_split, time, extent, level_count)
+    lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
+    gone = causes.nonzero().squeeze(1)
+    lineage.died(torch.cat((table["id"], new["id"]))[gone], causes[gone], time, step)

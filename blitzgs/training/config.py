@@ -186,6 +186,7 @@ class PopulationConfig:
             those below `min_opacity` go too; 1: all, as above.
         phi: from the first pass on, weigh the gradients that density control adds up with phi, the share of
             the views seeing a Gaussian in which it counts.
+        lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).
     """
 
     grad_threshold: float = 2e-4
@@ -200,6 +201,7 @@ class PopulationConfig:
     pass1_keep: float = 0.7
     pass2_mass: float = 0.99
     phi: bool = True
+    lineage: bool = False
 
 
 @dataclass(frozen=True)

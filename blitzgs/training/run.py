@@ -28,6 +28,7 @@ CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
 EVALUATION = "evaluation"
+LINEAGE = "lineage"
 # Sections and fields that a resumed run may change: they decide nothing about the result beyond rounding, but
 # for `data.allow_missing`, without which a run whose photograph is lost could not go on.
 FREE_FIELDS = (
@@ -56,6 +57,7 @@ class Progress:
         peak_gaussians: most Gaussians so far.
         seconds: of training so far, without evaluations.
         milestones: how many Gaussians there were at the points of the run that are named so.
+        ledger: of the lineage (`blitzgs.population.lineage.Ledger`), where there is one.
     """
 
     step: int
@@ -64,6 +66,7 @@ class Progress:
     peak_gaussians: int
     seconds: float
     milestones: dict[str, int] = dataclasses.field(default_factory=dict)
+    ledger: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
 @dataclass

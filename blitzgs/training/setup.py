@@ -12,6 +12,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.population.initialisation import octree_gaussians
+from blitzgs.population.lineage import Lineage, initial_births, ledger_of
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run
 from blitzgs.training.agreement import SaveClock
@@ -95,8 +96,17 @@ def set_up(
         run_id=run_id,
         origin=_origin(restored, resume, folder),
         save_clock=SaveClock(config.log.checkpoint_seconds),
+        lineage=_start_lineage(folder, table, progress, ranks) if config.population.lineage else None,
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
+
+
+def _start_lineage(folder: Path, table: GaussianTable, progress: Progress, ranks: Ranks) -> Lineage:
+    """Begin the log of births and deaths, or go on from the checkpoint's."""
+    lineage = Lineage(folder / run.LINEAGE, ranks, progress.step, ledger_of(progress.ledger))
+    if not progress.ledger:
+        lineage.born(initial_births(table["id"], table["parent"], table["means"]), progress.step)
+    return lineage
 
 
 def _origin(restored: run.Restored | None, resume: bool, folder: Path) -> str:

@@ -117,6 +117,8 @@ class Trainer:
         """Stop loading batches and close the log."""
         self._loader.close()
         self.state.log.close()
+        if self.state.lineage is not None:
+            self.state.lineage.close()
 
     def step(self, step: int) -> None:
         """Take one optimiser step (from 1), without the schedule's events."""

@@ -4,11 +4,13 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.importance import CULL, PHI, is_culled
+from blitzgs.population.lineage import Cause, read_lineage
 from blitzgs.training import run
 from blitzgs.training.events import importance
 from blitzgs.training.trainer import Trainer
@@ -138,3 +140,24 @@ def test_passes_are_the_same_at_every_world_size(whole_run, tmp_path, world_size
         order, reference = got[0].argsort(), want[0].argsort()
         for a, b in zip(got, want, strict=True):
             assert torch.equal(a[order], b[reference])
+
+
+def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
+    """Every Gaussian of the final model was born and did not die; each death has its mechanism."""
+    pytest.importorskip("pyarrow")
+    stop_at_step_50(monkeypatch)
+    train(tmp_path, "population.lineage=true")
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    trainer, _ = train(tmp_path, "population.lineage=true", resume=True)
+    tables = read_lineage(tmp_path / run.LINEAGE)
+    births, deaths = tables["births"]["id"], tables["deaths"]["id"]
+    assert sorted(set(births) - set(deaths)) == sorted(trainer.state.table["id"].tolist())
+    causes = dict(zip(*np.unique(tables["deaths"]["cause"], return_counts=True), strict=True))
+    events = pass_events(tmp_path)
+    assert causes[Cause.PASS_1] == events["pass_1"]["before"] - events["pass_1"]["gaussians"]
+    late = causes.get(Cause.PASS_2, 0) + causes.get(Cause.LATE_OPACITY, 0)
+    assert late == events["pass_2"]["before"] - events["pass_2"]["gaussians"]
+    assert causes[Cause.SPLIT] + causes.get(Cause.OPACITY, 0) > 0
+    ledger = trainer.state.progress.ledger
+    assert ledger["births"] == len(births) and ledger["deaths"] == len(deaths)

@@ -33,6 +33,8 @@ def run(state: TrainingState, event: Event) -> None:
         seed=state.config.seed,
         level_count=state.progress.level_count,
         ranks=state.ranks,
+        extent=state.space.extent,
+        lineage=state.lineage,
     )
     counts = dataclasses.asdict(report) | {"gaussians": len(state.table)}
     values = state.ranks.all_reduce(torch.tensor(list(counts.values()), device=state.ranks.device))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.population.importance import Importance, ViewBatch, sweep
+from blitzgs.population.lineage import Cause
 from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.population.redistribution import redistribute
 from blitzgs.training.guard import check_table
@@ -41,7 +42,11 @@ def run(state: TrainingState, event: Event) -> None:
     )
     found.store(state.table)
     before = state.population()
-    state.table.keep(chosen(state, event, found))
+    causes = causes_of_death(state, event, found)
+    if state.lineage is not None:
+        gone = causes.nonzero().squeeze(1)
+        state.lineage.died(state.table["id"][gone], causes[gone], event.time, state.progress.step)
+    state.table.keep(causes == 0)
     after = state.population()
     if redistribute(state.table, state.ranks, max_imbalance=0):
         state.sort()
@@ -65,20 +70,22 @@ def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
             yield ViewBatch(some, state.views.pick([state.capture.train[column] for column in some]))
 
 
-def chosen(state: TrainingState, event: Event, found: Importance) -> Tensor:
-    """Mark the rows that a pass keeps, bool [N]; every rank calls this."""
+def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Tensor:
+    """Tell which rows a pass takes out, and why: uint8 [N] of `Cause`; 0: kept. Every rank calls this."""
     population, table, ids = state.config.population, state.table, state.table["id"]
-    everyone = torch.ones_like(ids, dtype=torch.bool)
+    causes = torch.zeros_like(ids, dtype=torch.uint8)
     if event.kind == "pass_1":
-        if population.pass1_keep == 1:
-            return everyone
-        return sample_by_score(
-            found.score, ids, population.pass1_keep, state.config.seed, event.time, state.ranks
-        )
+        if population.pass1_keep < 1:
+            kept = sample_by_score(
+                found.score, ids, population.pass1_keep, state.config.seed, event.time, state.ranks
+            )
+            causes[~kept] = Cause.PASS_1
+        return causes
     # Where nothing contributes to any view, there is no mass to keep a share of.
     total = state.ranks.all_reduce(found.score.double().sum())
-    if population.pass2_mass == 1 or not total.item() > 0:
-        return everyone
-    least = population.min_opacity
-    opaque = table["opacities"] >= (math.log(least / (1.0 - least)) if least > 0 else -math.inf)
-    return top_by_score(found.score, ids, population.pass2_mass, state.ranks) & opaque
+    if population.pass2_mass < 1 and total.item() > 0:
+        least = population.min_opacity
+        logit = math.log(least / (1.0 - least)) if least > 0 else -math.inf
+        causes[table["opacities"] < logit] = Cause.LATE_OPACITY
+        causes[~top_by_score(found.score, ids, population.pass2_mass, state.ranks)] = Cause.PASS_2
+    return causes

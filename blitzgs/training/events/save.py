@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
+from blitzgs.population.lineage import ledger_state
 from blitzgs.training import run as run_folder
 from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.schedule import Event
@@ -69,6 +71,10 @@ def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[
 
 
 def _write(state: TrainingState) -> None:
+    """Write a checkpoint, after the lineage has been written and found to add up."""
+    if state.lineage is not None:
+        ledger = ledger_state(state.lineage.settle(state.table["id"], state.progress.step))
+        state.progress = replace(state.progress, ledger=ledger)
     run_folder.save(
         state.folder, state.table, state.progress, state.space, state.config, state.ranks, state.run_id
     )

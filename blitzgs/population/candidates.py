@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Candidates of densification: what is known of a Gaussian before it is born (paper, spawn gate)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import GaussianTable
+
+# In the order of the columns of `spawn_features`.
+FEATURES = (
+    "gradient",
+    "parent_opacity",
+    "parent_scale",
+    "parent_age",
+    "views",
+    "level",
+    "time",
+    "is_split",
+)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The candidates of one density event on this rank, M of them.
+
+    Attributes:
+        parents: int64 [M], persistent ids of the Gaussians to be cloned or split.
+        is_split: bool [M].
+        features: float32 [M, 8], see `FEATURES`.
+        time: of the event, in images.
+    """
+
+    parents: Tensor
+    is_split: Tensor
+    features: Tensor
+    time: int
+
+
+# Tells which candidates are not to be born, bool [M]; every rank calls it, with or without candidates.
+Veto = Callable[[Candidates, Ranks], Tensor]
+
+
+@torch.no_grad()
+def spawn_features(
+    table: GaussianTable,
+    rows: Tensor,
+    is_split: Tensor,
+    time: int,
+    extent: float,
+    level_count: int,
+) -> Tensor:
+    """Return the features of candidates at a density event, before its statistics are reset.
+
+    Args:
+        table: this rank's Gaussians, caught up.
+        rows: int64 [M], their parents.
+        is_split: bool [M].
+        time: of the event, in images.
+        extent: of the scene, in the unit of the means.
+        level_count: number of octree levels.
+
+    Returns:
+        float32 [M, 8]: mean gradient over the views that saw the parent (half-image units), the parent's
+        opacity, the mean of its three scales relative to extent, its age in images, those views' number, the
+        child's octree level (the parent's, one more for a split), the time, and whether it is a split.
+    """
+    views = table["grad_count"][rows]
+    level = table["level"][rows].int()
+    # In float64, so that the rounded result does not depend on how the maths library vectorises.
+    columns = (
+        table["grad_sum"][rows] / views.clamp(min=1),
+        table["opacities"][rows].double().sigmoid(),
+        table["scales"][rows].double().exp().mean(1) / extent,
+        time - table["birth"][rows],
+        views,
+        torch.where(is_split, (level + 1).clamp(max=level_count - 1), level),
+        torch.full_like(views, time),
+        is_split,
+    )
+    return torch.stack([column.float() for column in columns], 1)

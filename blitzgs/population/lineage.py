@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lineage: every birth and death of a Gaussian, logged as Parquet and reconciled with the live population.
+
+Each rank writes parts of two tables into one folder, which hold what happened up to the optimiser step in
+their names:
+
+- births: id, parent (-1: of the initial model), x, y, z, and the spawn features of `candidates.FEATURES`
+  (NaN for the initial model but for `time`, 0);
+- deaths: id, time (in images), cause (`Cause`).
+
+A Gaussian that has no death is alive. At each checkpoint births - deaths must be the live population, in
+number and in the sum of the hashes of all ids, or the run fails. A run that goes on from a checkpoint drops
+the parts written after it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import re
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.ops.counter_random import hash_keys
+from blitzgs.population.candidates import FEATURES
+
+_PART = re.compile(r"(births|deaths)_(\d{8})_(\d{4})_(\d{4})\.parquet")
+# Rows that are kept in memory before they are written.
+_MOST_PENDING = 1 << 20
+
+
+class Cause(enum.IntEnum):
+    """Why a Gaussian died."""
+
+    OPACITY = 1  # too transparent at a density event
+    SIZE = 2  # too large there, on screen or in the world
+    SPLIT = 3  # gave way to its children
+    PASS_1 = 4  # not drawn by the first importance pass
+    PASS_2 = 5  # outside the mass that the second pass keeps
+    LATE_OPACITY = 6  # within it, but too transparent
+
+
+class LineageError(RuntimeError):
+    """Births and deaths do not add up to the live population."""
+
+
+@dataclass(frozen=True)
+class Births:
+    """Gaussians born on this rank, M of them.
+
+    Attributes:
+        ids: int64 [M].
+        parents: int64 [M].
+        means: float32 [M, 3].
+        features: float32 [M, 8], of the candidates that they come from.
+    """
+
+    ids: Tensor
+    parents: Tensor
+    means: Tensor
+    features: Tensor
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """What was born and died so far, over all ranks; part of a checkpoint.
+
+    Attributes:
+        births: number.
+        deaths: number.
+        id_sum: sum of the hashed ids of births less that of deaths, modulo 2^64, as a signed integer.
+    """
+
+    births: int = 0
+    deaths: int = 0
+    id_sum: int = 0
+
+
+class Lineage:
+    """Logs births and deaths of one rank."""
+
+    def __init__(self, folder: Path, ranks: Ranks, step: int, ledger: Ledger) -> None:
+        """Begin, or go on from a checkpoint. Collective.
+
+        Args:
+            folder: of the parts, made if missing; of all ranks.
+            ranks: the job.
+            step: optimiser step of the checkpoint; parts of later ones are deleted. 0: all are.
+            ledger: of the checkpoint.
+
+        Raises:
+            ImportError: pyarrow is not installed.
+        """
+        self._parquet = _pyarrow()
+        self._folder, self._ranks, self.ledger = folder, ranks, ledger
+        if ranks.rank == 0:
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in list(folder.iterdir()):
+                name = _PART.fullmatch(path.name)
+                if path.name.startswith(".") or (name and (step == 0 or int(name[2]) > step)):
+                    path.unlink()
+        ranks.barrier()
+        self._sums = torch.zeros(3, dtype=torch.int64, device=ranks.device)
+        self._pending: dict[str, list[dict[str, Tensor]]] = {"births": [], "deaths": []}
+        self._rows, self._parts = 0, 0
+        self._writer = ThreadPoolExecutor(1, "lineage")
+        self._writing: list[Future[None]] = []
+
+    def born(self, births: Births, step: int) -> None:
+        """Log births at the end of an optimiser step."""
+        self._count(births.ids, births=True)
+        columns = {"id": births.ids, "parent": births.parents}
+        columns |= dict(zip("xyz", births.means.unbind(1), strict=True))
+        self._log("births", columns | dict(zip(FEATURES, births.features.unbind(1), strict=True)), step)
+
+    def died(self, ids: Tensor, causes: Tensor, time: int, step: int) -> None:
+        """Log deaths.
+
+        Args:
+            ids: int64 [M].
+            causes: [M], values of `Cause`.
+            time: of the event, in images.
+            step: optimiser step.
+        """
+        self._count(ids, births=False)
+        times = torch.full_like(ids, time, dtype=torch.int32)
+        self._log("deaths", {"id": ids, "time": times, "cause": causes.to(torch.uint8)}, step)
+
+    def settle(self, ids: Tensor, step: int) -> Ledger:
+        """Write what is pending and check the books, before a checkpoint is written. Collective.
+
+        Args:
+            ids: int64 [N], of this rank's live Gaussians.
+            step: optimiser step.
+
+        Returns:
+            The ledger up to now.
+
+        Raises:
+            LineageError: on every rank, when births - deaths is not the live population.
+            OSError: a part could not be written.
+        """
+        self._flush(step)
+        for writing in self._writing:
+            writing.result()
+        self._writing.clear()
+        live = torch.stack((torch.tensor(len(ids), device=ids.device), hash_keys(ids).sum()))
+        totals = self._ranks.all_reduce(torch.cat((self._sums, live))).tolist()
+        self._sums.zero_()
+        ledger = Ledger(
+            self.ledger.births + totals[0],
+            self.ledger.deaths + totals[1],
+            _wrapped(self.ledger.id_sum + totals[2]),
+        )
+        if ledger.births - ledger.deaths != totals[3] or ledger.id_sum != totals[4]:
+            raise LineageError(
+                f"lineage: {ledger.births:,} births less {ledger.deaths:,} deaths is not the live population "
+                f"of {totals[3]:,} Gaussians{_same_number(ledger, totals[3])}; the log in {self._folder} is "
+                "not to be trusted. Please report this; population.lineage=false trains without it."
+            )
+        self.ledger = ledger
+        return ledger
+
+    def close(self) -> None:
+        """Stop writing; what was not settled is lost, as is the training since then."""
+        self._writer.shutdown(wait=True, cancel_futures=True)
+
+    def _count(self, ids: Tensor, births: bool) -> None:
+        sign = 1 if births else -1
+        self._sums[0 if births else 1] += len(ids)
+        self._sums[2] += sign * hash_keys(ids).sum()
+
+    def _log(self, table: str, columns: dict[str, Tensor], step: int) -> None:
+        self._pending[table].append({name: column.cpu() for name, column in columns.items()})
+        self._rows += len(columns["id"])
+        if self._rows > _MOST_PENDING:
+            self._flush(step)
+
+    def _flush(self, step: int) -> None:
+        """Have the pending rows written by another thread."""
+        for table, pieces in self._pending.items():
+            if not pieces:
+                continue
+            name = f"{table}_{step:08d}_{self._ranks.rank:04d}_{self._parts:04d}.parquet"
+            self._parts += 1
+            self._writing.append(self._writer.submit(self._write, name, list(pieces)))
+            pieces.clear()
+        self._rows = 0
+
+    def _write(self, name: str, pieces: list[dict[str, Tensor]]) -> None:
+        columns = {key: torch.cat([piece[key] for piece in pieces]).numpy() for key in pieces[0]}
+        unfinished = self._folder / f".{name}"
+        arrow, parquet = self._parquet
+        parquet.write_table(arrow.table(columns), unfinished, compression="zstd")
+        unfinished.rename(self._folder / name)
+
+
+def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
+    """Read the log of a run.
+
+    Args:
+        folder: that of the parts.
+
+    Returns:
+        {"births": columns, "deaths": columns}, numpy arrays by name.
+
+    Raises:
+        FileNotFoundError: there is no log.
+        ImportError: pyarrow is not installed.
+    """
+    arrow, parquet = _pyarrow()
+    tables = {}
+    for table in ("births", "deaths"):
+        paths = sorted(path for path in folder.glob(f"{table}_*.parquet") if _PART.fullmatch(path.name))
+        if not paths and table == "births":
+            raise FileNotFoundError(
+                f"{folder} holds no lineage: train with --population.lineage=true to log it"
+            )
+        parts = [parquet.read_table(path) for path in paths]
+        if parts:
+            joined = arrow.concat_tables(parts)
+            tables[table] = {name: joined[name].to_numpy() for name in joined.column_names}
+        else:
+            tables[table] = {
+                name: torch.empty(0, dtype=torch.int64).numpy() for name in ("id", "time", "cause")
+            }
+    return tables
+
+
+def initial_births(ids: Tensor, parents: Tensor, means: Tensor) -> Births:
+    """Return the births of a model's first Gaussians, which were no candidates."""
+    features = torch.full((len(ids), len(FEATURES)), torch.nan, device=ids.device)
+    features[:, FEATURES.index("time")] = 0
+    return Births(ids, parents, means, features)
+
+
+def ledger_of(state: dict[str, int] | None) -> Ledger:
+    """Read a ledger back from a checkpoint."""
+    return Ledger(**(state or {}))
+
+
+def ledger_state(ledger: Ledger) -> dict[str, int]:
+    """Return a ledger for a checkpoint."""
+    return dataclasses.asdict(ledger)
+
+
+def _wrapped(value: int) -> int:
+    """Take an integer modulo 2^64, signed."""
+    return (value + (1 << 63)) % (1 << 64) - (1 << 63)
+
+
+def _same_number(ledger: Ledger, live: int) -> str:
+    return " (their numbers agree, their ids do not)" if ledger.births - ledger.deaths == live else ""
+
+
+def _pyarrow() -> tuple[ModuleType, ModuleType]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ImportError("lineage is logged as Parquet: install pyarrow (pip install pyarrow)") from error
+    return pyarrow, pyarrow.parquet
