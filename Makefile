@@ -44,11 +44,12 @@ io:
 	  -o blitzgs/_lib/_io$$($(PYTHON) -c "import sysconfig; print(sysconfig.get_config_var('EXT_SUFFIX'))")
 
 # A second `make demo` continues the run where it stopped, or measures the finished one again. A new run from the
-# start goes into a folder of its own: make demo DEMO=runs/another
+# start goes into a folder of its own, and has to when the configuration has changed: make demo DEMO=runs/another
 demo: venv build
 	$(RUN) blitzgs synth $(DEMO)/city --preset demo
 	$(RUN) blitzgs train --config configs/smoke.yaml --data $(DEMO)/city --out $(DEMO)/run \
-	  $(if $(wildcard $(DEMO)/run/checkpoints/*),--resume)
+	  $(if $(wildcard $(DEMO)/run/checkpoints/*),--resume) \
+	  || { echo "A new run from the start: make demo DEMO=runs/another"; exit 1; }
 	$(RUN) blitzgs export $(DEMO)/run --ply $(DEMO)/city.ply
 	@echo
 	@echo "Pictures (render | photograph | error): $(DEMO)/run/evaluation"

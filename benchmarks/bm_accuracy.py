@@ -209,7 +209,7 @@ def line(figures: Figures) -> str:
 
 
 def plot(rows: list[Figures], title: str, path: Path) -> None:
-    """Draw time against error, better towards the lower left, and the line of what nothing beats in both.
+    """Draw time against error, better towards the lower left, and the Pareto front.
 
     Without matplotlib there is no plot.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real training, some way in: what a step and a density event take, and where the GPU and the host wait.
+"""A real training, some thousand images in: how long a step and a density event take, and who waits when.
 
     python benchmarks/bm_training.py --data DIR --config configs/aerial.yaml [--images 10000] [--FIELD=VALUE]
     torchrun --nproc-per-node=2 benchmarks/bm_training.py --data DIR --config configs/aerial.yaml

@@ -37,7 +37,7 @@ def _load(path: Path) -> None:
 
 
 def without_autograd(op: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an op that torch does not differentiate: for callers that do, or that need no gradient.
+    """Return an op without its autograd formula, for callers that have their own or need no gradient.
 
     A gradient formula registered in Python takes every call through Python once more: 20 us of the host's
     time.

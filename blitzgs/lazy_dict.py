@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A dict some of whose values cost nothing until they are read."""
+"""A dict that computes some of its values only when they are read."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch.utils import _pytree as pytree
 
 
 class Later:
-    """A value that `LazyDict` works out when it is first read."""
+    """A value that `LazyDict` computes when it is first read."""
 
     __slots__ = ("compute",)
 
@@ -21,8 +21,8 @@ class Later:
 class LazyDict(dict[str, Any]):
     """A dict whose `Later` values are replaced by what they compute when they are first read.
 
-    In every other way a dict: no reader sees a `Later`, copies and pickles are plain dicts, and any value may
-    be replaced or deleted.
+    In every other way it is a dict: readers never see a `Later`, copies and pickles are plain dicts, and any
+    value may be replaced or deleted.
     """
 
     def __getitem__(self, key: str) -> Any:

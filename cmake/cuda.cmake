@@ -41,8 +41,7 @@ target_compile_options(
     -diag-suppress=20012>
 )
 
-# Rows, colours and tiles are worked out in different kernels, and by some twice: no contraction, so that they
-# get the same bits.
+# Several kernels compute the same splats, colours and tiles. Without contraction they all get the same bits.
 set_source_files_properties(
   ${CMAKE_SOURCE_DIR}/csrc/project/project_survey_cuda.cu
   ${CMAKE_SOURCE_DIR}/csrc/project/project_rows_cuda.cu

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The image by definition: plain float64 PyTorch, one short function for each formula.
 
-Every kernel of every backend is held against `render`. It visits each Gaussian at each pixel (no tiles, no
-radius, no culling but the depth range), so it is for small inputs; autograd differentiates it.
+Tests compare every kernel of every backend with `render`. It visits each Gaussian at each pixel (no tiles, no
+radius, no culling but the depth range), so it is for small inputs. Autograd differentiates it.
 """
 
 from blitzgs.reference.compositing import Composite, composite

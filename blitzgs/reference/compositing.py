@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Front-to-back alpha compositing of every splat at every pixel, and which pixels sit on a cut."""
+"""Front-to-back alpha compositing of every splat at every pixel, and which pixels lie on a cut."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _cut(unclipped: Tensor, after: Tensor, before: Tensor, depths: Tensor, toler
     def near(value: Tensor, limit: float) -> Tensor:
         return (value - limit).abs() <= tolerance * limit
 
-    # What lies behind the end of a pixel decides nothing there.
+    # Splats behind the end of a pixel have no effect on it.
     reached = before >= MIN_TRANSMITTANCE * (1 - tolerance)
     undecided = near(unclipped, ALPHA_CUT) | near(unclipped, ALPHA_MAX) | near(after, MIN_TRANSMITTANCE)
     touched = unclipped >= ALPHA_CUT * (1 - tolerance)
@@ -109,6 +109,6 @@ def _cut(unclipped: Tensor, after: Tensor, before: Tensor, depths: Tensor, toler
     gap = depths[1:, None] - front[:-1]
     tie = touched.clone()
     tie[:1] = False
-    # Equal depths are decided, by the index.
+    # Equal depths are no cut: the index orders them.
     tie[1:] &= (gap > 0) & (gap <= tolerance * 1e-2 * depths[1:, None].abs())
     return ((undecided | tie) & reached).any(dim=0)

@@ -8,10 +8,11 @@
 //   the
 //                    eigenvalue's root term clamped at sqrt(0.1) as in the original renderer
 //
-// v_means2d [P, 2] gradient by the pixel position, rows v_stride apart; weight turns the gradient of the
-// batch's loss into that of one view's (B for a mean over B views); phi [N] or null (1); conics [P, 3]
-// inverse covariance (a, b, c); visible_ids int32 [U], row_offsets int32 [U + 1]. In place, one thread a
-// Gaussian, rows in order: deterministic. O(P).
+// v_means2d [P, 2] is the gradient by the pixel position, with v_stride numbers from one row to the next;
+// weight is the factor from the gradient of the batch's loss to the gradient of one view's loss (B for a mean
+// over B views); phi [N] or null (1); conics [P, 3] inverse covariance (a, b, c); visible_ids int32 [U],
+// row_offsets int32 [U + 1]. The statistics are updated in place. One thread adds up the rows of a Gaussian
+// in order, so the result is deterministic. O(P).
 #pragma once
 #include <cmath>
 #include <cstdint>

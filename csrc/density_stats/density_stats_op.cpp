@@ -43,7 +43,7 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   if (visible == 0) return;
   const Tensor visible_ids = as_contiguous(visible_ids_in), row_offsets = as_contiguous(row_offsets_in);
   const Tensor conics = as_contiguous(conics_in);
-  // Part of a table's rows is read where it is.
+  // A gradient that is part of a table's rows is read in place, without a copy.
   const Tensor v_means2d = v_means2d_in.stride(1) == 1 ? v_means2d_in : as_contiguous(v_means2d_in);
 
   DeviceScope scope(grad_sum);

@@ -2,8 +2,8 @@
 // Distances to the k nearest other points, exact.
 //
 // points [N, 3]; distances [N, k] ascending, in the unit of the points. Duplicates are at distance 0 of each
-// other. A row that is not finite is nobody's neighbour and gets infinity, and so do the entries beyond the
-// last neighbour when fewer than k others exist.
+// other. A row that is not finite is no point's neighbour, and its distances are infinite. So are the entries
+// beyond the last neighbour when fewer than k others exist.
 //
 // Points are sorted along a Morton curve; boxes of 8 consecutive points, of 8 such boxes and so on form an
 // implicit tree, which follows the density of the cloud. A query starts in its own leaf and climbs,
@@ -40,7 +40,7 @@ struct KnnTree {
   const KnnBox<T>* boxes;
 };
 
-// Sizes of the levels above n sorted points; returns the number of boxes.
+// Computes the sizes of the levels above n sorted points; returns the number of boxes.
 template <class T>
 std::int64_t plan_knn_levels(std::int32_t n, KnnTree<T>& tree) {
   std::int64_t total = 0;
@@ -104,7 +104,7 @@ struct KnnQuery {
     return d[0] * d[0] + d[1] * d[1] + d[2] * d[2] < best[K - 1];
   }
 
-  // Everything under one node.
+  // Visits everything below one node.
   BLITZGS_HD void descend(int from_level, std::int32_t from_node) {
     std::int32_t nodes[kKnnLevels * kKnnFan];
     signed char levels[kKnnLevels * kKnnFan];

@@ -43,7 +43,8 @@ __global__ void fill_infinite(float* values, std::int64_t n) {
   if (i < n) values[i] = INFINITY;
 }
 
-// Rows in curve order; ends with the stream idle, as the number of finite points shapes the tree.
+// Sorts the rows along the curve. It waits for the stream at its end, because the number of finite points
+// decides the shape of the tree.
 std::int32_t sort_along_curve(const float* points, std::int32_t n, std::int32_t* order, Workspace& workspace,
                               cudaStream_t stream) {
   MortonBounds* bounds = find_morton_bounds(points, n, workspace, stream);

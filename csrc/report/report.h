@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a step tells the host, put together in one launch beside the step and written where it is wanted: the
-// loss's sums, added up from the parts that the loss's kernel left, and what the rank's tiles cost.
+// What a step reports to the host: the loss's sums, added up from the parts that the loss's kernel wrote, and
+// the costs of the rank's tiles. One launch beside the step writes the report into the memory of every rank
+// that reads it.
 //
 //   parts double [B, K, 2], sums of |x - y| and of SSIM of each view in K parts -> l1 [B], ssim [B]
 //   tile_work int32 [tiles], of which [tile_begin, tile_end) are this rank's  -> tiles [tiles], only those
 //
-// Parts are added in a fixed order; the same on the CPU and on CUDA to rounding of doubles.
+// Parts are added in a fixed order. CPU and CUDA agree to the rounding of doubles.
 #pragma once
 #include <cstdint>
 

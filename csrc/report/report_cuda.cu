@@ -9,7 +9,7 @@ namespace {
 
 constexpr int kReportThreads = 256;
 
-// The first blocks have a view each, the others tiles.
+// Each of the first blocks adds up a view; the others copy the costs of tiles.
 __global__ void __launch_bounds__(kReportThreads)
     report_kernel(const __grid_constant__ Report<float> report) {
   const std::int64_t view = blockIdx.x;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A column of a table put together anew: row i becomes the old row rows[i], or the new row rows[i] - count.
+// Makes a column of a table anew: row i becomes the old row rows[i], or the new row rows[i] - count.
 //
 // Rows are bytes, `row_bytes` each; rows int64 [n], in [0, count + number of new rows). fresh: the new rows;
 // null: zeros. Reads and writes every row once.

@@ -8,7 +8,7 @@ namespace {
 
 constexpr int kThreads = 256;
 
-// A block puts kThreads rows together, a thread a word of `units` in each.
+// A block copies kThreads rows; a thread copies one of the `units` words of a row at a time.
 template <class Word>
 __global__ void __launch_bounds__(kThreads) take_rows_kernel(const TakeRows take, std::uint32_t units) {
   __shared__ std::int64_t rows[kThreads];
