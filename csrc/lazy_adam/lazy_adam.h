@@ -59,7 +59,8 @@ struct AdamArgs {
   double beta1, beta2, eps;
   bool sparse;  // plain sparse Adam: no decay, no drift
 
-  BLITZGS_HD bool with_gradient() const { return columns[0].grad != nullptr; }
+  // SH are asked, as the other columns may be empty.
+  BLITZGS_HD bool with_gradient() const { return columns[kAdamColumns - 1].grad != nullptr; }
   // The step after which all listed parameters stand when they have caught up; a step with a gradient
   // follows.
   BLITZGS_HD std::int32_t target() const { return with_gradient() ? step - 1 : step; }

@@ -110,13 +110,15 @@ __global__ void __launch_bounds__(kListThreads)
 }
 
 // Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every kRows rows.
-// ShPacks: packs in an SH row; 0: as many as `sh_packs` says.
+// ShPacks: packs in an SH row; 0: as many as there are. The other columns are empty where a parameter is
+// stepped alone.
 template <int ShWidth, int ShPacks, class F>
-__device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
-  const int packs = ShPacks ? ShPacks : sh_packs;
+__device__ __forceinline__ void for_each_pack(const AdamArgs<float>& args, const F& update) {
+  const int packs = ShPacks ? ShPacks : static_cast<int>(args.columns[4].width) / ShWidth;
+  const int others = args.columns[0].width > 0 ? 8 : 0;
   // Where the number of packs is known, a single round handles all of them.
   constexpr int kRound = ShPacks ? kRows * (ShPacks + 8) : kThreads;
-  for (int item = threadIdx.x; item < kRows * (packs + 8); item += kRound) {
+  for (int item = threadIdx.x; item < kRows * (packs + others); item += kRound) {
     const int rest = item - kRows * packs;
     if (rest < 0) {
       update.template operator()<4, ShWidth>(item / packs, item % packs);
@@ -173,7 +175,7 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
       if (debtor.row >= 0) pay_pack<Column, Width>(args, prepared.debts, debtor, pack);
     }
   };
-  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, pay);
+  for_each_pack<ShWidth, ShPacks>(args, pay);
 }
 
 template <int Column, int Width>
@@ -201,7 +203,7 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
     const std::int64_t row = args.ids ? args.ids[first + local] : first + local;
     step_pack<Column, Width>(args, step, row, first + local, pack);
   };
-  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, take_step);
+  for_each_pack<ShWidth, ShPacks>(args, take_step);
   __syncthreads();
   if (threadIdx.x >= count) return;
   const std::int64_t i = first + threadIdx.x, row = args.ids ? args.ids[i] : i;

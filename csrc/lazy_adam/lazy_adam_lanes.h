@@ -113,7 +113,7 @@ class AdamGather {
 
   void flush() {
     if (used_ == 0) return;
-    const bool step = job_.args.columns[0].grad != nullptr;
+    const bool step = job_.args.with_gradient();
     T p[kLanes] = {}, m[kLanes] = {}, v[kLanes] = {};
     for (int i = 0; i < used_; ++i) {
       p[i] = *from_[i].p;

@@ -2,6 +2,7 @@
 // What the ops that move parameters share: the checked tensors of the optimiser's state and schedule.
 #pragma once
 #include <optional>
+#include <utility>
 #include <vector>
 
 #include "common/op.h"
@@ -34,8 +35,13 @@ struct AdamTensors {
     check_floating(op, "means", like());
     for (int c = 0; c < kAdamColumns; ++c) {
       for (const Tensor* tensor : {&params[c], &exp_avgs[c], &exp_avg_sqs[c]}) check_column(*tensor, c);
-      STD_TORCH_CHECK(c != 1 || params[c].numel() == 4 * rows(), "blitzgs::", op,
-                      ": quats must have shape [*, 4], got ", shape_of(params[c]));
+    }
+    // A single parameter, of any width, is stepped as SH: the other columns are then empty.
+    const bool alone = params[0].numel() == 0;
+    for (const auto& [c, values] : {std::pair{0, 3}, std::pair{1, 4}, std::pair{2, 3}, std::pair{3, 1}}) {
+      STD_TORCH_CHECK(params[c].numel() == (alone ? 0 : values * rows()), "blitzgs::", op, ": ",
+                      kAdamNames[c], " must have ", alone ? 0 : values, " values in each of ", rows(),
+                      " rows, got ", shape_of(params[c]));
     }
     check_dtype(op, "last_step", last_step, ScalarType::Int);
     check_shape(op, "last_step", last_step, {rows()});

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a parameter's rows owe for steps without a gradient, where learning rates are known step by step."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from blitzgs.ops.lazy_adam import explicit_steps, schedule_table
+
+# csrc/lazy_adam/adam_table.h: a row has 4 orders of 6 groups, then powers and corrections. A parameter that
+# is stepped alone takes the place of SH, whose first three values have a group and the rest another.
+_ORDERS, _GROUPS, _OWN = 4, 6, slice(4, 6)
+_FIRST_CAPACITY = 1024
+
+
+class Drift:
+    """The tables of one parameter for the op, up to the step that was taken last.
+
+    The drift of a row from step p to step s is a sum over the steps between, so each step adds its term to
+    the rows of the steps before: as many as matter, after which the moments have decayed below rounding.
+
+    Attributes:
+        table: float64 [S + 1, 30], see csrc/lazy_adam/adam_table.h.
+        lr_table: float32 [S + 1, 6].
+        reach: for how many steps a row without a gradient moves.
+    """
+
+    def __init__(self, betas: tuple[float, float], dtype: torch.dtype, device: torch.device) -> None:
+        """Start without any step.
+
+        Args:
+            betas: decay rates of the moments.
+            dtype: of the parameter.
+            device: likewise.
+
+        Raises:
+            ValueError: decay rates outside their range.
+        """
+        self.betas = betas
+        self.reach = explicit_steps(*betas, dtype)
+        self.table = torch.zeros(0, _ORDERS * _GROUPS, dtype=torch.float64, device=device)
+        self.lr_table = torch.zeros(0, _GROUPS, device=device)
+        self._grow(_FIRST_CAPACITY)
+        ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
+        distances = np.arange(self.reach, 0, -1)[:, None]
+        decays = (ratio * root ** np.arange(_ORDERS)) ** distances
+        self._decays = torch.from_numpy(decays).to(device)[:, :, None]
+
+    def _grow(self, capacity: int) -> None:
+        device, known = self.lr_table.device, len(self.lr_table)
+        rates = torch.zeros(capacity + 1, _GROUPS)
+        # Without rates the tails are zero: what is left are the powers and corrections of the steps.
+        table, rates = schedule_table(rates, *self.betas).to(device), rates.to(device)
+        table[:known, : _ORDERS * _GROUPS] = self.table[:, : _ORDERS * _GROUPS]
+        rates[:known] = self.lr_table
+        self.table, self.lr_table = table, rates
+
+    def terms(self, step: int, lr: float, lr_rest: float) -> list[float]:
+        """Return what a step adds to the steps before it, and its rates: 10 numbers for `add`."""
+        beta1, beta2 = self.betas
+        lr, lr_rest = float(np.float32(lr)), float(np.float32(lr_rest))  # as in lr_table
+        first = 1 / (1 - beta1**step)
+        second = 1 / math.sqrt(-math.expm1(step * math.log(beta2)))
+        shares = [first * second ** (order - 1) for order in range(_ORDERS)]
+        return [share * rate for share in shares for rate in (lr, lr_rest)] + [lr, lr_rest]
+
+    def add(self, step: int, terms: Tensor) -> None:
+        """Take note of a step.
+
+        Args:
+            step: its number, from 1.
+            terms: float64 [10], from `terms`, on the device of the parameter.
+        """
+        if step >= len(self.lr_table):
+            self._grow(2 * step)
+        begin = max(0, step - self.reach)
+        tails = self.table[begin:step, : _ORDERS * _GROUPS].view(-1, _ORDERS, _GROUPS)[:, :, _OWN]
+        tails.addcmul_(self._decays[begin - step :], terms[: 2 * _ORDERS].view(1, _ORDERS, 2))
+        self.lr_table[step, _OWN] = terms[2 * _ORDERS :].float()

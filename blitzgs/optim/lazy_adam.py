@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adam for parameters of which each step gives a gradient to some rows: as cheap as these, exact for all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from blitzgs.optim.drift import Drift
+
+# Of the state of a parameter: the step that its rows' parameters, and their moments, stand at.
+_STEPS = ("last_step", "moment_step")
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class LazyAdam(torch.optim.Optimizer):
+    """`torch.optim.Adam` for tables of rows, at the cost of the rows that have a gradient.
+
+    A sparse gradient (`rasterization(..., sparse_grad=True)`) counts as zero in the rows it does not have.
+    Those rows are left behind: `catch_up` brings them, in closed form and whatever the number of steps, to
+    where `torch.optim.Adam` has them (csrc/lazy_adam/lazy_adam.h). It has to be called before they are read:
+    before a view is rendered, before a strategy looks at the parameters, and before evaluation. A dense
+    gradient has all rows, and the step is plain Adam's.
+
+    Parameters are [N, ...], contiguous, float32, or float64 on the CPU. Learning rates are rounded to
+    float32. A parameter of SH coefficients may give its first coefficient (three values a row) another
+    learning rate than the rest: see `lr_rest`.
+
+    Example::
+
+        optimizer = LazyAdam([
+            {"params": [means], "lr": 1.6e-4, "name": "means"},
+            {"params": [sh], "lr": 2.5e-3, "lr_rest": 1.25e-4, "name": "sh"},
+        ], eps=1e-15)
+        optimizer.catch_up()
+        rasterization(means, ..., sparse_grad=True)[0].sum().backward()
+        optimizer.step()
+        new = optimizer.keep(mask)  # {"means": Parameter, "sh": Parameter}
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ) -> None:
+        """Take parameters, or groups of them, as any optimiser of torch.
+
+        Args:
+            params: parameters, or dicts of them with options of their own: those below, `lr_rest` (the
+                learning rate of all but the first three values of a row; None: as `lr`) and `name`.
+            lr: learning rate; a scheduler may change it from step to step.
+            betas: decay rates of the moments, 0 <= beta1 < sqrt(beta2) < 1; fixed once a step was taken.
+            eps: added to the root of the second moment.
+
+        Raises:
+            ValueError: an option outside its range.
+        """
+        # By places of group and parameter: strategies replace parameters and rework all else of their state.
+        self._drifts: dict[tuple[int, int], Drift] = {}
+        super().__init__(params, {"lr": lr, "lr_rest": None, "betas": betas, "eps": eps})
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_drifts": self._drifts}
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Add parameters with options of their own, see `__init__`."""
+        super().add_param_group(param_group)
+        group = self.param_groups[-1]
+        beta1, beta2 = group["betas"]
+        if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 * beta1 < beta2):
+            raise ValueError(
+                f"LazyAdam: betas must satisfy 0 <= beta1 < sqrt(beta2) < 1, got {group['betas']}"
+            )
+        for name in ("lr", "lr_rest", "eps"):
+            if group[name] is not None and not group[name] >= 0:
+                raise ValueError(f"LazyAdam: {name} must be 0 or more, got {group[name]}")
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Take a step for the rows that have a gradient, which first catch up with the step before.
+
+        Args:
+            closure: computes the loss anew.
+
+        Returns:
+            What the closure returned.
+
+        Raises:
+            ValueError: a parameter or its state is not as the class says.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        stepped, terms = [], []
+        for place, group, param in self._placed():
+            if param.grad is None:
+                continue
+            state, drift = self._state_of(param), self._drift_of(place, group, param)
+            state["step"] += 1
+            rest = group["lr"] if group["lr_rest"] is None else group["lr_rest"]
+            terms.append(drift.terms(int(state["step"]), float(group["lr"]), float(rest)))
+            stepped.append((group, param, state, drift))
+        # One copy to a device for all its parameters.
+        on_device = {
+            device: torch.tensor(terms, dtype=torch.float64, device=device)
+            for device in {param.device for _, param, *_ in stepped}
+        }
+        for index, (group, param, state, drift) in enumerate(stepped):
+            drift.add(int(state["step"]), on_device[param.device][index])
+            self._step_one(group, param, state, drift)
+        return loss
+
+    def _step_one(self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift) -> None:
+        assert param.grad is not None
+        if param.grad.is_sparse:
+            if param.grad.sparse_dim() != 1:
+                raise ValueError(
+                    "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
+                    f"{param.grad.sparse_dim()} of them"
+                )
+            gradient = param.grad.coalesce()
+            ids, values = gradient.indices()[0].int(), gradient.values()
+        else:
+            ids = torch.arange(len(param), dtype=torch.int32, device=param.device)
+            values = param.grad
+        if param.numel() == 0 or len(ids) == 0:
+            return
+        torch.ops.blitzgs.lazy_adam_step_(
+            *_alone(param, state), _with_nothing(values), ids, state["last_step"], state["moment_step"],
+            drift.table, drift.lr_table, int(state["step"]), drift.reach, *drift.betas, group["eps"], False,
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def catch_up(self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None) -> None:
+        """Bring rows that had no gradient of late to where Adam has them, to be read.
+
+        Costs a look at the steps the rows stand at, and work for those that are behind and still move.
+
+        Args:
+            params: which of the parameters; None: all.
+            rows: int32 [A], which of their rows, each once; None: all.
+        """
+        chosen = None if params is None else {id(param) for param in params}
+        for place, group, param in self._placed():
+            if not self.state.get(param) or param.numel() == 0:
+                continue
+            if chosen is not None and id(param) not in chosen:
+                continue
+            state, drift = self._state_of(param), self._drift_of(place, group, param)
+            torch.ops.blitzgs.lazy_adam_catch_up_(
+                *_alone(param, state), rows, state["last_step"], state["moment_step"], drift.table,
+                drift.lr_table, int(state["step"]), drift.reach, *drift.betas, group["eps"], None,
+            )  # fmt: skip
+
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Bring all rows and their moments to where `torch.optim.Adam` has them."""
+        self.catch_up()
+        for _, group, param in self._placed():
+            if not self.state.get(param):
+                continue
+            state = self._state_of(param)
+            behind = (int(state["step"]) - state["moment_step"]).double()
+            behind = behind.view(-1, *(1,) * (param.dim() - 1))
+            for name, beta in zip(_MOMENTS, group["betas"], strict=True):
+                state[name] *= (beta**behind).to(param.dtype)
+            for name in _STEPS:
+                state[name].fill_(int(state["step"]))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Settle all rows and return the state as `torch.optim.Adam` has it: step, exp_avg, exp_avg_sq."""
+        self.settle()
+        packed = super().state_dict()
+        packed["state"] = {
+            index: {name: value for name, value in state.items() if name not in _STEPS}
+            for index, state in packed["state"].items()
+        }
+        return packed
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over a state of this class or of `torch.optim.Adam`; parameters as they were then."""
+        super().load_state_dict(state_dict)
+        self._drifts.clear()
+        for _, group, param in self._placed():
+            group.setdefault("lr_rest", None)
+            state = self.state.get(param)
+            if state:
+                state["step"] = torch.tensor(float(state["step"]))
+                stand = torch.full((len(param),), int(state["step"]), dtype=torch.int32, device=param.device)
+                state.update({name: stand.clone() for name in _STEPS})
+
+    def append(self, rows: Mapping[str, Tensor]) -> dict[str, Parameter]:
+        """Add rows at the end of every parameter; their moments are zero.
+
+        Args:
+            rows: [M, ...] for the `name` of every group.
+
+        Returns:
+            The new parameters by name, which take the place of the old ones here.
+
+        Raises:
+            ValueError: names or shapes that do not fit.
+        """
+        named = self._named()
+        if rows.keys() != named.keys():
+            raise ValueError(f"LazyAdam.append: rows for {sorted(named)} are needed, got {sorted(rows)}")
+        counts = {len(new) for new in rows.values()}
+        if len(counts) != 1:
+            raise ValueError(f"LazyAdam.append: the numbers of new rows differ: {sorted(counts)}")
+        (count,) = counts
+
+        def grow(name: str, old: Tensor) -> Tensor:
+            return torch.cat([old, rows[name].to(old)])
+
+        def grow_state(old: Tensor) -> Tensor:
+            return torch.cat([old, old.new_zeros(count, *old.shape[1:])])
+
+        return self._renew(named, grow, grow_state)
+
+    def keep(self, mask: Tensor) -> dict[str, Parameter]:
+        """Keep the rows where `mask`, bool [N], is true; returns as `append`."""
+        if mask.dtype != torch.bool:
+            raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
+        return self.permute(mask.nonzero()[:, 0])
+
+    def permute(self, order: Tensor) -> dict[str, Parameter]:
+        """Reorder rows: row i becomes the old row `order[i]`, int64 [N'], each at most once; as `append`."""
+        return self._renew(self._named(), lambda _, old: old[order], lambda old: old[order])
+
+    @torch.no_grad()
+    def _renew(
+        self,
+        named: dict[str, dict[str, Any]],
+        of_param: Callable[[str, Tensor], Tensor],
+        of_state: Callable[[Tensor], Tensor],
+    ) -> dict[str, Parameter]:
+        self.catch_up()
+        renewed = {}
+        for name, group in named.items():
+            old = group["params"][0]
+            new = Parameter(of_param(name, old.detach()), requires_grad=old.requires_grad)
+            state = self.state.pop(old, None)
+            if state:
+                for key in (*_MOMENTS, *_STEPS):
+                    state[key] = of_state(state[key])
+                self.state[new] = state
+            group["params"] = [new]
+            renewed[name] = new
+        return renewed
+
+    def _named(self) -> dict[str, dict[str, Any]]:
+        """Return the groups by name.
+
+        Raises:
+            ValueError: a group has no name of its own, or several parameters.
+        """
+        named = {group.get("name"): group for group in self.param_groups if len(group["params"]) == 1}
+        if None in named or len(named) != len(self.param_groups):
+            raise ValueError(
+                "LazyAdam: to change rows, each group needs one parameter and a 'name' of its own"
+            )
+        return named  # type: ignore[return-value]
+
+    def _placed(self) -> Iterator[tuple[tuple[int, int], dict[str, Any], Tensor]]:
+        """Iterate over parameters with their places and groups."""
+        for g, group in enumerate(self.param_groups):
+            for p, param in enumerate(group["params"]):
+                yield (g, p), group, param
+
+    def _drift_of(self, place: tuple[int, int], group: dict[str, Any], param: Tensor) -> Drift:
+        """Return the drift of the rows of the parameter at a place, made on first use."""
+        betas = tuple(group["betas"])
+        drift = self._drifts.get(place)
+        if drift is None:
+            drift = self._drifts[place] = Drift(betas, param.dtype, param.device)
+        if drift.betas != betas:
+            raise ValueError(f"LazyAdam: betas cannot change from {drift.betas} to {betas} after a step")
+        return drift
+
+    def _state_of(self, param: Tensor) -> dict[str, Any]:
+        """Return the state of a parameter, made on first use, mended where a strategy has added rows."""
+        state: dict[str, Any] = self.state[param]
+        if not param.is_contiguous():
+            raise ValueError(
+                f"LazyAdam: a parameter of shape {list(param.shape)} is not contiguous; clone it"
+            )
+        if not state:
+            state["step"] = torch.tensor(0.0)
+            state.update({name: torch.zeros_like(param) for name in _MOMENTS})
+            steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
+            state.update({name: steps.clone() for name in _STEPS})
+        for name in _STEPS:
+            # gsplat's strategies append zeros in float, which is right for rows whose moments are zero.
+            if state[name].dtype != torch.int32:
+                state[name] = state[name].int()
+        for name in (*_MOMENTS, *_STEPS):
+            if len(state[name]) != len(param):
+                raise ValueError(
+                    f"LazyAdam: a parameter has {len(param)} rows and its {name} {len(state[name])}; change "
+                    "both together (append, keep, permute)"
+                )
+        return state
+
+
+def _alone(param: Tensor, state: dict[str, Any]) -> tuple[list[Tensor], ...]:
+    """Return a parameter and its moments as the op takes tables: as SH, without the other columns."""
+    return tuple(_with_nothing(values) for values in (param.detach(), *(state[name] for name in _MOMENTS)))
+
+
+def _with_nothing(values: Tensor) -> list[Tensor]:
+    return [values.new_empty(len(values), 0)] * 4 + [values]

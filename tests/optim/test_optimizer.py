@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.optim.LazyAdam` against `torch.optim.Adam`, which gets zeros where there is no gradient."""
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+
+from blitzgs.optim import LazyAdam
+from tests.helpers import BACKENDS, DEVICES, relative_error
+
+SHAPES = {"means": (3,), "quats": (4,), "opacities": (), "sh": (16, 3), "features": (7,)}
+LR = 2.0**-7  # a float32, as LazyAdam rounds learning rates to
+BOUND = {torch.float32: 3e-5, torch.float64: 1e-11}
+
+
+class Pair:
+    """The same parameters under both optimisers; gradients of a few rows at a time."""
+
+    def __init__(self, backend, rows=60, lr=LR, **options):
+        self.device, self.dtype = backend
+        self.generator = torch.Generator().manual_seed(0)
+        start = {name: self.normal(rows, *shape) for name, shape in SHAPES.items()}
+        self.lazy, self.dense = ({k: v.clone().requires_grad_() for k, v in start.items()} for _ in range(2))
+        self.ours = LazyAdam(self.groups(self.lazy, lr), **options)
+        self.torchs = torch.optim.Adam(self.groups(self.dense, lr), **options)
+
+    def groups(self, params, lr):
+        return [
+            {"params": [p], "lr": lr * (1 + i), "name": name} for i, (name, p) in enumerate(params.items())
+        ]
+
+    def normal(self, *shape):
+        return torch.randn(*shape, generator=self.generator, dtype=torch.float64).to(self.device, self.dtype)
+
+    def step(self, share=0.3, dense=False):
+        rows = len(self.dense["means"])
+        ids = (torch.rand(rows, generator=self.generator) < share).nonzero()[:, 0].to(self.device)
+        for name, shape in SHAPES.items():
+            # From large to so small that eps matters.
+            values = self.normal(len(ids), *shape) * 10.0 ** (
+                -8 * torch.rand(1, generator=self.generator).item()
+            )
+            full = torch.zeros_like(self.dense[name]).index_copy_(0, ids, values)
+            self.dense[name].grad = full
+            sparse = torch.sparse_coo_tensor(ids[None], values, full.shape, is_coalesced=True)
+            self.lazy[name].grad = full.clone() if dense else sparse
+        self.ours.step()
+        self.torchs.step()
+
+    def require_equal(self):
+        self.ours.catch_up()
+        for name in SHAPES:
+            assert relative_error(self.lazy[name], self.dense[name]) < BOUND[self.dtype], name
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "options", [{}, {"eps": 1e-15}, {"betas": (0.5, 0.9)}, {"betas": (0.0, 0.99)}], ids=str
+)
+def test_it_is_dense_adam(backend, options):
+    pair = Pair(backend, **options)
+    for _ in range(12):
+        pair.step(0.2)
+    pair.require_equal()
+    for _ in range(12):
+        pair.step(0.05)
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rows_may_be_behind_for_long(backend):
+    pair = Pair(backend, rows=30)
+    pair.step(1.0)
+    for _ in range(1100):  # more than there are tables for at first
+        pair.step(0.02)
+    pair.require_equal()
+
+
+def test_learning_rates_follow_a_scheduler():
+    pair = Pair(("cpu", torch.float64))
+    decays = [torch.optim.lr_scheduler.ExponentialLR(o, 0.5) for o in (pair.ours, pair.torchs)]
+    for _ in range(12):
+        pair.step(0.1)
+        for decay in decays:
+            decay.step()
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_first_values_of_a_row_may_have_a_rate_of_their_own(device):
+    generator = torch.Generator().manual_seed(1)
+    start = torch.randn(20, 16, 3, generator=generator).to(device)
+    sh, dc, rest = (t.clone().requires_grad_() for t in (start, start[:, :1], start[:, 1:]))
+    whole = LazyAdam([{"params": [sh], "lr": 1e-2, "lr_rest": 1e-3}])
+    split = torch.optim.Adam([{"params": [dc], "lr": 1e-2}, {"params": [rest], "lr": 1e-3}])
+    for _ in range(10):
+        gradient = torch.randn(20, 16, 3, generator=generator).to(device)
+        gradient[torch.rand(20, generator=generator) < 0.7] = 0
+        sh.grad = gradient.to_sparse(1)
+        dc.grad, rest.grad = gradient[:, :1].clone(), gradient[:, 1:].clone()
+        whole.step()
+        split.step()
+    whole.catch_up()
+    assert relative_error(sh, torch.cat([dc, rest], 1)) < 3e-5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_dense_gradients_and_missing_ones(backend):
+    pair = Pair(backend)
+    for number in range(9):
+        pair.step(0.3, dense=number % 3 == 0)
+        if number == 4:  # a step that one parameter has no part in
+            for params in (pair.lazy, pair.dense):
+                for name, param in params.items():
+                    param.grad = None if name == "quats" else torch.ones_like(param)
+            pair.ours.step()
+            pair.torchs.step()
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rows_are_added_kept_and_reordered(backend):
+    pair = Pair(backend)
+
+    def renew_dense(of_row):
+        for group in pair.torchs.param_groups:
+            (old,) = group["params"]
+            state = pair.torchs.state.pop(old)
+            new = torch.nn.Parameter(of_row(group["name"], old.detach()))
+            for key in ("exp_avg", "exp_avg_sq"):
+                state[key] = of_row(None, state[key])
+            pair.torchs.state[new] = state
+            group["params"], pair.dense[group["name"]] = [new], new
+
+    for _ in range(8):
+        pair.step(0.2)
+    new = {name: pair.normal(9, *shape) for name, shape in SHAPES.items()}
+    pair.lazy = pair.ours.append(new)
+    renew_dense(lambda name, old: torch.cat([old, new[name] if name else old.new_zeros(9, *old.shape[1:])]))
+    for _ in range(8):
+        pair.step(0.2)
+    mask = torch.rand(69, generator=pair.generator).to(pair.device) < 0.6
+    pair.lazy = pair.ours.keep(mask)
+    renew_dense(lambda _, old: old[mask])
+    for _ in range(8):
+        pair.step(0.2)
+    order = torch.randperm(int(mask.sum()), generator=pair.generator).to(pair.device)
+    pair.lazy = pair.ours.permute(order)
+    renew_dense(lambda _, old: old[order])
+    pair.step(0.2)
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_state_is_that_of_adam(backend):
+    """It goes from one to the other and back; training continues as if nothing had happened."""
+    pair = Pair(backend)
+    for _ in range(10):
+        pair.step(0.2)
+    saved = io.BytesIO()
+    torch.save(pair.ours.state_dict(), saved)
+    saved.seek(0)
+    ours, adams = torch.load(saved), pair.torchs.state_dict()
+    for index, state in adams["state"].items():
+        assert ours["state"][index].keys() == state.keys()
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert relative_error(ours["state"][index][key], state[key]) < BOUND[pair.dtype]
+    pair.require_equal()
+    pair.torchs.load_state_dict({**adams, "state": ours["state"]})
+    pair.ours = LazyAdam(pair.groups(pair.lazy, LR))
+    pair.ours.load_state_dict(adams)
+    for _ in range(10):
+        pair.step(0.2)
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_continues(copy_of):
+    pair = Pair(("cpu", torch.float64))
+    for _ in range(5):
+        pair.step(0.3)
+    pair.ours = copy_of(pair.ours)
+    pair.lazy = {group["name"]: group["params"][0] for group in pair.ours.param_groups}
+    for _ in range(5):
+        pair.step(0.3)
+    pair.require_equal()
+
+
+def test_catching_up_some_rows_of_some_parameters():
+    pair = Pair(("cpu", torch.float64))
+    pair.step(1.0)
+    for _ in range(5):
+        pair.step(0.0)
+    before = {name: param.detach().clone() for name, param in pair.lazy.items()}
+    rows = torch.tensor([3, 7], dtype=torch.int32)
+    pair.ours.catch_up([pair.lazy["means"]], rows)
+    moved = (pair.lazy["means"] != before["means"]).any(dim=1).nonzero()[:, 0]
+    assert moved.tolist() == [3, 7]
+    assert relative_error(pair.lazy["means"][rows], pair.dense["means"][rows]) < 1e-11
+    assert torch.equal(pair.lazy["sh"], before["sh"])
+    pair.require_equal()
+
+
+def test_a_closure_computes_the_loss():
+    param = torch.ones(4, 3, requires_grad=True)
+    optimizer = LazyAdam([param], lr=0.1)
+
+    def closure():
+        optimizer.zero_grad()
+        loss = param.square().sum()
+        loss.backward()
+        return loss
+
+    first = optimizer.step(closure).item()
+    assert optimizer.step(closure).item() < first == 12.0
+
+
+def test_wrong_use_is_refused():
+    param = torch.ones(4, 3, requires_grad=True)
+    with pytest.raises(ValueError, match=r"betas must satisfy .* got \(0.99, 0.9\)"):
+        LazyAdam([param], betas=(0.99, 0.9))
+    with pytest.raises(ValueError, match="lr must be 0 or more, got -1"):
+        LazyAdam([param], lr=-1)
+    optimizer = LazyAdam([{"params": [param], "name": "means"}])
+    with pytest.raises(ValueError, match=r"rows for \['means'\] are needed, got \['x'\]"):
+        optimizer.append({"x": torch.ones(1, 3)})
+    with pytest.raises(ValueError, match="mask must be bool"):
+        optimizer.keep(torch.ones(4))
+    with pytest.raises(ValueError, match="one parameter and a 'name' of its own"):
+        LazyAdam([param]).keep(torch.ones(4, dtype=torch.bool))
+    param.grad = torch.ones_like(param)
+    optimizer.step()
+    optimizer.param_groups[0]["betas"] = (0.5, 0.9)
+    with pytest.raises(ValueError, match=r"betas cannot change from \(0.9, 0.999\) to \(0.5, 0.9\)"):
+        optimizer.step()
+    optimizer.param_groups[0]["betas"] = (0.9, 0.999)
+    optimizer.state[param]["exp_avg"] = torch.zeros(5, 3)
+    with pytest.raises(ValueError, match="a parameter has 4 rows and its exp_avg 5"):
+        optimizer.step()
