@@ -24,6 +24,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash
 from blitzgs.training.events import evaluate, handle, save
 from blitzgs.training.guard import LossGuard
+from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.setup import set_up
@@ -61,6 +62,7 @@ class Trainer:
             state.owners if ranks.world_size > 1 else None,
         )
         self._guard = LossGuard()
+        self._memory = MemoryMeter()
 
     @torch.no_grad()
     def train(self) -> dict[str, Any] | None:
@@ -142,6 +144,7 @@ class Trainer:
         state.stepped(step, degree)
         if measured is not None:
             log_step(state, measured, batch, names, sums)
+            self._memory.sample(state.ranks.device)
 
     def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
         """Add a step's screen-space gradients to the statistics that density control reads."""
@@ -182,18 +185,22 @@ class Trainer:
         with StopRequest() as stop:
             agreement = Agreement(state.ranks, stop, state.save_clock)
             save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
+        population = population_report(state, self._memory)
+        state.log.event(state.images_seen, "population", population, describe(population))
         summary = evaluate.run(state) | {
             "images": state.images_seen,
             "seconds": state.progress.seconds,
             "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
             "gaussians": state.population(),
             "peak_gaussians": state.progress.peak_gaussians,
+            "population": population,
             "peak_memory_bytes": run.peak_memory_bytes(state.ranks.device),
             "config_hash": config_hash(state.config),
             "run": state.run_id,
             "versions": run.versions(state.ranks.device),
         }
         if state.ranks.rank == 0:
+            write_picture(state, population)
             try:
                 write_file(state.folder / run.SUMMARY, json.dumps(summary, indent=1))
             except OSError as error:

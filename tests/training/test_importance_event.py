@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -67,6 +68,26 @@ def test_what_the_passes_keep(whole_run):
     }
     culled = torch.stack([is_culled(table[CULL], v) for v in range(7)])
     assert culled.any() and not culled.all()
+
+
+def test_the_population_is_reported(whole_run):
+    folder, trainer, summary = whole_run
+    report, milestones = summary["population"], trainer.state.progress.milestones
+    assert list(report)[:7] == [
+        "initial", "before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2", "final",
+    ]  # fmt: skip
+    assert {name: report[name] for name in milestones} == milestones
+    assert report["final"] == summary["gaussians"] and report["peak"] == summary["peak_gaussians"]
+    assert len(report["peak_memory_bytes"]) == 1 and report["peak_memory_bytes"][0] > 0
+    picture = ElementTree.parse(folder / "population.svg").getroot()
+    (line,) = picture.iter("{http://www.w3.org/2000/svg}polyline")
+    points = [tuple(map(float, p.split(","))) for p in line.get("points").split()]
+    # The start, density events at 20, 40, 60 and 80, before and after each pass, and the end.
+    assert len(points) == 1 + 4 + 4 + 1
+    assert points == sorted(points, key=lambda point: point[0])
+    # Upwards is smaller; the first pass drops from 40's peak, at one time.
+    (x1, top), (x2, low) = points[3:5]
+    assert x1 == x2 and low > top
 
 
 def test_resume_is_exact_and_carries_the_columns(whole_run, tmp_path, monkeypatch):
