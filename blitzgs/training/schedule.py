@@ -96,7 +96,7 @@ class Schedule:
         """Tabulate the learning rates of the whole run.
 
         The position rate falls exponentially from `position` to `position_final` over `position_decay`
-        images, both times `extent`; every rate is multiplied by sqrt(B).
+        images, both times `extent`; with `position` 0 it stays 0. Every rate is multiplied by sqrt(B).
 
         Args:
             config: the rates for B = 1.
@@ -107,7 +107,8 @@ class Schedule:
         """
         begin = torch.arange(self.steps, dtype=torch.float64) * self.batch_size
         progress = (begin / (self._config.position_decay * self._config.scale)).clamp(max=1.0)
-        position = config.position * (config.position_final / config.position) ** progress * extent
+        fall = config.position_final / config.position if config.position > 0 else 0.0
+        position = config.position * fall**progress * extent
         constants = (config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest)
         table = torch.zeros(self.steps + 1, len(RATES), dtype=torch.float64)
         table[1:, 0] = position

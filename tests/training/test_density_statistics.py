@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The statistics that density control reads, as training gathers them, against autograd in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.ops.photometric import photometric_loss
+from blitzgs.reference import render
+from blitzgs.training.trainer import Trainer
+from tests.training.tiny import HEIGHT, WIDTH, tiny_config, tiny_scene
+
+STATISTICS = ("grad_sum", "grad_count", "max_radii")
+# Nothing grows or is reset within the steps of a test; statistics gather.
+QUIET = (
+    "schedule.iterations=200",
+    "schedule.densify_from=150",
+    "schedule.densify_until=180",
+    "schedule.sh_every=2",
+    "model.antialiased=true",
+)
+STILL = [f"optimiser.{name}=0" for name in ("position", "sh_dc", "sh_rest", "opacity", "scale", "rotation")]
+
+
+def make_trainer(folder, *overrides) -> Trainer:
+    """A trainer of eight training views, each of which sees a part of the Gaussians."""
+    scene, images = tiny_scene()
+    scene.train, scene.test = list(range(8)), []
+    for camera in scene.cameras:
+        camera.K = camera.K * np.array([[2.5, 1, 1], [1, 2.5, 1], [1, 1, 1]])
+    trainer = Trainer(tiny_config(*QUIET, *overrides), scene, images, folder, Ranks())
+    trainer.state.start_clock()
+    return trainer
+
+
+def take_steps(trainer: Trainer, count: int) -> None:
+    """Take the next steps without events."""
+    with torch.no_grad():
+        for _ in range(count):
+            trainer.step(trainer.state.progress.step + 1)
+
+
+def of_one_view(trainer: Trainer, index: int, sh_degree: int) -> tuple[torch.Tensor, ...]:
+    """Return gradient norm (half images), visibility and radius of each Gaussian in a view, by autograd."""
+    state, table = trainer.state, trainer.state.table
+    views = state.views.pick([index])
+    model, extent = state.config.model, state.space.extent
+    image = render(
+        table["means"].double().requires_grad_(),
+        table["quats"],
+        table["scales"].double().exp(),
+        table["opacities"].double().sigmoid(),
+        table["sh"],
+        views.viewmats[0],
+        views.Ks[0],
+        WIDTH,
+        HEIGHT,
+        sh_degree=sh_degree,
+        near_plane=model.near * extent,
+        eps2d=model.eps2d,
+        antialiased=model.antialiased,
+    )
+    loss = photometric_loss(image.image[None], state.images.get(index)[None], None, state.config.loss.ssim)
+    (gradient,) = torch.autograd.grad(loss.sum(), image.splats.means2d)
+    splats, count = image.splats, len(table)
+    norms, seen, radii = torch.zeros(count).double(), torch.zeros(count).bool(), torch.zeros(count).double()
+    norms[splats.ids] = (gradient * torch.tensor([WIDTH / 2, HEIGHT / 2])).norm(dim=1)
+    a, b, c = splats.conics.detach().unbind(dim=1)
+    # A Gaussian counts where the box around alpha >= 1/255 overlaps the image.
+    sigmas = (2 * (255 * splats.opacities.detach()).clamp(min=1).log()).sqrt()
+    spread = torch.stack([c, a], dim=1) / (a * c - b * b)[:, None]
+    half, size = sigmas[:, None] * spread.sqrt(), torch.tensor([WIDTH, HEIGHT])
+    centres = splats.means2d.detach()
+    seen[splats.ids] = ((centres + half > 0) & (centres - half < size)).all(dim=1) & (sigmas > 0)
+    # 3 sigma along the longer axis; INRIA's renderer takes round splats for a little larger than they are.
+    half_trace = spread.sum(dim=1) / 2
+    gap = (half_trace**2 - 1 / (a * c - b * b)).clamp(min=0.1)
+    radii[splats.ids] = 3 * (half_trace + gap.sqrt()).sqrt()
+    return norms, seen, radii
+
+
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_they_are_those_of_autograd(tmp_path, batch_size):
+    """Over several steps that change the Gaussians, through loss, compositing and projection."""
+    trainer = make_trainer(tmp_path, f"schedule.batch_size={batch_size}")
+    table, steps = trainer.state.table, 4
+    sums, counts = torch.zeros(len(table)).double(), torch.zeros(len(table)).int()
+    radii = torch.zeros(len(table)).double()
+    batches = []
+    get = trainer._loader.get
+    trainer._loader.get = lambda *step: batches.append(get(*step)) or batches[-1]
+    for step in range(steps):
+        before = {name: table[name].clone() for name in table}
+        take_steps(trainer, 1)
+        after = {name: table[name].clone() for name in table}
+        for name in table:  # as the step saw it
+            table[name].copy_(before[name])
+        trainer.state.optimiser.catch_up(table, None, step)
+        degree = trainer.state.schedule.sh_degree(step * batch_size, 3)
+        for index in batches[step].indices:
+            norms, seen, reach = of_one_view(trainer, index, degree)
+            sums += norms
+            counts += seen
+            radii = torch.maximum(radii, reach.where(seen, 0))
+        for name in table:
+            table[name].copy_(after[name])
+    assert len(set(sum((batch.indices for batch in batches), []))) == min(8, steps * batch_size)
+    assert trainer.state.progress.sh_degree > 0
+    assert counts.max() == steps * batch_size and counts.min() < counts.max()
+    assert torch.equal(table["grad_count"], counts)
+    error = (table["grad_sum"] - sums).abs() / sums.mean()
+    # Where rounding decides whether a splat covers a pixel, the few splats of that pixel feel it.
+    assert error.median() < 1e-6 and error.quantile(0.9) < 2e-5 and error.max() < 0.02
+    excess = table["max_radii"] - radii  # rounded up to whole pixels
+    assert excess.min() > -1e-3 and excess.max() < 1 + 1e-3
+    trainer.close()
+
+
+@pytest.mark.parametrize("batch_size", [2, 4, 8])
+def test_they_do_not_depend_on_the_batch_size(tmp_path, batch_size):
+    """The gradients of a view's own loss, added up: METHOD, section 3. With the Gaussians standing still."""
+    tables = {}
+    for size in (1, batch_size):
+        trainer = make_trainer(tmp_path / str(size), f"schedule.batch_size={size}", *STILL)
+        # Two epochs in which every view has its turn, at degrees that do not depend on the step's length.
+        trainer.state.schedule.sh_degree = lambda begin, limit: limit
+        take_steps(trainer, 16 // size)
+        tables[size] = trainer.state.table
+        trainer.close()
+    one, several = tables[1], tables[batch_size]
+    assert torch.equal(one["means"], several["means"]) and one["grad_sum"].max() > 0
+    assert torch.equal(one["grad_count"], several["grad_count"])
+    assert torch.equal(one["max_radii"], several["max_radii"])
+    torch.testing.assert_close(one["grad_sum"], several["grad_sum"], rtol=1e-5, atol=1e-9)
