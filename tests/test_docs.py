@@ -12,6 +12,7 @@ import pytest
 from blitzgs import cli
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import load_config, to_dict
+from tests.training.tiny import OVERRIDES, write_tiny_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
@@ -185,25 +186,12 @@ def test_commands_are_used_rightly(name, tmp_path, monkeypatch, capsys):
 
 
 def test_the_python_example_of_the_readme_runs(tmp_path, monkeypatch):
-    import torch
-
-    from blitzgs.formats.ply import write_ply
-
-    example = next(block for block in code_blocks(ROOT / "README.md", ["python"]) if "read_ply" in block)
-    g = torch.Generator().manual_seed(0)
-    n = 50
-    write_ply(
-        tmp_path / "city.ply",
-        means=(40 * torch.randn(n, 3, generator=g)).double(),
-        quats=torch.randn(n, 4, generator=g),
-        scales=torch.full((n, 3), 1.0),
-        opacities=torch.full((n,), 3.0),
-        sh=torch.rand(n, 16, 3, generator=g),
-    )
+    example = next(block for block in code_blocks(ROOT / "README.md", ["python"]) if "open_run" in block)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs" / "demo").mkdir(parents=True)
-    (tmp_path / "city.ply").rename(tmp_path / "runs" / "demo" / "city.ply")
+    write_tiny_capture(tmp_path / "capture")
+    flags = ["--data", "capture", "--out", "runs/demo/run", "--device", "cpu", *(f"--{o}" for o in OVERRIDES)]
+    assert cli.main(["train", *flags]) == 0
     names = {}
     exec(compile(example, "README.md", "exec"), names)
-    assert names["renders"].shape == (1, 600, 800, 3) and names["alphas"].max() > 0.9
-    assert (tmp_path / "from_above.png").stat().st_size > 10_000
+    assert names["image"].shape == (600, 800, 3)
+    assert (tmp_path / "from_above.png").stat().st_size > 1000
