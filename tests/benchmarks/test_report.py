@@ -2,6 +2,8 @@
 """Pages of figures match the results of one commit, and what benchmarks write is what the report reads."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -171,6 +173,17 @@ def test_a_benchmark_notes_what_the_report_needs(tmp_path, monkeypatch):
     command = "python benchmarks/bm_photometric.py --device cpu --height 20 --width 30 --repeats 1"
     assert f"`{command}`" in page and "| 1 view(s) of 30 × 20 | ms | byte floor, ms |" in page
     assert page.count("\n| ") == 6
+
+
+def test_the_exchange_benchmark_writes_what_the_report_reads(tmp_path):
+    flags = "--gaussians 2000 --ranks 2 --batch 1 --batches 1 --visits 1 --device cpu"
+    path = tmp_path / "exchange.json"
+    command = [sys.executable, "benchmarks/bm_exchange.py", *flags.split(), "--json", str(path)]
+    subprocess.run(command, cwd=report.ROOT, env=os.environ | {"BLITZGS_COMMIT": "abc"}, check=True)
+    page = made(tmp_path, "exchange")
+    assert f"`python benchmarks/bm_exchange.py {flags}`" in page and "commit abc" in page
+    for line in ("| project | ", "| optimiser | ", "| **steps in a row** | ", "| MB between ranks | 0 |"):
+        assert f"\n{line}" in page
 
 
 def test_the_commit_is_that_of_the_checkout(monkeypatch):
