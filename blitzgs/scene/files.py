@@ -78,7 +78,7 @@ def _mega_nerf_mapping(root: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     mapping = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
         if not line.strip():
             continue
         original, separator, metadata = line.rpartition(",")

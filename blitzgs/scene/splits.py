@@ -28,7 +28,7 @@ def from_list(names: Sequence[str], path: Path) -> list[int]:
         for key in {name, pure.name, pure.stem, str(pure.with_suffix(""))}:
             lookup.setdefault(key, set()).add(index)
     test: set[int] = set()
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
         entry = line.split("#")[0].strip()
         if not entry:
             continue

@@ -67,7 +67,7 @@ def read_transforms(root: Path) -> Transforms:
     points_path = None
     for path in find_transforms(root):
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(path.read_text(encoding="utf-8-sig"))
             entries = content["frames"]
             if not isinstance(entries, list):
                 raise TypeError("'frames' is not a list")

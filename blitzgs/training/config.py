@@ -18,7 +18,8 @@ class DataConfig:
         path: folder of the capture.
         images: image folder inside the capture.
         downscale: integer factor by which images are reduced (1: as they are).
-        masks: mask folder inside the capture; null uses `masks/` where there is one.
+        masks: mask folder inside the capture; null uses `masks/` where there is one, true requires it, false
+            uses none.
         split: which views are held out: a number n (every n-th), "val" (Mega-NeRF's `val/` layout), a text
             file with one image name a line, or "auto": `val/` where there is one, else every 8th.
         undistort: where a distorted image does not fill its pinhole image: "crop" or "mask".
@@ -32,7 +33,7 @@ class DataConfig:
     path: str = ""
     images: str = "images"
     downscale: int = 1
-    masks: str | None = None
+    masks: str | bool | None = None
     split: str = "auto"
     undistort: str = "crop"
     exif: str = "auto"

@@ -7,18 +7,17 @@ import dataclasses
 import difflib
 import hashlib
 import json
-import math
 import types
 import typing
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import yaml
 
-from blitzgs.distributed.group import Transport
 from blitzgs.output import write_file
 from blitzgs.training.config import Config
+from blitzgs.training.config_ranges import problems
 
 
 class ConfigError(ValueError):
@@ -44,11 +43,13 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
         if not equals:
             raise ConfigError(f"'{text}' is not an override: write --section.field=value")
         try:
-            _merge(values, _nest(name.split("."), yaml.safe_load(value)), name)
-        except yaml.YAMLError as error:
+            parsed = yaml.safe_load(value)
+        except _UNREADABLE as error:
             raise ConfigError(f"{name}: cannot read the value '{value}': {error}") from error
+        _merge(values, _nest(name.split("."), parsed), name)
     config: Config = _build(Config, values, "")
-    _check(config)
+    for problem in problems(config):
+        raise ConfigError(problem)
     return config
 
 
@@ -74,15 +75,33 @@ def config_hash(config: Config) -> str:
     return hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode()).hexdigest()[:16]
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML without the trap that of two equal keys the first is silently forgotten."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Build a mapping as the parent class does; a key that is there twice is an error."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                text = f"'{key.value}' is there twice"
+                raise yaml.MarkedYAMLError(problem=text, problem_mark=key.start_mark)
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
+
+
+# What PyYAML raises for text that is no YAML, or that no Python value can hold.
+_UNREADABLE = (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError)
+
+
 def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
     path = path.resolve()
     if path in seen:
         raise ConfigError(f"{path}: 'base' leads back to the same file")
     try:
-        values = yaml.safe_load(path.read_text()) or {}
+        values = yaml.load(path.read_text(encoding="utf-8-sig"), _Loader) or {}
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except _UNREADABLE as error:
         raise ConfigError(f"{path}: not valid YAML: {error}") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: must hold sections, got {type(values).__name__}")
@@ -133,8 +152,8 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
         return _build(typing.cast(type, hint), value, path)
     origin, options = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        if value is None:
-            return None
+        if value is None or (isinstance(value, bool) and bool in options):
+            return value
         return _convert(next(option for option in options if option is not type(None)), value, path)
     if origin is tuple:
         if not isinstance(value, (list, tuple)) or len(value) != len(options):
@@ -161,75 +180,3 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
 
 def _kind(hint: type) -> str:
     return {int: "an integer", float: "a number", bool: "true or false", str: "text"}.get(hint, hint.__name__)
-
-
-def _check(config: Config) -> None:
-    schedule, population = config.schedule, config.population
-    rules = [
-        (0 <= config.model.sh_degree <= 3, "model.sh_degree", config.model.sh_degree, "0, 1, 2 or 3"),
-        (0 < config.model.near < config.model.far, "model.near", config.model.near, "positive and below far"),
-        (
-            0 < config.model.initial_opacity < 1,
-            "model.initial_opacity",
-            config.model.initial_opacity,
-            "between 0 and 1",
-        ),
-        (config.data.downscale >= 1, "data.downscale", config.data.downscale, "1 or more"),
-        (config.data.threads >= 1, "data.threads", config.data.threads, "1 or more"),
-        (config.data.prefetch >= 0, "data.prefetch", config.data.prefetch, "0 or more"),
-        (config.lod.fork > 1, "lod.fork", config.lod.fork, "above 1"),
-        (schedule.iterations >= 1, "schedule.iterations", schedule.iterations, "1 or more"),
-        (schedule.scale > 0, "schedule.scale", schedule.scale, "positive"),
-        (1 <= schedule.batch_size <= 32, "schedule.batch_size", schedule.batch_size, "1 to 32"),
-        (schedule.densify_every >= 1, "schedule.densify_every", schedule.densify_every, "1 or more"),
-        (schedule.reset_every >= 0, "schedule.reset_every", schedule.reset_every, "0 (never) or more"),
-        (schedule.sh_every >= 1, "schedule.sh_every", schedule.sh_every, "1 or more"),
-        (schedule.position_decay >= 1, "schedule.position_decay", schedule.position_decay, "1 or more"),
-        (
-            0 < config.optimiser.final_share <= 1,
-            "optimiser.final_share",
-            config.optimiser.final_share,
-            "in (0, 1]",
-        ),
-        (0 <= config.loss.ssim <= 1, "loss.ssim", config.loss.ssim, "between 0 and 1"),
-        (config.loss.scale_reference > 0, "loss.scale_reference", config.loss.scale_reference, "positive"),
-        (
-            population.min_opacity < population.reset_opacity < 1,
-            "population.reset_opacity",
-            population.reset_opacity,
-            f"between population.min_opacity ({population.min_opacity}) and 1, or all Gaussians are pruned",
-        ),
-        (
-            0 <= population.opacity_decay < 1,
-            "population.opacity_decay",
-            population.opacity_decay,
-            "in [0, 1)",
-        ),
-        (
-            population.max_gaussians >= 0,
-            "population.max_gaussians",
-            population.max_gaussians,
-            "0 (no cap) or more",
-        ),
-        (0 < population.pass1_keep <= 1, "population.pass1_keep", population.pass1_keep, "in (0, 1]"),
-        (0 < population.pass2_mass <= 1, "population.pass2_mass", population.pass2_mass, "in (0, 1]"),
-        (schedule.t1 >= 0, "schedule.t1", schedule.t1, "0 (none) or more"),
-        (schedule.t2 >= 0, "schedule.t2", schedule.t2, "0 (none) or more"),
-        (
-            config.ranks.transport in get_args(Transport),
-            "ranks.transport",
-            config.ranks.transport,
-            "one of " + ", ".join(get_args(Transport)),
-        ),
-        (config.log.every >= 1, "log.every", config.log.every, "1 or more"),
-        (config.log.keep_checkpoints >= 1, "log.keep_checkpoints", config.log.keep_checkpoints, "1 or more"),
-    ]
-    for name in ("position", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation", "eps"):
-        rate = getattr(config.optimiser, name)
-        rules.append((0 <= rate < math.inf, f"optimiser.{name}", rate, "0 or more, and finite"))
-    for name in ("beta1", "beta2"):
-        beta = getattr(config.optimiser, name)
-        rules.append((0 <= beta < 1, f"optimiser.{name}", beta, "in [0, 1)"))
-    for fine, name, value, wanted in rules:
-        if not fine:
-            raise ConfigError(f"{name}: must be {wanted}, got {value}")

@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
+import json
+import tempfile
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, config_hash, from_dict, load_config, save_config, to_dict
+from blitzgs.training.config_ranges import CHOICES, RANGES, flat_fields, problems
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
@@ -37,11 +42,11 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--schedule.iterations=many", r"schedule.iterations: must be an integer, got 'many' \(str\)"),
         ("--schedule.iterations=3.5", "schedule.iterations: must be an integer, got 3.5"),
         ("--schedule.batch_size=true", "schedule.batch_size: must be an integer, got True"),
-        ("--schedule.batch_size=33", "schedule.batch_size: must be 1 to 32, got 33"),
+        ("--schedule.batch_size=33", r"schedule.batch_size: must be in \[1, 32\], got 33"),
         ("--loss.ssim=high", "loss.ssim: must be a number, got 'high'"),
-        ("--loss.ssim=1.5", "loss.ssim: must be between 0 and 1, got 1.5"),
-        ("--optimiser.opacity=-0.01", "optimiser.opacity: must be 0 or more, and finite, got -0.01"),
-        ("--optimiser.sh_dc=.inf", "optimiser.sh_dc: must be 0 or more, and finite, got inf"),
+        ("--loss.ssim=1.5", r"loss.ssim: must be in \[0, 1\], got 1.5"),
+        ("--optimiser.opacity=-0.01", r"optimiser.opacity: must be in \[0, 10\], got -0.01"),
+        ("--optimiser.sh_dc=.inf", r"optimiser.sh_dc: must be in \[0, 10\], got inf"),
         ("--optimiser.beta2=1.0", r"optimiser.beta2: must be in \[0, 1\), got 1.0"),
         ("--model.background=[0, 0]", "model.background: must be a list of 3 values"),
         ("--loss=3", "loss: must be a section with ssim"),
@@ -69,3 +74,96 @@ def test_unreadable_files(tmp_path):
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configurations_load(path):
     assert load_config(path).schedule.iterations > 0
+
+
+NUMBERS = [(name, value) for name, value in flat_fields(Config()) if isinstance(value, (int, float, tuple))]
+NUMBERS = [(name, value) for name, value in NUMBERS if not isinstance(value, bool)]
+
+
+def test_every_number_has_a_range_and_every_default_lies_in_it():
+    assert sorted(name for name, _ in NUMBERS) == sorted(RANGES)
+    assert list(problems(Config())) == []
+    fields = {name for name, _ in flat_fields(Config())}
+    assert set(CHOICES) <= fields
+
+
+@pytest.mark.parametrize(("name", "default"), NUMBERS, ids=lambda value: str(value))
+@pytest.mark.parametrize("value", [".nan", ".inf", "-.inf", "-1", "1e40", "-1e-9", str(10**30), "2e15"])
+def test_senseless_numbers_are_refused_by_name(name, default, value):
+    number = float(value.replace(".nan", "nan").replace(".inf", "inf"))
+    if not isinstance(default, tuple) and number in RANGES[name]:
+        assert name.startswith(("population.grad", "seed")) and number >= 0
+        return
+    text = f"[{value}, 0, 0]" if isinstance(default, tuple) else value
+    with pytest.raises(ConfigError, match=rf"{name}.*: must be .*got"):
+        load_config(None, [f"--{name}={text}"])
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("schedule.scale=1e-9", r"schedule.scale: must be in \[0.0001, 10,000\], got 1e-09"),
+        ("schedule.iterations=999999999", "times schedule.scale must be at most 10,000,000 images"),
+        ("lod.fork=1e30", r"lod.fork: must be in \[1.01, 100\], got 1e\+30"),
+        ("lod.base_resolution=0", "lod.base_resolution: must be in"),
+        ("population.min_opacity=2", r"population.min_opacity: must be in \[0, 1\), got 2.0"),
+        ("model.near=2e6", "model.near: must be in"),
+        ("model.far=0.001", "model.near: must be below model.far"),
+        ("data.exif=maybe", "data.exif: must be one of auto, apply, ignore, got maybe"),
+        ("ranks.timeout_seconds=-1", r"ranks.timeout_seconds: must be in \[1, 1,000,000\], got -1.0"),
+    ],
+)
+def test_hostile_values(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(None, [f"--{override}"])
+
+
+def test_masks_may_be_switched_off():
+    assert load_config(None, ["--data.masks=false"]).data.masks is False
+    assert load_config(None, ["--data.masks=true"]).data.masks is True
+    assert load_config(None, ["--data.masks=folder"]).data.masks == "folder"
+
+
+def test_a_section_that_is_there_twice_is_refused_and_a_bom_is_not_read(tmp_path):
+    file = tmp_path / "config.yaml"
+    file.write_text("seed: 1\nloss:\n  ssim: 0.5\nloss:\n  scale: 1\n")
+    with pytest.raises(ConfigError, match="config.yaml: not valid YAML: 'loss' is there twice"):
+        load_config(file)
+    file.write_bytes(b"\xef\xbb\xbfseed: 7\n")
+    assert load_config(file).seed == 7
+
+
+VALUES = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
+    max_leaves=4,
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.sampled_from([name for name, _ in flat_fields(Config())] + ["loss", "seed.x", "", "data."]), VALUES)
+def test_any_value_is_taken_or_refused_by_name(name, value):
+    try:
+        config = load_config(None, [f"{name}={json.dumps(value)}"])
+    except ConfigError as error:
+        assert str(error)
+        return
+    assert list(problems(config)) == []
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.binary(max_size=60))
+@example(b"loss: &a {ssim: *a}")
+@example(b"? {a: 1}\n: 2")
+@example(b"<<: {seed: 3}")
+@example(b"base: [1]")
+def test_any_file_is_taken_or_refused(content):
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "config.yaml"
+        file.write_bytes(content)
+        try:
+            load_config(file)
+        except ConfigError as error:
+            assert "config.yaml" in str(error) or ":" in str(error)

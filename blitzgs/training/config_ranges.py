@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The values that every field of a configuration may have; checked when it is read.
+
+A field without an entry here is refused by a test. The limits keep out what cannot work (a rate of infinity,
+an opacity of 2) and what would only exhaust memory or never end; they are far from any sensible value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, get_args
+
+from blitzgs.distributed.group import Transport
+from blitzgs.training.config import Config
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers from `low` to `high`, without those two where they are open."""
+
+    low: float
+    high: float
+    low_open: bool = False
+    high_open: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        above = value > self.low if self.low_open else value >= self.low
+        return above and (value < self.high if self.high_open else value <= self.high)
+
+    def __str__(self) -> str:
+        brackets = "(" if self.low_open else "[", ")" if self.high_open else "]"
+        return f"in {brackets[0]}{self.low:,.12g}, {self.high:,.12g}{brackets[1]}"
+
+
+# Images of a whole run: its table of learning rates takes 48 bytes a step.
+_MOST_IMAGES = 10_000_000
+_TIME = Range(0, 1e9)
+_EVERY = Range(1, 1e9)
+_EVERY_OR_NEVER = Range(0, 1e9)
+_SHARE = Range(0, 1, low_open=True)
+_RATE = Range(0, 10)
+_BETA = Range(0, 1, high_open=True)
+# The position's rate falls by a power of the ratio of the two, which must stay a number.
+_POSITION_RATE = Range(1e-20, 1)
+_LENGTH = Range(0, 1e6)
+
+RANGES: Mapping[str, Range] = {
+    "data.downscale": Range(1, 1000),
+    "data.cache_bytes": Range(0, 2**50),
+    "data.threads": Range(1, 1024),
+    "data.prefetch": Range(0, 1000),
+    "model.sh_degree": Range(0, 3),
+    "model.background": Range(0, 1),
+    "model.near": Range(1e-9, 1e6),
+    "model.far": Range(1e-9, 1e12),
+    "model.eps2d": Range(0, 100),
+    "model.initial_opacity": Range(1e-4, 0.9999),
+    "lod.fork": Range(1.01, 100),
+    "lod.visible_threshold": Range(0, 1),
+    "lod.base_resolution": Range(1e-6, 1),
+    "schedule.iterations": Range(1, 1e9),
+    "schedule.scale": Range(1e-4, 1e4),
+    "schedule.batch_size": Range(1, 32),
+    "schedule.densify_from": _TIME,
+    "schedule.densify_until": _TIME,
+    "schedule.densify_every": _EVERY,
+    "schedule.size_prune_after": _TIME,
+    "schedule.reset_every": _EVERY_OR_NEVER,
+    "schedule.t1": _EVERY_OR_NEVER,
+    "schedule.t2": _EVERY_OR_NEVER,
+    "schedule.sh_every": _EVERY,
+    "schedule.position_decay": _EVERY,
+    "schedule.checkpoint_every": _EVERY_OR_NEVER,
+    "schedule.evaluate_every": _EVERY_OR_NEVER,
+    "optimiser.position": _POSITION_RATE,
+    "optimiser.position_final": _POSITION_RATE,
+    "optimiser.sh_dc": _RATE,
+    "optimiser.sh_rest": _RATE,
+    "optimiser.opacity": _RATE,
+    "optimiser.scale": _RATE,
+    "optimiser.rotation": _RATE,
+    "optimiser.final_share": Range(1e-6, 1),
+    "optimiser.beta1": _BETA,
+    "optimiser.beta2": _BETA,
+    "optimiser.eps": Range(1e-30, 1),
+    "loss.ssim": Range(0, 1),
+    "loss.scale": Range(0, 1e6),
+    "loss.scale_reference": Range(1e-6, 1e6),
+    "population.grad_threshold": Range(0, 1e30),
+    "population.clone_scale": _LENGTH,
+    "population.min_opacity": Range(0, 1, high_open=True),
+    "population.reset_opacity": Range(0, 1, low_open=True, high_open=True),
+    "population.opacity_decay": Range(0, 1, high_open=True),
+    "population.prune_screen_radius": _LENGTH,
+    "population.prune_world_scale": _LENGTH,
+    "population.max_gaussians": Range(0, 1e11),
+    "population.pass1_keep": _SHARE,
+    "population.pass2_mass": _SHARE,
+    "ranks.timeout_seconds": Range(1, 1e6),
+    "ranks.max_imbalance": Range(1, 1e6),
+    "log.every": _EVERY,
+    "log.pictures": Range(0, 1e6),
+    "log.checkpoint_seconds": Range(0, 1e9),
+    "log.keep_checkpoints": Range(1, 1e6),
+    "seed": Range(0, 2**63 - 1),
+}
+
+CHOICES: Mapping[str, tuple[str, ...]] = {
+    "data.undistort": ("crop", "mask"),
+    "data.exif": ("auto", "apply", "ignore"),
+    "ranks.transport": get_args(Transport),
+}
+
+
+def problems(config: Config) -> Iterator[str]:
+    """Name each field whose value makes no sense, with the value and what is allowed."""
+    for name, value in flat_fields(config):
+        numbers = value if isinstance(value, tuple) else (value,)
+        if name in RANGES and not all(number in RANGES[name] for number in numbers):
+            yield f"{name}: must be {RANGES[name]}, got {value}"
+        if name in CHOICES and value not in CHOICES[name]:
+            yield f"{name}: must be one of {', '.join(CHOICES[name])}, got {value}"
+    model, schedule, population = config.model, config.schedule, config.population
+    if not model.near < model.far:
+        yield f"model.near: must be below model.far ({model.far}), got {model.near}"
+    images = schedule.iterations * schedule.scale
+    if not math.isnan(images) and images > _MOST_IMAGES:
+        yield (
+            f"schedule.iterations: times schedule.scale must be at most {_MOST_IMAGES:,} images, got "
+            f"{images:,.0f}"
+        )
+    if not population.min_opacity < population.reset_opacity:
+        yield (
+            f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
+            f"all Gaussians are pruned; got {population.reset_opacity}"
+        )
+
+
+def flat_fields(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """All fields of a configuration as (dotted name, value)."""
+    for entry in fields(section):
+        value = getattr(section, entry.name)
+        if is_dataclass(value):
+            yield from flat_fields(value, f"{where}{entry.name}.")
+        else:
+            yield where + entry.name, value
