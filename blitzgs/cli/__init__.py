@@ -19,7 +19,7 @@ from blitzgs.scene.synth import command as synth
 from blitzgs.training.batches import PhotographError
 from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.folder_checks import FolderError
-from blitzgs.training.guard import NonFiniteError
+from blitzgs.training.guard import ModelLostError, NonFiniteError
 
 # What a user can cause and mend: reported as a message. Anything else is ours and keeps its traceback.
 USER_ERRORS = (
@@ -29,6 +29,7 @@ USER_ERRORS = (
     CheckpointError,
     FolderError,
     MismatchError,
+    ModelLostError,
     NonFiniteError,
     PhotographError,
 )

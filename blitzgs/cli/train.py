@@ -98,6 +98,8 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
     # A path as it is: brackets and colons in it mean nothing.
     console.print(str(folder), markup=False, highlight=False, soft_wrap=True)
+    if summary.get("split") == "train":
+        console.print("no view is held out: the figures are those of the training views", style="yellow")
     for name, value in summary.items():
         if isinstance(value, (int, float)):
             table.add_row(name, f"{value:,.4f}" if isinstance(value, float) else f"{value:,}")

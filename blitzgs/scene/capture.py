@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from blitzgs.scene.undistort import Rectification, rectify
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
 _SAMPLED_POINTS = 2000
+_MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Cameras closer together than this share of the points' distance are in one place, up to rounding: the
 # parallax between them is far below a pixel.
 _LEAST_SPREAD = 1e-6
@@ -141,11 +142,14 @@ def load_capture(
     with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # headers may lie on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
     mask_folder = _mask_folder(root, masks)
+    if masks is False:
+        views = [replace(view, mask_path=None) for view in views]
     plans: dict[Lens, Rectification] = {}
     cameras = [
         _camera(view, header, offset, downscale, undistort, exif, mask_folder, plans)
         for view, header in zip(views, headers, strict=True)
     ]
+    _check_masks(cameras, mask_folder)
     points = _finite_points(points)
     if len(points.positions) == 0:
         points = _random_points(cameras, offset)
@@ -281,6 +285,31 @@ def _mask_folder(root: Path, masks: str | bool | None) -> Path | None:
     if masks is not None:
         raise FileNotFoundError(f"{folder}: no such folder of masks")
     return None
+
+
+def _check_masks(cameras: Sequence[Camera], folder: Path | None) -> None:
+    """Check that the masks belong to the images: pixels that should not count must not count silently."""
+    used = {camera.mask_path for camera in cameras if camera.mask_path is not None}
+    missing = sorted(str(path) for path in used if not path.is_file())
+    if missing:
+        raise FileNotFoundError(
+            f"{len(missing)} masks are missing (first: {missing[0]}); use --data.masks=false to train without"
+        )
+    if folder is None:
+        return
+    files = {path for path in folder.rglob("*") if path.suffix.lower() in _MASK_SUFFIXES}
+    unused = sorted(str(path.relative_to(folder)) for path in files - used)
+    if files and not used:
+        raise ValueError(
+            f"none of the {len(files)} masks in {folder} belongs to an image: they are called like "
+            f"{unused[0]}, the images like {cameras[0].name}; rename them to NAME.png, or use "
+            "--data.masks=false"
+        )
+    if unused:
+        warnings.warn(
+            f"{len(unused)} of {len(files)} masks in {folder} belong to no image (first: {unused[0]})",
+            stacklevel=3,
+        )
 
 
 def _camera(

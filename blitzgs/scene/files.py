@@ -89,10 +89,16 @@ def _mega_nerf_mapping(root: Path) -> dict[str, str]:
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of an image: NAME.png as COLMAP has it, STEM.png, or the image's own name; else None."""
+    """The mask of an image: NAME.png as COLMAP has it, STEM.png, or the image's own name; else None.
+
+    A name that is absolute or climbs out of its folder counts by its last part: joined as it is, it could
+    lead to the photograph itself.
+    """
     pure = PurePath(name)
+    leads_out = pure.is_absolute() or ".." in pure.parts
     for candidate in (f"{name}.png", str(pure.with_suffix(".png")), name):
-        for path in (folder / candidate, folder / PurePath(candidate).name):
+        inner = folder / PurePath(candidate).name
+        for path in (inner,) if leads_out else (folder / candidate, inner):
             if path.is_file():
                 return path
     return None

@@ -156,7 +156,8 @@ def evaluate(
 
     Returns:
         {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}; the
-        means are absent without views. The same on every rank.
+        means are absent without views, and a view that is masked all over is left out. The same on every
+        rank.
 
     Raises:
         OSError: a file cannot be written, and `optional_files` is not set.
@@ -177,6 +178,8 @@ def evaluate(
             continue
         target = images.get(index).to(table.device)
         mask = images.mask(index)
+        if mask is not None and not bool(mask.any()):
+            continue  # nothing to compare
         metrics = image_metrics(render, target, None if mask is None else mask.to(table.device))
         if lpips is not None:
             pair = [
@@ -189,7 +192,12 @@ def evaluate(
             picture = comparison(render, target, mask)
             files.write(chosen[index], encode_image(picture, ".jpg"))
     found = {name: view for part in ranks.all_gather_object(per_view) for name, view in part.items()}
-    per_view = {cameras[index].name: found[cameras[index].name] for index in indices}
+    names = [cameras[index].name for index in indices]
+    masked = [name for name in names if name not in found]
+    if masked and ranks.rank == 0:
+        text = f"{len(masked)} views are masked all over and count for nothing: {', '.join(masked[:5])}"
+        warnings.warn(text, stacklevel=2)
+    per_view = {name: found[name] for name in names if name in found}
     result: dict[str, Any] = {}
     for metric in METRICS:
         values = [view[metric] for view in per_view.values() if metric in view]

@@ -18,6 +18,10 @@ class NonFiniteError(RuntimeError):
     """NaN or infinity appeared; the message names the step, the view and the op or column it came from."""
 
 
+class ModelLostError(RuntimeError):
+    """No Gaussian is left; says what to do."""
+
+
 class LossGuard:
     """Looks at every step's loss: at once on the CPU, one step late on CUDA, where looking means waiting."""
 

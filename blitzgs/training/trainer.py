@@ -23,7 +23,7 @@ from blitzgs.training.batches import BatchLoader, Images, PhotographError
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash
 from blitzgs.training.events import evaluate, handle, save
-from blitzgs.training.guard import LossGuard
+from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
@@ -75,6 +75,7 @@ class Trainer:
         Raises:
             NonFiniteError: a loss or a parameter stopped being finite.
             PhotographError: a photograph cannot be read; the steps before it are saved.
+            ModelLostError: no Gaussian is left.
             CheckpointError: the model could not be saved, although the run waited for room.
         """
         state, schedule, done = self.state, self.state.schedule, self.state.progress.step
@@ -182,6 +183,8 @@ class Trainer:
         """Save and evaluate the trained model; return and write the summary."""
         state, step = self.state, self.state.progress.step
         state.catch_up()
+        if state.population() == 0:
+            raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
         with StopRequest() as stop:
             agreement = Agreement(state.ranks, stop, state.save_clock)
             save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)

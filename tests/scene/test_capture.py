@@ -10,6 +10,7 @@ import pytest
 from blitzgs.scene import colmap
 from blitzgs.scene.cameras import camera_centers
 from blitzgs.scene.capture import load_capture
+from blitzgs.scene.files import find_mask
 from blitzgs.scene.image_files import apply_orientation, read_header
 from blitzgs.scene.images import ImageStore
 from tests.scene.helpers import shared_data, smooth_image, write_capture, write_image
@@ -372,14 +373,14 @@ def test_blender_transforms(tmp_path):
 
 def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     frames = []
-    (tmp_path / "masks").mkdir()
+    (tmp_path / "own").mkdir()
     for i in range(4):
         write_image(tmp_path / "images" / f"f{i}.png", smooth_image(48, 64, i))
-        cv2.imwrite(str(tmp_path / "masks" / f"f{i}.png"), np.zeros((48, 64), dtype=np.uint8))
+        cv2.imwrite(str(tmp_path / "own" / f"f{i}.png"), np.zeros((48, 64), dtype=np.uint8))
         matrix = np.eye(4)
         matrix[0, 3] = i
         frame = {"file_path": f"images/f{i}.png", "transform_matrix": matrix.tolist()}
-        frames.append(frame | ({"mask_path": f"masks/f{i}.png"} if i == 1 else {}))
+        frames.append(frame | ({"mask_path": f"own/f{i}.png"} if i == 1 else {}))
     (tmp_path / "p.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
         "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
@@ -392,7 +393,7 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     }
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(content))
-    capture = load_capture(tmp_path, masks=False)
+    capture = load_capture(tmp_path)
     assert capture.test == [2] and not capture.has_alpha
     np.testing.assert_allclose(capture.points + capture.offset, [[1, 2, 3], [4, 5, 6]])
     assert capture.colors.tolist() == [[9, 8, 7], [1, 2, 3]] and capture.track_lengths is None
@@ -408,3 +409,35 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     path.write_text('{"frames": 3}')
     with pytest.raises(ValueError, match="not a transforms file with a list of frames"):
         load_capture(tmp_path)
+    assert all(camera.mask_path is None for camera in load_capture(tmp_path, masks=False).cameras)
+
+
+def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path):
+    root = write_capture(tmp_path, NAMES)
+    (root / "masks").mkdir()
+    mask = np.zeros((48, 64), dtype=np.uint8)
+    cv2.imwrite(str(root / "masks" / "mask_of_v00.png"), mask)
+    with pytest.raises(ValueError, match="none of the 1 masks in .*mask_of_v00.png.*data.masks=false"):
+        load_capture(root)
+    assert load_capture(root, masks=False).cameras[0].mask_path is None
+    cv2.imwrite(str(root / "masks" / f"{NAMES[1]}.png"), mask)
+    with pytest.warns(UserWarning, match="1 of 2 masks in .* belong to no image .first: mask_of_v00.png"):
+        load_capture(root)
+
+
+def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
+    """Joined to the folder of masks as they are, absolute names and `..` lead to the photographs."""
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "capture" / "masks").mkdir(parents=True)
+    write_image(tmp_path / "photos" / "a.png", smooth_image(64, 48))
+    photo = str(tmp_path / "photos" / "a.png")
+    assert find_mask(tmp_path / "capture" / "masks", photo) is None
+    assert find_mask(tmp_path / "capture" / "masks", "../../photos/a.png") is None
+    cv2.imwrite(str(tmp_path / "capture" / "masks" / "a.png"), np.ones((4, 4), dtype=np.uint8))
+    assert find_mask(tmp_path / "capture" / "masks", photo) == tmp_path / "capture" / "masks" / "a.png"
+
+
+def test_a_list_file_may_begin_with_a_byte_order_mark(tmp_path):
+    root = write_capture(tmp_path, NAMES)
+    (root / "test.txt").write_bytes(b"\xef\xbb\xbf" + NAMES[3].encode() + b"\r\n")
+    assert load_capture(root, split="test.txt").test == [3]

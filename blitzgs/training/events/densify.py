@@ -9,7 +9,7 @@ import torch
 
 from blitzgs.population.density import DensityRules, decay_opacities, densify
 from blitzgs.population.redistribution import redistribute
-from blitzgs.training.guard import check_table
+from blitzgs.training.guard import ModelLostError, check_table
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
 
@@ -19,6 +19,7 @@ def run(state: TrainingState, event: Event) -> None:
 
     Raises:
         NonFiniteError: a parameter is not finite.
+        ModelLostError: no Gaussian is left.
     """
     step = state.progress.step
     state.catch_up()
@@ -39,6 +40,12 @@ def run(state: TrainingState, event: Event) -> None:
     counts = dataclasses.asdict(report) | {"gaussians": len(state.table)}
     values = state.ranks.all_reduce(torch.tensor(list(counts.values()), device=state.ranks.device))
     counts = dict(zip(counts, values.tolist(), strict=True))
+    if counts["gaussians"] == 0:
+        raise ModelLostError(
+            f"the density event after {event.time:,} images pruned the last Gaussian: check that the poses "
+            "and points belong together, or prune less (population.min_opacity, prune_screen_radius, "
+            "prune_world_scale; schedule.size_prune_after)"
+        )
     if redistribute(state.table, state.ranks, state.config.ranks.max_imbalance):
         counts["redistributed"] = 1
         state.sort()

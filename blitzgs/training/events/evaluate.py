@@ -18,13 +18,16 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
     """Evaluate the held-out views (the training views when there are none), while the clock stands still.
 
     Returns:
-        The mean of each metric.
+        The mean of each metric, and under "split" whether they are those of held-out or of training views.
     """
     with state.paused_clock():
         folder = state.folder / run_folder.EVALUATION / f"{state.images_seen:06d}"
-        metrics = measure(state, state.capture.test or state.capture.train, folder)
+        capture = state.capture
+        metrics = measure(state, capture.test or capture.train, folder)
         means = {name: value for name, value in metrics.items() if name != "views"}
-        text = "evaluation: " + "  ".join(f"{name} {value:.4f}" for name, value in means.items())
+        what = "evaluation" if capture.test else "evaluation of TRAINING views (none is held out)"
+        text = f"{what}: " + "  ".join(f"{name} {value:.4f}" for name, value in means.items())
+        means["split"] = "test" if capture.test else "train"
         state.log.event(state.images_seen, "evaluation", means, text)
     return means
 
