@@ -42,8 +42,6 @@ _EVERY_OR_NEVER = Range(0, 1e9)
 _SHARE = Range(0, 1, low_open=True)
 _RATE = Range(0, 10)
 _BETA = Range(0, 1, high_open=True)
-# The position's rate falls by a power of the ratio of the two, which must stay a number.
-_POSITION_RATE = Range(1e-20, 1)
 _LENGTH = Range(0, 1e6)
 
 RANGES: Mapping[str, Range] = {
@@ -74,8 +72,8 @@ RANGES: Mapping[str, Range] = {
     "schedule.position_decay": _EVERY,
     "schedule.checkpoint_every": _EVERY_OR_NEVER,
     "schedule.evaluate_every": _EVERY_OR_NEVER,
-    "optimiser.position": _POSITION_RATE,
-    "optimiser.position_final": _POSITION_RATE,
+    "optimiser.position": Range(0, 1),
+    "optimiser.position_final": Range(1e-20, 1),
     "optimiser.sh_dc": _RATE,
     "optimiser.sh_rest": _RATE,
     "optimiser.opacity": _RATE,
@@ -125,6 +123,9 @@ def problems(config: Config) -> Iterator[str]:
     model, schedule, population = config.model, config.schedule, config.population
     if not model.near < model.far:
         yield f"model.near: must be below model.far ({model.far}), got {model.near}"
+    if 0 < config.optimiser.position < 1e-20:
+        # The rate falls by a power of the ratio of position_final to it, which must stay a number.
+        yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
     images = schedule.iterations * schedule.scale
     if not math.isnan(images) and images > _MOST_IMAGES:
         yield (

@@ -393,6 +393,7 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     }
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(content))
+    assert all(camera.mask_path is None for camera in load_capture(tmp_path, masks=False).cameras)
     capture = load_capture(tmp_path)
     assert capture.test == [2] and not capture.has_alpha
     np.testing.assert_allclose(capture.points + capture.offset, [[1, 2, 3], [4, 5, 6]])
@@ -409,7 +410,6 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     path.write_text('{"frames": 3}')
     with pytest.raises(ValueError, match="not a transforms file with a list of frames"):
         load_capture(tmp_path)
-    assert all(camera.mask_path is None for camera in load_capture(tmp_path, masks=False).cameras)
 
 
 def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path):

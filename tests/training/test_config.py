@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, config_hash, from_dict, load_config, save_config, to_dict
 from blitzgs.training.config_ranges import CHOICES, RANGES, flat_fields, problems
+from blitzgs.training.schedule import Schedule
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
@@ -116,6 +117,12 @@ def test_senseless_numbers_are_refused_by_name(name, default, value):
 def test_hostile_values(override, message):
     with pytest.raises(ConfigError, match=message):
         load_config(None, [f"--{override}"])
+
+
+def test_a_rate_of_nothing_keeps_the_means_in_place():
+    config = load_config(None, ["--optimiser.position=0"])
+    rates = Schedule(config.schedule).learning_rates(config.optimiser, 3.0)
+    assert rates.isfinite().all() and not rates[:, 0].any() and rates[1:, 1:].all()
 
 
 def test_masks_may_be_switched_off():
