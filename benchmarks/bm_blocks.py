@@ -7,8 +7,10 @@ python benchmarks/bm_blocks.py [--device cuda] [--rows 16000000] [--views 1]
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import torch
+from harness import write_json
 from scenes import aerial
 from timing import median_ms
 from torch import Tensor
@@ -28,6 +30,7 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=16_000_000)
     parser.add_argument("--views", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     device, n = args.device, args.rows
     scene = aerial(n, device)
@@ -73,6 +76,9 @@ def main() -> None:
     }
     for name, milliseconds in timings.items():
         print(f"{name:32s} {milliseconds:8.3f} ms")
+    if args.json:
+        counts = {"rows": n, "views": args.views, "active": len(active), "visible": visible}
+        write_json(args.json, device, **counts, ms=timings)
 
 
 if __name__ == "__main__":

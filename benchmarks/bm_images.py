@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from harness import write_json
 
 from blitzgs.scene.capture import Capture, load_capture
 from blitzgs.scene.colmap import ColmapCamera, ColmapImages, ColmapModel, write_model
@@ -49,7 +50,8 @@ def throughput(store: ImageStore, ahead: int, rounds: int) -> float:
     return len(order) / (time.perf_counter() - begin)
 
 
-def report(capture: Capture, threads: int, rounds: int) -> None:
+def report(capture: Capture, threads: int, rounds: int) -> dict[str, float]:
+    """Print and return images a second by source, and the size of the compressed images."""
     camera = capture.cameras[0]
     raw = 3 * camera.width * camera.height
     source = camera.rectification.lens
@@ -57,14 +59,16 @@ def report(capture: Capture, threads: int, rounds: int) -> None:
         f"{len(capture.cameras)} images, {source.width} x {source.height} -> {camera.width} x {camera.height}"
     )
     few = ImageStore(capture, threads=threads, decoded_bytes=8 * threads * raw)
-    print(f"cold, files to pixels        {throughput(few, 2 * threads, 1):8.1f} images/s")
-    print(f"from compressed memory       {throughput(few, 2 * threads, rounds):8.1f} images/s")
+    results = {"cold, files to pixels": throughput(few, 2 * threads, 1)}
+    results["from compressed memory"] = throughput(few, 2 * threads, rounds)
     part = few.compressed_bytes / len(capture.cameras) / raw
-    print(f"compressed                   {part:8.2f} of the raw pixels")
     ample = ImageStore(capture, threads=threads, decoded_bytes=2 * raw * len(capture.cameras))
     throughput(ample, 2 * threads, 1)
-    rate = throughput(ample, 2 * threads, rounds)
-    print(f"from the decoded cache       {rate:8.1f} images/s")
+    results["from the decoded cache"] = throughput(ample, 2 * threads, rounds)
+    for name, rate in results.items():
+        print(f"{name:28s} {rate:8.1f} images/s")
+    print(f"{'compressed':28s} {part:8.2f} of the raw pixels")
+    return results | {"compressed share of the raw pixels": part}
 
 
 def main() -> None:
@@ -75,6 +79,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=float, default=2)
     parser.add_argument("--threads", type=int, default=4)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if args.data is None:
@@ -82,7 +87,9 @@ def main() -> None:
         begin = time.perf_counter()
         capture = load_capture(args.data or folder, downscale=args.downscale)
         print(f"load_capture                 {1e3 * (time.perf_counter() - begin):8.1f} ms")
-        report(capture, args.threads, args.rounds)
+        results = report(capture, args.threads, args.rounds)
+    if args.json:
+        write_json(args.json, "cpu", results=results)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import torch
+from harness import write_json
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
@@ -71,15 +73,19 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=4_000_000)
     parser.add_argument("--fraction", type=float, default=0.1)
     parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     device, n = args.device, args.rows
     state = State(n, device)
     bandwidth = copy_bandwidth(device, 2048 if device == "cuda" else 256)
     print(f"{n} rows of {FLOATS} floats, {device}, copy {bandwidth:.0f} GB/s")
 
+    results: list[dict[str, object]] = []
+
     def report(name: str, milliseconds: float, rows: int, touched: int) -> None:
         gigabytes = rows * FLOATS * 4 * touched / 1e9
         floor, rate = 1e3 * gigabytes / bandwidth, 1e3 * gigabytes / milliseconds
+        results.append({"work": name, "rows": rows, "ms": milliseconds, "floor_ms": floor})
         print(f"{name:58s} {milliseconds:8.3f} ms  {rate:6.0f} GB/s  floor {floor:.3f} ms", flush=True)
 
     none = torch.zeros(n, dtype=torch.int64, device=device)
@@ -109,6 +115,8 @@ def main() -> None:
     dense = torch.optim.Adam(state.params, lr=1e-6, betas=(BETA1, BETA2), eps=EPS, fused=True)
     milliseconds = median_ms(lambda _: dense.step(), [(state.params[0],)], args.repeats)
     report("torch fused dense Adam", milliseconds, n, 7)
+    if args.json:
+        write_json(args.json, device, rows=n, results=results)
 
 
 if __name__ == "__main__":

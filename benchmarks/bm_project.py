@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import torch
+from harness import write_json
 from scenes import BenchmarkScene, aerial
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
@@ -71,17 +73,24 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=1_000_000)
     parser.add_argument("--views", type=int, nargs="+", default=[1, 4])
     parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     bandwidth = copy_bandwidth(args.device, 2048 if args.device == "cuda" else 256)
     print(f"{args.gaussians} Gaussians, {args.device}, copy {bandwidth:.0f} GB/s")
+    results: list[dict[str, object]] = []
     for views in args.views:
         scene = aerial(args.gaussians, args.device, views=views)
         forward = arguments(scene)
         rows = project_rows(*forward)
         visible, n_rows, _ = rows.counts.tolist()
 
-        def report(name: str, milliseconds: float, megabytes: float, n_rows: int = n_rows) -> None:
+        def report(
+            name: str, milliseconds: float, megabytes: float, n_rows: int = n_rows, views: int = views
+        ) -> None:
             floor = megabytes / bandwidth
+            results.append(
+                {"views": views, "work": name, "rows": n_rows, "ms": milliseconds, "floor_ms": floor}
+            )
             each = 1e6 * milliseconds / max(n_rows, 1)
             print(f"  {name:32s} {milliseconds:9.3f} ms  {each:7.1f} ns a row  byte floor {floor:.3f} ms")
 
@@ -103,6 +112,8 @@ def main() -> None:
         report(f"Morton order, {len(active[0])} active", time, (CULL_BYTES * len(active[0]) + moved) / 1e6)
         time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, rows)], args.repeats)
         report("Morton order, backward", time, back)
+    if args.json:
+        write_json(args.json, args.device, gaussians=args.gaussians, results=results)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The CPU rasteriser against plain PyTorch, on the same splats and the same image.
 
-    python -m benchmarks.bm_rasterize [--threads 2] [--json out.json]
+    python benchmarks/bm_rasterize.py [--threads 2] [--json out.json]
 
 The PyTorch implementation is written to be fast: it takes the same tile lists, evaluates whole batches of
 tiles of similar list length at once, and gets its gradients from autograd. A blend is a (splat, pixel) pair
@@ -14,11 +14,11 @@ import argparse
 from collections.abc import Callable
 
 import torch
+from harness import add_arguments, report
+from scenes import BenchmarkScene, aerial, garden_like
+from timing import median_ms
 from torch import Tensor
 
-from benchmarks.harness import add_arguments, report
-from benchmarks.scenes import BenchmarkScene, aerial, garden_like
-from benchmarks.timing import median_ms
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.project import project
 from blitzgs.ops.rasterize import rasterize
