@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 # Idle OpenMP threads sleep instead of spinning. On a machine with other work, spinning makes every parallel
@@ -12,26 +13,34 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
+    from blitzgs.losses import l1_ssim
     from blitzgs.ops.importance import contributions
-    from blitzgs.rendering import rasterization
+    from blitzgs.rendering import rasterization, raw_rasterization
     from blitzgs.training.run_folder import open_run
+    from blitzgs.view.blocks import morton_order
 
 __version__ = "0.1.0"
-__all__ = ["contributions", "open_run", "rasterization"]
+__all__ = [
+    "contributions",
+    "l1_ssim",
+    "morton_order",
+    "open_run",
+    "rasterization",
+    "raw_rasterization",
+]
+
+_MODULES = {
+    "contributions": "blitzgs.ops.importance",
+    "l1_ssim": "blitzgs.losses",
+    "morton_order": "blitzgs.view.blocks",
+    "open_run": "blitzgs.training.run_folder",
+    "rasterization": "blitzgs.rendering",
+    "raw_rasterization": "blitzgs.rendering",
+}
 
 
 def __getattr__(name: str) -> Any:
     # Loaded on first use: `blitzgs --help` and the synthetic city need no kernels.
-    if name == "rasterization":
-        from blitzgs.rendering import rasterization
-
-        return rasterization
-    if name == "open_run":
-        from blitzgs.training.run_folder import open_run
-
-        return open_run
-    if name == "contributions":
-        from blitzgs.ops.importance import contributions
-
-        return contributions
+    if name in _MODULES:
+        return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module 'blitzgs' has no attribute {name!r}")

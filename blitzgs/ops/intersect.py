@@ -50,8 +50,10 @@ def intersect(
         tile_size: edge of a tile in pixels, 1 to 64.
         tile_begin: first owned tile; tiles outside [tile_begin, tile_end) get empty lists.
         tile_end: end of the owned tiles, -1 for all.
-        n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``), -1 to
-            have them counted. If there are more, CUDA lists the first ``n_isects`` by depth.
+        n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``),
+            -1 to have them counted. On CUDA the check that it is one waits for the device; the op
+            ``torch.ops.blitzgs.intersect``, which nothing waits for there, then lists the first so many, by
+            depth.
         n_rows: int64 [1] on the device of the rows: only the first ``n_rows`` of the P rows are valid, the
             others are never read. With it, the host can queue the CUDA op before it knows the number. None:
             all rows; a number outside [0, P] counts as 0.
@@ -63,12 +65,20 @@ def intersect(
 
     Raises:
         RuntimeError: wrong shapes, dtypes or devices, a tile range outside the image, 2^31 rows or tiles or
-            more, or (CPU) more intersections than ``n_isects``.
+            more, or more intersections than ``n_isects``.
     """
-    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
-        means2d, conics, row_opacities, depths, camera_ids, ids, n_cameras, width, height, tile_size,
-        tile_begin, tile_end, n_isects, n_rows,
-    )  # fmt: skip
+    rows = (means2d, conics, row_opacities, depths, camera_ids, ids)
+    grid = (n_cameras, width, height, tile_size, tile_begin, tile_end)
+    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(*rows, *grid, n_isects, n_rows)
+    # Lists that are not full have all intersections; on CUDA full ones may have lost some.
+    checked = means2d.is_cuda and n_isects >= 0 and not torch.compiler.is_compiling()
+    if checked and int(tile_offsets[-1]) == n_isects:
+        needed = len(torch.ops.blitzgs.intersect(*rows, *grid, -1, n_rows)[0])
+        if needed > n_isects:
+            raise RuntimeError(
+                f"blitzgs::intersect: n_isects is {n_isects} but there are {needed} intersections; pass the "
+                "sum of tiles_touched, or -1 to have them counted"
+            )
     return isect_rows, tile_offsets
 
 

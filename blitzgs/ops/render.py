@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.host import tell_host
-from blitzgs.ops.project import Rows, color_rows, holds, queue_rows, room_for, rows_of
+from blitzgs.ops.project import RowRoom, Rows, Sizes, color_rows, holds, queue_rows, room_for, rows_of
 
 
 class Rendered(NamedTuple):
@@ -27,6 +27,7 @@ def render_queued(
     channels: Callable[[Rows], Tensor],
     backgrounds: Tensor | None,
     backward_follows: bool,
+    sizes: Sizes | None = None,
 ) -> Rendered | None:
     """Render without gradients, for ops that are then given the result to differentiate it.
 
@@ -37,12 +38,13 @@ def render_queued(
         channels: what is composited of the rows, [P, D], whatever their number P; their counts are None.
         backgrounds: [B, D] or None.
         backward_follows: see the op `rasterize_fwd`.
+        sizes: how much room to make; None: what calls of this size needed before.
 
     Returns:
         None where no call before told how much room is needed, or it was too little.
     """
-    room = room_for(*arguments)
-    sizes = room.sizes
+    room = room_for(*arguments) if sizes is None else RowRoom()
+    sizes = room.sizes if sizes is None else sizes
     if not all(sizes[:2]):
         return None
     viewmats, (width, height, tile_size) = arguments[5], arguments[9:12]

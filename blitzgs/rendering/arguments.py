@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -73,6 +74,7 @@ class Gaussians:
         per_view: whether every view has colours of its own.
         lead: the dimensions of the batch, and C.
         raw: whether scales and opacities are before their activation.
+        named: the arguments of the call that have to be finite, a tensor for each scene.
     """
 
     scenes: tuple[Scene, ...]
@@ -81,7 +83,8 @@ class Gaussians:
     sh_degree: int | None
     per_view: bool
     lead: tuple[int, ...]
-    raw: bool = False
+    raw: bool
+    named: Mapping[str, tuple[Tensor, ...]]
 
     @property
     def views(self) -> int:
@@ -155,6 +158,7 @@ def gaussians_of(
     Ks: Tensor,
     sh_degree: int | None,
     with_colors: bool,
+    raw: bool = False,
 ) -> Gaussians:
     """Check shapes and fold the dimensions of the batch into one.
 
@@ -168,6 +172,7 @@ def gaussians_of(
         Ks: likewise.
         sh_degree: likewise.
         with_colors: whether colours are rendered.
+        raw: whether scales and opacities are before their activation.
 
     Raises:
         ValueError: a shape that does not fit, by name.
@@ -189,14 +194,14 @@ def gaussians_of(
     per_view = colors is not None and _per_view(colors, batch, C, N, sh_degree)
     colors = colors if with_colors else None
     whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
-    return Gaussians(
-        _scenes(whole, batch),
-        colors,
-        opacities,
-        sh_degree if with_colors else None,
-        per_view,
-        (*batch, C),
-    )
+    scenes = _scenes(whole, batch)
+    named = {
+        name: tuple(getattr(scene, name) for scene in scenes)
+        for name in Scene._fields[:7]
+        if name != "colors" or colors is not None
+    }
+    degree = sh_degree if with_colors else None
+    return Gaussians(scenes, colors, opacities, degree, per_view, (*batch, C), raw, named)
 
 
 def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
@@ -224,11 +229,14 @@ def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
     """
     batch = gaussians.lead[:-1]
     _require("covars", covars, (*batch, gaussians.count, 3, 3), "[..., N, 3, 3]")
-    scenes = []
+    scenes, uppers = [], []
     for scene, own in zip(gaussians.scenes, covars.reshape(-1, *covars.shape[-3:]).unbind(0), strict=True):
         found = decompose(own)
+        uppers.append(found.upper)
         scenes.append(scene._replace(quats=found.quats, scales=found.scales, covariances=found))
-    return replace(gaussians, scenes=tuple(scenes))
+    named = {name: given for name, given in gaussians.named.items() if name not in ("quats", "scales")}
+    named["covars"] = tuple(uppers)
+    return replace(gaussians, scenes=tuple(scenes), named=named)
 
 
 def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree: int | None) -> bool:

@@ -10,12 +10,13 @@ from itertools import count
 import torch
 from torch import Tensor
 
-from blitzgs.rendering.arguments import Gaussians, Scene
+from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.layout import Layout
 
 # On CUDA the parameters are looked through in the first of so many calls of a size: it takes a pass over all
 # of them, and what is not finite stays so.
 EVERY_CUDA_CALLS = 32
+COLOURS = ("colors", "sh0", "shN")
 
 
 @torch.no_grad()
@@ -25,26 +26,14 @@ def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
     Indices count through the scenes of a batch. An argument that is finite has no entry.
     """
     found = {}
-    given = ("quats", "scales") if gaussians.scenes[0].covariances is None else ("covars",)
-    for name in ("means", *given, "opacities", "colors", "viewmats", "Ks"):
-        columns = [t for t in (_column(scene, name) for scene in gaussians.scenes) if t is not None]
-        if not columns:
-            continue
-        if name == "colors" and gaussians.per_view:
-            finite = [_finite(t.movedim(1, 0), "colors", False) for t in columns]
-        else:
-            finite = [_finite(t, name, gaussians.raw) for t in columns]
-        bad = (~torch.cat(finite)).nonzero()[:, 0]
+    for name, tensors in gaussians.named.items():
+        # Of colours per view, a Gaussian's are those of all views.
+        rows = [t.movedim(1, 0) for t in tensors] if name == "colors" and gaussians.per_view else tensors
+        finite = torch.cat([_finite(t, name, gaussians.raw) for t in rows])
+        bad = (~finite).nonzero()[:, 0]
         if len(bad):
             found[name] = bad
     return found
-
-
-def _column(scene: Scene, name: str) -> Tensor | None:
-    if name == "covars":
-        return None if scene.covariances is None else scene.covariances.upper
-    column: Tensor | None = getattr(scene, name)
-    return column
 
 
 def _finite(values: Tensor, name: str, raw: bool) -> Tensor:
@@ -63,13 +52,12 @@ def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> N
     A few sums tell whether to look closer. SH, which are most of a Gaussian, are looked at in visible rows
     alone.
     """
-    first = gaussians.scenes[0].means
+    first = gaussians.named["means"][0]
     if first.is_cuda and next(_calls(first.device, first.shape[0])) % EVERY_CUDA_CALLS:
         return
+    summed = [t for name, given in gaussians.named.items() if name not in COLOURS for t in given]
     with torch.no_grad():
-        sums = [t.sum() for s in gaussians.scenes for t in (s.means, s.quats, s.scales, s.viewmats, s.Ks)]
-        if not gaussians.raw:
-            sums += [s.opacities.sum() for s in gaussians.scenes]
+        sums = [t.sum() for t in summed]
         # Rows whose colour is not finite have no opacity, and no other row is below 1/255.
         hidden = (layout.rows.opacities == 0).any()
         looks_finite = bool(torch.stack(sums).sum().isfinite() & ~hidden)

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.intersect import intersect
-from blitzgs.ops.project import Rows
+from blitzgs.ops.project import Rows, Sizes
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.render import Rendered, render_queued
 from blitzgs.rendering.arguments import Gaussians
@@ -47,6 +46,7 @@ def render(
     gaussians: Gaussians,
     project: ProjectOptions,
     image: ImageOptions,
+    sizes: Sizes | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render; returns what `blitzgs.rasterization` does.
 
@@ -55,6 +55,7 @@ def render(
         gaussians: what is rendered.
         project: how it is projected.
         image: how it is composited.
+        sizes: how much room rows and lists need, if that is known.
     """
     compiling = torch.compiler.is_compiling()
     by_value = gaussians.colors is not None and gaussians.sh_degree is None
@@ -62,7 +63,7 @@ def render(
     groups = groups_of(hidden, project)
     ready = None
     if len(groups) == 1 and groups[0].covariances is None and not by_value and not compiling:
-        ready = _queued(groups[0], gaussians, project, image)
+        ready = _queued(groups[0], gaussians, project, image, sizes)
     rows = project_groups(groups, image.sparse_grad, None if ready is None else ready.rows)
     layout = Layout(rows, gaussians.lead, gaussians.count, image.packed)
     laid = _laid(layout, gaussians, project, image)
@@ -88,7 +89,11 @@ def render(
 
 
 def _queued(
-    group: Group, gaussians: Gaussians, project: ProjectOptions, image: ImageOptions
+    group: Group,
+    gaussians: Gaussians,
+    project: ProjectOptions,
+    image: ImageOptions,
+    sizes: Sizes | None,
 ) -> Rendered | None:
     """Have all of it queued on CUDA before the host knows how many rows there are, if that can be done."""
     means = group.arguments[0]
@@ -106,6 +111,7 @@ def _queued(
         lambda rows: _channels_of_rows(rows, gaussians, image.render_mode),
         image.backgrounds,
         differentiable and not image.absgrad,
+        sizes,
     )
 
 
@@ -129,14 +135,18 @@ def _lists(
     if ready is not None:
         lists = Lists(ready.isect_rows, ready.tile_offsets, width, height, tile_size)
         return lists, lists
-    splats = (rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids)
-    grid: dict[str, Any] = {"n_cameras": gaussians.images, "width": width, "height": height}
-    known = -1 if torch.compiler.is_compiling() else int(rows.counts[2])
-    lists = Lists(*intersect(*splats, tile_size=tile_size, n_isects=known, **grid), width, height, tile_size)
+
+    def lists_of(size: int, n_isects: int) -> Lists:
+        isect_rows, offsets = torch.ops.blitzgs.intersect(
+            rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, None, gaussians.images,
+            width, height, size, 0, -1, n_isects,
+        )  # fmt: skip
+        return Lists(isect_rows, offsets, width, height, size)
+
+    lists = lists_of(tile_size, -1 if torch.compiler.is_compiling() else int(rows.counts[2]))
     if not rows.means2d.is_cuda or tile_size in CUDA_TILE_SIZES:
         return lists, lists
-    size = CUDA_TILE_SIZES[1]
-    return lists, Lists(*intersect(*splats, tile_size=size, **grid), width, height, size)
+    return lists, lists_of(CUDA_TILE_SIZES[1], -1)
 
 
 def _without_non_finite(gaussians: Gaussians) -> Gaussians:

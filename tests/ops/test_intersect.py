@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
+from tests.helpers import DEVICES
 from tests.ops.splats import Splats, pixel_alphas, random_splats
 
 WIDTH, HEIGHT = 91, 70
@@ -126,8 +127,9 @@ def test_does_not_depend_on_threads():
     assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r, strict=True))
 
 
-def test_capacity():
-    splats = random_splats(100, WIDTH, HEIGHT)
+@pytest.mark.parametrize("device", DEVICES)
+def test_capacity(device):
+    splats = Splats(*(t.to(device) for t in vars(random_splats(100, WIDTH, HEIGHT)).values()))
     options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     rows, offsets = intersect(*splats.rows(), **options)
     roomy, same_offsets = intersect(*splats.rows(), n_isects=len(rows) + 5, **options)

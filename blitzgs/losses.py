@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.l1_ssim`: the loss of 3DGS as one call, image gradient included."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blitzgs.ops.derivatives import first_only
+from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts
+
+
+def l1_ssim(
+    renders: Tensor, targets: Tensor, masks: Tensor | None = None, ssim_weight: float = 0.2
+) -> Tensor:
+    """Return ``(1 - w) mean |x - y| + w (1 - mean SSIM)``, the mean over views (Kerbl et al. 2023, eq. 7).
+
+    SSIM has an 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2 and zero padding (Wang et al.
+    2004). The loss and its gradient are worked out together, in one pass over the images. Differentiable,
+    once, in `renders`.
+
+    Args:
+        renders: x [..., H, W, 3], float32 (CPU also float64), nominal range [0, 1]: what
+            `blitzgs.rasterization` returns.
+        targets: y of the same shape, uint8 (value / 255) or the dtype of `renders`.
+        masks: [..., H, W], bool or uint8, 0 = excluded; windows centred elsewhere still see such a pixel. A
+            view without a pixel has loss 0.
+        ssim_weight: w in [0, 1].
+
+    Returns:
+        A scalar, dtype of `renders`.
+
+    Raises:
+        ValueError: shapes that do not fit, or a weight outside [0, 1].
+        RuntimeError: wrong dtypes.
+    """
+    if renders.dim() < 3 or renders.shape[-1] != 3 or targets.shape != renders.shape:
+        raise ValueError(
+            f"renders and targets must be [..., H, W, 3], got {list(renders.shape)} and {list(targets.shape)}"
+        )
+    if masks is not None and masks.shape != renders.shape[:-1]:
+        raise ValueError(f"masks must be {list(renders.shape[:-1])}, got {list(masks.shape)}")
+    if not 0 <= ssim_weight <= 1:
+        raise ValueError(f"ssim_weight must be in [0, 1], got {ssim_weight}")
+    x, y = renders.reshape(-1, *renders.shape[-3:]), targets.reshape(-1, *targets.shape[-3:])
+    masks = None if masks is None else masks.reshape(-1, *masks.shape[-2:])
+    if torch.compiler.is_compiling() or not (torch.is_grad_enabled() and renders.requires_grad):
+        return photometric_loss(x, y, masks, ssim_weight).mean()
+    loss: Tensor = _L1Ssim.apply(x, y, masks, ssim_weight)  # type: ignore[no-untyped-call]
+    return loss
+
+
+class _L1Ssim(torch.autograd.Function):
+    """The loss with its gradient by the images, which is made together with it."""
+
+    @staticmethod
+    def forward(ctx: Any, renders: Tensor, targets: Tensor, masks: Tensor | None, weight: float) -> Tensor:
+        counts = pixel_counts(renders, masks)
+        share = torch.full_like(counts, 1 / len(renders))
+        parts, v_renders, _ = photometric_fwd_bwd(
+            renders, targets, masks, (1 - weight) * share, -weight * share, samples=counts.clamp_min(1)
+        )
+        ctx.save_for_backward(v_renders)
+        ctx.renders = renders  # not saved, as its values are not needed and may change
+        l1, ssim = parts.sum(dim=1).unbind(dim=1)
+        per_view = ((1 - weight) * l1 + weight * (counts - ssim)) / counts.clamp_min(1)
+        return per_view.mean().to(renders.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, v_loss: Tensor) -> Any:
+        (v_renders,) = ctx.saved_tensors
+        with torch.no_grad():
+            gradient: Tensor | None = v_renders * v_loss
+        (gradient,) = first_only("l1_ssim", [gradient], [ctx.renders, v_loss])
+        return gradient, None, None, None

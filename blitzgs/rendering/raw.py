@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.raw_rasterization`: from the parameters that are learned, at the cost of what is visible."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from blitzgs.lazy_dict import Later
+from blitzgs.ops.project import project_rows
+from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
+from blitzgs.rendering.groups import ProjectOptions, groups_of
+from blitzgs.rendering.images import ImageOptions, render
+
+
+class CatchesUp(Protocol):
+    """An optimiser whose parameters may be behind: `blitzgs.optim.LazyAdam`."""
+
+    def catch_up(self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None) -> None:
+        """Bring rows of parameters up to date."""
+
+
+def raw_rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = True,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    optimizers: CatchesUp | Iterable[Any] | Mapping[str, Any] = (),
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
+
+    The same as `blitzgs.rasterization` of `exp(scales)`, `sigmoid(opacities)` and `cat([sh0, shN], 1)`,
+    without any of these in memory: what the views see is found first, and only that is gathered, activated
+    and rendered. Gradients are sparse, over the visible Gaussians alone: the parameters have to be leaves.
+
+    Args:
+        means: [N, 3] in world units, float32, or float64 on the CPU.
+        quats: [N, 4] (w, x, y, z), need not be normalised.
+        scales: [N, 3] logarithms of standard deviations.
+        opacities: [N] logits.
+        sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
+        shN: [N, K - 1, 3], the others.
+        viewmats: [C, 4, 4] world to camera, a rotation and a translation.
+        Ks: [C, 3, 3] intrinsics in px.
+        width: image width in px.
+        height: image height in px.
+        near_plane: as for `blitzgs.rasterization`, like the next three.
+        far_plane: likewise.
+        radius_clip: likewise.
+        eps2d: likewise.
+        sh_degree: degree to evaluate, 0 to 3; None: the highest there is.
+        tile_size: as for `blitzgs.rasterization`, like the next two.
+        backgrounds: likewise.
+        render_mode: likewise.
+        sparse_grad: False: dense gradients, for optimisers that take no others.
+        absgrad: as for `blitzgs.rasterization`, like the next.
+        rasterize_mode: likewise.
+        optimizers: those of the parameters, by name or not. `blitzgs.optim.LazyAdam` among them catch up what
+            is read here: the geometry of all Gaussians, and the SH of those that are visible.
+
+    Returns:
+        As `blitzgs.rasterization(..., packed=True)`.
+
+    Raises:
+        TypeError: as `blitzgs.rasterization`, like the next two.
+        ValueError: likewise.
+        RuntimeError: likewise.
+    """
+    check_options(render_mode, rasterize_mode, "pinhole", tile_size)
+    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
+    check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks} | ({} if shN is None else {"shN": shN}))
+    if means.dim() != 2:
+        raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
+    harmonics = [sh0] if shN is None else [sh0, shN]
+    _check_harmonics(harmonics, len(means))
+    if sh_degree is None:
+        sh_degree = math.isqrt(sum(part.shape[1] for part in harmonics)) - 1
+    project = ProjectOptions(
+        width, height, tile_size, near_plane, far_plane, eps2d, radius_clip, rasterize_mode == "antialiased"
+    )
+    geometry = (means, quats, scales, opacities)
+    whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, False, raw=True)
+    lazy = _lazy(optimizers)
+    for optimizer in lazy:
+        optimizer.catch_up(geometry)
+    ids, sizes = _visible([group.arguments for group in groups_of(whole, project)])
+    for optimizer in lazy:
+        optimizer.catch_up(harmonics, ids)
+    shaded = "RGB" in render_mode
+    seen = _Visible.apply(ids, sparse_grad, *geometry, *(harmonics if shaded else ()))  # type: ignore[no-untyped-call]
+    sh = None if not shaded else seen[4] if shN is None else torch.cat(seen[4:], dim=1)
+    gaussians = gaussians_of(
+        seen[0], seen[1], seen[2], seen[3], sh, viewmats, Ks, sh_degree, shaded, raw=True
+    )
+    named = {**whole.named, **({"sh0": (sh0,), "shN": (shN,)} if shN is not None else {"sh0": (sh0,)})}
+    background = background_rows(backgrounds, gaussians, render_mode)
+    image = ImageOptions(render_mode, background, True, False, absgrad)
+    renders, alphas, meta = render(
+        "raw_rasterization", replace(gaussians, named=named), project, image, sizes
+    )
+    of_seen = meta["gaussian_ids"]
+    meta["gaussian_ids"] = Later(lambda: ids.long()[of_seen])
+    return renders, alphas, meta
+
+
+def _lazy(optimizers: Any) -> list[CatchesUp]:
+    if hasattr(optimizers, "catch_up"):
+        return [optimizers]
+    given = optimizers.values() if isinstance(optimizers, Mapping) else optimizers
+    return [optimizer for optimizer in given if hasattr(optimizer, "catch_up")]
+
+
+def _check_harmonics(harmonics: list[Tensor], count: int) -> None:
+    for name, part in zip(("sh0", "shN"), harmonics, strict=False):
+        if part.dim() != 3 or part.shape[0] != count or part.shape[2] != 3:
+            raise ValueError(f"{name} must be [N, K, 3] with N = {count}, got {list(part.shape)}")
+
+
+@torch.no_grad()
+def _visible(calls: list[tuple[Any, ...]]) -> tuple[Tensor, tuple[int, int, int] | None]:
+    """Return the Gaussians that some view sees, int32 [U], and the rows there will be of them.
+
+    Args:
+        calls: arguments of the op for at most 32 views each.
+
+    Returns:
+        Ascending ids; how many Gaussians, rows and intersections there are, if all are of one call.
+    """
+    parts = [project_rows(*arguments) for arguments in calls]
+    if len(parts) > 1:
+        return torch.cat([rows.visible_ids for rows in parts]).unique(), None
+    visible, rows, isects = parts[0].counts.tolist()
+    return parts[0].visible_ids, (visible, rows, isects)
+
+
+class _Visible(torch.autograd.Function):
+    """The rows `ids` of tables; their gradients are sparse, or dense where that is wanted."""
+
+    @staticmethod
+    def forward(ctx: Any, ids: Tensor, sparse: bool, *tables: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(ids)
+        ctx.sparse, ctx.shapes = sparse, [table.shape for table in tables]
+        ctx.set_materialize_grads(False)
+        return tuple(table.index_select(0, ids) for table in tables)
+
+    @staticmethod
+    def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
+        ids = ctx.saved_tensors[0].long()
+        gradients = (
+            None if v is None else _of_all(ids, v, shape, ctx.sparse)
+            for v, shape in zip(v_rows, ctx.shapes, strict=True)
+        )
+        return None, None, *gradients
+
+
+def _of_all(ids: Tensor, v_rows: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
+    """Return the gradient of a whole table, from that of its rows `ids`."""
+    if sparse:
+        return torch.sparse_coo_tensor(ids[None], v_rows, shape, is_coalesced=True, check_invariants=False)
+    return v_rows.new_zeros(shape).index_copy_(0, ids, v_rows)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.l1_ssim` is the mean of `photometric_loss`, which its own tests hold against the textbook."""
+
+import pytest
+import torch
+
+import blitzgs
+from blitzgs.ops.photometric import photometric_loss
+from tests.helpers import BACKENDS, relative_error
+
+
+def images(device, dtype, *lead):
+    generator = torch.Generator().manual_seed(0)
+    renders = torch.rand(*lead, 21, 34, 3, generator=generator, dtype=torch.float64)
+    targets = torch.randint(256, renders.shape, generator=generator, dtype=torch.uint8)
+    masks = torch.rand(*lead, 21, 34, generator=generator) > 0.3
+    return renders.to(device, dtype), targets.to(device), masks.to(device)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_loss_and_gradient(backend, masked, weight):
+    renders, targets, masks = images(*backend, 3)
+    masks[1] = False  # a view without a pixel
+    masks = masks if masked else None
+    results = []
+    for loss_of in (blitzgs.l1_ssim, lambda *a: photometric_loss(*a).mean()):
+        x = renders.clone().requires_grad_()
+        loss = loss_of(x, targets, masks, weight)
+        (3 * loss).backward()
+        results.append((loss.detach(), x.grad))
+    bound = 1e-12 if renders.dtype == torch.float64 else 1e-5
+    assert results[0][0].shape == () and results[0][0].dtype == renders.dtype
+    for actual, expected in zip(*results, strict=True):
+        assert relative_error(actual, expected) < bound
+    assert relative_error(blitzgs.l1_ssim(renders, targets, masks, weight), results[0][0]) < bound
+
+
+def test_leading_dimensions_and_floating_targets():
+    renders, targets, masks = images("cpu", torch.float64, 2, 2)
+    expected = blitzgs.l1_ssim(renders.flatten(0, 1), targets.flatten(0, 1), masks.flatten(0, 1))
+    assert torch.equal(blitzgs.l1_ssim(renders, targets, masks), expected)
+    single = blitzgs.l1_ssim(renders[0, 0], targets[0, 0].double() / 255, masks[0, 0])
+    assert relative_error(single, blitzgs.l1_ssim(renders[:1, 0], targets[:1, 0], masks[:1, 0])) < 1e-12
+
+
+def test_renders_may_change_after_the_loss():
+    renders, targets, _ = images("cpu", torch.float32, 1)
+    x = renders.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(blitzgs.l1_ssim(x, targets), x)
+    y = x * 1
+    loss = blitzgs.l1_ssim(y, targets)
+    y.zero_()
+    assert torch.equal(torch.autograd.grad(loss, x)[0], expected)
+
+
+def test_a_second_derivative_is_refused():
+    renders, targets, _ = images("cpu", torch.float32, 1)
+    x = renders.requires_grad_()
+    (gradient,) = torch.autograd.grad(blitzgs.l1_ssim(x, targets), x, create_graph=True)
+    with pytest.raises(RuntimeError, match="l1_ssim has first derivatives only"):
+        gradient.sum().backward()
+
+
+def test_it_compiles():
+    torch._dynamo.reset()
+    renders, targets, masks = images("cpu", torch.float32, 2)
+    x = renders.clone().requires_grad_()
+    compiled = torch.compile(blitzgs.l1_ssim, fullgraph=True, backend="aot_eager")
+    (gradient,) = torch.autograd.grad(compiled(x, targets, masks), x)
+    (expected,) = torch.autograd.grad(blitzgs.l1_ssim(x, targets, masks), x)
+    assert relative_error(gradient, expected) < 1e-5
+
+
+def test_wrong_use_is_refused():
+    x = torch.rand(1, 8, 8, 3)
+    with pytest.raises(ValueError, match=r"must be \[..., H, W, 3\], got \[1, 8, 8, 3\] and \[1, 8, 7, 3\]"):
+        blitzgs.l1_ssim(x, x[:, :, :7])
+    with pytest.raises(ValueError, match=r"masks must be \[1, 8, 8\], got \[8, 8\]"):
+        blitzgs.l1_ssim(x, x, torch.ones(8, 8))
+    with pytest.raises(ValueError, match=r"ssim_weight must be in \[0, 1\], got 2"):
+        blitzgs.l1_ssim(x, x, ssim_weight=2)

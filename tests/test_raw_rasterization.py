@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs.raw_rasterization` is `blitzgs.rasterization` of activated parameters, for what is visible."""
+
+import pytest
+import torch
+
+import blitzgs
+from blitzgs.optim import LazyAdam
+from tests.helpers import BACKENDS, DEVICES, needs_cuda, random_scene, relative_error
+
+NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def raw_parameters(scene):
+    """Leaves, as gsplat's trainer has them."""
+    values = {
+        "means": scene.means,
+        "quats": scene.quats,
+        "scales": scene.scales.log(),
+        "opacities": scene.opacities.logit(),
+        "sh0": scene.colors[:, :1],
+        "shN": scene.colors[:, 1:],
+    }
+    return {name: value.detach().clone().requires_grad_() for name, value in values.items()}
+
+
+def spread(scene):
+    """Put half of the Gaussians where few views see them."""
+    scene.means[::2] *= 5.0
+    return scene
+
+
+def activated(p, scene, **options):
+    return blitzgs.rasterization(
+        p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(),
+        torch.cat([p["sh0"], p["shN"]], dim=1), scene.viewmats, scene.Ks, scene.width, scene.height,
+        **{"sh_degree": 3, **options},
+    )  # fmt: skip
+
+
+def raw(p, scene, **options):
+    return blitzgs.raw_rasterization(
+        *p.values(), scene.viewmats, scene.Ks, scene.width, scene.height, **options
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "options", [{}, {"render_mode": "RGB+ED"}, {"rasterize_mode": "antialiased"}], ids=str
+)
+@pytest.mark.parametrize("cameras", [1, 3, 40])
+def test_it_renders_what_activated_parameters_render(backend, options, cameras):
+    device, dtype = backend
+    scene = spread(random_scene(n=80, cameras=cameras, width=24, height=20, dtype=dtype, device=device))
+    bound = 1e-11 if dtype == torch.float64 else 1e-4
+    expected, actual = raw_parameters(scene), raw_parameters(scene)
+    for _ in range(2):  # on CUDA the second call of `rasterization` is queued
+        image, alphas, meta = activated(expected, scene, **options)
+        own_image, own_alphas, own_meta = raw(actual, scene, **options)
+    assert relative_error(own_image, image) < bound and relative_error(own_alphas, alphas) < bound
+    for name in ("camera_ids", "gaussian_ids", "radii", "tiles_per_gauss"):
+        assert torch.equal(own_meta[name], meta[name]), name
+    assert relative_error(own_meta["means2d"], meta["means2d"]) < bound
+    image.square().sum().backward()
+    own_meta["means2d"].retain_grad()
+    own_image.square().sum().backward()
+    visible = meta["gaussian_ids"].unique()
+    for name in NAMES:
+        gradient = actual[name].grad
+        assert gradient.is_sparse and torch.equal(gradient.coalesce().indices()[0], visible), name
+        assert relative_error(gradient.to_dense(), expected[name].grad) < 10 * bound, name
+    assert own_meta["means2d"].grad.any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_gradients_may_be_dense_and_sh_one_tensor(device):
+    scene = spread(random_scene(n=60, device=device))
+    expected, split = raw_parameters(scene), raw_parameters(scene)
+    whole = torch.cat([split.pop("sh0"), split.pop("shN")], dim=1).detach().requires_grad_()
+    activated(expected, scene, sh_degree=2)[0].square().sum().backward()
+    split |= {"sh0": whole, "shN": None}
+    raw(split, scene, sh_degree=2, sparse_grad=False)[0].square().sum().backward()
+    for name in NAMES[:4]:
+        assert relative_error(split[name].grad, expected[name].grad) < 1e-4, name
+    joined = torch.cat([expected["sh0"].grad, expected["shN"].grad], dim=1)
+    assert relative_error(whole.grad, joined) < 1e-4
+
+
+def test_depth_has_no_gradient_of_sh():
+    scene = random_scene(n=30)
+    p = raw_parameters(scene)
+    image, _, _ = raw(p, scene, render_mode="D")
+    image.sum().backward()
+    assert p["means"].grad is not None and p["sh0"].grad is None and p["shN"].grad is None
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_nothing_visible_is_an_empty_image(device):
+    scene = random_scene(n=20, device=device)
+    scene.means += 1e4
+    p = raw_parameters(scene)
+    image, alphas, meta = raw(p, scene, backgrounds=torch.full((2, 3), 0.5, device=device))
+    assert (image == 0.5).all() and not alphas.any() and len(meta["gaussian_ids"]) == 0
+    image.sum().backward()
+    assert p["means"].grad.coalesce().values().shape == (0, 3)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("in_one", [True, False])
+def test_lazy_steps_are_those_of_dense_adam(backend, in_one):
+    """Views in turn, so that most rows are behind when they are next seen."""
+    device, dtype = backend
+    scene = spread(random_scene(n=60, cameras=6, width=20, height=16, dtype=dtype, device=device))
+    dense, lazy = raw_parameters(scene), raw_parameters(scene)
+    rates = dict(zip(NAMES, (2.0**-9, 2.0**-10, 2.0**-8, 2.0**-6, 2.0**-8, 2.0**-10), strict=True))
+    groups = [{"params": [p], "lr": rates[name], "name": name} for name, p in lazy.items()]
+    adam = torch.optim.Adam([{"params": [p], "lr": rates[name]} for name, p in dense.items()], eps=1e-15)
+    if in_one:
+        optimizers = LazyAdam(groups, eps=1e-15)
+    else:  # as gsplat's strategies want them
+        optimizers = {group["name"]: LazyAdam([group], eps=1e-15) for group in groups}
+    generator = torch.Generator().manual_seed(2)
+    for _ in range(14):
+        one = random_scene(n=1, cameras=1, width=20, height=16)
+        view = torch.randint(6, (1,), generator=generator).item()
+        one.viewmats, one.Ks = scene.viewmats[view, None], scene.Ks[view, None]
+        target = torch.rand(1, 16, 20, 3, generator=generator).to(device, dtype)
+        for p, image in ((dense, activated(dense, one)[0]), (lazy, raw(lazy, one, optimizers=optimizers)[0])):
+            for param in p.values():
+                param.grad = None
+            blitzgs.l1_ssim(image, target).backward()
+        adam.step()
+        for optimizer in [optimizers] if in_one else optimizers.values():
+            optimizer.step()
+    for optimizer in [optimizers] if in_one else optimizers.values():
+        optimizer.catch_up()
+    for name in NAMES:
+        assert relative_error(lazy[name], dense[name]) < (1e-9 if dtype == torch.float64 else 2e-3), name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_not_finite_is_named(name):
+    scene = random_scene(n=40, cameras=1)
+    p = raw_parameters(scene)
+    seen = int(raw(p, scene)[2]["gaussian_ids"][0])
+    p[name].data[seen] = torch.nan
+    with pytest.warns(RuntimeWarning, match=rf"blitzgs.raw_rasterization: NaN or infinite values in {name};"):
+        image, _, meta = raw(p, scene)
+    assert image.isfinite().all()
+    assert {key: value.tolist() for key, value in meta["non_finite"].items()} == {name: [seen]}
+
+
+def test_infinite_logits_are_fine(recwarn):
+    scene = random_scene(n=40, cameras=1)
+    p = raw_parameters(scene)
+    p["opacities"].data[:20], p["scales"].data[5] = torch.inf, -torch.inf
+    image, _, meta = raw(p, scene)
+    assert image.isfinite().all() and meta["non_finite"] == {}
+    assert not [w for w in recwarn if "blitzgs" in str(w.message)]
+
+
+def test_wrong_shapes_are_refused_by_name():
+    scene = random_scene(n=20)
+    p = raw_parameters(scene)
+    with pytest.raises(ValueError, match=r"shN must be \[N, K, 3\] with N = 20, got \[19, 15, 3\]"):
+        raw({**p, "shN": p["shN"][:19]}, scene)
+    with pytest.raises(ValueError, match=r"means must be \[N, 3\], got \[1, 20, 3\]"):
+        raw({**p, "means": p["means"][None]}, scene)
+    with pytest.raises(TypeError, match=r"quats must be a torch\.Tensor, got ndarray"):
+        raw({**p, "quats": p["quats"].detach().numpy()}, scene)
+    with pytest.raises(ValueError, match="sh_degree 3 needs 16 SH coefficients, got 4"):
+        raw({**p, "shN": p["shN"][:, :3]}, scene, sh_degree=3)
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_memory_follows_what_is_visible():
+    scene = random_scene(n=1000, cameras=1, device="cuda")
+    p = raw_parameters(scene)
+    far = {name: t.detach().repeat(1000, *(1,) * (t.dim() - 1)) for name, t in p.items()}
+    far["means"][1000:] += 1e4
+    far = {name: t.requires_grad_() for name, t in far.items()}
+    for _ in range(3):
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        raw(far, scene)[0].sum().backward()
+        torch.cuda.synchronize()
+        peak = torch.cuda.max_memory_allocated() - before
+        for t in far.values():
+            t.grad = None
+    assert peak < 40e6  # 1 M Gaussians have 236 MB of parameters
