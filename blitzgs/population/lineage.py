@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import json
 import re
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
 from blitzgs.population.candidates import FEATURES
 
+# What was trained: the capture's name and fingerprint, and the schedule under which its Gaussians lived.
+ABOUT = "about.json"
 _PART = re.compile(r"(births|deaths)_(\d{8})_(\d{4})_(\d{4})\.parquet")
 # Rows that are kept in memory before they are written.
 _MOST_PENDING = 1 << 20
@@ -86,7 +89,9 @@ class Ledger:
 class Lineage:
     """Logs births and deaths of one rank."""
 
-    def __init__(self, folder: Path, ranks: Ranks, step: int, ledger: Ledger) -> None:
+    def __init__(
+        self, folder: Path, ranks: Ranks, step: int, ledger: Ledger, about: dict[str, Any] | None = None
+    ) -> None:
         """Begin, or go on from a checkpoint. Collective.
 
         Args:
@@ -94,6 +99,7 @@ class Lineage:
             ranks: the job.
             step: optimiser step of the checkpoint; parts of later ones are deleted. 0: all are.
             ledger: of the checkpoint.
+            about: what is trained, for the file `ABOUT`.
 
         Raises:
             ImportError: pyarrow is not installed.
@@ -106,6 +112,7 @@ class Lineage:
                 name = _PART.fullmatch(path.name)
                 if path.name.startswith(".") or (name and (step == 0 or int(name[2]) > step)):
                     path.unlink()
+            (folder / ABOUT).write_text(json.dumps(about or {}, indent=1) + "\n")
         ranks.barrier()
         self._sums = torch.zeros(3, dtype=torch.int64, device=ranks.device)
         self._pending: dict[str, list[dict[str, Tensor]]] = {"births": [], "deaths": []}

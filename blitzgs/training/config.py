@@ -97,6 +97,7 @@ class ScheduleConfig:
         size_prune_after: density events later than this also prune by size.
         reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
             `densify_until`; 0: never.
+        gate_from: density events from here on go through `population.gate`.
         t1, t2: the first and the second importance pass, where `population.importance` is set; 0: none. A
             pass follows the density event of the same image.
         sh_every: the spherical-harmonics degree grows by one each time.
@@ -113,6 +114,7 @@ class ScheduleConfig:
     densify_every: int = 100
     size_prune_after: int = 3_000
     reset_every: int = 0
+    gate_from: int = 11_250
     t1: int = 7_500
     t2: int = 16_000
     sh_every: int = 1_000
@@ -187,6 +189,9 @@ class PopulationConfig:
             those below `min_opacity` go too; 1: all, as above.
         phi: from the first pass on, weigh the gradients that density control adds up with phi, the share of
             the views seeing a Gaussian in which it counts.
+        gate: model file of a spawn gate (`blitzgs gate fit`); null: none.
+        gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
+            event from `schedule.gate_from` on.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).
     """
 
@@ -202,6 +207,8 @@ class PopulationConfig:
     pass1_keep: float = 0.7
     pass2_mass: float = 0.99
     phi: bool = True
+    gate: str | None = None
+    gate_rate: float = 0.6
     lineage: bool = False
 
 

@@ -88,6 +88,10 @@ class Schedule:
         """Tell whether the step at [begin, begin + B) counts for a density event still to come."""
         return begin < self._config.densify_until * self._config.scale
 
+    def gates(self, time: int) -> bool:
+        """Tell whether the candidates of a density event at `time` go through the spawn gate."""
+        return time >= self._scaled(self._config.gate_from)
+
     def prunes_by_size(self, time: int) -> bool:
         """Tell whether a density event at `time` also prunes by screen and world size."""
         return time > self._scaled(self._config.size_prune_after)

@@ -21,7 +21,8 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import save_config
 from blitzgs.training.evaluation import load_lpips
 from blitzgs.training.folder_checks import check_room, check_writable
-from blitzgs.training.inputs import check_alike, check_capture
+from blitzgs.training.gate import life_fields, open_gate
+from blitzgs.training.inputs import capture_fingerprint, check_alike, check_capture
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_cameras import CAMERAS, save_cameras
@@ -96,14 +97,24 @@ def set_up(
         run_id=run_id,
         origin=_origin(restored, resume, folder),
         save_clock=SaveClock(config.log.checkpoint_seconds),
-        lineage=_start_lineage(folder, table, progress, ranks) if config.population.lineage else None,
+        veto=open_gate(config, capture, ranks),
+        lineage=_start_lineage(config, capture, folder, table, progress, ranks),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
 
 
-def _start_lineage(folder: Path, table: GaussianTable, progress: Progress, ranks: Ranks) -> Lineage:
+def _start_lineage(
+    config: Config, capture: Capture, folder: Path, table: GaussianTable, progress: Progress, ranks: Ranks
+) -> Lineage | None:
     """Begin the log of births and deaths, or go on from the checkpoint's."""
-    lineage = Lineage(folder / run.LINEAGE, ranks, progress.step, ledger_of(progress.ledger))
+    if not config.population.lineage:
+        return None
+    about = {
+        "name": Path(config.data.path).resolve().name,
+        "scene": capture_fingerprint(capture),
+        "schedule": life_fields(config),
+    }
+    lineage = Lineage(folder / run.LINEAGE, ranks, progress.step, ledger_of(progress.ledger), about)
     if not progress.ledger:
         lineage.born(initial_births(table["id"], table["parent"], table["means"]), progress.step)
     return lineage

@@ -15,6 +15,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions
+from blitzgs.population.candidates import Veto
 from blitzgs.population.lineage import Lineage
 from blitzgs.scene.capture import Capture
 from blitzgs.training.agreement import SaveClock
@@ -52,6 +53,7 @@ class TrainingState:
         run_id: names the run in its log, over every resume.
         origin: where the run begins, in words.
         save_clock: says when the next checkpoint by wall time is due.
+        veto: withholds candidates of densification from `schedule.gate_from` on, or None.
         lineage: logs births and deaths, or None.
         log: where the run reports; silent until the loop opens the run's own.
     """
@@ -73,6 +75,7 @@ class TrainingState:
     run_id: str
     origin: str
     save_clock: SaveClock
+    veto: Veto | None
     lineage: Lineage | None
     log: RunLog
     _started: float = field(default_factory=time.monotonic)

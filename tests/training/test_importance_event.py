@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.population.gate_fit import fit, read_spawns
 from blitzgs.population.importance import CULL, PHI, is_culled
 from blitzgs.population.lineage import Cause, read_lineage
 from blitzgs.training import run
@@ -182,3 +183,28 @@ def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
     assert causes[Cause.SPLIT] + causes.get(Cause.OPACITY, 0) > 0
     ledger = trainer.state.progress.ledger
     assert ledger["births"] == len(births) and ledger["deaths"] == len(deaths)
+
+
+def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
+    """Fitted on the lineage of one run, used in another; both of its warnings are due."""
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("xgboost")
+    train(tmp_path / "lineage", "population.lineage=true", "population.grad_threshold=1e-4")
+    run_of = read_spawns(tmp_path / "lineage" / run.LINEAGE)
+    assert run_of.features.shape[1] == 8 and run_of.times.max() == 80
+    path = tmp_path / "gate.json"
+    figures = fit([run_of], path)
+    assert figures["protocol"] == "a quarter of the parents held out"
+    flags = [f"population.gate={path}", "schedule.gate_from=60", "population.gate_rate=0.5"]
+    with pytest.warns(UserWarning) as warned:
+        train(tmp_path / "gated", *flags)
+    texts = [str(w.message) for w in warned if "spawn gate" in str(w.message)]
+    assert any("fitted on this very capture" in text for text in texts)
+    assert any("population.grad_threshold (0.0001, here 0.0002)" in text for text in texts)
+    lines = [json.loads(line) for line in (tmp_path / "gated" / "log.jsonl").read_text().splitlines()]
+    events = {r["t"]: r for r in lines if r.get("event") == "densify"}
+    assert events[20]["vetoed"] == events[40]["vetoed"] == 0
+    for t in (60, 80):
+        grown = events[t]["cloned"] + events[t]["split"]
+        assert grown > 10 and grown <= events[t]["vetoed"] <= grown + 2
+        assert events[t]["held_back"] == events[t]["vetoed"]

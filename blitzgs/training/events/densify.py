@@ -35,6 +35,7 @@ def run(state: TrainingState, event: Event) -> None:
         level_count=state.progress.level_count,
         ranks=state.ranks,
         extent=state.space.extent,
+        veto=state.veto if state.schedule.gates(event.time) else None,
         lineage=state.lineage,
     )
     counts = dataclasses.asdict(report) | {"gaussians": len(state.table)}

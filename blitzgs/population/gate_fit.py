@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits and judges spawn gates on lineage: which candidates' children survived to the final model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blitzgs.population.candidates import FEATURES
+from blitzgs.population.lineage import ABOUT, read_lineage
+from blitzgs.population.spawn_gate import GateInfo, write_info
+
+# Births of a scene that a fit takes at most, drawn evenly.
+MOST_ROWS = 4_000_000
+PARAMETERS = {
+    "objective": "binary:logistic",
+    "tree_method": "hist",
+    "max_depth": 6,
+    "eta": 0.1,
+    "min_child_weight": 20,
+    "subsample": 0.8,
+    "base_score": 0.5,
+}
+ROUNDS = 200
+# Share of a lone scene's births, by parent, that judge the fit on the others.
+HELD_OUT = 0.25
+
+
+@dataclass(frozen=True)
+class Spawns:
+    """The spawns of one run, K of them, without its initial Gaussians.
+
+    Attributes:
+        name: of the run.
+        scene: fingerprint of its capture.
+        schedule: fields of its configuration.
+        features: float32 [K, 8], see `candidates.FEATURES`.
+        survived: bool [K].
+        parents: int64 [K].
+        positions: float32 [K, 3], where they were born.
+    """
+
+    name: str
+    scene: str
+    schedule: dict[str, Any]
+    features: NDArray[np.float32]
+    survived: NDArray[np.bool_]
+    parents: NDArray[np.int64]
+    positions: NDArray[np.float32]
+
+    @property
+    def times(self) -> NDArray[np.float32]:
+        """When they were born, images."""
+        times: NDArray[np.float32] = self.features[:, FEATURES.index("time")]
+        return times
+
+
+def read_spawns(folder: Path) -> Spawns:
+    """Read the spawns of a finished run from its lineage.
+
+    Args:
+        folder: that of the lineage.
+
+    Raises:
+        FileNotFoundError: there is no lineage.
+        ValueError: nothing was born, or all or none of it survived.
+        ImportError: pyarrow is not installed.
+    """
+    tables = read_lineage(folder)
+    about = json.loads((folder / ABOUT).read_text())
+    births, deaths = tables["births"], tables["deaths"]
+    spawned = births["parent"] >= 0
+    survived = ~np.isin(births["id"][spawned], deaths["id"])
+    if not len(survived) or survived.all() or not survived.any():
+        raise ValueError(
+            f"{folder}: {int(survived.sum()):,} of {len(survived):,} spawns survived; a gate needs a "
+            "finished run in which some did and some did not"
+        )
+    return Spawns(
+        name=about["name"],
+        scene=about["scene"],
+        schedule=about["schedule"],
+        features=np.stack([births[name][spawned].astype(np.float32) for name in FEATURES], 1),
+        survived=survived,
+        parents=births["parent"][spawned],
+        positions=np.stack([births[axis][spawned] for axis in "xyz"], 1),
+    )
+
+
+def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
+    """Return the area under the ROC curve: the chance that a positive scores higher, ties counting half."""
+    _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
+    ends = counts.cumsum()
+    ranks = (ends - (counts - 1) / 2)[inverse]
+    n_positive = int(positive.sum())
+    n_negative = len(positive) - n_positive
+    return float((ranks[positive].sum() - n_positive * (n_positive + 1) / 2) / (n_positive * n_negative))
+
+
+def best_feature(spawns: Spawns) -> tuple[str, float]:
+    """Return the single feature that separates best by itself, in either direction, and its AUC."""
+    found = [(name, auc(spawns.features[:, k], spawns.survived)) for k, name in enumerate(FEATURES)]
+    return max(((name, max(value, 1 - value)) for name, value in found), key=lambda pair: pair[1])
+
+
+def fit(runs: Sequence[Spawns], path: Path, seed: int = 0) -> dict[str, Any]:
+    """Fit a gate on all runs, and measure how such a gate does on scenes that it has not seen.
+
+    With several scenes, one after the other is left out, a gate is fitted on the runs of the others and
+    judged on its spawns. With a single scene, a quarter of the parents is held out instead.
+
+    Args:
+        runs: at least one.
+        path: of the model, `NAME.json`; its metadata lie beside it.
+        seed: of the draws of rows.
+
+    Returns:
+        The figures that go into the metadata: for each run held out, the AUC of the gate, that of the best
+        single feature and its name, the spawns and the share that survived.
+
+    Raises:
+        ValueError: the runs are of different schedules.
+        ImportError: xgboost is not installed.
+    """
+    xgboost = _xgboost()
+    schedules = {json.dumps(run.schedule, sort_keys=True) for run in runs}
+    if len(schedules) > 1:
+        raise ValueError("the runs have different schedules; fit one gate for each: " + "; ".join(schedules))
+    scenes = sorted({run.scene for run in runs})
+    figures = []
+    for run in runs:
+        if len(scenes) > 1:
+            others = [other for other in runs if other.scene != run.scene]
+            judged = np.ones(len(run.survived), bool)
+            booster = _train(xgboost, others, [np.ones(len(o.survived), bool) for o in others], seed)
+        else:
+            judged = _hash_uniform(run.parents) < HELD_OUT
+            booster = _train(xgboost, runs, [_hash_uniform(o.parents) >= HELD_OUT for o in runs], seed)
+        figures.append(judge(run, _predict(xgboost, booster, run.features), judged))
+    protocol = "leave one scene out" if len(scenes) > 1 else "a quarter of the parents held out"
+    result = {"protocol": protocol, "held_out": figures}
+    booster = _train(xgboost, runs, [np.ones(len(run.survived), bool) for run in runs], seed)
+    booster.save_model(path)
+    write_info(path, GateInfo(FEATURES, runs[0].schedule, {run.name: run.scene for run in runs}, auc=result))
+    return result
+
+
+def judge(run: Spawns, scores: NDArray[Any], rows: NDArray[np.bool_] | None = None) -> dict[str, Any]:
+    """Return how scores separate the spawns of a run (or some of them) that survived from the others."""
+    if rows is not None:
+        run = Spawns(
+            run.name,
+            run.scene,
+            run.schedule,
+            run.features[rows],
+            run.survived[rows],
+            run.parents[rows],
+            run.positions[rows],
+        )
+        scores = scores[rows]
+    name, single = best_feature(run)
+    return {
+        "run": run.name,
+        "auc": auc(scores, run.survived),
+        "best_feature": name,
+        "best_feature_auc": single,
+        "spawns": len(run.survived),
+        "survived": float(run.survived.mean()),
+    }
+
+
+def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[np.bool_]], seed: int) -> Any:
+    generator = np.random.default_rng(seed)
+    features, labels = [], []
+    for run, mine in zip(runs, rows, strict=True):
+        chosen = mine.nonzero()[0]
+        if len(chosen) > MOST_ROWS:
+            chosen = np.sort(generator.choice(chosen, MOST_ROWS, replace=False))
+        features.append(run.features[chosen])
+        labels.append(run.survived[chosen])
+    data = xgboost.DMatrix(np.concatenate(features), np.concatenate(labels), feature_names=list(FEATURES))
+    return xgboost.train(PARAMETERS | {"seed": seed}, data, ROUNDS)
+
+
+def _predict(xgboost: ModuleType, booster: Any, features: NDArray[np.float32]) -> NDArray[np.float32]:
+    data = xgboost.DMatrix(features, feature_names=list(FEATURES))
+    scores: NDArray[np.float32] = booster.predict(data, output_margin=True)
+    return scores
+
+
+def _hash_uniform(ids: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Map ids to [0, 1), so that the children of a parent stay together."""
+    mixed = (ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(11)
+    return mixed / 2.0**53
+
+
+def _xgboost() -> ModuleType:
+    try:
+        import xgboost
+    except ImportError as error:
+        raise ImportError("fitting a gate needs xgboost: pip install xgboost") from error
+    module: ModuleType = xgboost
+    return module

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The spawn gate: its trees against XGBoost, its veto against sorting, its fit on lives that can be told."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.population.candidates import FEATURES, Candidates
+from blitzgs.population.gate_fit import Spawns, auc, best_feature, fit, judge
+from blitzgs.population.spawn_gate import (
+    GateError,
+    RandomVeto,
+    RankVeto,
+    SpawnGate,
+    info_path,
+    veto_lowest,
+)
+from tests.distributed.rank_harness import run_ranks
+from tests.helpers import DEVICES
+
+xgboost = pytest.importorskip("xgboost")
+SCHEDULE = {"schedule.iterations": 100}
+
+
+def spawns(scene, count=4000, seed=0, schedule=SCHEDULE):
+    """Lives decided by two features together, neither of which tells by itself, and by chance."""
+    g = np.random.default_rng(seed)
+    features = g.random((count, len(FEATURES)), dtype=np.float32)
+    features[:, 7] = features[:, 7] > 0.5
+    features[::50, 0] = np.nan
+    hidden = (features[:, 1] > 0.5) ^ (features[:, 5] > 0.4)
+    survived = np.where(g.random(count) < 0.85, hidden, g.random(count) < 0.5)
+    parents = g.integers(0, 1 << 62, count)
+    return Spawns(scene, scene, schedule, features, survived, parents, g.random((count, 3), dtype=np.float32))
+
+
+@pytest.fixture(scope="module")
+def gate(tmp_path_factory):
+    path = tmp_path_factory.mktemp("gate") / "gate.json"
+    return path, fit([spawns("a", seed=1), spawns("b", seed=2), spawns("c", seed=3)], path)
+
+
+def candidates(count=1000, seed=5, device="cpu"):
+    run = spawns("d", count, seed)
+    features = torch.from_numpy(run.features).to(device)
+    return Candidates(torch.from_numpy(run.parents).to(device), features[:, 7] > 0.5, features, 100)
+
+
+def test_a_gate_transfers_to_scenes_it_has_not_seen(gate):
+    path, figures = gate
+    assert figures["protocol"] == "leave one scene out"
+    for entry in figures["held_out"]:
+        assert entry["auc"] > 0.88 > 0.65 > entry["best_feature_auc"]
+        assert entry["spawns"] == 4000
+    info = json.loads(info_path(path).read_text())
+    assert info["features"] == list(FEATURES) and info["scenes"] == {"a": "a", "b": "b", "c": "c"}
+    assert info["auc"] == figures and info["schedule"] == SCHEDULE
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("suffix", [".json", ".ubj"])
+def test_trees_are_those_of_xgboost(gate, tmp_path, device, suffix):
+    path, _ = gate
+    booster = xgboost.Booster(model_file=str(path))
+    copy = tmp_path / f"gate{suffix}"
+    booster.save_model(copy)
+    info_path(copy).write_text(info_path(path).read_text())
+    some = candidates(20_000)
+    some.features[::7, 3] = float("nan")
+    scores = SpawnGate(copy).scores(some.features.to(device)).cpu().double() / 2**32
+    data = xgboost.DMatrix(some.features.numpy(), feature_names=list(FEATURES))
+    margins = torch.from_numpy(booster.predict(data, output_margin=True)).double()
+    assert (scores - scores.mean() - margins + margins.mean()).abs().max() < 1e-4
+    assert SpawnGate(copy).scores(some.features[:0]).shape == (0,)
+
+
+def test_vetoes_the_lowest_of_clones_and_of_splits():
+    some = candidates(101)
+    scores = torch.randn(101, generator=torch.Generator().manual_seed(2))
+    scores[:30] = -3.0  # ties
+    for rate in (0.0, 0.3, 0.6, 1.0):
+        vetoed = veto_lowest(scores, some, rate, Ranks())
+        for group in (some.is_split, ~some.is_split):
+            rows = sorted(
+                group.nonzero().squeeze(1).tolist(), key=lambda i: (float(scores[i]), int(some.parents[i]))
+            )
+            k = -int(-len(rows) * round(rate * 10) // 10)
+            assert vetoed[rows[:k]].all() and not vetoed[rows[k:]].any()
+
+
+def _veto(ranks, path):
+    some = candidates()
+    mine = torch.arange(1000) % 5 % ranks.world_size == ranks.rank
+    own = Candidates(some.parents[mine], some.is_split[mine], some.features[mine], some.time)
+    vetoes = RankVeto(SpawnGate(path), 0.6), RandomVeto(0.6, 4)
+    return [own.parents[veto(own, ranks)].tolist() for veto in vetoes]
+
+
+def test_the_same_vetoes_at_every_world_size(gate):
+    alone = _veto(Ranks(), gate[0])
+    answers = run_ranks(_veto, 3, gate[0])
+    for k, want in enumerate(alone):
+        assert sorted(i for answer in answers for i in answer[k]) == sorted(want)
+        assert 600 <= len(want) <= 602
+    assert set(alone[0]) != set(alone[1])
+
+
+def test_auc_is_the_chance_to_rank_right():
+    g = np.random.default_rng(0)
+    scores, positive = g.integers(0, 20, 300), g.random(300) < 0.3
+    pairs = scores[positive][:, None] - scores[~positive][None]
+    assert auc(scores, positive) == pytest.approx(((pairs > 0) + 0.5 * (pairs == 0)).mean(), abs=1e-12)
+    run = spawns("a")
+    name, value = best_feature(run)
+    assert name in FEATURES and 0.5 <= value < 0.65
+    assert judge(run, run.survived.astype(float))["auc"] == 1
+
+
+def test_a_lone_scene_holds_parents_out(tmp_path):
+    figures = fit([spawns("a")], tmp_path / "g.json")
+    (entry,) = figures["held_out"]
+    assert 800 < entry["spawns"] < 1200 and entry["auc"] > 0.85
+    with pytest.raises(ValueError, match="different schedules"):
+        fit([spawns("a"), spawns("b", schedule={"x": 1})], tmp_path / "h.json")
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda path: info_path(path).unlink(), "is missing: a gate is a model and its metadata"),
+        (lambda path: info_path(path).write_text("{}"), "is not the metadata of a gate"),
+        (lambda path: path.write_text("no"), "is not a binary classifier in XGBoost's JSON"),
+        (
+            lambda path: info_path(path).write_text(
+                info_path(path).read_text().replace("parent_age", "parent_name")
+            ),
+            "was fitted on the features",
+        ),
+        (
+            lambda path: path.write_text(path.read_text().replace("binary:logistic", "reg:squarederror")),
+            "objective reg:squarederror",
+        ),
+    ],
+)
+def test_bad_files_are_named(gate, tmp_path, break_it, message):
+    path = tmp_path / "gate.json"
+    path.write_text(gate[0].read_text())
+    info_path(path).write_text(info_path(gate[0]).read_text())
+    SpawnGate(path)
+    break_it(path)
+    with pytest.raises(GateError, match=message):
+        SpawnGate(path)
