@@ -59,7 +59,7 @@ COMMANDS = {
     "accuracy": "python benchmarks/bm_accuracy.py",
     "quality": (
         "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
-        "--recipe aerial=configs/aerial.yaml --recipe gsplat=gsplat-default --seeds 0 1 2"
+        "--recipe aerial=configs/aerial.yaml --recipe gsplat=gsplat-default-reset --seeds 0 1 2"
     ),
 }
 # bm_quality.py takes no --json: it collects all of its runs in one file.
