@@ -55,6 +55,8 @@ SMOOTH_UNTIL = 80  # images
 SMOOTH, ROUGH = (0.0015, 0.012), (0.02, 0.2)  # loss, relative; PSNR, dB
 COUNT_TOLERANCE = 0.02  # relative
 DENSIFIED_TOLERANCE = (0.1, 5)  # of all Gaussians cloned, split and pruned: relative, and in number
+# Events that change the Gaussians; others only tell of them.
+CHANGES = ("densify", "reset_opacities")
 Curves = dict[str, Any]
 
 
@@ -85,7 +87,7 @@ def train(config: dict[str, Any], folder: Path, jitter: float = 0.0) -> Curves:
         "loss": [record["loss"] for record in steps],
         "psnr": [record["psnr"] for record in steps],
         "gaussians": [record["gaussians"] for record in steps],
-        "events": [[record["t"], record["event"]] for record in records if "event" in record],
+        "events": [[record["t"], record["event"]] for record in records if record.get("event") in CHANGES],
         "densified": {
             name: sum(event[name] for event in densified) for name in ("cloned", "split", "pruned")
         },
