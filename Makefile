@@ -25,7 +25,7 @@ $(VENV)/.torch: | $(VENV)/bin/python
 
 # Editable: the sources run in place and the kernels are built into blitzgs/_lib.
 $(VENV)/.installed: pyproject.toml setup.py $(VENV)/.torch
-	$(PYTHON) -m pip install --quiet cmake ninja "pybind11>=2.13"
+	$(PYTHON) -m pip install --quiet cmake ninja "pybind11>=2.13" "setuptools>=77" wheel
 	$(RUN) $(PYTHON) -m pip install --quiet --no-build-isolation -e ".[synth,log]"
 	touch $@
 
