@@ -31,16 +31,18 @@ from pathlib import Path
 
 import torch
 from exact_windows import EPS2D, FAR, NEAR, ExactWindows
+from gradients import parameter_gradients
 from harness import write_json
 from scenes import BenchmarkScene, aerial
 from timing import median_ms
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import Share, TileRanges
+from blitzgs.distributed.ownership import TileAssignment, TileRanges
+from blitzgs.distributed.transport import CollectiveTransport, LocalTransport, Transport
 from blitzgs.model import PARAMETERS, GaussianTable, schema
 from blitzgs.ops.intersect import tile_counts
-from blitzgs.pipeline import Frame, RenderOptions, Views, backward, forward
+from blitzgs.pipeline import Frame, RenderOptions, Views, forward
 
 IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # of the default setting
 
@@ -111,20 +113,25 @@ class Renderer:
             tile_size=option.tile_size,
             deterministic=option.deterministic,
         )
-        self.share = None
+        self.assignment: TileAssignment | None = None
+        self.transport: Transport = LocalTransport()
         if option.exchanged:
             columns, lines = tile_counts(scene.width, scene.height, option.tile_size)
             bounds = (0, len(Ks) * columns * lines)
             ranges = TileRanges(bounds, len(Ks), scene.width, scene.height, option.tile_size)
-            self.share = Share(Ranks(device=device), ranges, option.half)
+            ranks = Ranks(device=device)
+            self.assignment = TileAssignment(ranks, ranges)
+            self.transport = CollectiveTransport(ranks, option.half)
 
     def forward(self) -> Frame:
         """Render."""
-        return forward(self.table, self.views, self.options, share=self.share)
+        return forward(
+            self.table, self.views, self.options, assignment=self.assignment, transport=self.transport
+        )
 
-    def backward(self, frame: Frame, v_renders: Tensor) -> tuple[Tensor, ...]:
+    def backward(self, frame: Frame, v_renders: Tensor) -> list[Tensor]:
         """Return the gradients of the visible Gaussians."""
-        return backward(self.table, frame, v_renders)
+        return parameter_gradients(self.table, frame, v_renders)
 
     def step_ms(self, repeats: int) -> float:
         """Return the milliseconds of forward and backward, per view."""

@@ -31,14 +31,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from gradients import parameter_gradients
 from harness import write_json
 from scenes import aerial
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import LOSS_REACH, TILE_COST, Share, TileOwners, TileRanges, cost_balance
+from blitzgs.distributed.ownership import (
+    LOSS_HALO,
+    TILE_COST,
+    TileAssignment,
+    TileOwners,
+    TileRanges,
+    cost_balance,
+)
 from blitzgs.distributed.pixels import collect_images
-from blitzgs.distributed.rows import Traffic
+from blitzgs.distributed.transport import Traffic, open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views, unmarked
 from blitzgs.population.initialisation import octree_gaussians
@@ -170,7 +178,7 @@ class Workload:
         """Divide the tiles of a batch as the trainer does."""
         if self.ranks.world_size == 1:
             return None
-        return self.owners.divide(keys, views.width, views.height, self.options.tile_size, LOSS_REACH)
+        return self.owners.divide(keys, views.width, views.height, self.options.tile_size, LOSS_HALO)
 
     def batch(self, keys: list[int], views: Views) -> Batch:
         """Return views with grey photographs."""
@@ -186,7 +194,7 @@ class Workload:
         return {
             "rows": len(frame.rows.gaussian_ids),
             "visible": len(frame.rows.visible_ids),
-            "sent": 0 if frame.route is None else _sent_elsewhere(frame.route.traffic),
+            "sent": 0 if frame.traffic is None else _sent_elsewhere(frame.traffic),
             "work": sums,
             "ranges": batch.ranges,
         }
@@ -228,10 +236,11 @@ def half_precision_error(load: Workload) -> dict[str, float]:
     keys, views = load.batches[0]
     batch, images, gradients = load.batch(keys, views), [], []
     for half in (False, True):
-        share = Share(load.ranks, batch.ranges, half) if batch.ranges is not None else None
-        frame = pipeline.forward(load.table, views, load.options, share=share)
+        assignment = TileAssignment(load.ranks, batch.ranges) if batch.ranges is not None else None
+        transport = open_transport(load.ranks, half)
+        frame = pipeline.forward(load.table, views, load.options, assignment=assignment, transport=transport)
         terms = loss_terms(frame, batch, load.loss, 1.0)
-        gradients.append(pipeline.backward(load.table, frame, terms.v_renders)[0])
+        gradients.append(parameter_gradients(load.table, frame, terms.v_renders)[0])
         images.append(frame.renders)
         if batch.ranges is not None:
             collect_images(frame.renders, batch.ranges, load.ranks, 0)
@@ -271,7 +280,7 @@ def measure(args: argparse.Namespace) -> None:
             "visible per step": visible,
             "rows per step": rows,
             "rows sent to other ranks": sent,
-            "bytes per step": {"splats": 52 * sent, "gradients": (36 if ranks.peers is None else 48) * sent},
+            "bytes per step": {"splats": 52 * sent, "gradients": (36 if ranks.memory is None else 48) * sent},
             "balance": {"estimated": max(estimated), "measured": max(measured)},
             "ms": {s: statistics.median(t[i] for t in times) for i, s in enumerate(STAGES)},
         }

@@ -25,8 +25,8 @@ from scenes import BenchmarkScene, aerial
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.transport import LocalTransport
 from blitzgs.model import GaussianTable
-from blitzgs.ops.project import RowRoom
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.population.importance import ViewBatch, sweep
 from blitzgs.survey import survey
@@ -88,21 +88,21 @@ def _wait(device: torch.device) -> None:
 def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, Any]]:
     """Time renders, survey and sweep of all views, and the compositing of the first batch."""
     table, batches = table_of(scene), batches_of(scene, length)
-    ranks, room = Ranks(device=table.device), RowRoom()
+    ranks, transport = Ranks(device=table.device), LocalTransport()
     n_views = len(scene.viewmats)
 
     def renders() -> None:
         for batch in batches:
-            pipeline.forward(table, batch.views, OPTIONS, room=room)
+            pipeline.forward(table, batch.views, OPTIONS, transport=transport)
 
     def surveys() -> None:
         for batch in batches:
-            survey(table, batch.views, OPTIONS, room=room)
+            survey(table, batch.views, OPTIONS, transport=transport)
 
     def sweeps() -> None:
         sweep(table, batches, n_views, OPTIONS, ranks)
 
-    frame = pipeline.forward(table, batches[0].views, OPTIONS, room=room)
+    frame = pipeline.forward(table, batches[0].views, OPTIONS, transport=transport)
     splats = frame.splats
     grid = pipeline.tile_grid(batches[0].views, OPTIONS, None)
     shapes = (splats.means2d, splats.conics, splats.opacities)

@@ -21,7 +21,7 @@ from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
 from blitzgs.ops.blocks import BLOCK_ROWS, cull_blocks, update_block_bounds_
-from blitzgs.ops.project import Rows, project_rows
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
 from blitzgs.view.blocks import morton_order
 
 COLUMNS = ("means", "quats", "scales", "opacities", "sh")
@@ -32,14 +32,9 @@ ROW_GRADIENT_BYTES = 4 * (2 + 3 + 1 + 3)  # read backward
 GRADIENT_BYTES = 4 * 59  # parameters read and gradients written backward, each
 
 
-def arguments(
-    scene: BenchmarkScene, active_ids: Tensor | None = None, active_views: Tensor | None = None
-) -> tuple[Any, ...]:
-    raw = scene.raw()
-    return (
-        *raw.values(), scene.viewmats, scene.Ks, active_ids, active_views, scene.width, scene.height, 16, 3,
-        0.01, 1e10, 0.3, 0.0, False, True,
-    )  # fmt: skip
+def inputs_of(scene: BenchmarkScene, *active: Tensor) -> ProjectionInputs:
+    options = ProjectionOptions(scene.width, scene.height, sh_degree=3)
+    return ProjectionInputs(list(scene.raw().values()), (scene.viewmats, scene.Ks), options, active)
 
 
 def in_morton_order(scene: BenchmarkScene) -> BenchmarkScene:
@@ -59,9 +54,10 @@ def active_rows(scene: BenchmarkScene) -> tuple[Tensor, Tensor]:
 
 def backward_arguments(scene: BenchmarkScene, rows: Rows) -> tuple[Any, ...]:
     v = [torch.randn_like(getattr(rows, name)) for name in ("means2d", "conics", "opacities", "colors")]
+    inputs = inputs_of(scene)
     return (
-        *scene.raw().values(), scene.viewmats, scene.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
-        scene.width, scene.height, 3, 0.3, False, True, v[0], v[1], None, v[2], v[3], None, False,
+        inputs.gaussians, list(inputs.cameras), [rows.camera_ids, rows.visible_ids, rows.row_offsets],
+        inputs.options.ints, inputs.options.floats, v, None, None, False,
     )  # fmt: skip
 
 
@@ -80,8 +76,8 @@ def main() -> None:
     results: list[dict[str, object]] = []
     for views in args.views:
         scene = aerial(args.gaussians, args.device, views=views)
-        forward = arguments(scene)
-        rows = project_rows(*forward)
+        forward = inputs_of(scene)
+        rows = project_rows(forward)
         visible, n_rows, _ = rows.counts.tolist()
 
         def report(
@@ -96,9 +92,9 @@ def main() -> None:
 
         print(f"{views} view(s): {visible} visible, {n_rows} rows")
         moved = VISIBLE_BYTES * visible + ROW_BYTES * n_rows
-        time = median_ms(project_rows, [forward], args.repeats)
+        time = median_ms(project_rows, [(forward,)], args.repeats)
         report("forward, all candidates", time, (CULL_BYTES * args.gaussians + moved) / 1e6)
-        time = median_ms(project_rows, [arguments(scene, rows.visible_ids)], args.repeats)
+        time = median_ms(project_rows, [(inputs_of(scene, rows.visible_ids),)], args.repeats)
         report("forward, the visible given", time, (CULL_BYTES * visible + moved) / 1e6)
         back = (2 * GRADIENT_BYTES * visible + ROW_GRADIENT_BYTES * n_rows) / 1e6
         time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, rows)], args.repeats)
@@ -106,9 +102,9 @@ def main() -> None:
         del rows, forward
         scene = in_morton_order(scene)
         active = active_rows(scene)
-        forward = arguments(scene, *active)
-        rows = project_rows(*forward)
-        time = median_ms(project_rows, [forward], args.repeats)
+        forward = inputs_of(scene, *active)
+        rows = project_rows(forward)
+        time = median_ms(project_rows, [(forward,)], args.repeats)
         report(f"Morton order, {len(active[0])} active", time, (CULL_BYTES * len(active[0]) + moved) / 1e6)
         time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, rows)], args.repeats)
         report("Morton order, backward", time, back)

@@ -26,8 +26,8 @@ from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
 from blitzgs import rasterization
-from blitzgs.ops.project import project_rows
-from blitzgs.ops.rasterize import gradient_columns, rasterize_fwd
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_rows
+from blitzgs.ops.rasterize import rasterize_fwd
 
 try:
     import gsplat
@@ -52,15 +52,12 @@ class OurRender:
         self.scene = scene
         self.parameters = [raw[k].contiguous() for k in ("means", "quats", "scales", "opacities", "sh")]
         self.cameras = [scene.viewmats, scene.Ks]
+        self.options = ProjectionOptions(scene.width, scene.height, TILE_SIZE, sh_degree=3)
         self.grid = (len(scene.viewmats), scene.width, scene.height, TILE_SIZE, 0, -1)
 
     def project(self) -> None:
         """Run the projection."""
-        s = self.scene
-        self.rows = project_rows(
-            *self.parameters, *self.cameras, None, None, s.width, s.height, TILE_SIZE, 3, 0.01, 1e10, 0.3,
-            0.0, False, True,
-        )  # fmt: skip
+        self.rows = project_rows(ProjectionInputs(self.parameters, self.cameras, self.options))
 
     def intersect(self) -> None:
         """List the rows of each tile."""
@@ -80,15 +77,14 @@ class OurRender:
         ops.rasterize_bwd_packed_(
             *self.splats, renders, rest, last, aux, v_renders, *self.grid, False, packed
         )
-        self.v_rows = gradient_columns(packed)
+        self.v_rows = [packed]
 
     def project_backward(self) -> None:
         """Differentiate the projection, to compact rows."""
-        r, s = self.rows, self.scene
-        v_means2d, v_conics, v_opacities, v_colors = self.v_rows
+        r = self.rows
         self.gradients = ops.project_bwd(
-            *self.parameters, *self.cameras, r[1], r[2], r[3], s.width, s.height, 3, 0.3, False, True,
-            v_means2d, v_conics, None, v_opacities, v_colors, None, False,
+            self.parameters, self.cameras, [r[1], r[2], r[3]], self.options.ints, self.options.floats,
+            self.v_rows, None, None, False,
         )  # fmt: skip
 
     def forward(self) -> Tensor:

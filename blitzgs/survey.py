@@ -3,18 +3,18 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.exchange import send_back_sums
-from blitzgs.distributed.ownership import Share
+from blitzgs.distributed.ownership import TileAssignment
+from blitzgs.distributed.transport import LocalTransport, Transport, open_transport
 from blitzgs.model import GaussianTable
-from blitzgs.ops.project import RowRoom, Rows
-from blitzgs.pipeline import RenderOptions, Views, list_rows, tile_grid, unmarked
+from blitzgs.ops.capacity import Sizes
+from blitzgs.ops.projection import Rows
+from blitzgs.pipeline import RenderOptions, Views, inputs_of, list_splats, tile_grid
 
 
 class Survey(NamedTuple):
@@ -35,8 +35,8 @@ def survey(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
-    share: Share | None = None,
-    room: RowRoom | None = None,
+    assignment: TileAssignment | None = None,
+    transport: Transport | None = None,
 ) -> Survey:
     """Find what each Gaussian contributes to views of a table whose rows are up to date; no colour is shaded.
 
@@ -44,51 +44,35 @@ def survey(
         table: the Gaussians.
         views: at most 32 views.
         options: how to render; of the colours, those of degree 0 are worked out and not used.
-        share: who composites which tiles; every rank of the job calls this with its table. None: this rank
-            alone. Not in half precision: what is surveyed is the image.
-        room: as for `forward`.
+        assignment: who composites which tiles; every rank of the job calls this with its table. None: this
+            rank alone.
+        transport: as for `forward`; not in half precision, because the image is surveyed.
 
     Returns:
         The rows of this rank's Gaussians with the sums over all tiles, wherever they were composited: the
         same bits at any number of ranks.
     """
-    room = room or RowRoom()
+    if transport is None:
+        transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
     options = replace(options, sh_degree=0)
-    share = None if share is None else replace(share, half=False)
+    inputs, grid = inputs_of(table, views, options), tile_grid(views, options, assignment)
+
+    def attempt(capacity: Sizes | None) -> tuple[Survey | None, Sizes]:
+        with transport.start(inputs, assignment, capacity) as exchange:
+            arrived = exchange.receive()
+            splats = arrived.splats
+            weights, pixels = torch.ops.blitzgs.contributions(
+                splats.means2d, splats.conics, splats.opacities, *list_splats(arrived, grid), *grid,
+                arrived.n_splats,
+            )  # fmt: skip
+            counts = exchange.finish()
+        if counts is None:
+            return None, exchange.needed
+        weights, pixels = (column[: len(counts.splats.depths)] for column in (weights, pixels))
+        if assignment is not None:
+            returned = exchange.return_sums(torch.stack((weights, pixels.long()), 1))
+            weights, pixels = returned[:, 0], returned[:, 1].int()
+        return Survey(counts.rows, weights, pixels), exchange.needed
+
     with torch._C._AutoDispatchBelowAutograd():
-        while True:
-            with ExitStack() as waiting:
-                found = _survey(table, views, options, share, room, waiting)
-            if found is not None:
-                return found
-
-
-def _survey(
-    table: GaussianTable,
-    views: Views,
-    options: RenderOptions,
-    share: Share | None,
-    room: RowRoom,
-    waiting: ExitStack,
-) -> Survey | None:
-    """Queue all of it, then wait for the numbers of rows; None: the room was too small, and has learnt."""
-    projection, splats, isect_rows, tile_offsets = list_rows(
-        table, views, options, None, share, room, unmarked, waiting
-    )
-    if projection.space is not None:
-        # Nobody reads the colours, but the next exchange must not find their stream at work.
-        projection.space.meet_colors()
-    sums: tuple[Tensor, Tensor] = torch.ops.blitzgs.contributions(
-        splats.means2d, splats.conics, splats.opacities, isect_rows, tile_offsets,
-        *tile_grid(views, options, share), projection.n_rows,
-    )  # fmt: skip
-    known = projection.settle()
-    if known is None:
-        return None
-    weights, pixels = sums
-    if projection.n_rows is not None:
-        weights, pixels = (column[: len(known.splats.depths)] for column in sums)
-    if share is not None and known.route is not None:
-        returned = send_back_sums(torch.stack((weights, pixels.long()), 1), known.route, share.ranks)
-        weights, pixels = returned[:, 0], returned[:, 1].int()
-    return Survey(known.rows, weights, pixels)
+        return transport.capacity.run(attempt)

@@ -5,6 +5,24 @@
 // csrc/<op>/<op>.h; Python functions, fake kernels and autograd: blitzgs/ops/<op>.py.
 #include <torch/csrc/stable/library.h>
 
+#include <cstdint>
+#include <vector>
+
+#include "common/splat_gradient.h"
+
+namespace blitzgs {
+namespace {
+
+std::vector<std::int64_t> splat_gradient_layout() {
+  constexpr std::int64_t kFloat = sizeof(float);
+  return {offsetof(SplatGradient, mean2d) / kFloat,     offsetof(SplatGradient, conic) / kFloat,
+          offsetof(SplatGradient, opacity) / kFloat,    offsetof(SplatGradient, color) / kFloat,
+          offsetof(SplatGradient, mean2d_abs) / kFloat, kSplatGradient};
+}
+
+}  // namespace
+}  // namespace blitzgs
+
 STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The active set: blocks of consecutive rows with bounds, culled against the views.
   m.def("morton_keys(Tensor points) -> Tensor");
@@ -17,64 +35,40 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "float near_plane, float far_plane, float eps2d) -> (Tensor active_ids, Tensor active_views, "
       "Tensor count)");
 
-  // Projection: parameters to screen-space rows, ordered by (Gaussian, view).
+  // Projection: parameters to screen-space rows, ordered by (Gaussian, view). Groups of arguments, as
+  // blitzgs/ops/project.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras (viewmats,
+  // Ks); active ([ids[, views[, count]]]); rank_tiles (begin and end of each rank); capacity ([visible,
+  // rows]; none: wait for their number); rows (camera_ids, visible_ids, row_offsets); ints (width, height,
+  // tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d, radius_clip).
   m.def(
-      "project_count(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
-      "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
-      "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
-      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count=None, "
-      "int visible_room=0, int row_room=0, Tensor? ids=None) -> (Tensor plan, Tensor carry, Tensor totals, "
-      "Tensor[] rows)");
+      "project_fwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] active, int[] ints, float[] floats, "
+      "int[] rank_tiles, int[] capacity, Tensor? ids) -> (Tensor gaussian_ids, "
+      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, "
+      "Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
+      "Tensor rank_masks, Tensor row_ids, Tensor totals)");
+  // v_splats: (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
-      "project_emit(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
-      "Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? active_views, int width, int height, "
-      "int tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, "
-      "bool antialiased, bool raw, int[] tile_begins, int[] tile_ends, Tensor? active_count, Tensor plan, "
-      "Tensor carry, Tensor counts, Tensor? ids=None) -> (Tensor gaussian_ids, "
-      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, "
-      "Tensor means2d, Tensor conics, Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, "
-      "Tensor tiles_touched, Tensor rank_masks, Tensor row_ids)");
-  // The colours of the rows that project_count had room for.
-  m.def(
-      "project_colors_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
-      "Tensor viewmats, Tensor Ks, int width, int height, int sh_degree, Tensor totals, "
-      "Tensor(a!)[] rows) -> ()");
-  // Colours, unless colors_stream is 0, in that stream: they are valid, here and there, once it was waited
-  // for.
-  m.def(
-      "project_rows_to_peers_(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, "
-      "Tensor viewmats, Tensor Ks, int width, int height, int sh_degree, Tensor everyone, int rank, "
-      "Tensor(a!)[] rows, Tensor(b!)[] buffers, int capacity, int colors_stream) -> "
-      "Tensor[]");
-  m.def(
-      "project_bwd(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor? sh, Tensor viewmats, "
-      "Tensor Ks, Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, "
-      "int sh_degree, float eps2d, bool antialiased, bool raw, Tensor? v_means2d, Tensor? v_conics, "
-      "Tensor? v_depths, Tensor? v_row_opacities, Tensor? v_colors, Tensor? scale_reg, bool need_viewmats, "
-      "Tensor? places=None, int[] group_sizes=[], int[] starts=[], Tensor[]? buffers=None, int offset=0, "
-      "bool dense=False) -> ("
-      "Tensor v_means, Tensor v_quats, "
-      "Tensor v_scales, Tensor v_opacities, Tensor v_sh, Tensor v_viewmats)");
-  // project_bwd, then lazy_adam_step_ of the visible rows.
+      "project_bwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] rows, int[] ints, float[] floats, "
+      "Tensor[] v_splats, Tensor? v_depths, Tensor? scale_reg, bool need_viewmats, bool dense=False) -> ("
+      "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
+      "Tensor v_viewmats)");
+  // project_bwd, then lazy_adam_step_ of the visible rows. With places, v_splats are the tables of the ranks
+  // that composited the splats. Groups: last_steps (last_step, moment_step); tables (schedule_table,
+  // lr_table); steps (step, explicit_steps, sparse); decays (beta1, beta2, eps).
   m.def(
       "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
-      "Tensor(d!) last_step, Tensor(e!) moment_step, Tensor table, Tensor lr_table, int step, "
-      "int explicit_steps, float beta1, float beta2, float eps, bool sparse, Tensor viewmats, Tensor Ks, "
-      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, int width, int height, int sh_degree, "
-      "float eps2d, bool antialiased, Tensor? v_means2d, Tensor? v_conics, Tensor? v_row_opacities, "
-      "Tensor? v_colors, Tensor? scale_reg, Tensor? places=None, int[] group_sizes=[], int[] starts=[], "
-      "Tensor[]? buffers=None, int offset=0, Tensor(f!)? means2d_sums=None) -> ()");
+      "Tensor(d!)[] last_steps, Tensor[] tables, int[] steps, float[] decays, Tensor[] cameras, "
+      "Tensor[] rows, int[] ints, float[] floats, Tensor[] v_splats, Tensor? places=None, "
+      "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None) -> ()");
+  // Where the parts of a splat gradient begin in its floats, and last how many these are: mean2d, conic,
+  // opacity, color, mean2d_abs.
+  m.def("splat_gradient_layout() -> int[]");
 
   // Which rows each tile composites, front to back by (depth, id).
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor depths, Tensor camera_ids, "
       "Tensor? ids, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
       "int n_isects, Tensor? n_rows=None) -> (Tensor isect_rows, Tensor tile_offsets)");
-
-  // Which ranks a row has to be sent to.
-  m.def(
-      "route_count(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor camera_ids, int[] "
-      "tile_begins, int[] tile_ends, int width, int height, int tile_size) -> (Tensor masks, Tensor counts)");
 
   // Rows on their way between ranks, packed for a collective or written straight into peers' memory (CUDA).
   m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
@@ -83,8 +77,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "sum_rows(Tensor values, Tensor places, int[] group_sizes, int rows, int[] widths) -> "
       "Tensor[] columns");
   m.def(
-      "meet_peers_(Tensor(a!)[] mail, int rank, int meeting, Tensor? values, int first, "
-      "float timeout_seconds, Tensor(b!)? known=None) -> ()");
+      "send_splats_(Tensor[] columns, Tensor rank_masks, Tensor everyone, int rank, Tensor(a!)[] buffers, "
+      "int capacity) -> (Tensor places, Tensor plan)");
+  m.def(
+      "device_barrier_(Tensor(a!)[] control, int rank, int number, Tensor? values, int first, "
+      "float timeout_seconds, Tensor(b!)? host=None) -> ()");
   // Writes a small tensor into pinned memory of the host, behind what is queued (CUDA).
   m.def("tell_host_(Tensor(a!) known, Tensor values) -> ()");
 
@@ -139,17 +136,16 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "report_(Tensor? parts, Tensor? tile_work, int tile_begin, int tile_end, int rank, int n_ranks, "
       "Tensor(a!)[] targets) -> ()");
 
-  // The optimiser: dense Adam over an index list, and its statistics for density control.
+  // The optimiser: dense Adam over an index list, and its statistics for density control. Groups of arguments
+  // as for project_bwd_step_.
   m.def(
-      "lazy_adam_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, Tensor[] grads, "
-      "Tensor ids, Tensor(d!) last_step, Tensor(e!) moment_step, Tensor table, Tensor lr_table, int step, "
-      "int explicit_steps, float beta1, float beta2, float eps, bool sparse) -> ()");
+      "lazy_adam_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
+      "Tensor(d!)[] last_steps, Tensor[] grads, Tensor ids, Tensor[] tables, int[] steps, float[] decays) "
+      "-> ()");
   m.def(
-      "lazy_adam_catch_up_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, Tensor? "
-      "ids, "
-      "Tensor(d!) last_step, Tensor(e!) moment_step, Tensor table, Tensor lr_table, int step, "
-      "int explicit_steps, float beta1, "
-      "float beta2, float eps, Tensor? count=None) -> ()");
+      "lazy_adam_catch_up_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
+      "Tensor(d!)[] last_steps, Tensor? ids, Tensor[] tables, int[] steps, float[] decays, "
+      "Tensor? count=None) -> ()");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
@@ -161,4 +157,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Scene initialisation.
   m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");
   m.def("knn_distances(Tensor points, int k) -> Tensor");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(blitzgs, CompositeExplicitAutograd, m) {
+  m.impl("splat_gradient_layout", TORCH_BOX(&blitzgs::splat_gradient_layout));
 }

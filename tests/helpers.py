@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 import blitzgs
-from blitzgs.ops.scatter import RowTables
+from benchmarks.gradients import parameter_gradients as parameter_gradients
+from benchmarks.gradients import sum_of_ranks as sum_of_ranks
 from blitzgs.reference import ReferenceImage, render
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
@@ -168,18 +169,3 @@ def image_error(actual: Tensor, expected: Tensor, cut: Tensor, most_cut: float =
     if not (actual.isfinite().all() and expected.isfinite().all()):
         return math.inf
     return (actual - expected)[~cut].abs().max().item() if (~cut).any() else 0.0
-
-
-def sum_tables(tables: RowTables, rows: int) -> Tensor:
-    """Return the gradients of a rank's rows that lie in tables (`blitzgs.ops.scatter.RowTables`): [P, 12]."""
-    assert tables.places is not None
-    total = torch.zeros(rows, 12, device=tables.places.device)
-    for m, (size, start) in enumerate(zip(tables.group_sizes, tables.starts, strict=True)):
-        words = tables.buffers[m][tables.offset :][12 * start :][: 12 * size]
-        runs = tables.places[:, m, None]
-        first, bits = runs.bitwise_and(0xFFFFFFFF), runs >> 32
-        here = bits >> torch.arange(32, device=runs.device) & 1
-        at = (first + here.cumsum(1) - here).flatten()[:rows]
-        here = here.flatten()[:rows].bool()
-        total[here] += words.view(torch.float32).view(-1, 12)[at[here]]
-    return total

@@ -6,8 +6,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from blitzgs.ops import render
-from blitzgs.ops.project import RowRoom
 from tests.helpers import (
     DEVICES,
     PARAMETERS,
@@ -111,13 +109,6 @@ def test_a_call_does_not_depend_on_those_before(device):
     assert all(torch.equal(meta[name], value) for name, value in first[2].items())
     for gradient, expected in zip(gradients, first[1], strict=True):
         assert relative_error(gradient, expected) < 1e-5  # atomic sums are in no particular order
-
-
-def test_nothing_is_queued_where_no_call_told_how_much_room_is_needed(monkeypatch):
-    monkeypatch.setattr(render, "queue_rows", None)
-    monkeypatch.setattr(render, "room_for", lambda *_: RowRoom())
-    arguments = (*(None,) * 5, torch.eye(4)[None], *(None,) * 3, 8, 8, 16)
-    assert render.render_queued(arguments, lambda rows: rows.colors, None, False) is None
 
 
 @pytest.mark.parametrize("device", DEVICES)

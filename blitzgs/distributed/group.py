@@ -16,7 +16,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from blitzgs.distributed.peers import Peers, connect
+from blitzgs.distributed.shared_memory import SharedMemory, connect
 from blitzgs.distributed.watchdog import Watchdog, open_store
 from blitzgs.ops.host import to_host
 
@@ -46,8 +46,8 @@ class Ranks:
         device: where this rank computes.
         timeout_seconds: a rank that does not show up at a collective for this long ends the job.
         shares_gpu: several ranks of this host compute on one GPU.
-        peers: memory shared between the ranks; None: rows travel by collectives.
-        transport: how rows travel, in words, for the log.
+        memory: shared between the ranks; None: splats travel by collectives.
+        transport: how splats travel, in words, for the log.
     """
 
     rank: int = 0
@@ -58,7 +58,7 @@ class Ranks:
     timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
     shares_gpu: bool = False
     watchdog: Watchdog | None = None
-    peers: Peers | None = None
+    memory: SharedMemory | None = None
     transport: str = "none: one rank"
     _side: torch.cuda.Stream | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -77,7 +77,7 @@ class Ranks:
         Args:
             device: "auto" (CUDA when this torch has a GPU), "cpu", "cuda" or "cuda:INDEX".
             timeout_seconds: see the class.
-            transport: of rows between ranks: "peer" writes them to the other GPUs' memory, "collective"
+            transport: of splats between ranks: "peer" writes them to the other GPUs' memory, "collective"
                 lets NCCL or Gloo carry them, "auto" prefers the former where it works.
             share_gpus: where a host has fewer GPUs than ranks, deal them out in turn, so that ranks share
                 them: for development, as each then waits for the others' turns on the GPU.
@@ -141,16 +141,16 @@ class Ranks:
         self._choose_transport(transport, self.timeout_seconds + margin)
 
     def _choose_transport(self, transport: Transport, timeout_seconds: float) -> None:
-        peers: Peers | str = "not asked for"
+        memory: SharedMemory | str = "not asked for"
         if transport != "collective":
-            peers = connect(self, timeout_seconds)
-        if isinstance(peers, Peers):
+            memory = connect(self, timeout_seconds)
+        if isinstance(memory, SharedMemory):
             others = "ranks' memory on shared GPUs" if self.shares_gpu else "GPUs' memory"
-            self.peers, self.transport = peers, f"peer: rows are written to the other {others}"
+            self.memory, self.transport = memory, f"peer: splats are written to the other {others}"
         elif transport == "peer":
-            raise RuntimeError(f"transport peer is impossible: {peers}; use auto or collective")
+            raise RuntimeError(f"transport peer is impossible: {memory}; use auto or collective")
         else:
-            self.transport = f"collective ({dist.get_backend()}); peer memory: {peers}"
+            self.transport = f"collective ({dist.get_backend()}); peer memory: {memory}"
 
     def __enter__(self) -> Ranks:
         return self
@@ -171,7 +171,7 @@ class Ranks:
         if self.watchdog is not None:
             self.watchdog.stop()
             self.watchdog = None
-        self.peers = None
+        self.memory = None
         if self.world_size > 1 and dist.is_initialized():
             dist.destroy_process_group()
 
@@ -204,12 +204,10 @@ class Ranks:
             values: int64 [n] on `device`; the same n on all ranks, at most 256.
 
         Returns:
-            int64 [M, n], those of each rank; valid until the next call.
+            int64 [M, n], those of each rank.
         """
         if self.world_size == 1:
             return values[None]
-        if self.peers is not None:
-            return self.peers.share(values).everyone
         everyone = values.new_empty(self.world_size * len(values))
         # Newer versions of torch have it under another name, and warn about this one.
         gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)

@@ -48,10 +48,10 @@ class HostSum:
             return
         stream.wait_stream(torch.cuda.current_stream(ranks.device))
         with torch.cuda.stream(stream):
-            if ranks.peers is not None:
-                boards = ranks.reading(partial(ranks.peers.boards, words))
+            if ranks.memory is not None:
+                boards = ranks.reading(partial(ranks.memory.boards, words))
                 report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, boards)
-                ranks.peers.meet_beside()
+                ranks.memory.side_barrier()
                 total = boards[ranks.rank]
             else:
                 new = torch.empty if ranks.world_size == 1 else torch.zeros

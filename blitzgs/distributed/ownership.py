@@ -19,7 +19,7 @@ from blitzgs.distributed.host_sum import HostSum
 # image), in units of one entry.
 TILE_COST = 8
 # Windows of the loss reach this far: 5 px from an owned pixel, and 5 more for its gradient.
-LOSS_REACH = 10
+LOSS_HALO = 10
 # Costs that `divide` first adds up together.
 _STRETCH = 128
 
@@ -36,8 +36,8 @@ class TileRanges:
         width: image width in pixels.
         height: image height in pixels.
         tile_size: tile edge in pixels.
-        reach: a rank composites, besides its own tiles, those within this many pixels of them; what several
-            ranks composite has the same bits on each. `LOSS_REACH` where a loss is to be computed: no pixel
+        halo: a rank composites, besides its own tiles, those within this many pixels of them; what several
+            ranks composite has the same bits on each. `LOSS_HALO` where a loss is to be computed: no pixel
             then has to be fetched. 0: its own alone.
     """
 
@@ -46,7 +46,7 @@ class TileRanges:
     width: int
     height: int
     tile_size: int = 16
-    reach: int = 0
+    halo: int = 0
 
     @property
     def tiles_x(self) -> int:
@@ -63,13 +63,13 @@ class TileRanges:
         return self.bounds[rank], self.bounds[rank + 1]
 
     def composited(self, rank: int) -> tuple[int, int]:
-        """Return the [first, one past last) tile that a rank composites: its own and those within `reach`.
+        """Return the [first, one past last) tile that a rank composites: its own and those within `halo`.
 
         A little more than those: whole stretches of tiles in the flattened order, never beyond the view.
         Empty for a rank without tiles. The firsts ascend with the ranks.
         """
         begin, end = self.of(rank)
-        ring = -(-self.reach // self.tile_size)
+        ring = -(-self.halo // self.tile_size)
         stretch = ring * (self.tiles_x + 1) if ring else 0
         low = max(begin // self.tiles_per_view * self.tiles_per_view, begin - stretch)
         if begin == end:
@@ -84,7 +84,7 @@ class TileRanges:
         pixels = owned.repeat_interleave(self.tile_size, 1).repeat_interleave(self.tile_size, 2)
         return pixels[:, : self.height, : self.width]
 
-    def pixel_rows(self, rank: int, view: int, margin: int = LOSS_REACH) -> tuple[int, int]:
+    def pixel_rows(self, rank: int, view: int, margin: int = LOSS_HALO) -> tuple[int, int]:
         """Return the rows [y0, y1) of a view's image that a rank's tiles and a margin around them cover.
 
         (0, 0) when the rank owns no tile of the view.
@@ -100,18 +100,16 @@ class TileRanges:
 
 
 @dataclass(frozen=True)
-class Share:
+class TileAssignment:
     """Who composites what in one rendering.
 
     Attributes:
         ranks: the job; all its ranks render together.
         ranges: the tiles of each.
-        half: exchange splats in half precision (see `blitzgs.distributed.exchange.plan_route`).
     """
 
     ranks: Ranks
     ranges: TileRanges
-    half: bool = False
 
     @property
     def tiles(self) -> tuple[int, int]:
@@ -120,14 +118,19 @@ class Share:
 
     @property
     def composited(self) -> tuple[int, int]:
-        """The [first, one past last) tile that this rank composites."""
+        """The [first, one past last) tile that this rank composites: its own and the halo around them."""
         return self.ranges.composited(self.ranks.rank)
+
+    @property
+    def all_composited(self) -> list[tuple[int, int]]:
+        """`composited` of every rank."""
+        return [self.ranges.composited(rank) for rank in range(self.ranks.world_size)]
 
 
 class TileOwners:
     """Divides the tiles of each batch by what they cost at the last visit of each view.
 
-    Every rank holds the same costs and so draws the same borders without a word.
+    Every rank holds the same costs and so draws the same borders without asking the others.
     """
 
     def __init__(self, ranks: Ranks) -> None:
@@ -135,7 +138,7 @@ class TileOwners:
         self._costs: dict[Hashable, tuple[HostSum, int, int]] = {}  # where a view's tiles are in the sums
 
     def divide(
-        self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, reach: int = 0
+        self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, halo: int = 0
     ) -> TileRanges:
         """Divide the tiles of a batch.
 
@@ -144,7 +147,7 @@ class TileOwners:
             width: image width in pixels.
             height: image height in pixels.
             tile_size: tile edge in pixels.
-            reach: see `TileRanges`.
+            halo: see `TileRanges`.
 
         Returns:
             Ranges whose costs differ by at most one tile from an equal share.
@@ -153,7 +156,7 @@ class TileOwners:
         cost = np.concatenate([self._cost(key, unit.tiles_per_view) for key in keys])
         cost += TILE_COST
         bounds = divide(cost, self.ranks.world_size)
-        return TileRanges(bounds, len(keys), width, height, tile_size, reach)
+        return TileRanges(bounds, len(keys), width, height, tile_size, halo)
 
     def record(
         self,

@@ -3,42 +3,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-
 import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
 
-@contextmanager
-def tell_host(values: Tensor) -> Iterator[Callable[[], Tensor]]:
-    """Give a function that waits for a few numbers and returns them on the CPU.
+class HostCopy:
+    """A few numbers on their way to the host. What is queued before `read` runs meanwhile.
 
-    What is queued before it is called runs meanwhile. On CUDA a kernel writes the numbers into the host's
-    memory: a copy would make the stream wait for the copying engine, 15 us. That memory has to live until
-    then, so leaving waits too.
-
-    Args:
-        values: int64 [n].
+    On CUDA a kernel writes the numbers into the host's memory: a copy would make the stream wait for the
+    copying engine, 15 us. That memory has to live until then, so this is a context manager, and leaving it
+    waits too.
     """
-    if not values.is_cuda:
-        yield lambda: values
-        return
-    known = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
-    torch.ops.blitzgs.tell_host_(known, values)
-    told = torch.cuda.Event()
-    told.record(torch.cuda.current_stream(values.device))
 
-    def wait() -> Tensor:
-        told.synchronize()
-        return known
+    def __init__(self, values: Tensor) -> None:
+        """Start to bring `values`, int64 [n], to the host."""
+        self._host = values
+        self._written: torch.cuda.Event | None = None
+        if values.is_cuda:
+            self._host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
+            torch.ops.blitzgs.tell_host_(self._host, values)
+            self._written = torch.cuda.Event()
+            self._written.record(torch.cuda.current_stream(values.device))
 
-    try:
-        yield wait
-    finally:
-        told.synchronize()
+    def read(self) -> Tensor:
+        """Wait for the numbers and return them, on the CPU."""
+        if self._written is not None:
+            self._written.synchronize()
+        return self._host
+
+    def __enter__(self) -> HostCopy:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.read()
 
 
 @torch.library.register_fake("blitzgs::tell_host_")

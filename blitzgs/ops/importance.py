@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from blitzgs.ops.project import Rows, project_rows
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
 
 # Units of a weight in 1, kContributionScale of csrc/importance/importance.h.
 UNITS = 1 << 32
@@ -118,10 +118,12 @@ def contributions(
     for begin in range(0, len(viewmats), _VIEWS):
         views = slice(begin, begin + _VIEWS)
         n_views = len(viewmats[views])
-        rows = project_rows(
-            means, quats, scales, opacities, None, viewmats[views], Ks[views], None, None, width, height,
-            _TILE_SIZE, 0, near_plane, far_plane, eps2d, 0.0, rasterize_mode == "antialiased", False,
+        options = ProjectionOptions(
+            width, height, _TILE_SIZE, near_plane=near_plane, far_plane=far_plane, eps2d=eps2d,
+            antialiased=rasterize_mode == "antialiased", raw=False,
         )  # fmt: skip
+        gaussians, cameras = (means, quats, scales, opacities), (viewmats[views], Ks[views])
+        rows = project_rows(ProjectionInputs(gaussians, cameras, options))
         row_weights, row_pixels = _of_rows(rows, n_views, width, height)
         at = rows.camera_ids.long() + begin, rows.gaussian_ids.long()
         weights[at] = row_weights.double() / UNITS

@@ -65,18 +65,12 @@ def lazy_adam_step_(
         list(params),
         list(exp_avgs),
         list(exp_avg_sqs),
+        [last_step, moment_step],
         list(grads),
         ids,
-        last_step,
-        moment_step,
-        table,
-        lr_table,
-        step,
-        explicit_steps(beta1, beta2, params[0].dtype),
-        beta1,
-        beta2,
-        eps,
-        sparse,
+        [table, lr_table],
+        [step, explicit_steps(beta1, beta2, params[0].dtype), int(sparse)],
+        [beta1, beta2, eps],
     )
 
 
@@ -98,9 +92,9 @@ def lazy_adam_catch_up_(
     """Bring the parameters of the rows `ids` (None: all rows) to where dense Adam has them after ``step``.
 
     In place. Rows that stand at `step` already are left untouched. Moments and `moment_step` stay: the next
-    step with a gradient applies the decay they still owe, beta^(step - moment_step). Arguments as in
+    step with a gradient applies the decay that is pending, beta^(step - moment_step). Arguments as in
     `lazy_adam_step_`; ``step`` may be 0 (nothing to do). ``count``, int32 [1]: only the first `count` of
-    `ids` are rows; nobody waits for it.
+    `ids` are rows; the host does not wait for it.
 
     Raises:
         ValueError: decay rates outside their range.
@@ -111,16 +105,11 @@ def lazy_adam_catch_up_(
         list(params),
         list(exp_avgs),
         list(exp_avg_sqs),
+        [last_step, moment_step],
         ids,
-        last_step,
-        moment_step,
-        table,
-        lr_table,
-        step,
-        explicit_steps(beta1, beta2, params[0].dtype),
-        beta1,
-        beta2,
-        eps,
+        [table, lr_table],
+        [step, explicit_steps(beta1, beta2, params[0].dtype), 0],
+        [beta1, beta2, eps],
         count,
     )
 

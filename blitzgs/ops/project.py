@@ -4,121 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.host import tell_host
-
-
-class Rows(NamedTuple):
-    """What the views see, ordered by (Gaussian, view): P rows of U different Gaussians."""
-
-    gaussian_ids: Tensor  # int32 [P]
-    camera_ids: Tensor  # int32 [P]
-    visible_ids: Tensor  # int32 [U], ascending
-    row_offsets: Tensor  # int32 [U + 1]: rows row_offsets[u] to row_offsets[u + 1] are of visible_ids[u]
-    means2d: Tensor  # [P, 2], px; the centre of pixel (i, j) is (i + 0.5, j + 0.5)
-    conics: Tensor  # [P, 3]: a, b, c of the inverse 2D covariance, 1/px^2
-    depths: Tensor  # [P]: camera-space z
-    opacities: Tensor  # [P]: compensated in antialiased mode
-    colors: Tensor  # [P, 3]; [0, 3] without SH
-    radii: Tensor  # int32 [P, 2]: half width and height of the box around alpha >= 1/255, rounded up
-    tiles_touched: Tensor  # int32 [P]
-    rank_masks: Tensor  # int64 [P]: bit m set where rank m wants the row; [0] where no rank asked
-    counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
-
-
-def rows_of(columns: Sequence[Tensor], counts: Tensor) -> Rows:
-    """Return the rows that lie in columns with room behind them.
-
-    Args:
-        columns: those of `Rows` but the last, and perhaps more.
-        counts: `Rows.counts`.
-    """
-    visible, rows = counts[:2].tolist()
-    lengths = (rows, rows, visible, visible + 1, *(rows,) * 8)
-    # No views to autograd: a Function may return those, but nobody might change them in place.
-    with torch._C._AutoDispatchBelowADInplaceOrView():
-        return Rows._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
-
-
-# Visible Gaussians, rows and row-tile intersections.
-Sizes = tuple[int, int, int]
-
-
-class RowRoom:
-    """Room for the rows of a frame and for what is listed of them, by what the frames before needed.
-
-    CUDA then works before the host knows how much there is; where there is too little room it works once
-    more.
-
-    Attributes:
-        sizes: how much there is room for; zeros: the host waits. Threads may share a room: take its sizes
-            once a frame.
-    """
-
-    def __init__(self) -> None:
-        self.sizes: Sizes = (0, 0, 0)
-
-    def learn(self, needed: Sequence[int]) -> None:
-        """Take note of what a frame needed, as `sizes`."""
-        # Views differ: what the largest one of late needed, and some more.
-        visible, rows, isects = (
-            max(n * 9 // 8, size - size // 256) for n, size in zip(needed, self.sizes, strict=True)
-        )
-        self.sizes = (visible, rows, isects)
-
-
-def holds(sizes: Sizes, needed: Sequence[int]) -> bool:
-    """Tell whether there is room for so many of the first of `sizes`."""
-    return all(n <= size for n, size in zip(needed, sizes, strict=False))
-
-
-def queue_rows(
-    arguments: Sequence[Any], sizes: Sizes, ids: Tensor | None = None
-) -> tuple[tuple[Tensor, Tensor], Tensor, list[Tensor]]:
-    """Have rows written into the room there is for them, without waiting for their number.
-
-    Args:
-        arguments: of the op `project_count`, from means to active_count.
-        sizes: how much there is room for.
-        ids: int64 [N], see `emit_rows`.
-
-    Returns:
-        What `emit_rows` takes; the totals of `project_count`, on the device; the columns of `Rows` but
-        counts, and the rows' ids, with room behind them and without colours, or nothing: there was no room.
-    """
-    plan, carry, totals, columns = torch.ops.blitzgs.project_count(*arguments, *sizes[:2], ids)
-    return (plan, carry), totals, columns
-
-
-def color_rows(arguments: Sequence[Any], totals: Tensor, columns: list[Tensor]) -> None:
-    """Give the rows of `queue_rows` their colours, as far as there was room for rows."""
-    if columns:
-        width, height, _, sh_degree = arguments[9:13]
-        torch.ops.blitzgs.project_colors_(*arguments[:7], width, height, sh_degree, totals, columns)
-
-
-def emit_rows(
-    arguments: Sequence[Any], planned: tuple[Tensor, Tensor], counts: Tensor, ids: Tensor | None = None
-) -> list[Tensor]:
-    """Write all rows of a projection, once their number is known.
-
-    Args:
-        arguments: as for `queue_rows`.
-        planned: from `queue_rows`.
-        counts: the totals, on the CPU.
-        ids: int64 [N], persistent, of the Gaussians; None: the rows' are not wanted.
-
-    Returns:
-        The columns of `Rows` but counts, and the rows' ids.
-    """
-    return list(torch.ops.blitzgs.project_emit(*arguments, *planned, counts, ids))
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
+from blitzgs.ops.splat_gradients import packed_table
 
 
 def project(
@@ -182,167 +75,174 @@ def project(
         RuntimeError: a wrong shape, dtype or value, by name.
         ValueError: `sparse_grad` under `torch.compile`.
     """
-    arguments = (
-        means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width, height, tile_size,
-        sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
-    )  # fmt: skip
-    return differentiable_rows(arguments, sparse_grad)
+    if active_views is not None and active_ids is None:
+        active_ids = torch.arange(len(means), dtype=torch.int32, device=means.device)
+    inputs = ProjectionInputs(
+        gaussians_of(means, quats, scales, opacities, sh),
+        (viewmats, Ks),
+        ProjectionOptions(
+            width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
+        ),
+        [tensor for tensor in (active_ids, active_views) if tensor is not None],
+    )
+    return differentiable_rows(inputs, sparse_grad)
 
 
-def differentiable_rows(arguments: tuple[Any, ...], sparse_grad: bool, rows: Rows | None = None) -> Rows:
-    """`project`, by position.
+def gaussians_of(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None
+) -> list[Tensor]:
+    """Return `ProjectionInputs.gaussians`."""
+    return [means, quats, scales, opacities, *([] if sh is None else [sh])]
+
+
+def differentiable_rows(inputs: ProjectionInputs, sparse_grad: bool, rows: Rows | None = None) -> Rows:
+    """`project` of grouped arguments.
 
     Args:
-        arguments: from means to raw, in the order of the op.
+        inputs: what is projected.
         sparse_grad: see `project`.
         rows: what `project_rows` returned or would return, if they are there already.
     """
+    gaussians, (viewmats, Ks) = list(inputs.gaussians), inputs.cameras  # noqa: N806
     if not torch.compiler.is_compiling():
-        return Rows._make(_Project.apply(*arguments[:6], arguments[6:], sparse_grad, rows))  # type: ignore[no-untyped-call]
+        sh = gaussians[4] if len(gaussians) > 4 else None
+        columns = _Project.apply(*gaussians[:4], sh, viewmats, inputs, sparse_grad, rows)  # type: ignore[no-untyped-call]
+        return Rows._make(columns)
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
-    plan, carry, totals, _ = torch.ops.blitzgs.project_count(*arguments, [], [])
-    counts = totals.cpu()[:3]
-    *emitted, _ = torch.ops.blitzgs.project_emit(*arguments, [], [], None, plan, carry, counts)
-    return Rows._make((*emitted, counts))
-
-
-def project_rows(*arguments: Any) -> Rows:
-    """`project` without gradients, with the positional arguments of its ops, from means to raw."""
-    room = room_for(*arguments)
-    sizes = room.sizes
-    arguments = (*arguments, [], [], None)
-    with torch._C._AutoDispatchBelowAutograd():
-        planned, totals, columns = queue_rows(arguments, sizes)
-        with tell_host(totals) as told:
-            color_rows(arguments, totals, columns)
-            counts = told()[:3]
-        needed = counts.tolist()
-        if not columns or not holds(sizes, needed[:2]):
-            columns = emit_rows(arguments, planned, counts)
-    room.learn(needed)
-    return rows_of(columns, counts)
-
-
-def room_for(*arguments: Any) -> RowRoom:
-    """Return the room that is kept for calls of `project_rows` of a size."""
-    means, viewmats = arguments[0], arguments[5]
-    return _room(means.device, len(means), len(viewmats))
-
-
-@lru_cache(maxsize=16)
-def _room(_device: torch.device, _gaussians: int, _views: int) -> RowRoom:
-    """Return the room that is kept for calls of a size."""
-    return RowRoom()
-
-
-@torch.library.register_fake("blitzgs::project_count")
-def _(means: Tensor, *rest: Any) -> Any:
-    context = torch.library.get_ctx()
-    viewmats, tile_begins = rest[4], rest[18]
-    return (
-        means.new_empty(context.new_dynamic_size(), dtype=torch.int64),
-        means.new_empty(context.new_dynamic_size(), dtype=torch.uint8),
-        means.new_empty(3 + viewmats.shape[0] + 2 * len(tile_begins), dtype=torch.int64),
+    *columns, _, totals = torch.ops.blitzgs.project_fwd(
+        gaussians,
+        [viewmats, Ks],
+        list(inputs.active),
+        inputs.options.ints,
+        inputs.options.floats,
         [],
+        [],
+        None,
     )
+    return Rows._make((*columns, totals.cpu()[:3]))
 
 
-@torch.library.register_fake("blitzgs::project_emit")
-def _(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None, *rest: Any) -> Any:
-    context = torch.library.get_ctx()
+@torch.library.register_fake("blitzgs::project_fwd")
+def _(
+    gaussians: Sequence[Tensor],
+    cameras: Sequence[Tensor],
+    active: Sequence[Tensor],
+    ints: Sequence[int],
+    floats: Sequence[float],
+    rank_tiles: Sequence[int],
+    capacity: Sequence[int],
+    ids: Tensor | None,
+) -> tuple[Tensor, ...]:
+    context, means = torch.library.get_ctx(), gaussians[0]
     U, P = context.new_dynamic_size(), context.new_dynamic_size()
-    tile_begins = rest[14]
 
-    def ints(*shape: Any) -> Tensor:
+    def ints_of(*shape: Any) -> Tensor:
         return means.new_empty(shape, dtype=torch.int32)
 
     return (
-        ints(P),
-        ints(P),
-        ints(U),
-        ints(U + 1),
+        ints_of(P),
+        ints_of(P),
+        ints_of(U),
+        ints_of(U + 1),
         means.new_empty(P, 2),
         means.new_empty(P, 3),
         means.new_empty(P),
         means.new_empty(P),
-        means.new_empty(0 if sh is None else P, 3),
-        ints(P, 2),
-        ints(P),
-        means.new_empty(P if tile_begins else 0, dtype=torch.int64),
-        means.new_empty(P if any(ids is not None for ids in rest[20:]) else 0, dtype=torch.int64),
+        means.new_empty(P if len(gaussians) > 4 else 0, 3),
+        ints_of(P, 2),
+        ints_of(P),
+        means.new_empty(P if rank_tiles else 0, dtype=torch.int64),
+        means.new_empty(0 if ids is None else P, dtype=torch.int64),
+        means.new_empty(3 + cameras[0].shape[0] + len(rank_tiles), dtype=torch.int64),
     )
 
 
 @torch.library.register_fake("blitzgs::project_bwd")
 def _(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    camera_ids: Tensor,
-    visible_ids: Tensor,
-    *rest: Any,
-) -> Any:
-    dense = any(rest[19:])
+    gaussians: Sequence[Tensor],
+    cameras: Sequence[Tensor],
+    rows: Sequence[Tensor],
+    ints: Sequence[int],
+    floats: Sequence[float],
+    v_splats: Sequence[Tensor],
+    v_depths: Tensor | None,
+    scale_reg: Tensor | None,
+    need_viewmats: bool,
+    dense: bool = False,
+) -> tuple[Tensor, ...]:
+    means, (_, visible_ids, _) = gaussians[0], rows
     length = (means if dense else visible_ids).shape[0]
     return (
         means.new_empty(length, 3),
         means.new_empty(length, 4),
         means.new_empty(length, 3),
         means.new_empty(length),
-        means.new_empty(length, 0 if sh is None else sh.shape[1], 3),
-        means.new_empty(viewmats.shape[0] if rest[13] else 0, 4, 4),
+        means.new_empty(length, gaussians[4].shape[1] if len(gaussians) > 4 else 0, 3),
+        means.new_empty(cameras[0].shape[0] if need_viewmats else 0, 4, 4),
     )
 
 
-def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    means, quats, scales, opacities, sh, viewmats, Ks = inputs[:7]
-    width, height, _, sh_degree = inputs[9:13]
-    eps2d, _, antialiased, raw = inputs[15:19]
-    rows = Rows._make((*output[:12], None))
+def _save(ctx: Any, inputs: ProjectionInputs, rows: Rows) -> None:
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(
-        means, quats, scales, opacities, sh, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets
+        *inputs.gaussians, *inputs.cameras, rows.camera_ids, rows.visible_ids, rows.row_offsets
     )
-    ctx.options = (width, height, sh_degree, eps2d, antialiased, raw)
-    ctx.sparse = (False,) * 5
+    ctx.options, ctx.n_gaussians = inputs.options, len(inputs.gaussians)
 
 
-def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
-    return (*_gradients(ctx, v_output[:12]), *(None,) * 20)
+class _Saved(NamedTuple):
+    """What `_save` saved, in its groups."""
+
+    gaussians: Sequence[Tensor]
+    cameras: Sequence[Tensor]
+    rows: Sequence[Tensor]
+
+    @classmethod
+    def of(cls, ctx: Any) -> _Saved:
+        """Read it, once: checkpointing recomputes saved tensors for each reading."""
+        *tensors, viewmats, Ks, camera_ids, visible_ids, row_offsets = ctx.saved_tensors  # noqa: N806
+        return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, row_offsets))
 
 
-def _gradients(ctx: Any, v_output: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
-    """Return the gradients of means, quats, scales, opacities, sh and viewmats, where they are needed."""
-    saved = ctx.saved_tensors  # read once: checkpointing recomputes them for each reading
+def _gradients(
+    ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: Rows
+) -> tuple[Tensor | None, ...]:
+    """Return the gradients of all gaussians (None where there are no sh) and viewmats, where needed.
+
+    Args:
+        ctx: from `_save`.
+        needed: which of means, quats, scales, opacities and, unless there are none, sh need a gradient.
+        need_viewmats: whether viewmats do.
+        sparse: which of these gradients are to be sparse.
+        v: gradients of the rows; None: zero.
+    """
+    saved = _Saved.of(ctx)
     with torch.no_grad():
-        gradients = _first_gradients(ctx, saved, v_output)
-    return first_only("project", gradients, (*saved[:6], *v_output))
+        gradients = _first_gradients(ctx.options, saved, needed, need_viewmats, sparse, v)
+    return first_only("project", gradients, (*saved.gaussians, saved.cameras[0], *v))
 
 
 def _first_gradients(
-    ctx: Any, saved: tuple[Any, ...], v_output: tuple[Tensor | None, ...]
+    options: ProjectionOptions,
+    saved: _Saved,
+    needed: Sequence[bool],
+    need_viewmats: bool,
+    sparse: Sequence[bool],
+    v: Rows,
 ) -> tuple[Tensor | None, ...]:
-    parameters, (viewmats, Ks, *rows) = saved[:5], saved[5:]
-    means, *_, sh = parameters
-    *needed, need_viewmats = ctx.needs_input_grad[:6]
     # Where all are to be dense, the kernel writes them so; a dense one that nobody needs would cost memory.
-    dense = not any(ctx.sparse) and all(needed if sh is not None else needed[:4])
+    dense = not any(sparse) and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
-        *parameters, viewmats, Ks, *rows, *ctx.options, *_row_gradients(means, sh, rows[0], v_output), None,
-        need_viewmats, dense=dense,
+        list(saved.gaussians), list(saved.cameras), list(saved.rows), options.ints, options.floats,
+        _splat_gradients(saved, v), v.depths, None, need_viewmats, dense,
     )  # fmt: skip
+    found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if not dense:
-        ids = rows[1].long()
-        columns = zip(parameters, gradients, ctx.sparse, needed, strict=True)
-        gradients = [_of_all(ids, *column) if wanted else None for *column, wanted in columns]
-    elif sh is None:
-        gradients[4] = None
-    return (*gradients, v_viewmats if need_viewmats else None)
+        ids = saved.rows[1].long()
+        columns = zip(saved.gaussians, gradients, sparse, needed, strict=False)
+        found = [_of_all(ids, *column) if wanted else None for *column, wanted in columns]
+    return (*found, *[None] * (5 - len(found)), v_viewmats if need_viewmats else None)
 
 
 def _of_all(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> Tensor:
@@ -354,21 +254,16 @@ def _of_all(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> T
     return torch.zeros_like(parameter).index_copy_(0, ids, gradient)
 
 
-def _row_gradients(
-    means: Tensor, sh: Tensor | None, camera_ids: Tensor, v_output: tuple[Tensor | None, ...]
-) -> tuple[Tensor | None, ...]:
-    """Return the gradients of means2d, conics, depths, opacities and colors as `project_bwd` takes them."""
-    v = Rows._make((*v_output, None))
-    needed = [v.means2d, v.conics, v.opacities] + ([] if sh is None else [v.colors])
-    if any(gradient is None for gradient in needed):
-        zeros = means.new_zeros(len(camera_ids), 3)
-        v = v._replace(
-            means2d=zeros[:, :2] if v.means2d is None else v.means2d,
-            conics=zeros if v.conics is None else v.conics,
-            opacities=zeros[:, 0] if v.opacities is None else v.opacities,
-            colors=zeros if v.colors is None and sh is not None else v.colors,
-        )
-    return v.means2d, v.conics, v.depths, v.opacities, v.colors
+def _splat_gradients(saved: _Saved, v: Rows) -> list[Tensor]:
+    """Return the gradients of means2d, conics, opacities and colors as `project_bwd` takes them."""
+    columns = [v.means2d, v.conics, v.opacities] + ([v.colors] if len(saved.gaussians) > 4 else [])
+    if v.depths is None and len(columns) == 4 and (table := packed_table(columns)) is not None:
+        return [table]
+    if all(column is not None for column in columns):
+        return columns
+    zeros = saved.gaussians[0].new_zeros(len(saved.rows[0]), 3)
+    parts = (zeros[:, :2], zeros, zeros[:, 0], zeros)
+    return [part if column is None else column for column, part in zip(columns, parts, strict=False)]
 
 
 class _Project(torch.autograd.Function):
@@ -380,20 +275,45 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        *parameters, options, sparse_grad, rows = arguments
-        inputs = (*parameters, *options)
+        *tensors, inputs, sparse_grad, rows = arguments
+        *gaussians, viewmats = tensors
+        cameras = (viewmats, inputs.cameras[1])
+        inputs = inputs._replace(gaussians=[t for t in gaussians if t is not None], cameras=cameras)
         if rows is None:
-            rows = project_rows(*inputs)
-        _setup_context(ctx, inputs, rows[:-1])
+            rows = project_rows(inputs)
+        _save(ctx, inputs, rows)
         ctx.mark_non_differentiable(rows.counts)
-        if sparse_grad:
-            opacities, sh = parameters[3:5]
-            ctx.sparse = (True, True, True, *(sh is not None and t.is_leaf for t in (opacities, sh)))
+        opacities, sh = gaussians[3:5]
+        leaves = [sh is not None and tensor.is_leaf for tensor in (opacities, sh)]
+        ctx.sparse = (True, True, True, *leaves) if sparse_grad else (False,) * 5
         return tuple(rows)
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
-        return (*_gradients(ctx, v_output[:-1]), None, None, None)
+        *needed, need_viewmats = ctx.needs_input_grad[:6]
+        v = Rows._make((*v_output[:-1], None))
+        return (*_gradients(ctx, needed[: ctx.n_gaussians], need_viewmats, ctx.sparse, v), *(None,) * 3)
 
 
-torch.library.register_autograd("blitzgs::project_emit", _backward, setup_context=_setup_context)
+def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+    gaussians, cameras, _, ints, floats, *_ = inputs
+    options = ProjectionOptions.of(ints, floats)
+    # Torch wants a gradient for each argument, and for each tensor of a list.
+    ctx.no_gradients = [_no_gradient(argument) for argument in inputs[2:]]
+    *columns, _, _ = output
+    _save(ctx, ProjectionInputs(gaussians, cameras, options), Rows._make((*columns, None)))
+
+
+def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
+    needed, (need_viewmats, _) = ctx.needs_input_grad[:2]
+    v = Rows._make((*v_output[:12], None))
+    *gradients, v_viewmats = _gradients(ctx, needed, need_viewmats, (False,) * 5, v)
+    return gradients[: len(needed)], [v_viewmats, None], *ctx.no_gradients
+
+
+def _no_gradient(argument: object) -> list[None] | None:
+    tensors = isinstance(argument, (list, tuple)) and all(isinstance(x, Tensor) for x in argument)
+    return [None] * len(argument) if tensors else None  # type: ignore[arg-type]
+
+
+torch.library.register_autograd("blitzgs::project_fwd", _backward, setup_context=_setup_context)

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.lazy_adam import explicit_steps, schedule_table
-from blitzgs.ops.project import Rows
-from blitzgs.ops.scatter import NO_TABLES, RowTables
+from blitzgs.ops.projection import ProjectionOptions, Rows
+from blitzgs.ops.splat_gradients import SplatGradients
 
 
 @torch.no_grad()
@@ -28,20 +28,10 @@ def project_bwd_step_(
     eps: float,
     sparse: bool,
     rows: Rows,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
-    sh_degree: int,
-    eps2d: float,
-    antialiased: bool,
-    v_means2d: Tensor | None = None,
-    v_conics: Tensor | None = None,
-    v_opacities: Tensor | None = None,
-    v_colors: Tensor | None = None,
+    cameras: Sequence[Tensor],
+    options: ProjectionOptions,
+    gradients: SplatGradients,
     scale_reg: Tensor | None = None,
-    tables: RowTables = NO_TABLES,
     means2d_sums: Tensor | None = None,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their rows.
@@ -64,36 +54,34 @@ def project_bwd_step_(
         eps: added to the root of the second moment.
         sparse: plain sparse Adam.
         rows: what `project` made of these parameters and views: P rows.
-        viewmats: [B, 4, 4], as for `project`, like the next six.
-        Ks: [B, 3, 3].
-        width: image width in px.
-        height: image height in px.
-        sh_degree: degree that was evaluated.
-        eps2d: variance added to both screen axes, px^2.
-        antialiased: whether opacities were compensated for that.
-        v_means2d: gradient of `rows.means2d`, [P, 2].
-        v_conics: gradient of `rows.conics`, [P, 3].
-        v_opacities: gradient of `rows.opacities`, [P].
-        v_colors: gradient of `rows.colors`, [P, 3].
+        cameras: viewmats [B, 4, 4] and Ks [B, 3, 3], as for `project`.
+        options: with which the rows were projected; scales and opacities are taken before their activation.
+        gradients: of the rows.
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
-        tables: instead of the four gradients, where they lie (CUDA).
-        means2d_sums: [P, 2], becomes the gradient of `rows.means2d` from tables.
-
-    The four gradients may be views of one table, in this order: on CUDA, one of 12 floats a row
-    (`blitzgs.ops.rasterize.gradient_columns`) is read where it lies.
+        means2d_sums: [P, 2], becomes the gradient of `rows.means2d` where `gradients` has it at ranks.
 
     Raises:
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
     torch.ops.blitzgs.project_bwd_step_(
-        list(params), list(exp_avgs), list(exp_avg_sqs), last_step, moment_step,
-        schedule_table(lr_table, beta1, beta2), lr_table, step, explicit_steps(beta1, beta2, params[0].dtype),
-        beta1, beta2, eps, sparse, viewmats, Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets, width,
-        height, sh_degree, eps2d, antialiased, v_means2d, v_conics, v_opacities, v_colors, scale_reg,
-        *tables, means2d_sums,
-    )  # fmt: skip
+        list(params),
+        list(exp_avgs),
+        list(exp_avg_sqs),
+        [last_step, moment_step],
+        [schedule_table(lr_table, beta1, beta2), lr_table],
+        [step, explicit_steps(beta1, beta2, params[0].dtype), int(sparse)],
+        [beta1, beta2, eps],
+        list(cameras),
+        [rows.camera_ids, rows.visible_ids, rows.row_offsets],
+        options.ints,
+        options.floats,
+        list(gradients.parts),
+        gradients.places,
+        scale_reg,
+        means2d_sums,
+    )
 
 
 @torch.library.register_fake("blitzgs::project_bwd_step_")

@@ -12,44 +12,9 @@ from torch import Tensor
 from blitzgs._library import without_autograd
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import tile_counts
+from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
-PACKED_GRADIENT = 12  # kPackedGradient of csrc/rasterize/rasterize.h
-
-
-class GradientRoom:
-    """Where the backward pass adds up the gradients of rows on CUDA: zeros that the forward pass wrote.
-
-    They are good for one backward pass; later ones get others.
-    """
-
-    def __init__(self, zeros: Tensor | None, others: Callable[[], Tensor] | None = None) -> None:
-        """Keep the zeros.
-
-        Args:
-            zeros: [P or more, 12], the last output of `rasterize_fwd`, or none, [0, 12] or None.
-            others: makes others; None: they are allocated.
-        """
-        self._zeros, self._others = zeros, others
-
-    def take(self, means2d: Tensor) -> Tensor:
-        """Return zeros [P, 12] for the P rows."""
-        zeros, self._zeros = self._zeros, None
-        if zeros is not None and len(zeros) >= len(means2d):
-            return zeros if len(zeros) == len(means2d) else zeros[: len(means2d)]
-        return means2d.new_zeros(len(means2d), PACKED_GRADIENT) if self._others is None else self._others()
-
-
-def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """View a table of the gradients of rows as columns.
-
-    Args:
-        packed: [P, 12], of the op `rasterize_bwd_packed_`.
-
-    Returns:
-        Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
-    """
-    return packed[:, :2], packed[:, 2:5], packed[:, 5], packed[:, 6:9]
 
 
 def rasterize(
@@ -163,7 +128,7 @@ def _(
         means2d.new_empty(pixels, dtype=torch.int32),
         means2d.new_empty(tile_offsets.shape[0] - 1, dtype=torch.int32),
         means2d.new_empty(aux_size, dtype=torch.uint8),
-        means2d.new_empty(n_ready, PACKED_GRADIENT),
+        means2d.new_empty(n_ready, SPLAT_GRADIENT),
     )
 
 
@@ -212,7 +177,7 @@ def _save(ctx: Any, splats: Any, grid: Any, output: tuple[Tensor, ...]) -> None:
     # Not the renders, which callers may change in place: the backward pass does not need them.
     _, transmittances, last_ids, _, aux, row_gradients = output
     ctx.set_materialize_grads(False)
-    ctx.room = GradientRoom(row_gradients)
+    ctx.gradients = GradientBuffer(row_gradients)
     ctx.save_for_backward(*splats, transmittances, last_ids, aux)
     ctx.grid = grid
 
@@ -258,7 +223,7 @@ def _first_gradients(
     v_abs = v_backgrounds = None
     v_splats: Sequence[Tensor]
     if may_pack and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
-        packed = ctx.room.take(splats[0])
+        packed = ctx.gradients.take(splats[0])
         torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, *ctx.grid, deterministic, packed)
         v_splats = gradient_columns(packed)
     else:

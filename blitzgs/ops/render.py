@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from blitzgs.ops.host import tell_host
-from blitzgs.ops.project import RowRoom, Rows, Sizes, color_rows, holds, queue_rows, room_for, rows_of
+from blitzgs.ops.capacity import CapacityEstimate, Sizes
+from blitzgs.ops.host import HostCopy
+from blitzgs.ops.projection import ProjectionInputs, Rows, capacity_for, rows_of
 
 
 class Rendered(NamedTuple):
@@ -23,49 +24,47 @@ class Rendered(NamedTuple):
 
 
 def render_queued(
-    arguments: tuple[Any, ...],
+    inputs: ProjectionInputs,
     channels: Callable[[Rows], Tensor],
     backgrounds: Tensor | None,
     backward_follows: bool,
     sizes: Sizes | None = None,
-) -> Rendered | None:
+) -> Rendered:
     """Render without gradients, for ops that are then given the result to differentiate it.
 
-    The host learns how many rows there are when all is queued, while the GPU works.
+    Where calls of this size were made before, the host learns how many rows there are when all is queued,
+    while the GPU works.
 
     Args:
-        arguments: of `project_rows`.
+        inputs: of `project_rows`.
         channels: what is composited of the rows, [P, D], whatever their number P; their counts are None.
         backgrounds: [B, D] or None.
         backward_follows: see the op `rasterize_fwd`.
-        sizes: how much room to make; None: what calls of this size needed before.
-
-    Returns:
-        None where no call before told how much room is needed, or it was too little.
+        sizes: what is needed, if that is known; None: as much as calls of this size needed before.
     """
-    room = room_for(*arguments) if sizes is None else RowRoom()
-    sizes = room.sizes if sizes is None else sizes
-    if not all(sizes[:2]):
-        return None
-    viewmats, (width, height, tile_size) = arguments[5], arguments[9:12]
-    grid = (len(viewmats), width, height, tile_size, 0, -1)
-    with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
-        queued = (*arguments, [], [], None)
-        _, totals, columns = queue_rows(queued, sizes)
-        with tell_host(totals) as told:
-            color_rows(queued, totals, columns)
-            rows = Rows._make((*columns[:12], None))
-            splats, n_rows = (rows.means2d, rows.conics, rows.opacities), totals[1:2]
+    options = inputs.options
+    grid = (inputs.n_views, options.width, options.height, options.tile_size, 0, -1)
+
+    def attempt(capacity: Sizes | None) -> tuple[Rendered | None, list[int]]:
+        projected = inputs.run(capacity)
+        rows, n_rows = projected.rows, None if capacity is None else projected.totals[1:2]
+        with HostCopy(projected.totals) as copy:
+            n_isects = int(copy.read()[2]) if capacity is None else capacity.isects
+            splats = rows.means2d, rows.conics, rows.opacities
             isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
-                *splats, rows.depths, rows.camera_ids, None, *grid, sizes[2], n_rows
+                *splats, rows.depths, rows.camera_ids, None, *grid, n_isects, n_rows
             )
             composited = torch.ops.blitzgs.rasterize_fwd(
                 *splats, channels(rows), backgrounds, isect_rows, tile_offsets, *grid, None, True,
                 backward_follows, n_rows,
             )  # fmt: skip
-            counts = told()[:3]
-    needed = counts.tolist()
-    room.learn(needed)
-    if not holds(sizes, needed):
-        return None
-    return Rendered(rows_of(columns, counts), isect_rows[: needed[2]], tile_offsets, composited)
+            counts = copy.read()[:3]
+        needed = counts.tolist()
+        if capacity is not None and not capacity.holds(needed):
+            return None, needed
+        listed = isect_rows[: needed[2]]
+        return Rendered(rows_of(rows[:12], counts), listed, tile_offsets, composited), needed
+
+    with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
+        estimate = capacity_for(inputs) if sizes is None else CapacityEstimate(sizes)
+        return estimate.run(attempt)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,30 +13,6 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 
 # Rows that share an entry of `places`, see csrc/scatter/scatter.h.
 RUN = 32
-
-
-class RowTables(NamedTuple):
-    """Where the gradients of rows lie at the M ranks that composited them, whose memory is shared (CUDA).
-
-    By default nowhere. Where several ranks had a row, its gradient is the sum in their order.
-
-    Attributes:
-        places: where each row is among those that a rank had of this one, as `scatter_rows` returns it.
-        group_sizes: how many those are, for each rank.
-        starts: in which row of each rank's table they begin.
-        buffers: int32 [words] of each rank, all of one length, mapped on this device.
-        offset: the tables begin at this word of the buffers. Their rows are those of `rasterize_bwd_packed_`,
-            float32 [.., 12].
-    """
-
-    places: Tensor | None = None
-    group_sizes: Sequence[int] = ()
-    starts: Sequence[int] = ()
-    buffers: Sequence[Tensor] | None = None
-    offset: int = 0
-
-
-NO_TABLES = RowTables()
 
 
 def scatter_rows(

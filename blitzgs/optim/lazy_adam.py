@@ -133,8 +133,9 @@ class LazyAdam(torch.optim.Optimizer):
         if param.numel() == 0 or len(ids) == 0:
             return
         torch.ops.blitzgs.lazy_adam_step_(
-            *_alone(param, state), _with_nothing(values), ids, state["last_step"], state["moment_step"],
-            drift.table, drift.lr_table, int(state["step"]), drift.reach, *drift.betas, group["eps"], False,
+            *_alone(param, state), [state["last_step"], state["moment_step"]], _with_nothing(values), ids,
+            [drift.table, drift.lr_table], [int(state["step"]), drift.reach, 0],
+            [*drift.betas, group["eps"]],
         )  # fmt: skip
 
     @torch.no_grad()
@@ -155,8 +156,9 @@ class LazyAdam(torch.optim.Optimizer):
                 continue
             state, drift = self._state_of(param), self._drift_of(place, group, param)
             torch.ops.blitzgs.lazy_adam_catch_up_(
-                *_alone(param, state), rows, state["last_step"], state["moment_step"], drift.table,
-                drift.lr_table, int(state["step"]), drift.reach, *drift.betas, group["eps"], None,
+                *_alone(param, state), [state["last_step"], state["moment_step"]], rows,
+                [drift.table, drift.lr_table], [int(state["step"]), drift.reach, 0],
+                [*drift.betas, group["eps"]], None,
             )  # fmt: skip
 
     @torch.no_grad()

@@ -22,11 +22,11 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
+from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.importance import UNITS
-from blitzgs.ops.project import RowRoom
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.survey import Survey, survey
 
@@ -94,10 +94,11 @@ def sweep(
     """
     sums = _Sums(len(table), n_views, table.device)
     owners = owners or TileOwners(ranks)
-    room = RowRoom()
+    transport = open_transport(ranks)
     for batch in batches:
-        share = _share(batch, options, owners)
-        sums.add(survey(table, batch.views, options, share, room), batch.columns, table["id"], ranks)
+        assignment = _assign(batch, options, owners)
+        surveyed = survey(table, batch.views, options, assignment, transport)
+        sums.add(surveyed, batch.columns, table["id"], ranks)
     return sums.result()
 
 
@@ -106,13 +107,13 @@ def is_culled(cull: Tensor, column: int) -> Tensor:
     return (cull[:, column // _WORD] >> (column % _WORD) & 1).bool()
 
 
-def _share(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Share | None:
+def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> TileAssignment | None:
     """Divide the tiles of a batch among the ranks; no loss looks beyond their borders."""
     if owners.ranks.world_size == 1:
         return None
     views = batch.views
     ranges = owners.divide(list(batch.columns), views.width, views.height, options.tile_size)
-    return Share(owners.ranks, ranges)
+    return TileAssignment(owners.ranks, ranges)
 
 
 class _Sums:

@@ -9,12 +9,11 @@ on the screen, which the image depends on, is then worked out from the covarianc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from blitzgs.ops.project import Rows
+from blitzgs.ops.projection import ProjectionInputs, Rows
 
 
 @dataclass(frozen=True)
@@ -66,18 +65,20 @@ def _quaternions(rotations: Tensor) -> Tensor:
     return torch.nn.functional.normalize(products[torch.arange(len(r), device=r.device), best], dim=1)
 
 
-def shaped_by(rows: Rows, arguments: tuple[Any, ...], decomposed: Decomposed) -> Rows:
+def shaped_by(rows: Rows, inputs: ProjectionInputs, decomposed: Decomposed) -> Rows:
     """Return rows whose conics, and compensated opacities, come from covariances (docs/image.md).
 
     In double, because the determinant of a covariance loses the digits of a thin splat.
 
     Args:
         rows: of the decomposed covariances.
-        arguments: of the op `project_count`, from means to raw.
+        inputs: of the projection.
         decomposed: the covariances.
     """
-    means, opacities, viewmats, Ks = (arguments[i].double() for i in (0, 3, 5, 6))
-    width, height, eps2d, antialiased = arguments[9], arguments[10], arguments[15], arguments[17]
+    means, _, _, opacities, *_ = inputs.gaussians
+    means, opacities, viewmats, Ks = (t.double() for t in (means, opacities, *inputs.cameras))
+    options = inputs.options
+    width, height, eps2d, antialiased = options.width, options.height, options.eps2d, options.antialiased
     views, ids = rows.camera_ids, rows.gaussian_ids
     viewmats, Ks = viewmats.index_select(0, views), Ks.index_select(0, views)
     rotations = viewmats[:, :3, :3]

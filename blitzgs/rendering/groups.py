@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from blitzgs.ops.project import Rows, differentiable_rows
+from blitzgs.ops.project import differentiable_rows, gaussians_of
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows
 from blitzgs.rendering.arguments import Gaussians, Scene
 from blitzgs.rendering.covariances import Decomposed, shaped_by
 
@@ -36,12 +36,12 @@ class Group:
     """Views of one scene that are projected together.
 
     Attributes:
-        arguments: of the op, from means to raw.
+        inputs: of the projection.
         first_image: number of its first view among the images of the call.
         covariances: given instead of quats and scales; None: those were.
     """
 
-    arguments: tuple[Any, ...]
+    inputs: ProjectionInputs
     first_image: int
     covariances: Decomposed | None
 
@@ -51,6 +51,10 @@ def groups_of(gaussians: Gaussians, options: ProjectOptions) -> list[Group]:
     groups = []
     sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
     most = 1 if sh_per_view else MOST_VIEWS
+    projection = ProjectionOptions(
+        options.width, options.height, options.tile_size, gaussians.sh_degree or 0, options.near_plane,
+        options.far_plane, options.eps2d, options.radius_clip, options.antialiased, gaussians.raw,
+    )  # fmt: skip
     for s, scene in enumerate(gaussians.scenes):
         # A split of nothing to be split would still cost the host a node of the graph.
         views = [(scene.viewmats, scene.Ks)]
@@ -58,12 +62,11 @@ def groups_of(gaussians: Gaussians, options: ProjectOptions) -> list[Group]:
             views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
         sh = _sh_of_views(gaussians, scene, len(views))
         for part, (viewmats, Ks) in enumerate(views):
-            arguments = (
-                *scene[:4], sh[part], viewmats, Ks, None, None, options.width, options.height,
-                options.tile_size, gaussians.sh_degree or 0, options.near_plane, options.far_plane,
-                options.eps2d, options.radius_clip, options.antialiased, gaussians.raw,
-            )  # fmt: skip
-            groups.append(Group(arguments, s * gaussians.views + part * most, scene.covariances))
+            means, quats, scales, opacities = scene[:4]
+            inputs = ProjectionInputs(
+                gaussians_of(means, quats, scales, opacities, sh[part]), (viewmats, Ks), projection
+            )
+            groups.append(Group(inputs, s * gaussians.views + part * most, scene.covariances))
     return groups
 
 
@@ -88,9 +91,9 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rows | Non
     """
     parts = []
     for group in groups:
-        rows = differentiable_rows(group.arguments, sparse_grad, ready)
+        rows = differentiable_rows(group.inputs, sparse_grad, ready)
         if group.covariances is not None:
-            rows = shaped_by(rows, group.arguments, group.covariances)
+            rows = shaped_by(rows, group.inputs, group.covariances)
         parts.append(rows)
     if len(parts) == 1:
         return parts[0]

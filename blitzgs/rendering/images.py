@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.project import Rows, Sizes
+from blitzgs.ops.capacity import Sizes
+from blitzgs.ops.projection import Rows
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.render import Rendered, render_queued
 from blitzgs.rendering.arguments import Gaussians
@@ -19,7 +20,7 @@ from blitzgs.rendering.layout import Layout
 from blitzgs.rendering.meta import Lists, make_meta
 
 # What the CUDA kernels composite; for any other size, meta's lists are of the tiles asked for alone.
-CUDA_TILE_SIZES = (8, 16, 32)
+CUDA_TILE_SIZE = 16
 
 
 @dataclass(frozen=True)
@@ -96,18 +97,18 @@ def _queued(
     sizes: Sizes | None,
 ) -> Rendered | None:
     """Have all of it queued on CUDA before the host knows how many rows there are, if that can be done."""
-    means = group.arguments[0]
+    means = group.inputs.gaussians[0]
     # Hooks on saved tensors (checkpointing) want the same shapes each time, without room behind rows.
     if (
         not means.is_cuda
-        or project.tile_size not in CUDA_TILE_SIZES
+        or project.tile_size != CUDA_TILE_SIZE
         or torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
     ):
         return None
-    inputs = [*group.arguments[:6], gaussians.colors]
+    inputs = [*group.inputs.gaussians, *group.inputs.cameras, gaussians.colors]
     differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     return render_queued(
-        group.arguments,
+        group.inputs,
         lambda rows: _channels_of_rows(rows, gaussians, image.render_mode),
         image.backgrounds,
         differentiable and not image.absgrad,
@@ -144,9 +145,9 @@ def _lists(
         return Lists(isect_rows, offsets, width, height, size)
 
     lists = lists_of(tile_size, -1 if torch.compiler.is_compiling() else int(rows.counts[2]))
-    if not rows.means2d.is_cuda or tile_size in CUDA_TILE_SIZES:
+    if not rows.means2d.is_cuda or tile_size == CUDA_TILE_SIZE:
         return lists, lists
-    return lists, lists_of(CUDA_TILE_SIZES[1], -1)
+    return lists, lists_of(CUDA_TILE_SIZE, -1)
 
 
 def _without_non_finite(gaussians: Gaussians) -> Gaussians:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.project import Rows
+from blitzgs.ops.projection import Rows
 
 
 class Layout:

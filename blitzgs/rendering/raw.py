@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.lazy_dict import Later
-from blitzgs.ops.project import project_rows
+from blitzgs.ops.capacity import Sizes
+from blitzgs.ops.projection import ProjectionInputs, project_rows
 from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
 from blitzgs.rendering.groups import ProjectOptions, groups_of
 from blitzgs.rendering.images import ImageOptions, render
@@ -105,7 +106,7 @@ def raw_rasterization(
     lazy = _lazy(optimizers)
     for optimizer in lazy:
         optimizer.catch_up(geometry)
-    ids, sizes = _visible([group.arguments for group in groups_of(whole, project)])
+    ids, sizes = _visible([group.inputs for group in groups_of(whole, project)])
     for optimizer in lazy:
         optimizer.catch_up(harmonics, ids)
     shaded = "RGB" in render_mode
@@ -139,20 +140,19 @@ def _check_harmonics(harmonics: list[Tensor], count: int) -> None:
 
 
 @torch.no_grad()
-def _visible(calls: list[tuple[Any, ...]]) -> tuple[Tensor, tuple[int, int, int] | None]:
+def _visible(calls: list[ProjectionInputs]) -> tuple[Tensor, Sizes | None]:
     """Return the Gaussians that some view sees, int32 [U], and the rows there will be of them.
 
     Args:
-        calls: arguments of the op for at most 32 views each.
+        calls: what is projected, into at most 32 views each.
 
     Returns:
         Ascending ids; how many Gaussians, rows and intersections there are, if all are of one call.
     """
-    parts = [project_rows(*arguments) for arguments in calls]
+    parts = [project_rows(inputs) for inputs in calls]
     if len(parts) > 1:
         return torch.cat([rows.visible_ids for rows in parts]).unique(), None
-    visible, rows, isects = parts[0].counts.tolist()
-    return parts[0].visible_ids, (visible, rows, isects)
+    return parts[0].visible_ids, Sizes._make(parts[0].counts.tolist())
 
 
 class _Visible(torch.autograd.Function):

@@ -11,7 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import LOSS_REACH, TileOwners, TileRanges
+from blitzgs.distributed.ownership import LOSS_HALO, TileOwners, TileRanges
 from blitzgs.pipeline import Views
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.views import VIEW_NUMBERS, ViewSet, unpack_views
@@ -213,7 +213,7 @@ class BatchLoader:
     def _divide(self, indices: list[int]) -> TileRanges | None:
         if self._owners is None:
             return None
-        return self._owners.divide(indices, *self._views.size(indices), reach=LOSS_REACH)
+        return self._owners.divide(indices, *self._views.size(indices), halo=LOSS_HALO)
 
     def _rows(self, indices: list[int], ranges: TileRanges | None) -> list[tuple[int, int]]:
         """Pixel rows [y0, y1) of each view that this rank needs."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs import pipeline
-from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.pixels import collect_images
 from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import ssim
@@ -115,7 +115,7 @@ def render_view(
     if ranks.world_size == 1:
         return pipeline.forward(table, picked, options).renders[0]
     ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
-    frame = pipeline.forward(table, picked, options, share=Share(ranks, ranges))
+    frame = pipeline.forward(table, picked, options, assignment=TileAssignment(ranks, ranges))
     owners.record([index], frame.tile_work, ranges)
     collect_images(frame.renders, ranges, ranks, destination)
     return frame.renders[0] if ranks.rank == destination else None

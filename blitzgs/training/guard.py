@@ -70,9 +70,9 @@ def _origin(table: GaussianTable, frame: Frame | None) -> str:
         for name in ("means2d", "conics", "depths", "opacities", "colors"):
             if not bool(getattr(frame.rows, name).isfinite().all()):
                 return f"it first appears in op project, output {name}"
-        finite, share = frame.renders.isfinite(), frame.share
-        if share is not None:
-            finite = finite[share.ranges.pixel_mask(share.ranks.rank, finite.device)]
+        finite, assignment = frame.renders.isfinite(), frame.assignment
+        if assignment is not None:
+            finite = finite[assignment.ranges.pixel_mask(assignment.ranks.rank, finite.device)]
         if not bool(finite.all()):
             return "it first appears in op rasterize, output renders"
     return "parameters and images are finite: it comes from op photometric"

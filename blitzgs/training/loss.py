@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import LOSS_REACH
+from blitzgs.distributed.ownership import LOSS_HALO
 from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.pipeline import Frame
@@ -47,16 +47,16 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: floa
     Raises:
         ValueError: the ranks composited less than their losses read.
     """
-    count, share = len(frame.views), frame.share
-    if share is not None and share.ranges.reach < LOSS_REACH:
-        raise ValueError(f"the loss reads {LOSS_REACH} px beyond a rank's tiles: divide them with that reach")
+    count, assignment = len(frame.views), frame.assignment
+    if assignment is not None and assignment.ranges.halo < LOSS_HALO:
+        raise ValueError(f"the loss reads {LOSS_HALO} px beyond a rank's tiles: divide them with that halo")
     parts, v_renders, scale_reg = photometric_fwd_bwd(
         frame.renders,
         batch.targets,
         batch.masks,
         *_weights(config.ssim, count, batch.samples.device),
         frame.options.tile_size,
-        *((0, -1) if share is None else share.tiles),
+        *((0, -1) if assignment is None else assignment.tiles),
         samples=batch.samples,
         visible=frame.visible if config.scale > 0 else None,
         scale_weight=config.scale / (length_unit * count),
@@ -89,8 +89,8 @@ def scale_term(frame: Frame, table: GaussianTable, length_unit: float) -> Tensor
     smallest = table["scales"][frame.rows.gaussian_ids].amin(dim=1).exp() / length_unit
     views = torch.arange(len(frame.views), device=smallest.device)
     sums = (smallest[:, None] * (frame.rows.camera_ids[:, None] == views)).sum(dim=0)
-    if frame.share is not None:
-        frame.share.ranks.all_reduce(sums)
+    if frame.assignment is not None:
+        frame.assignment.ranks.all_reduce(sums)
     return sums / frame.visible.clamp(min=1)
 
 
@@ -99,10 +99,10 @@ def batch_psnr(frame: Frame, batch: Batch) -> Tensor:
     error = ((frame.renders.clamp(0, 1) - batch.targets.float() / 255.0) ** 2).sum(-1)
     if batch.masks is not None:
         error *= batch.masks != 0
-    if frame.share is not None:
-        ranks, ranges = frame.share.ranks, frame.share.ranges
+    if frame.assignment is not None:
+        ranks, ranges = frame.assignment.ranks, frame.assignment.ranges
         error = error.where(ranges.pixel_mask(ranks.rank, error.device), 0.0)
     total = error.sum()
-    if frame.share is not None:
-        frame.share.ranks.all_reduce(total)
+    if frame.assignment is not None:
+        frame.assignment.ranks.all_reduce(total)
     return -10.0 * (total / batch.samples.sum()).clamp(min=1e-12).log10()

@@ -10,7 +10,8 @@ from torch import Tensor
 from blitzgs.model import GaussianTable
 from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, schedule_table
 from blitzgs.ops.project_step import project_bwd_step_
-from blitzgs.pipeline import Frame, RowGradients
+from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.pipeline import Frame
 from blitzgs.training.config import OptimiserConfig
 from blitzgs.training.schedule import Schedule
 
@@ -63,7 +64,7 @@ class LazyAdam:
         self,
         table: GaussianTable,
         frame: Frame,
-        v: RowGradients,
+        v: SplatGradients,
         scale_reg: Tensor | None,
         step: int,
         means2d_sums: Tensor | None = None,
@@ -73,12 +74,12 @@ class LazyAdam:
         Args:
             table: the table that was rendered, unchanged since.
             frame: of `pipeline.forward`.
-            v: gradients of the frame's rows, from `pipeline.backward_rows`.
-            scale_reg: as for `pipeline.backward`.
+            v: gradients of the frame's splats, from `pipeline.backward_splats`.
+            scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
+                such term.
             step: the visible rows stand at the step before.
-            means2d_sums: [P, 2], becomes the gradient of the rows' means2d where `v` has it in tables.
+            means2d_sums: [P, 2], becomes the gradient of the splats' means2d where `v` has it at ranks.
         """
-        views, options = frame.views, frame.options
         project_bwd_step_(
             table.parameters,
             table.exp_avgs,
@@ -91,18 +92,9 @@ class LazyAdam:
             self._eps,
             self._sparse,
             frame.rows,
-            views.viewmats,
-            views.Ks,
-            views.width,
-            views.height,
-            sh_degree=options.sh_degree,
-            eps2d=options.eps2d,
-            antialiased=options.antialiased,
-            v_means2d=v.means2d,
-            v_conics=v.conics,
-            v_opacities=v.opacities,
-            v_colors=v.colors,
-            scale_reg=scale_reg,
-            tables=v.tables,
-            means2d_sums=means2d_sums,
+            (frame.views.viewmats, frame.views.Ks),
+            frame.options.projection(frame.views),
+            v,
+            scale_reg,
+            means2d_sums,
         )

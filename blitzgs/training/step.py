@@ -8,9 +8,9 @@ from torch import Tensor
 
 from blitzgs import pipeline
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.distributed.ownership import Share, TileOwners
+from blitzgs.distributed.ownership import TileAssignment, TileOwners
+from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
-from blitzgs.ops.project import RowRoom
 from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
@@ -39,11 +39,11 @@ class Stepper:
             owners: learns what the tiles cost.
             loss: weights of the loss.
             length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
-            half_exchange: see `blitzgs.distributed.exchange.plan_route`.
+            half_exchange: send splats in half precision, see `open_transport`.
         """
         self._table, self._optimiser, self._owners = table, optimiser, owners
-        self._loss, self._length_unit, self._half = loss, length_unit, half_exchange
-        self._room = RowRoom()
+        self._loss, self._length_unit = loss, length_unit
+        self._transport = open_transport(owners.ranks, half_exchange)
         self.reindex()
 
     def reindex(self) -> None:
@@ -73,8 +73,10 @@ class Stepper:
         mark("other")
         self._optimiser.catch_up(table, active.ids, step - 1, active.length)
         mark("optimiser")
-        share = None if batch.ranges is None else Share(ranks, batch.ranges, self._half)
-        frame = pipeline.forward(table, views, options, active, share, self._room, mark, True)
+        assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
+        frame = pipeline.forward(
+            table, views, options, active, assignment, self._transport, mark, backward_follows=True
+        )
         terms = loss_terms(frame, batch, self._loss, self._length_unit)
         mark("loss")
         if batch.ranges is None:
@@ -101,7 +103,7 @@ class Stepper:
             That gradient, [P, 2] per pixel, or None.
         """
         table = self._table
-        gradients = pipeline.backward_rows(frame, terms.v_renders, mark)
+        gradients = pipeline.backward_splats(frame, terms.v_renders, mark)
         v_means2d, sums = gradients.means2d, None
         if v_means2d is None and keep_means2d:
             v_means2d = sums = torch.empty_like(frame.rows.means2d)

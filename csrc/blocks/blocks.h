@@ -25,6 +25,7 @@
 #include <cstdint>
 
 #include "common/host_device.h"
+#include "common/limits.h"
 #include "common/stream.h"
 #include "lazy_adam/adam_table.h"
 #include "math/morton.h"
@@ -33,7 +34,6 @@ namespace blitzgs {
 
 constexpr int kBlockRows = 256;
 constexpr int kBlockBounds = 8;  // lowest corner, highest corner, largest sigma, whether all rows are finite
-constexpr int kMaxViews = 32;
 constexpr int kPlanes = 6;
 
 BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }

@@ -4,6 +4,7 @@
 #include "blocks/blocks.h"
 #include "common/launch.cuh"
 #include "common/multiprocessors.h"
+#include "common/warp.cuh"
 #include "common/zeros.cuh"
 #include "math/morton_cuda.cuh"
 
@@ -24,12 +25,12 @@ __global__ void make_keys(const float* points, std::int64_t n, const MortonBound
 
 // Appends the items of a warp's lanes to a list, with one atomic addition for the warp. All lanes call this.
 __device__ void append(bool present, std::int32_t item, std::int32_t* list, std::int32_t* length) {
-  const unsigned all = __ballot_sync(~0u, present);
+  const unsigned all = __ballot_sync(kFullWarp, present);
   if (!all) return;
   const int lane = threadIdx.x % 32, leader = __ffs(all) - 1;
   std::int32_t first = 0;
   if (lane == leader) first = atomicAdd(length, __popc(all));
-  first = __shfl_sync(~0u, first, leader);
+  first = __shfl_sync(kFullWarp, first, leader);
   if (present) list[first + __popc(all & ((1u << lane) - 1))] = item;
 }
 
@@ -50,10 +51,10 @@ __device__ __forceinline__ SweptBox box_around(SweptBox box) {
   for (int offset = kLanes / 2; offset > 0; offset /= 2) {
     SweptBox other;
     for (int axis = 0; axis < 3; ++axis) {
-      other.low[axis] = __shfl_xor_sync(~0u, box.low[axis], offset);
-      other.high[axis] = __shfl_xor_sync(~0u, box.high[axis], offset);
+      other.low[axis] = __shfl_xor_sync(kFullWarp, box.low[axis], offset);
+      other.high[axis] = __shfl_xor_sync(kFullWarp, box.high[axis], offset);
     }
-    other.sigma = __shfl_xor_sync(~0u, box.sigma, offset);
+    other.sigma = __shfl_xor_sync(kFullWarp, box.sigma, offset);
     extend(box, other);
   }
   return box;
@@ -103,7 +104,7 @@ __global__ void test_blocks(const float* bounds, CullCamera camera, int views, c
     plan.blocks[block] = seen = views_of_block(planes, views, bounds + block * kBlockBounds);
     if (!is_mixed(seen)) plan.active[block] = active = seen.all ? rows_in_block(plan.n, block) : 0;
   }
-  active = __reduce_add_sync(~0u, active);
+  active = __reduce_add_sync(kFullWarp, active);
   if (thread % 32 == 0 && active > 0) atomicAdd(groups + blockIdx.x, active);
   append(is_mixed(seen), static_cast<std::int32_t>(block), list, length);
 }
@@ -141,10 +142,10 @@ __device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* gr
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   std::int32_t sum = near < block ? plan.active[near] : 0;
   for (std::int64_t i = threadIdx.x; i < group; i += kGroup) sum += groups[i];
-  sum = __reduce_add_sync(~0u, sum);
+  sum = __reduce_add_sync(kFullWarp, sum);
   if (lane == 0) parts[warp] = sum;
   __syncthreads();
-  return __reduce_add_sync(~0u, lane < kWarps ? parts[lane] : 0);
+  return __reduce_add_sync(kFullWarp, lane < kWarps ? parts[lane] : 0);
 }
 
 // One warp for each block.
@@ -157,10 +158,10 @@ __global__ void __launch_bounds__(kBlockRows)
   const std::int32_t before = rows_before(plan, groups, first);
   const std::int32_t here = lane < kWarps && first + lane < blocks ? plan.active[first + lane] : 0;
   if (blockIdx.x == gridDim.x - 1 && warp == 0) {
-    const std::int32_t all = before + __reduce_add_sync(~0u, here);
+    const std::int32_t all = before + __reduce_add_sync(kFullWarp, here);
     if (lane == 0) *out.count = all;
   }
-  std::int32_t at = before + __reduce_add_sync(~0u, lane < warp ? here : 0);
+  std::int32_t at = before + __reduce_add_sync(kFullWarp, lane < warp ? here : 0);
   if (block >= blocks) return;
   const BlockViews seen = plan.blocks[block];
   if (!seen.some) return;
@@ -170,7 +171,7 @@ __global__ void __launch_bounds__(kBlockRows)
   for (int local = lane; local < kBlockRows; local += 32) {
     const std::int64_t row = block * kBlockRows + local;
     const std::uint32_t mask = local >= count ? 0 : mixed ? plan.masks[row] : seen.all;
-    const std::uint32_t ballot = __ballot_sync(~0u, mask != 0);
+    const std::uint32_t ballot = __ballot_sync(kFullWarp, mask != 0);
     const std::int32_t place = at + __popc(ballot & ((1u << lane) - 1));
     if (mask) {
       out.ids[place] = static_cast<std::int32_t>(row);

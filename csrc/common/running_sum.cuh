@@ -1,22 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sums over lanes, and of block sums over the blocks of one launch while they run.
+// Sums of block sums over the blocks of one launch, while these run.
 #pragma once
 #include <cstdint>
 #include <cuda/atomic>
 
+#include "common/warp.cuh"
+
 namespace blitzgs::cuda {
-
-inline constexpr unsigned kFullWarp = 0xffffffffu;
-
-template <class T>
-__device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
-#pragma unroll
-  for (int step = 1; step < 32; step *= 2) {
-    const T before = __shfl_up_sync(kFullWarp, value, step);
-    if (lane >= step) value += before;
-  }
-  return value;
-}
 
 // The sum over all blocks before a block, where each block has a sum in [0, 2^62). A block publishes its own
 // sum. It then adds up the sums of its predecessors, backwards, until it meets one that has published the sum

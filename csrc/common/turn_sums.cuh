@@ -2,6 +2,7 @@
 // The sum over all earlier turns, for blocks of a launch that take turns, while they run.
 #pragma once
 #include "common/running_sum.cuh"
+#include "common/warp.cuh"
 
 namespace blitzgs::cuda {
 

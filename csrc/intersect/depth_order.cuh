@@ -8,6 +8,7 @@
 #pragma once
 #include <cstdint>
 
+#include "common/warp.cuh"
 #include "intersect/radix_sweep.cuh"
 #include "intersect/touched_tiles.cuh"
 

@@ -14,6 +14,7 @@
 #include "common/launch.cuh"
 #include "common/multiprocessors.h"
 #include "common/running_sum.cuh"
+#include "common/warp.cuh"
 #include "intersect/depth_order.cuh"
 #include "intersect/radix_sweep.cuh"
 #include "intersect/touched_tiles.cuh"
@@ -55,10 +56,10 @@ __global__ void count_kernel(const Input in, std::int32_t* counts) {
 // Writes the entries of a warp's rows, one row for each lane. The warp's entries begin at `turn`, the lane's
 // at `turn` + `start`.
 template <class Key>
-__device__ __forceinline__ void write_entries(const Input& in, const Touched* all_touched, std::int32_t row,
-                                              const Touched& touched, std::int32_t start, std::int64_t turn,
-                                              std::int64_t capacity, Key* keys, std::int32_t* entries,
-                                              const TileDigits& digits, std::uint32_t* counts) {
+__device__ __forceinline__ void write_entries(const Input& in, std::int32_t row, const Touched& touched,
+                                              std::int32_t start, std::int64_t turn, std::int64_t capacity,
+                                              Key* keys, std::int32_t* entries, const TileDigits& digits,
+                                              std::uint32_t* counts) {
   const int lane = threadIdx.x % 32;
   // The lanes share all entries of compact rows: each writes every 32nd entry, whichever lane's row it
   // belongs to.
@@ -88,19 +89,7 @@ __device__ __forceinline__ void write_entries(const Input& in, const Touched* al
     const int source = __ffs(left) - 1;
     const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
     std::int64_t at = turn + __shfl_sync(kFullWarp, start, source);
-    Splat splat = load_splat(in, of_row);
-    splat.opacity = __shfl_sync(kFullWarp, splat.opacity, 0);  // the same for all lanes, if it changes now
-    if (splat.opacity == 0.f) {
-      // Its owner has hidden the row since it was counted (project_colors_to_ranks). Nothing will be
-      // composited of its entries, so they may be any tile's, but there they must be.
-      const std::int32_t counted = all_touched[of_row].count();
-      for (int k = lane; k < counted && at + k < capacity; k += 32) {
-        keys[at + k] = 0;
-        entries[at + k] = of_row;
-        digits.count(0, counts);
-      }
-      continue;
-    }
+    const Splat splat = load_splat(in, of_row);
     for_each_owned(in.grid, splat, [&](const Owned& owned) {
       const int n = owned.last - owned.first;
       for (int k = lane; k < n && at + k < capacity; k += 32) {
@@ -159,8 +148,8 @@ __global__ void __launch_bounds__(kThreads, 4)
 
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
-    write_entries(in, all_touched, row[k], touched[k], start[k], before + turn[k], capacity, keys, entries,
-                  digits, counts);
+    write_entries(in, row[k], touched[k], start[k], before + turn[k], capacity, keys, entries, digits,
+                  counts);
   }
   __syncthreads();
   add_counts(counts, digits.passes * TileDigits::kBins, histograms);

@@ -12,6 +12,7 @@
 #include "common/launch.cuh"
 #include "common/running_sum.cuh"
 #include "common/stream.h"
+#include "common/warp.cuh"
 
 namespace blitzgs::cuda {
 

@@ -3,6 +3,7 @@
 // contraction may include this (cmake/cuda.cmake), because the projection must count the same tiles.
 #pragma once
 #include "common/running_sum.cuh"
+#include "common/warp.cuh"
 #include "intersect/intersect.h"
 
 namespace blitzgs::cuda {

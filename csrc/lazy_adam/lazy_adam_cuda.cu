@@ -5,6 +5,7 @@
 
 #include "common/launch.cuh"
 #include "common/multiprocessors.h"
+#include "common/warp.cuh"
 #include "lazy_adam/lazy_adam_device.cuh"
 
 namespace blitzgs::cuda {
@@ -41,7 +42,7 @@ __global__ void __launch_bounds__(kPrepareThreads)
     prepared.debts[t].rules[group] = adam_rule(args, t, target, group, error);
 #pragma unroll
   for (int step = 1; step < kPrepareLanes; step *= 2) {
-    error = fmax(error, __shfl_xor_sync(~0u, error, step));
+    error = fmax(error, __shfl_xor_sync(kFullWarp, error, step));
   }
   if (t >= target || group != 0) return;
   AdamDebt<float>& debt = prepared.debts[t];
@@ -92,11 +93,12 @@ __global__ void __launch_bounds__(kListThreads)
       }
       if (from < args.step) args.last_step[row] = args.step;
     }
-    for (unsigned left = __ballot_sync(~0u, explicitly); left; left &= left - 1) {
+    for (unsigned left = __ballot_sync(kFullWarp, explicitly); left; left &= left - 1) {
       const int lane = __ffs(left) - 1;
-      const std::int64_t row = __shfl_sync(~0u, mine.row, lane);
-      const AdamDebt<float>& debt = prepared.debts[__shfl_sync(~0u, mine.from, lane)];
-      const Decay here{__shfl_sync(~0u, mine.here.first, lane), __shfl_sync(~0u, mine.here.second, lane)};
+      const std::int64_t row = __shfl_sync(kFullWarp, mine.row, lane);
+      const AdamDebt<float>& debt = prepared.debts[__shfl_sync(kFullWarp, mine.from, lane)];
+      const Decay here{__shfl_sync(kFullWarp, mine.here.first, lane),
+                       __shfl_sync(kFullWarp, mine.here.second, lane)};
       pay_elements<0>(args, debt, here, row);
       pay_elements<1>(args, debt, here, row);
       pay_elements<2>(args, debt, here, row);
@@ -105,7 +107,7 @@ __global__ void __launch_bounds__(kListThreads)
     }
     if (explicitly) mine.row = -1;
     if (i < n) debtors[i] = mine;
-    if (__any_sync(~0u, mine.row >= 0) && threadIdx.x % 32 == 0) *prepared.owing = true;
+    if (__any_sync(kFullWarp, mine.row >= 0) && threadIdx.x % 32 == 0) *prepared.owing = true;
   }
 }
 

@@ -4,17 +4,14 @@
 namespace blitzgs {
 namespace {
 
-void lazy_adam_step_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
-                     std::vector<Tensor> exp_avg_sqs, std::vector<Tensor> grads, const Tensor& ids,
-                     Tensor last_step, Tensor moment_step, const Tensor& table, const Tensor& lr_table,
-                     std::int64_t step, std::int64_t explicit_steps, double beta1, double beta2, double eps,
-                     bool sparse) {
+void lazy_adam_step(std::vector<Tensor> params, std::vector<Tensor> exp_avgs, std::vector<Tensor> exp_avg_sqs,
+                    std::vector<Tensor> last_steps, std::vector<Tensor> grads, const Tensor& ids,
+                    const std::vector<Tensor>& tables, const std::vector<std::int64_t>& steps,
+                    const std::vector<double>& decays) {
   constexpr const char* kOp = "lazy_adam_step_";
-  AdamTensors state{kOp,      params, exp_avgs,       exp_avg_sqs, last_step, moment_step, table,
-                    lr_table, step,   explicit_steps, beta1,       beta2,     eps,         sparse};
-  state.check();
+  AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
   check_adam_list(kOp, grads, "grads");
-  STD_TORCH_CHECK(step >= 1, "blitzgs::lazy_adam_step_: steps count from 1, got ", step);
+  STD_TORCH_CHECK(state.step >= 1, "blitzgs::lazy_adam_step_: steps count from 1, got ", state.step);
   check_dtype(kOp, "ids", ids, ScalarType::Int);
   check_shape(kOp, "ids", ids, {-1});
   const Tensor list = as_contiguous(ids);
@@ -36,15 +33,13 @@ void lazy_adam_step_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
   });
 }
 
-void lazy_adam_catch_up_(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
-                         std::vector<Tensor> exp_avg_sqs, const std::optional<Tensor>& ids, Tensor last_step,
-                         Tensor moment_step, const Tensor& table, const Tensor& lr_table, std::int64_t step,
-                         std::int64_t explicit_steps, double beta1, double beta2, double eps,
-                         const std::optional<Tensor>& count) {
+void lazy_adam_catch_up(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
+                        std::vector<Tensor> exp_avg_sqs, std::vector<Tensor> last_steps,
+                        const std::optional<Tensor>& ids, const std::vector<Tensor>& tables,
+                        const std::vector<std::int64_t>& steps, const std::vector<double>& decays,
+                        const std::optional<Tensor>& count) {
   constexpr const char* kOp = "lazy_adam_catch_up_";
-  AdamTensors state{kOp,      params, exp_avgs,       exp_avg_sqs, last_step, moment_step, table,
-                    lr_table, step,   explicit_steps, beta1,       beta2,     eps,         false};
-  state.check();
+  AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
   std::optional<Tensor> list;
   if (ids) {
     check_dtype(kOp, "ids", *ids, ScalarType::Int);
@@ -64,6 +59,6 @@ void lazy_adam_catch_up_(std::vector<Tensor> params, std::vector<Tensor> exp_avg
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("lazy_adam_step_", TORCH_BOX(&blitzgs::lazy_adam_step_));
-  m.impl("lazy_adam_catch_up_", TORCH_BOX(&blitzgs::lazy_adam_catch_up_));
+  m.impl("lazy_adam_step_", TORCH_BOX(&blitzgs::lazy_adam_step));
+  m.impl("lazy_adam_catch_up_", TORCH_BOX(&blitzgs::lazy_adam_catch_up));
 }

@@ -17,17 +17,67 @@ inline void check_adam_list(const char* op, const std::vector<Tensor>& tensors, 
                   " must hold means, quats, scales, opacities, sh; got ", tensors.size(), " tensors");
 }
 
+// The optimiser's state of a table, and where its schedule stands. last_steps: (last_step, moment_step);
+// tables: (table of adam_table.h, lr_table); steps: (step, explicit_steps, sparse); decays: (beta1, beta2,
+// eps).
 struct AdamTensors {
   const char* op;
   std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
   Tensor last_step, moment_step, table, lr_table;
-  std::int64_t step, explicit_steps;
-  double beta1, beta2, eps;
-  bool sparse;
+  std::int64_t step = 0, explicit_steps = 0;
+  double beta1 = 0, beta2 = 0, eps = 0;
+  bool sparse = false;
+
+  AdamTensors(const char* op_name, const std::vector<Tensor>& params_in,
+              const std::vector<Tensor>& exp_avgs_in, const std::vector<Tensor>& exp_avg_sqs_in,
+              const std::vector<Tensor>& last_steps, const std::vector<Tensor>& tables,
+              const std::vector<std::int64_t>& steps, const std::vector<double>& decays)
+      : op(op_name), params(params_in), exp_avgs(exp_avgs_in), exp_avg_sqs(exp_avg_sqs_in) {
+    STD_TORCH_CHECK(last_steps.size() == 2 && tables.size() == 2 && steps.size() == 3 && decays.size() == 3,
+                    "blitzgs::", op, ": expected last_steps (last_step, moment_step), tables (table, ",
+                    "lr_table), steps (step, explicit_steps, sparse) and decays (beta1, beta2, eps)");
+    last_step = last_steps[0];
+    moment_step = last_steps[1];
+    table = tables[0];
+    lr_table = tables[1];
+    step = steps[0];
+    explicit_steps = steps[1];
+    sparse = steps[2] != 0;
+    beta1 = decays[0];
+    beta2 = decays[1];
+    eps = decays[2];
+    check();
+  }
 
   const Tensor& like() const { return params[0]; }
   std::int64_t rows() const { return like().size(0); }
 
+  // Of n rows: those that `ids` lists, or all when it is null; gradients are left null.
+  template <class T>
+  AdamArgs<T> arguments(const std::int32_t* ids, std::int64_t n) {
+    AdamArgs<T> args{};
+    for (int c = 0; c < kAdamColumns; ++c) {
+      args.columns[c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
+                         mutable_data<T>(exp_avg_sqs[c]), nullptr, width(c)};
+    }
+    args.ids = ids;
+    args.n = n;
+    args.last_step = mutable_data<std::int32_t>(last_step);
+    args.moment_step = mutable_data<std::int32_t>(moment_step);
+    args.table = data<double>(table);
+    args.lr_table = data<float>(lr_table);
+    args.step = static_cast<std::int32_t>(step);
+    args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
+    args.beta1 = beta1;
+    args.beta2 = beta2;
+    args.eps = eps;
+    args.sparse = sparse;
+    return args;
+  }
+
+  std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
+
+ private:
   void check() const {
     check_adam_list(op, params, "params");
     check_adam_list(op, exp_avgs, "exp_avgs");
@@ -58,32 +108,6 @@ struct AdamTensors {
                     " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
   }
 
-  // Of n rows: those that `ids` lists, or all when it is null; gradients are left null.
-  template <class T>
-  AdamArgs<T> arguments(const std::int32_t* ids, std::int64_t n) {
-    AdamArgs<T> args{};
-    for (int c = 0; c < kAdamColumns; ++c) {
-      args.columns[c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
-                         mutable_data<T>(exp_avg_sqs[c]), nullptr, width(c)};
-    }
-    args.ids = ids;
-    args.n = n;
-    args.last_step = mutable_data<std::int32_t>(last_step);
-    args.moment_step = mutable_data<std::int32_t>(moment_step);
-    args.table = data<double>(table);
-    args.lr_table = data<float>(lr_table);
-    args.step = static_cast<std::int32_t>(step);
-    args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
-    args.beta1 = beta1;
-    args.beta2 = beta2;
-    args.eps = eps;
-    args.sparse = sparse;
-    return args;
-  }
-
-  std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
-
- private:
   void check_column(const Tensor& tensor, int column) const {
     const char* name = kAdamNames[column];
     check_dtype(op, name, tensor, like().scalar_type());

@@ -5,6 +5,7 @@
 
 #include "common/cuda_check.h"
 #include "common/stream.h"
+#include "common/warp.cuh"
 #include "math/morton.h"
 
 namespace blitzgs::cuda {
@@ -42,9 +43,10 @@ static __global__ void find_bounds(const float* points, std::int64_t n, MortonBo
       high[axis] = max(high[axis], ordered(p[axis]));
     }
   }
-  finite = __reduce_add_sync(~0u, finite);
+  finite = __reduce_add_sync(kFullWarp, finite);
   for (int axis = 0; axis < 3; ++axis) {
-    const std::int32_t l = __reduce_min_sync(~0u, low[axis]), h = __reduce_max_sync(~0u, high[axis]);
+    const std::int32_t l = __reduce_min_sync(kFullWarp, low[axis]),
+                       h = __reduce_max_sync(kFullWarp, high[axis]);
     if (threadIdx.x % 32 == 0) {
       atomicMin(&bounds->low[axis], l);
       atomicMax(&bounds->high[axis], h);

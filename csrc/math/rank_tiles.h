@@ -5,10 +5,9 @@
 #include <cstdint>
 
 #include "common/host_device.h"
+#include "common/limits.h"
 
 namespace blitzgs {
-
-constexpr int kMaxRanks = 63;  // a mask of ranks is an int64
 
 // Rank m composites tiles [begin[m], end[m]). Ranges may be empty and may overlap; their begins ascend.
 struct RankTiles {

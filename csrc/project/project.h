@@ -12,12 +12,10 @@
 // Rows are ordered by (Gaussian, view). Every value of a row depends on its Gaussian and view alone, so rows
 // are bit-identical however Gaussians are divided among calls. O(candidates * B + rows); no output of size N.
 //
-// On the CPU project_count projects and sums up what there will be, project_list writes which Gaussian and
-// view each row is of, and project_emit the rows. On CUDA project_survey lists, from few bytes per candidate,
-// the views that may see it; project_rows projects those pairs, counts what are rows and, as far as it was
-// given room for them, writes each behind those before it, in one launch: where the room turns out to be too
-// small, it runs again. project_colors adds the colours. Nobody waits for the device: kernels find the sums
-// there.
+// project() counts the rows and writes them, by three kernels on CUDA: the prefilter lists, from few bytes
+// per candidate, the views that may see it; write_rows projects those pairs, counts what are rows and writes
+// each behind those before it, in one launch; write_colors adds the colours. With a capacity given, CUDA does
+// all of that without waiting for the number of rows; without one it waits for the number and then writes.
 //
 // On several ranks, rank_tiles says which tiles each composites. The walk over a row's tiles that counts them
 // then also finds the ranks that the row has to reach.
@@ -31,8 +29,7 @@
 #include "common/stream.h"
 #include "math/rank_tiles.h"
 #include "project/project_row.h"
-#include "project/row_gradients.h"
-#include "scatter/scatter.h"
+#include "project/splat_gradients.h"
 
 namespace blitzgs {
 
@@ -50,12 +47,12 @@ struct ProjectInputs {
   const std::int32_t* n_active = nullptr;
 };
 
-// What project_count sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P rows,
+// What project() sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P rows,
 // the tiles they touch (an upper bound: hidden rows count), the rows of each view [B], and for each rank its
 // rows and the tiles they touch there [M, 2].
 inline constexpr int kTotalVisible = 0, kTotalRows = 1, kTotalTiles = 2, kTotalViews = 3;
 
-inline std::int64_t project_totals(std::int64_t n_views, std::int64_t n_ranks) {
+BLITZGS_HD std::int64_t project_totals(std::int64_t n_views, std::int64_t n_ranks) {
   return kTotalViews + n_views + 2 * n_ranks;
 }
 
@@ -68,8 +65,8 @@ struct ProjectSizes {
   std::int64_t visible, rows;
 };
 
-// How many there is room for, and what there is, as project_totals where the inputs are; null: the room is
-// what is needed, as always on the CPU.
+// How many there is room for, and what there is, as project_totals where the inputs are; null: exactly so
+// many.
 struct ProjectRoom {
   ProjectSizes sizes;
   const std::int64_t* totals;
@@ -91,32 +88,23 @@ struct ProjectOutputs {
   const std::int64_t* ids;
 };
 
-// What other ranks need of a row: means2d, conics, opacities, colors, depths, camera_ids and the Gaussian's
-// persistent id, in words.
-inline constexpr RowColumns<const std::int32_t> kEmittedColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
-inline constexpr int kOpacityColumn = 2, kColorColumn = 3;
-
-// What this rank writes to the others, as its device works it out.
-struct ProjectAdmitted {
-  std::int64_t received;  // rows that arrive here: the first word, for what takes that number on the device
-  ProjectSizes sizes;
-  RowGroups groups;                // rows for each rank, and the row of its target that they begin at
-  std::int64_t filled[kMaxRanks];  // how many of these have been given a place
+// Where project() puts the rows.
+template <class T>
+struct ProjectColumns {
+  ProjectIds ids;
+  ProjectOutputs<T> values;
 };
 
-// Where rows go besides (CUDA): each to the ranks of its rank mask, as `scatter` does (scatter/scatter.h), in
-// every target behind the rows of the ranks before this one, unless some rank has more than `capacity` rows,
-// of its own, to send or to get: then nothing is written, here and, as all ranks know of it, at no other.
-// everyone: project_totals of each rank, on the device. targets: where the columns of each rank's rows begin.
-// admitted and places are written too.
-struct ProjectScatter {
-  ProjectAdmitted* admitted;
-  RowPlace* places;
-  const std::int64_t* everyone;
-  int n_ranks, rank;
-  std::int64_t capacity;
-  ScatterTargets targets;
-  bool with_colors;  // else they follow: project_colors_to_ranks
+// Memory for the rows, from the caller of project().
+template <class T>
+class RowMemory {
+ public:
+  virtual ~RowMemory() = default;
+  // CUDA: rows for which the caller has asked for room before their number is known; null: as many as there
+  // are.
+  virtual const ProjectSizes* capacity() const = 0;
+  // Called once.
+  virtual ProjectColumns<T> allocate(const ProjectSizes&) = 0;
 };
 
 // Gradients by visible Gaussian, [U, ...] (sh [U, K, 3], null without sh), or, where `dense`, by Gaussian:
@@ -134,44 +122,22 @@ struct ProjectRows {
 };
 
 namespace cpu {
-// plan [project_plan_bytes] is the backend's own, from count to emit. So is what count puts into `carry` (the
-// CPU: its rows, which it need not compute twice; CUDA: nothing): one allocation at most, which emit gets
-// back.
-std::size_t project_plan_bytes(std::int64_t candidates);
 template <class T>
-void project_count(const ProjectInputs<T>&, const RankTiles& rank_tiles, void* plan, Workspace& carry,
-                   std::int64_t* totals, Workspace&, CudaStream);
-template <class T>
-void project_list(const ProjectInputs<T>&, const void* plan, const ProjectRoom&, const ProjectIds&,
-                  Workspace&, CudaStream);
-template <class T>
-void project_emit(const ProjectInputs<T>&, const RankTiles&, const void* carry, const ProjectIds&,
-                  const ProjectRoom&, const ProjectOutputs<T>&, Workspace&, CudaStream);
+void project(const ProjectInputs<T>&, const RankTiles&, RowMemory<T>&, std::int64_t* totals, Workspace&,
+             CudaStream);
 // scale_reg [B] or null: adds scale_reg[b] * d(min_j s_j) for each row in view b (the paper's L_scale).
 template <class T>
-void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
+void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const SplatGradientColumns<T>&,
                  const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
-// plan [project_plan_bytes]: from the survey to the rows.
-std::size_t project_plan_bytes(std::int64_t candidates);
-void project_survey(const ProjectInputs<float>&, void* plan, Workspace&, CudaStream);
-// totals: null, where they are known. With no room rows are counted only.
-void project_rows(const ProjectInputs<float>&, const RankTiles&, const void* plan, const ProjectSizes& room,
-                  const ProjectIds&, const ProjectOutputs<float>&, std::int64_t* totals, Workspace&,
-                  CudaStream);
-// Of the rows that project_rows wrote; none without sh. beside: leaves a place to kernels of other streams.
-void project_colors(const ProjectInputs<float>&, const ProjectIds&, const ProjectRoom&,
-                    const ProjectOutputs<float>&, CudaStream, bool beside = false);
-// Into the room for `capacity` rows that this rank has too.
-void project_rows_to_ranks(const ProjectIds&, const ProjectOutputs<float>&, int n_views,
-                           const ProjectScatter&, CudaStream);
-// The colours of rows that were sent without: nobody needs them to sort the rows, so they are worked out
-// while the rows travel, and travel while these are sorted. A row whose colour is not finite is hidden only
-// now: its opacity becomes zero where it went too, which may list it, but composites nothing of it.
-void project_colors_to_ranks(const ProjectOutputs<float>&, const ProjectScatter&, CudaStream);
+// Where the rows do not fit into the capacity, the totals are right all the same; the columns then hold the
+// first rows without colours.
 template <class T>
-void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const RowGradientSource&, const T* scale_reg,
+void project(const ProjectInputs<T>&, const RankTiles&, RowMemory<T>&, std::int64_t* totals, Workspace&,
+             CudaStream);
+template <class T>
+void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const SplatGradientSource&, const T* scale_reg,
                  const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cuda
 

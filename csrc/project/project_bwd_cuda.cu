@@ -113,7 +113,7 @@ __global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks
 }  // namespace
 
 template <>
-void project_bwd<float>(const Inputs& in, const ProjectRows& rows, const RowGradientSource& v,
+void project_bwd<float>(const Inputs& in, const ProjectRows& rows, const SplatGradientSource& v,
                         const float* scale_reg, const ProjectGradients<float>& out, Workspace& workspace,
                         CudaStream stream) {
   const std::int64_t blocks = project_blocks(rows.n_visible);

@@ -2,13 +2,13 @@
 // The projection's backward pass on CUDA, whatever becomes of the gradients.
 #pragma once
 #include "project/project_device.cuh"
-#include "project/row_reader.cuh"
+#include "project/splat_gradient_reader.cuh"
 
 namespace blitzgs::cuda {
 
 constexpr int kBackwardThreads = 128;
 
-// v: one of RowGradientSource.
+// v: one of SplatGradientSource.
 template <class Source>
 struct BackwardInputs {
   Inputs in;
@@ -19,7 +19,7 @@ struct BackwardInputs {
 
 // Calls f(degree, quads, BackwardInputs) with degree and quads as dispatch_sh has them.
 template <class F>
-void dispatch_backward(const Inputs& in, const ProjectRows& rows, const RowGradientSource& v,
+void dispatch_backward(const Inputs& in, const ProjectRows& rows, const SplatGradientSource& v,
                        const float* scale_reg, const F& f) {
   std::visit(
       [&](const auto& source) {
@@ -59,7 +59,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
                      end = exists ? args.rows.row_offsets[u + 1] : 0;
   const std::int64_t stride = 3 * in.options.sh_stride;
   const bool has_colors = in.sh && args.v.colored();
-  using Reader = RowReader<Source>;
+  using Reader = SplatGradientReader<Source>;
   Reader reader(args.v, pulled, in.n_views);
   if constexpr (QUADS) {
     if (has_colors) stage.gather(in.sh, stride, id, lane);
@@ -138,7 +138,8 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
 template <int DEGREE, bool QUADS, class Source, class Sink>
 void launch_backward(const BackwardInputs<Source>& args, const Sink& sink, CudaStream stream) {
   const auto kernel = backward_kernel<DEGREE, QUADS, Source, Sink>;
-  const std::size_t bytes = RowReader<Source>::shared_bytes(args.v, args.in.n_views, kBackwardThreads / 32);
+  const std::size_t bytes =
+      SplatGradientReader<Source>::shared_bytes(args.v, args.in.n_views, kBackwardThreads / 32);
   if (bytes > 0) {
     check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)),
           "project_bwd");

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 #include <mutex>
-#include <stdexcept>
 #include <utility>
 #include <vector>
 
@@ -33,7 +32,7 @@ ActiveGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
                            activate_opacity(in.opacities[id], in.options.raw));
 }
 
-// A row as the first pass finds it and the second takes it back.
+// A row as counting finds it and writing takes it back.
 template <class T>
 struct KeptRow {
   Row<T> row;
@@ -41,21 +40,14 @@ struct KeptRow {
   std::int64_t ranks;
 };
 
-// plan: the visible candidates and the rows before each block of kProjectBlock candidates [blocks + 1], and
-// view_masks [candidates]: bit v set iff view v sees it.
-template <class Count, class Mask>
-struct Plan {
-  Count *visible_before, *rows_before;
-  Mask* view_masks;
-
-  template <class Memory>
-  Plan(Memory* memory, std::int64_t candidates)
-      : visible_before(static_cast<Count*>(memory)),
-        rows_before(visible_before + project_blocks(candidates) + 1),
-        view_masks(reinterpret_cast<Mask*>(rows_before + project_blocks(candidates) + 1)) {}
+// What counting finds of a block of kProjectBlock candidates: its rows, the views that see each candidate,
+// and how many visible Gaussians and rows the blocks before it have.
+template <class T>
+struct CountedBlock {
+  std::vector<KeptRow<T>> rows;
+  std::vector<std::uint32_t> views;
+  std::int64_t visible = 0, visible_before = 0, rows_before = 0;
 };
-using NewPlan = Plan<std::int64_t, std::uint32_t>;
-using MadePlan = Plan<const std::int64_t, const std::uint32_t>;
 
 // Projects a candidate into the views that may see it, adds its rows to `rows` and what they are to `totals`,
 // and returns their views.
@@ -104,8 +96,8 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
 }
 
 template <class T>
-void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t id, std::int64_t index,
-              const KeptRow<T>& kept, const ProjectOutputs<T>& out) {
+void write_row(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t id, std::int64_t index,
+               const KeptRow<T>& kept, const ProjectOutputs<T>& out) {
   const Row<T>& row = kept.row;
   std::copy_n(row.mean2d, 2, out.means2d + 2 * index);
   std::copy_n(row.conic, 3, out.conics + 3 * index);
@@ -124,8 +116,8 @@ void emit_row(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t 
 // Gradients of visible Gaussian u; poses [B] or null.
 template <class T>
 void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras, const ProjectRows& rows,
-                  const ProjectRowGradients<T>& v, const T* scale_reg, std::int64_t u, PoseGradient<T>* poses,
-                  const ProjectGradients<T>& out) {
+                  const SplatGradientColumns<T>& v, const T* scale_reg, std::int64_t u,
+                  PoseGradient<T>* poses, const ProjectGradients<T>& out) {
   const std::int64_t id = rows.visible_ids[u];
   const std::int64_t stride = 3 * in.options.sh_stride;
   const ActiveGaussian<T> gaussian = load_gaussian(in, id);
@@ -173,95 +165,63 @@ void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_v
   }
 }
 
-}  // namespace
-
-std::size_t project_plan_bytes(std::int64_t candidates) {
-  return static_cast<std::size_t>(2 * (project_blocks(candidates) + 1)) * sizeof(std::int64_t) +
-         static_cast<std::size_t>(candidates) * sizeof(std::uint32_t);
+// Calls f(block, its first candidate, one past its last) for all blocks, in parallel.
+template <class T, class F>
+void for_each_block(std::vector<CountedBlock<T>>& blocks, std::int64_t n_candidates, const F& f) {
+  parallel_for(0, static_cast<std::int64_t>(blocks.size()), 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t block = begin; block < end; ++block) {
+      f(blocks[block], block * kProjectBlock, std::min(n_candidates, (block + 1) * kProjectBlock));
+    }
+  });
 }
 
+}  // namespace
+
 template <class T>
-void project_count(const ProjectInputs<T>& in, const RankTiles& rank_tiles, void* plan_memory,
-                   Workspace& carry, std::int64_t* totals, Workspace&, CudaStream) {
+void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, RowMemory<T>& memory,
+             std::int64_t* totals, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
-  const std::int64_t blocks = project_blocks(in.n_candidates);
   const std::int64_t n_totals = project_totals(in.n_views, rank_tiles.n_ranks);
-  const NewPlan plan(plan_memory, in.n_candidates);
-  std::vector<std::vector<KeptRow<T>>> kept(blocks);
+  std::vector<CountedBlock<T>> blocks(project_blocks(in.n_candidates));
   std::fill_n(totals, n_totals, 0);
   std::mutex adding;
-  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
+  for_each_block(blocks, in.n_candidates, [&](CountedBlock<T>& block, std::int64_t first, std::int64_t last) {
     std::vector<std::int64_t> sums(n_totals, 0);
-    for (std::int64_t block = begin; block < end; ++block) {
-      const std::int64_t before = sums[kTotalVisible];
-      const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
-      for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
-        plan.view_masks[c] = project_candidate(in, rank_tiles, cameras, c, &kept[block], sums.data());
-      }
-      plan.visible_before[block] = sums[kTotalVisible] - before;
+    for (std::int64_t c = first; c < last; ++c) {
+      block.views.push_back(project_candidate(in, rank_tiles, cameras, c, &block.rows, sums.data()));
     }
+    block.visible = sums[kTotalVisible];
     const std::lock_guard<std::mutex> lock(adding);
     for (std::int64_t i = 0; i < n_totals; ++i) totals[i] += sums[i];
   });
   std::int64_t visible = 0, rows = 0;
-  for (std::int64_t block = 0; block < blocks; ++block) {
-    visible += std::exchange(plan.visible_before[block], visible);
-    plan.rows_before[block] = rows;
-    rows += static_cast<std::int64_t>(kept[block].size());
+  for (CountedBlock<T>& block : blocks) {
+    block.visible_before = std::exchange(visible, visible + block.visible);
+    block.rows_before = std::exchange(rows, rows + static_cast<std::int64_t>(block.rows.size()));
   }
-  plan.visible_before[blocks] = visible;
-  plan.rows_before[blocks] = rows;
-  auto* all = carry.allocate<KeptRow<T>>(rows);
-  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      std::copy(kept[block].begin(), kept[block].end(), all + plan.rows_before[block]);
-      kept[block] = {};
-    }
-  });
-}
-
-template <class T>
-void project_list(const ProjectInputs<T>& in, const void* plan_memory, const ProjectRoom& room,
-                  const ProjectIds& ids, Workspace&, CudaStream) {
-  const ProjectSizes& sizes = room.sizes;
-  const std::int64_t blocks = project_blocks(in.n_candidates);
-  const MadePlan plan(plan_memory, in.n_candidates);
-  if (plan.visible_before[blocks] != sizes.visible || plan.rows_before[blocks] != sizes.rows) {
-    throw std::invalid_argument("blitzgs::project_emit: counts must be the totals of project_count");
-  }
-  ids.row_offsets[sizes.visible] = static_cast<std::int32_t>(sizes.rows);
-  parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      std::int64_t u = plan.visible_before[block], index = plan.rows_before[block];
-      const std::int64_t last = std::min(in.n_candidates, (block + 1) * kProjectBlock);
-      for (std::int64_t c = block * kProjectBlock; c < last; ++c) {
-        if (plan.view_masks[c] == 0) continue;
-        const auto id = static_cast<std::int32_t>(candidate_id(in, c));
-        ids.visible_ids[u] = id;
-        ids.row_offsets[u++] = static_cast<std::int32_t>(index);
-        for (std::uint32_t rest = plan.view_masks[c]; rest != 0; rest &= rest - 1) {
-          ids.gaussian_ids[index] = id;
-          ids.camera_ids[index++] = __builtin_ctz(rest);
-        }
+  const ProjectColumns<T> columns = memory.allocate({visible, rows});
+  const ProjectIds& ids = columns.ids;
+  ids.row_offsets[visible] = static_cast<std::int32_t>(rows);
+  for_each_block(blocks, in.n_candidates, [&](CountedBlock<T>& block, std::int64_t first, std::int64_t) {
+    std::int64_t u = block.visible_before, index = block.rows_before;
+    const KeptRow<T>* kept = block.rows.data();
+    for (std::size_t i = 0; i < block.views.size(); ++i) {
+      if (block.views[i] == 0) continue;
+      const auto id = static_cast<std::int32_t>(candidate_id(in, first + static_cast<std::int64_t>(i)));
+      ids.visible_ids[u] = id;
+      ids.row_offsets[u++] = static_cast<std::int32_t>(index);
+      for (std::uint32_t rest = block.views[i]; rest != 0; rest &= rest - 1) {
+        const int view = __builtin_ctz(rest);
+        ids.gaussian_ids[index] = id;
+        ids.camera_ids[index] = view;
+        write_row(in, cameras[view], id, index++, *kept++, columns.values);
       }
     }
   });
 }
 
 template <class T>
-void project_emit(const ProjectInputs<T>& in, const RankTiles&, const void* carry, const ProjectIds& ids,
-                  const ProjectRoom& room, const ProjectOutputs<T>& out, Workspace&, CudaStream) {
-  const std::vector<Camera<T>> cameras = make_cameras(in);
-  const auto* rows = static_cast<const KeptRow<T>*>(carry);
-  parallel_for(0, room.sizes.rows, kProjectBlock, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t row = begin; row < end; ++row) {
-      emit_row(in, cameras[ids.camera_ids[row]], ids.gaussian_ids[row], row, rows[row], out);
-    }
-  });
-}
-
-template <class T>
-void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const ProjectRowGradients<T>& v,
+void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const SplatGradientColumns<T>& v,
                  const T* scale_reg, const ProjectGradients<T>& out, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const std::int64_t blocks = project_blocks(rows.n_visible);
@@ -279,14 +239,10 @@ void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const Proj
   if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                               \
-  template void project_count<T>(const ProjectInputs<T>&, const RankTiles&, void*, Workspace&,               \
-                                 std::int64_t*, Workspace&, CudaStream);                                     \
-  template void project_list<T>(const ProjectInputs<T>&, const void*, const ProjectRoom&, const ProjectIds&, \
-                                Workspace&, CudaStream);                                                     \
-  template void project_emit<T>(const ProjectInputs<T>&, const RankTiles&, const void*, const ProjectIds&,   \
-                                const ProjectRoom&, const ProjectOutputs<T>&, Workspace&, CudaStream);       \
-  template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,   \
+#define BLITZGS_INSTANTIATE(T)                                                                              \
+  template void project<T>(const ProjectInputs<T>&, const RankTiles&, RowMemory<T>&, std::int64_t*,         \
+                           Workspace&, CudaStream);                                                         \
+  template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const SplatGradientColumns<T>&, \
                                const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)

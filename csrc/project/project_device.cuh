@@ -6,6 +6,7 @@
 #include <type_traits>
 
 #include "common/cuda_check.h"
+#include "common/warp.cuh"
 #include "project/project.h"
 
 namespace blitzgs::cuda {
@@ -61,7 +62,7 @@ struct TripleStage {
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
       const int at = i * 32 + lane;
-      const std::int64_t row = __shfl_sync(0xffffffffu, id, at / 3);
+      const std::int64_t row = __shfl_sync(kFullWarp, id, at / 3);
       if (row >= 0) part[i] = source[3 * row + at % 3];
     }
     return {part[0], part[1], part[2]};
@@ -101,7 +102,7 @@ struct TripleStage {
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
       const int at = i * 32 + lane;
-      const std::int64_t row = __shfl_sync(0xffffffffu, id, at / 3);
+      const std::int64_t row = __shfl_sync(kFullWarp, id, at / 3);
       if (row >= 0) out[3 * row + at % 3] = values[at];
     }
     __syncwarp();
@@ -145,9 +146,9 @@ struct ShStage {
   // Gathers row `id` of each lane (id < 0: none), once where consecutive lanes have the same; returns where a
   // lane's row is. Asynchronous until wait().
   __device__ __forceinline__ int gather(const float* sh, std::int64_t stride, std::int32_t id, int lane) {
-    const std::int32_t previous = __shfl_up_sync(0xffffffffu, id, 1);
+    const std::int32_t previous = __shfl_up_sync(kFullWarp, id, 1);
     const bool first = id >= 0 && (lane == 0 || id != previous);
-    const unsigned firsts = __ballot_sync(0xffffffffu, first);
+    const unsigned firsts = __ballot_sync(kFullWarp, first);
     const int slot = __popc(firsts & (0xffffffffu >> (31 - lane))) - 1, count = __popc(firsts);
     if (first) ids[slot] = id;
     __syncwarp();
@@ -192,7 +193,7 @@ struct ShStage {
 #pragma unroll
     for (int i = 0; i < Row::kQuads; ++i) {
       const int at = i * 32 + lane, slot = at / Row::kQuads, quad = at % Row::kQuads;
-      const std::int64_t row = __shfl_sync(0xffffffffu, id, slot);
+      const std::int64_t row = __shfl_sync(kFullWarp, id, slot);
       if (row >= 0) reinterpret_cast<float4*>(out + stride * row)[quad] = quads[slot * kPitch + quad];
     }
   }

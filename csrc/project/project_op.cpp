@@ -1,143 +1,150 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <tuple>
+#include "project/project_op.h"
 
-#include "project/project_forward_op.h"
+#include <algorithm>
+#include <tuple>
 
 namespace blitzgs {
 namespace {
 
-// The one allocation of project_count that outlives it.
-class Carry final : public Workspace {
- public:
-  explicit Carry(const Tensor& like) : like_(like), tensor_(make_empty(like, {0}, ScalarType::Byte)) {}
-  void* allocate_bytes(std::size_t bytes) override {
-    tensor_ = make_empty(like_, {static_cast<std::int64_t>(bytes)}, ScalarType::Byte);
-    return tensor_.mutable_data_ptr();
-  }
-  const Tensor& tensor() const { return tensor_; }
+// The candidates of a projection: ids, which views may see each, and how many of the ids are there; all
+// Gaussians and views where nothing is given.
+struct Candidates {
+  OptionalTensor ids, views, listed;
+  std::int64_t count;
 
- private:
-  Tensor like_, tensor_;
+  Candidates(const char* op, const TensorList& active, std::int64_t n_gaussians) : count(n_gaussians) {
+    check_group(op, "(ids, views, count), each left out with those behind it", active, 0, 3);
+    if (active.empty()) return;
+    ids = as_contiguous(active[0]);
+    check_shape(op, "active_ids", *ids, {-1});
+    check_dtype(op, "active_ids", *ids, ScalarType::Int);
+    if (active.size() > 1) {
+      views = as_contiguous(active[1]);
+      check_shape(op, "active_views", *views, {ids->numel()});
+      check_dtype(op, "active_views", *views, ScalarType::Int);
+    }
+    if (active.size() > 2) listed = active[2];
+    count = most_listed(op, listed, ids->numel());
+  }
 };
 
-// Counts the rows and, on CUDA, writes as many as there is room for, without colours.
-std::tuple<Tensor, Tensor, Tensor, RowList> project_count(
-    const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
-    const OptionalTensor& sh, const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& active_ids,
-    const OptionalTensor& active_views, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t sh_degree, double near_plane, double far_plane, double eps2d, double radius_clip,
-    bool antialiased, bool raw, const std::vector<std::int64_t>& tile_begins,
-    const std::vector<std::int64_t>& tile_ends, const OptionalTensor& active_count,
-    [[maybe_unused]] std::int64_t visible_room, [[maybe_unused]] std::int64_t row_room,
-    const OptionalTensor& ids) {
-  constexpr const char* kOp = "project_count";
-  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
-                  height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
-                  tile_begins, tile_ends, active_count);
-  const OptionalTensor persistent = checked_ids(kOp, f, ids);
-  const std::size_t bytes = backend::project_plan_bytes(f.candidates);
-  Tensor plan = make_empty(f.p.means, {static_cast<std::int64_t>((bytes + 7) / 8)}, ScalarType::Long);
-  Tensor totals = make_empty(f.p.means, {project_totals(f.p.n_views, f.ranks.n_ranks)}, ScalarType::Long);
-  Carry carry(f.p.means);
-  RowList rows;
-  DeviceScope scope(f.p.means);
-#ifdef BLITZGS_BACKEND_CUDA
-  const auto in = f.inputs<float>();
-  const ProjectSizes room{visible_room, row_room};
-  if (visible_room > 0 && row_room > 0) rows = make_rows(f, room, persistent.has_value());
-  cuda::project_survey(in, plan.mutable_data_ptr(), scope.workspace, scope.stream);
-  cuda::project_rows(in, f.ranks, plan.const_data_ptr(), room_of(rows),
-                     rows.empty() ? ProjectIds{} : row_ids(rows),
-                     rows.empty() ? ProjectOutputs<float>{} : row_values<float>(f, rows, persistent),
-                     mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
-#else
-  dispatch_floating(f.p.means, [&](auto zero) {
-    cpu::project_count(f.inputs<decltype(zero)>(), f.ranks, plan.mutable_data_ptr(), carry,
-                       mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
-  });
-#endif
-  return {plan, carry.tensor(), totals, rows};
+RankTiles checked_rank_tiles(const char* op, const IntList& begins_and_ends) {
+  const std::size_t n_ranks = begins_and_ends.size() / 2;
+  STD_TORCH_CHECK(begins_and_ends.size() == 2 * n_ranks && n_ranks <= kMaxRanks, "blitzgs::", op,
+                  ": rank_tiles must have a begin and an end for each of at most ", kMaxRanks, " ranks, got ",
+                  begins_and_ends.size(), " numbers");
+  RankTiles ranks{};
+  ranks.n_ranks = static_cast<int>(n_ranks);
+  for (std::size_t m = 0; m < n_ranks; ++m) {
+    ranks.begin[m] = begins_and_ends[2 * m];
+    ranks.end[m] = begins_and_ends[2 * m + 1];
+  }
+  return ranks;
 }
 
-ProjectSizes told_sizes(const char* op, const Tensor& counts) {
-  check_dtype(op, "counts", counts, ScalarType::Long);
-  STD_TORCH_CHECK(counts.is_cpu() && counts.numel() >= 2, "blitzgs::", op,
-                  ": counts must be the totals of project_count, on the CPU");
-  const auto* numbers = data<std::int64_t>(counts);
-  return {numbers[kTotalVisible], numbers[kTotalRows]};
+// The columns of rows as tensors, in the order in which the op returns them.
+struct RowTensors {
+  Tensor gaussian_ids, camera_ids, visible_ids, row_offsets, means2d, conics, depths, opacities, colors,
+      radii, tiles_touched, rank_masks, row_ids;
+};
+
+template <class T>
+class TorchRows final : public RowMemory<T> {
+ public:
+  // ids: persistent, of the Gaussians; none: the rows' are not wanted.
+  TorchRows(const Tensor& like, bool with_colors, bool with_masks, const OptionalTensor& ids,
+            const std::optional<ProjectSizes>& capacity, RowTensors* tensors)
+      : like_(like),
+        with_colors_(with_colors),
+        with_masks_(with_masks),
+        ids_(ids),
+        capacity_(capacity),
+        t_(*tensors) {}
+
+  const ProjectSizes* capacity() const override { return capacity_ ? &*capacity_ : nullptr; }
+
+  ProjectColumns<T> allocate(const ProjectSizes& sizes) override {
+    const std::int64_t U = sizes.visible, P = sizes.rows;
+    STD_TORCH_CHECK(
+        P <= std::numeric_limits<std::int32_t>::max(), "blitzgs::project_fwd: ", P,
+        " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
+    const auto make = [&](const std::vector<std::int64_t>& shape, ScalarType dtype) {
+      return make_empty(like_, shape, dtype);
+    };
+    const auto ints = ScalarType::Int, longs = ScalarType::Long, floats = like_.scalar_type();
+    t_.gaussian_ids = make({P}, ints);
+    t_.camera_ids = make({P}, ints);
+    t_.visible_ids = make({U}, ints);
+    t_.row_offsets = make({U + 1}, ints);
+    t_.means2d = make({P, 2}, floats);
+    t_.conics = make({P, 3}, floats);
+    t_.depths = make({P}, floats);
+    t_.opacities = make({P}, floats);
+    t_.colors = make({with_colors_ ? P : 0, 3}, floats);
+    t_.radii = make({P, 2}, ints);
+    t_.tiles_touched = make({P}, ints);
+    t_.rank_masks = make({with_masks_ ? P : 0}, longs);
+    t_.row_ids = make({ids_ ? P : 0}, longs);
+    return {{mutable_data<std::int32_t>(t_.gaussian_ids), mutable_data<std::int32_t>(t_.camera_ids),
+             mutable_data<std::int32_t>(t_.visible_ids), mutable_data<std::int32_t>(t_.row_offsets)},
+            {mutable_data<T>(t_.means2d), mutable_data<T>(t_.conics), mutable_data<T>(t_.depths),
+             mutable_data<T>(t_.opacities), mutable_data<T>(t_.colors), mutable_data<std::int32_t>(t_.radii),
+             mutable_data<std::int32_t>(t_.tiles_touched),
+             with_masks_ ? mutable_data<std::int64_t>(t_.rank_masks) : nullptr,
+             ids_ ? mutable_data<std::int64_t>(t_.row_ids) : nullptr, data_or_null<std::int64_t>(ids_)}};
+  }
+
+ private:
+  const Tensor& like_;
+  bool with_colors_, with_masks_;
+  const OptionalTensor& ids_;
+  std::optional<ProjectSizes> capacity_;
+  RowTensors& t_;
+};
+
+std::optional<ProjectSizes> checked_capacity(const char* op, const IntList& capacity) {
+  if (capacity.empty()) return std::nullopt;
+  STD_TORCH_CHECK(
+      capacity.size() == 2 && capacity[0] > 0 && capacity[1] > 0, "blitzgs::", op,
+      ": capacity must be how many visible Gaussians and rows there is room for, at least 1 each");
+  return ProjectSizes{capacity[0], capacity[1]};
 }
 
-using RowTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                              Tensor, Tensor, Tensor>;
+using Projected = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
+                             Tensor, Tensor, Tensor, Tensor>;
 
-// Writes all rows of a plan.
-RowTensors project_emit(const Tensor& means, const Tensor& quats, const Tensor& scales,
-                        const Tensor& opacities, const OptionalTensor& sh, const Tensor& viewmats,
-                        const Tensor& Ks, const OptionalTensor& active_ids,
-                        const OptionalTensor& active_views, std::int64_t width, std::int64_t height,
-                        std::int64_t tile_size, std::int64_t sh_degree, double near_plane, double far_plane,
-                        double eps2d, double radius_clip, bool antialiased, bool raw,
-                        const std::vector<std::int64_t>& tile_begins,
-                        const std::vector<std::int64_t>& tile_ends, const OptionalTensor& active_count,
-                        const Tensor& plan, [[maybe_unused]] const Tensor& carry, const Tensor& counts,
-                        const OptionalTensor& ids) {
-  constexpr const char* kOp = "project_emit";
-  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, active_ids, active_views, width,
-                  height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw,
-                  tile_begins, tile_ends, active_count);
-  check_plan(kOp, f, plan);
-  const OptionalTensor persistent = checked_ids(kOp, f, ids);
-  const ProjectSizes sizes = told_sizes(kOp, counts);
-  STD_TORCH_CHECK(sizes.rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", kOp, ": ", sizes.rows,
-                  " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
-  RowList r = make_rows(f, sizes, persistent.has_value());
-  DeviceScope scope(f.p.means);
-  dispatch_floating(f.p.means, [&](auto zero) {
+Projected project_fwd(const TensorList& gaussians, const TensorList& cameras, const TensorList& active,
+                      const IntList& ints, const FloatList& floats, const IntList& rank_tiles,
+                      const IntList& capacity, const OptionalTensor& ids) {
+  constexpr const char* kOp = "project_fwd";
+  const ProjectArguments p(kOp, gaussians, cameras, ints, floats);
+  const Candidates candidates(kOp, active, p.count);
+  const RankTiles ranks = checked_rank_tiles(kOp, rank_tiles);
+  const std::optional<ProjectSizes> sizes = checked_capacity(kOp, capacity);
+  if (ids) {
+    check_dtype(kOp, "ids", *ids, ScalarType::Long);
+    check_shape(kOp, "ids", *ids, {p.count});
+  }
+  const OptionalTensor persistent = contiguous_or_none(ids);
+  Tensor totals = make_empty(p.means, {project_totals(p.n_views, ranks.n_ranks)}, ScalarType::Long);
+  RowTensors t;
+  DeviceScope scope(p.means);
+  dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
-    const ProjectInputs<T> in = f.inputs<T>();
-    const ProjectIds listed = row_ids(r);
-    const ProjectOutputs<T> values = row_values<T>(f, r, persistent);
-    const ProjectRoom room{sizes, nullptr};
-#ifdef BLITZGS_BACKEND_CUDA
-    cuda::project_rows(in, f.ranks, plan.const_data_ptr(), sizes, listed, values, nullptr, scope.workspace,
-                       scope.stream);
-    cuda::project_colors(in, listed, room, values, scope.stream);
-#else
-    cpu::project_list(in, plan.const_data_ptr(), room, listed, scope.workspace, scope.stream);
-    cpu::project_emit(in, f.ranks, carry.const_data_ptr(), listed, room, values, scope.workspace,
-                      scope.stream);
-#endif
+    ProjectInputs<T> in = p.inputs<T>();
+    in.active_ids = data_or_null<std::int32_t>(candidates.ids);
+    in.active_views = data_or_null<std::int32_t>(candidates.views);
+    in.n_candidates = candidates.count;
+    in.n_active = data_or_null<std::int32_t>(candidates.listed);
+    TorchRows<T> rows(p.means, p.sh.has_value(), ranks.n_ranks > 0, persistent, sizes, &t);
+    backend::project(in, ranks, rows, mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
   });
-  return {r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12]};
+  return {t.gaussian_ids, t.camera_ids, t.visible_ids, t.row_offsets,   t.means2d,    t.conics,  t.depths,
+          t.opacities,    t.colors,     t.radii,       t.tiles_touched, t.rank_masks, t.row_ids, totals};
 }
-
-#ifdef BLITZGS_BACKEND_CUDA
-// Gives the rows of project_count their colours, as far as there was room for them.
-void project_colors(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
-                    const OptionalTensor& sh, const Tensor& viewmats, const Tensor& Ks, std::int64_t width,
-                    std::int64_t height, std::int64_t sh_degree, const Tensor& totals, RowList rows) {
-  constexpr const char* kOp = "project_colors_";
-  const Forward f(kOp, means, quats, scales, opacities, sh, viewmats, Ks, std::nullopt, std::nullopt, width,
-                  height, 16, sh_degree, 0, 0, 0, 0, false, false, {}, {}, std::nullopt);
-  check_rows(kOp, f, rows);
-  if (rows.empty()) return;
-  check_dtype(kOp, "totals", totals, ScalarType::Long);
-  STD_TORCH_CHECK(totals.is_contiguous() && totals.device() == f.p.means.device() &&
-                      totals.numel() >= project_totals(f.p.n_views, 0),
-                  "blitzgs::", kOp, ": totals must be those of project_count");
-  DeviceScope scope(f.p.means);
-  cuda::project_colors(f.inputs<float>(), row_ids(rows), {room_of(rows), data<std::int64_t>(totals)},
-                       row_values<float>(f, rows, std::nullopt), scope.stream);
-}
-#endif
 
 }  // namespace
 }  // namespace blitzgs
 
-BLITZGS_REGISTER(m) {
-  m.impl("project_count", TORCH_BOX(&blitzgs::project_count));
-  m.impl("project_emit", TORCH_BOX(&blitzgs::project_emit));
-#ifdef BLITZGS_BACKEND_CUDA
-  m.impl("project_colors_", TORCH_BOX(&blitzgs::project_colors));
-#endif
-}
+BLITZGS_REGISTER(m) { m.impl("project_fwd", TORCH_BOX(&blitzgs::project_fwd)); }

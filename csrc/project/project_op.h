@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the ops of the projection share: checked parameters and views.
+// What the ops of the projection share: groups of arguments, checked. Python's side of the groups is
+// blitzgs/ops/project.py.
 #pragma once
 #include <limits>
 #include <optional>
+#include <vector>
 
 #include "common/op.h"
 #include "project/project.h"
@@ -10,29 +12,72 @@
 namespace blitzgs {
 
 using OptionalTensor = std::optional<Tensor>;
+using TensorList = std::vector<Tensor>;
+using IntList = std::vector<std::int64_t>;
+using FloatList = std::vector<double>;
 
-// The contiguous inputs of both directions, checked. Held here so that the raw pointers stay valid.
-struct Parameters {
+inline OptionalTensor contiguous_or_none(const OptionalTensor& tensor) {
+  return tensor ? OptionalTensor(as_contiguous(*tensor)) : std::nullopt;
+}
+
+// A group of arguments has as many entries as its names.
+template <class List>
+void check_group(const char* op, const char* names, const List& list, std::size_t least, std::size_t most) {
+  STD_TORCH_CHECK(list.size() >= least && list.size() <= most, "blitzgs::", op, ": expected ", names,
+                  ", got ", list.size(), " entries");
+}
+
+// ints: width, height, tile_size, sh_degree, antialiased, raw. floats: near_plane, far_plane, eps2d,
+// radius_clip.
+inline ProjectOptions<double> checked_options(const char* op, const IntList& ints, const FloatList& floats) {
+  check_group(op, "(width, height, tile_size, sh_degree, antialiased, raw)", ints, 6, 6);
+  check_group(op, "(near_plane, far_plane, eps2d, radius_clip)", floats, 4, 4);
+  const std::int64_t width = ints[0], height = ints[1], tile_size = ints[2];
+  STD_TORCH_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24), "blitzgs::", op,
+                  ": width and height must be in [1, 2^24), got ", width, " x ", height);
+  STD_TORCH_CHECK(tile_size > 0 && tile_size < (1 << 24), "blitzgs::", op,
+                  ": tile_size must be in [1, 2^24), got ", tile_size);
+  ProjectOptions<double> options{};
+  options.width = static_cast<int>(width);
+  options.height = static_cast<int>(height);
+  options.tile_size = static_cast<int>(tile_size);
+  options.sh_degree = static_cast<int>(ints[3]);
+  options.antialiased = ints[4] != 0;
+  options.raw = ints[5] != 0;
+  options.near_plane = floats[0];
+  options.far_plane = floats[1];
+  options.eps2d = floats[2];
+  options.radius_clip = floats[3];
+  return options;
+}
+
+// Gaussians (means, quats, scales, opacities and perhaps sh) and cameras (viewmats, Ks), contiguous and
+// checked. Held here so that the raw pointers stay valid.
+struct ProjectArguments {
   Tensor means, quats, scales, opacities, viewmats, Ks;
   OptionalTensor sh;
   std::int64_t count, n_views, sh_stride;
+  ProjectOptions<double> options;
 
-  Parameters(const char* op, const Tensor& means_in, const Tensor& quats_in, const Tensor& scales_in,
-             const Tensor& opacities_in, const OptionalTensor& sh_in, const Tensor& viewmats_in,
-             const Tensor& Ks_in, std::int64_t sh_degree)
-      : means(as_contiguous(means_in)),
-        quats(as_contiguous(quats_in)),
-        scales(as_contiguous(scales_in)),
-        opacities(as_contiguous(opacities_in)),
-        viewmats(as_contiguous(viewmats_in)),
-        Ks(as_contiguous(Ks_in)),
-        sh(sh_in ? OptionalTensor(as_contiguous(*sh_in)) : std::nullopt) {
+  ProjectArguments(const char* op, const TensorList& gaussians, const TensorList& cameras,
+                   const IntList& ints, const FloatList& floats)
+      : options(checked_options(op, ints, floats)) {
+    check_group(op, "(means, quats, scales, opacities[, sh])", gaussians, 4, 5);
+    check_group(op, "(viewmats, Ks)", cameras, 2, 2);
+    means = as_contiguous(gaussians[0]);
+    quats = as_contiguous(gaussians[1]);
+    scales = as_contiguous(gaussians[2]);
+    opacities = as_contiguous(gaussians[3]);
+    if (gaussians.size() == 5) sh = as_contiguous(gaussians[4]);
+    viewmats = as_contiguous(cameras[0]);
+    Ks = as_contiguous(cameras[1]);
     check_floating(op, "means", means);
     check_shape(op, "means", means, {-1, 3});
     check_shape(op, "viewmats", viewmats, {-1, 4, 4});
     count = means.size(0);
     n_views = viewmats.size(0);
     sh_stride = sh && sh->dim() == 3 ? sh->size(1) : 0;
+    options.sh_stride = static_cast<int>(sh_stride);
     check_shape(op, "quats", quats, {count, 4});
     check_shape(op, "scales", scales, {count, 3});
     check_shape(op, "opacities", opacities, {count});
@@ -47,19 +92,12 @@ struct Parameters {
                     " views in one launch, got ", n_views, "; call it for fewer views at a time");
     STD_TORCH_CHECK(count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
                     ": at most 2^31 - 1 Gaussians on one device, got ", count);
-    if (sh) {
-      check_shape(op, "sh", *sh, {count, -1, 3});
-      check_dtype(op, "sh", *sh, dtype);
-      STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kMaxShDegree, "blitzgs::", op,
-                      ": sh_degree must be 0 to 3, got ", sh_degree);
-      STD_TORCH_CHECK(sh_basis_count(static_cast<int>(sh_degree)) <= sh_stride, "blitzgs::", op, ": sh has ",
-                      sh_stride, " coefficients, sh_degree ", sh_degree, " needs ",
-                      sh_basis_count(static_cast<int>(sh_degree)));
-    }
+    if (sh) check_sh(op);
   }
 
   template <class T>
-  ProjectInputs<T> inputs(const ProjectOptions<T>& options) const {
+  ProjectInputs<T> inputs() const {
+    const ProjectOptions<double>& o = options;
     return {data<T>(means),
             data<T>(quats),
             data<T>(scales),
@@ -71,17 +109,21 @@ struct Parameters {
             nullptr,
             count,
             static_cast<int>(n_views),
-            options};
+            {o.width, o.height, o.tile_size, o.sh_degree, o.sh_stride, static_cast<T>(o.near_plane),
+             static_cast<T>(o.far_plane), static_cast<T>(o.eps2d), static_cast<T>(o.radius_clip),
+             o.antialiased, o.raw}};
+  }
+
+ private:
+  void check_sh(const char* op) const {
+    check_shape(op, "sh", *sh, {count, -1, 3});
+    check_dtype(op, "sh", *sh, means.scalar_type());
+    STD_TORCH_CHECK(options.sh_degree >= 0 && options.sh_degree <= kMaxShDegree, "blitzgs::", op,
+                    ": sh_degree must be 0 to 3, got ", options.sh_degree);
+    STD_TORCH_CHECK(sh_basis_count(options.sh_degree) <= sh_stride, "blitzgs::", op, ": sh has ", sh_stride,
+                    " coefficients, sh_degree ", options.sh_degree, " needs ",
+                    sh_basis_count(options.sh_degree));
   }
 };
-
-inline void check_image(const char* op, std::int64_t width, std::int64_t height) {
-  STD_TORCH_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24), "blitzgs::", op,
-                  ": width and height must be in [1, 2^24), got ", width, " x ", height);
-}
-
-inline OptionalTensor contiguous_or_none(const OptionalTensor& tensor) {
-  return tensor ? OptionalTensor(as_contiguous(*tensor)) : std::nullopt;
-}
 
 }  // namespace blitzgs

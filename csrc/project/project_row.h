@@ -1,18 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 // One row: a Gaussian projected into a view, forward and backward, from the maths headers. Both backends call
 // these functions, so they compute the same row. CUDA should compile them without FMA contraction: two
-// kernels that project the same row (count, then emit) must get the same bits.
+// kernels that project the same row (counting, then writing) must get the same bits.
 #pragma once
 #include <cstdint>
 
+#include "common/limits.h"
 #include "math/projection.h"
 #include "math/rank_tiles.h"
 #include "math/sh.h"
 #include "math/tiles.h"
 
 namespace blitzgs {
-
-inline constexpr int kMaxViews = 32;  // views of one launch: a bit mask holds them
 
 template <class T>
 struct ProjectOptions {

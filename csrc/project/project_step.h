@@ -22,12 +22,12 @@ ProjectGradients<T> scratch_gradients(const ProjectRows& rows, AdamArgs<T>& adam
 
 namespace cpu {
 template <class T>
-void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const ProjectRowGradients<T>&,
+void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const SplatGradientColumns<T>&,
                       const T* scale_reg, AdamArgs<T> adam, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
 template <class T>
-void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const RowGradientSource&,
+void project_bwd_step(const ProjectInputs<T>&, const ProjectRows&, const SplatGradientSource&,
                       const T* scale_reg, AdamArgs<T> adam, Workspace&, CudaStream);
 }  // namespace cuda
 

@@ -4,7 +4,7 @@
 namespace blitzgs::cpu {
 
 template <class T>
-void project_bwd_step(const ProjectInputs<T>& in, const ProjectRows& rows, const ProjectRowGradients<T>& v,
+void project_bwd_step(const ProjectInputs<T>& in, const ProjectRows& rows, const SplatGradientColumns<T>& v,
                       const T* scale_reg, AdamArgs<T> adam, Workspace& workspace, CudaStream stream) {
   const ProjectGradients<T> gradients = scratch_gradients(rows, adam, workspace);
   project_bwd(in, rows, v, scale_reg, gradients, workspace, stream);
@@ -12,10 +12,10 @@ void project_bwd_step(const ProjectInputs<T>& in, const ProjectRows& rows, const
 }
 
 template void project_bwd_step<float>(const ProjectInputs<float>&, const ProjectRows&,
-                                      const ProjectRowGradients<float>&, const float*, AdamArgs<float>,
+                                      const SplatGradientColumns<float>&, const float*, AdamArgs<float>,
                                       Workspace&, CudaStream);
 template void project_bwd_step<double>(const ProjectInputs<double>&, const ProjectRows&,
-                                       const ProjectRowGradients<double>&, const double*, AdamArgs<double>,
+                                       const SplatGradientColumns<double>&, const double*, AdamArgs<double>,
                                        Workspace&, CudaStream);
 
 }  // namespace blitzgs::cpu

@@ -119,7 +119,7 @@ bool moves_by_packs(const AdamArgs<float>& adam) {
 }  // namespace
 
 template <>
-void project_bwd_step<float>(const Inputs& in, const ProjectRows& rows, const RowGradientSource& v,
+void project_bwd_step<float>(const Inputs& in, const ProjectRows& rows, const SplatGradientSource& v,
                              const float* scale_reg, AdamArgs<float> adam, Workspace& workspace,
                              CudaStream stream) {
   if (rows.n_visible == 0) return;

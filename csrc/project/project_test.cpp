@@ -46,39 +46,37 @@ struct World {
   }
 };
 
-struct Projected {
-  ProjectSizes sizes;
+struct Projected final : RowMemory<double> {
+  ProjectSizes sizes{};
   std::vector<std::int64_t> totals, rank_masks;
   std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, row_offsets, radii, tiles;
   std::vector<double> means2d, conics, depths, opacities, colors;
+
+  const ProjectSizes* capacity() const override { return nullptr; }
+  ProjectColumns<double> allocate(const ProjectSizes& counted) override {
+    sizes = counted;
+    const std::size_t U = sizes.visible, P = sizes.rows;
+    for (auto* ints : {&gaussian_ids, &camera_ids, &tiles}) ints->resize(P);
+    radii.resize(2 * P);
+    visible_ids.resize(U);
+    row_offsets.resize(U + 1);
+    means2d.resize(2 * P);
+    conics.resize(3 * P);
+    depths.resize(P);
+    opacities.resize(P);
+    colors.resize(3 * P);
+    rank_masks.resize(P);
+    return {{gaussian_ids.data(), camera_ids.data(), visible_ids.data(), row_offsets.data()},
+            {means2d.data(), conics.data(), depths.data(), opacities.data(), colors.data(), radii.data(),
+             tiles.data(), rank_masks.data(), nullptr, nullptr}};
+  }
 };
 
 Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) {
   Projected p;
-  TestWorkspace workspace, carry;
-  void* plan = workspace.allocate_bytes(cpu::project_plan_bytes(in.n_candidates));
+  TestWorkspace workspace;
   p.totals.resize(project_totals(in.n_views, ranks.n_ranks));
-  cpu::project_count(in, ranks, plan, carry, p.totals.data(), workspace, nullptr);
-  p.sizes = {p.totals[kTotalVisible], p.totals[kTotalRows]};
-  const std::size_t U = p.sizes.visible, P = p.sizes.rows;
-  for (auto* ints : {&p.gaussian_ids, &p.camera_ids, &p.tiles}) ints->resize(P);
-  p.radii.resize(2 * P);
-  p.visible_ids.resize(U);
-  p.row_offsets.resize(U + 1);
-  p.means2d.resize(2 * P);
-  p.conics.resize(3 * P);
-  p.depths.resize(P);
-  p.opacities.resize(P);
-  p.colors.resize(3 * P);
-  p.rank_masks.resize(P);
-  const ProjectIds ids{p.gaussian_ids.data(), p.camera_ids.data(), p.visible_ids.data(),
-                       p.row_offsets.data()};
-  const ProjectOutputs<double> out{p.means2d.data(), p.conics.data(), p.depths.data(), p.opacities.data(),
-                                   p.colors.data(),  p.radii.data(),  p.tiles.data(),  p.rank_masks.data(),
-                                   nullptr,          nullptr};
-  const ProjectRoom room{p.sizes, p.totals.data()};
-  cpu::project_list(in, plan, room, ids, workspace, nullptr);
-  cpu::project_emit(in, ranks, carry.last(), ids, room, out, workspace, nullptr);
+  cpu::project(in, ranks, p, p.totals.data(), workspace, nullptr);
   return p;
 }
 
@@ -117,7 +115,7 @@ struct Weights {
 
 }  // namespace
 
-TEST_CASE("rows are ordered by Gaussian and view, and the plan's counts are theirs") {
+TEST_CASE("rows are ordered by Gaussian and view, and the totals count them") {
   const World world;
   const Projected p = project(world.inputs());
   REQUIRE(p.sizes.rows > 2000);
@@ -203,8 +201,8 @@ TEST_CASE("the backward pass is the derivative of the rows") {
   TestWorkspace workspace;
   cpu::project_bwd(
       world.inputs(), ProjectRows{p.camera_ids.data(), p.visible_ids.data(), p.row_offsets.data(), U},
-      ProjectRowGradients<double>{weights.means2d.data(), weights.conics.data(), weights.depths.data(),
-                                  weights.opacities.data(), weights.colors.data()},
+      SplatGradientColumns<double>{weights.means2d.data(), weights.conics.data(), weights.depths.data(),
+                                   weights.opacities.data(), weights.colors.data()},
       weights.scale_reg.data(),
       ProjectGradients<double>{v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(),
                                v_sh.data(), v_viewmats.data()},

@@ -37,6 +37,7 @@
 #include <cstdint>
 
 #include "common/row_count.h"
+#include "common/splat_gradient.h"
 #include "common/stream.h"
 #include "math/tiles.h"
 
@@ -63,7 +64,7 @@ struct RasterizeOutput {
   T* transmittances;
   std::int32_t* last_ids;
   std::int32_t* tile_work;
-  T* row_gradients;  // null, or [P, kPackedGradient] to be zeroed; up to four channels on CUDA
+  T* row_gradients;  // null, or [P] SplatGradient to be zeroed; up to four channels on CUDA
   bool clear_rest;
 };
 
@@ -84,10 +85,6 @@ struct RasterizeGradients {
   T* v_colors;
   T* v_means2d_abs;  // null: not wanted
 };
-
-// Up to four channels on CUDA: the gradients of a row in kPackedGradient floats, mean2d 2, conic 3, opacity
-// 1, color, and the rest of no use. They are added to zeros, which forward may have written.
-inline constexpr std::int64_t kPackedGradient = 12;
 
 // The backend's own memory between forward and backward, 64-byte aligned. Its size, rasterize_aux_bytes(),
 // depends on shapes, not on values on the device; it fits the backward pass of rows and a grid if a forward

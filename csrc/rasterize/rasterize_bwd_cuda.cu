@@ -10,6 +10,7 @@
 #include <string>
 
 #include "common/launch.cuh"
+#include "common/warp.cuh"
 #include "rasterize/aux_layout.cuh"
 #include "rasterize/backward_pixel.cuh"
 #include "rasterize/row_entries.cuh"
@@ -345,7 +346,6 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
                           std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, float* packed,
                           Workspace& workspace, CudaStream stream) {
-  static_assert(sizeof(PackedGradient) == kPackedGradient * sizeof(float));
   if (in.n_rows == 0) return;
   const PackedRows rows(in, saved, n_isects, aux, deterministic, workspace, stream);
   rows.add(rows.chunk(0), false, reinterpret_cast<PackedGradient*>(packed));

@@ -3,6 +3,7 @@
 #include <string>
 
 #include "common/launch.cuh"
+#include "common/warp.cuh"
 #include "rasterize/aux_layout.cuh"
 #include "rasterize/compositor.cuh"
 #include "rasterize/pack_rows.cuh"
@@ -61,7 +62,7 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
 
 // At most so many 16-byte stores of zeros a thread; where tiles are too few for that, they are no help.
 constexpr int kMostZeros = 16;
-constexpr int kQuads = kPackedGradient / 4;  // such stores for a row
+constexpr int kQuads = kSplatGradient / 4;  // such stores for a row
 
 // This block's share of the zeros that backward starts from. Compositing waits for instructions, not for
 // memory, so the stores cost next to nothing; they ask for no room in the L2 cache, which the rows need.
@@ -147,7 +148,7 @@ __global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
 
 void zero_gradients(const RasterizeOutput<float>& out, std::int64_t n_rows, CudaStream stream) {
   if (n_rows == 0) return;
-  check(cudaMemsetAsync(out.row_gradients, 0, n_rows * kPackedGradient * sizeof(float), stream),
+  check(cudaMemsetAsync(out.row_gradients, 0, n_rows * kSplatGradient * sizeof(float), stream),
         "rasterize_fwd");
 }
 

@@ -116,7 +116,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid, known_rows);
   const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
-  Tensor row_gradients = make_empty(splats.means2d, {packed ? splats.n_rows : 0, kPackedGradient});
+  Tensor row_gradients = make_empty(splats.means2d, {packed ? splats.n_rows : 0, kSplatGradient});
   auto composited = composite(splats, packed ? std::optional(row_gradients) : std::nullopt, clear_rest);
   return std::tuple_cat(std::move(composited), std::tuple(row_gradients));
 }
@@ -201,7 +201,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
 void check_packed(const char* op, const Splats& splats, const Tensor& packed) {
   STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", op, ": colors must have 1 to 4 channels, got ",
                   splats.n_channels);
-  check_shape(op, "packed", packed, {-1, kPackedGradient});
+  check_shape(op, "packed", packed, {-1, kSplatGradient});
   STD_TORCH_CHECK(packed.size(0) >= splats.n_rows, "blitzgs::", op, ": packed must have ", splats.n_rows,
                   " rows or more, got ", packed.size(0));
   check_dtype(op, "packed", packed, ScalarType::Float);

@@ -11,12 +11,12 @@
 #include <cstdint>
 
 #include "common/cuda_check.h"
+#include "common/warp.cuh"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_order.cuh"
 
 namespace blitzgs::cuda {
 
-inline constexpr unsigned kFullWarp = 0xffffffffu;
 inline constexpr float kLog2Cut = -7.99435343685886f;    // log2(1/255)
 inline constexpr float kFactorScale = 0.849321800288f;   // sqrt(log2(e) / 2)
 inline constexpr float kInverseScale2 = 1.38629436112f;  // 1 / kFactorScale^2
@@ -33,11 +33,12 @@ struct __align__(32) PackedRow {
   float turn;       // the ellipse {log2(alpha) >= log2_opacity - r^2} reaches furthest right at dy = turn * r
 };
 
-// Gradients of one row: v_mean2d x y, v_conic a b | v_conic c, v_opacity, v_color 0 1 | v_color 2 3, v_abs x
-// y.
+// A SplatGradient as the kernels move it: mean2d x y, conic a b | conic c, opacity, color 0 1 | color 2 3,
+// mean2d_abs x y.
 struct __align__(16) PackedGradient {
   float4 quads[3];
 };
+static_assert(sizeof(PackedGradient) == sizeof(SplatGradient));
 
 // The channels of one launch: up to 4 of n_channels, from `first`.
 struct ChannelChunk {

@@ -7,6 +7,7 @@
 #pragma once
 #include <cstdint>
 
+#include "common/warp.cuh"
 #include "common/zeros.cuh"
 #include "math/tiles.h"
 
@@ -51,11 +52,11 @@ struct TileOrder {
       const auto length = static_cast<std::uint32_t>(offset[1] - offset[0]);
       length_class = max(kLengthClasses - 1 - (32 - __clz(length)), 0);
     }
-    const unsigned same = __match_any_sync(0xffffffffu, length_class);
+    const unsigned same = __match_any_sync(kFullWarp, length_class);
     const int lane = threadIdx.x % 32, leader = __ffs(same) - 1;
     int before = 0;
     if (lane == leader && present) before = atomicAdd(counts + length_class, __popc(same));
-    before = __shfl_sync(0xffffffffu, before, leader);
+    before = __shfl_sync(kFullWarp, before, leader);
     if (!present) return;
     const int place = before + __popc(same & ((1u << lane) - 1));
     tiles[static_cast<std::int64_t>(length_class) * n_tiles + place] =

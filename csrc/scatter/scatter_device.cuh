@@ -5,6 +5,7 @@
 #pragma once
 #include <type_traits>
 
+#include "common/warp.cuh"
 #include "scatter/scatter.h"
 
 namespace blitzgs::cuda {
@@ -54,7 +55,7 @@ struct ScatterState {
 __device__ __forceinline__ void count_by_warp(int (*counts)[kScatterWarps], int slot, std::int64_t mask,
                                               int n_ranks) {
   for (int m = 0; m < n_ranks; ++m) {
-    const unsigned going = __ballot_sync(0xffffffffu, (mask >> m) & 1);
+    const unsigned going = __ballot_sync(kFullWarp, (mask >> m) & 1);
     if (slot % 32 == 0) counts[m][slot / 32] = __popc(going);
   }
 }
@@ -150,7 +151,7 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
     const int slot = round * THREADS + static_cast<int>(threadIdx.x);
     for (int m = 0; m < n_ranks; ++m) {
       const bool goes = (masks[round] >> m) & 1;
-      const unsigned going = __ballot_sync(0xffffffffu, goes);
+      const unsigned going = __ballot_sync(kFullWarp, goes);
       if (goes)
         shared.list[m][place_in_block(shared.before[m], slot, going)] = static_cast<std::uint8_t>(slot);
       if (slot % 32 == 0 && first + slot < n_rows) {

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.project import Rows, project_rows
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
 
 ops = torch.ops.blitzgs
 
@@ -33,14 +33,23 @@ class Scene:
         names = ("means", "quats", "scales", "opacities", "sh", "viewmats", "Ks")
         return [getattr(self, name).to(device, dtype) for name in names]
 
+    def inputs(
+        self,
+        device: str,
+        dtype: torch.dtype = torch.float32,
+        active_ids: Tensor | None = None,
+        active_views: Tensor | None = None,
+        **changes: Any,
+    ) -> ProjectionInputs:
+        *gaussians, viewmats, Ks = self.parameters(device, dtype)
+        options = ProjectionOptions(self.width, self.height, sh_degree=self.degree, near_plane=0.1)._replace(
+            **changes
+        )
+        active = [tensor for tensor in (active_ids, active_views) if tensor is not None]
+        return ProjectionInputs(gaussians, (viewmats, Ks), options, active)
+
     def project(self, device: str, dtype: torch.dtype = torch.float32, **changes: Any) -> Rows:
-        options = {"near_plane": 0.1, "far_plane": 1e10, "eps2d": 0.3, "radius_clip": 0.0}
-        options |= {"antialiased": False, "raw": True, "active_ids": None, "active_views": None} | changes
-        ids, views = (options.pop(k) for k in ("active_ids", "active_views"))
-        return project_rows(
-            *self.parameters(device, dtype), ids, views, self.width, self.height, 16, self.degree,
-            *options.values(),
-        )  # fmt: skip
+        return project_rows(self.inputs(device, dtype, **changes))
 
     def grid(self, tile_size: int = 16, begin: int = 0, end: int = -1) -> tuple[int, ...]:
         return (len(self.Ks), self.width, self.height, tile_size, begin, end)

@@ -8,9 +8,12 @@ import torch
 from cuda_scenes import ops, relative_error
 
 from blitzgs import pipeline
+from blitzgs.distributed.transport import LocalTransport
 from blitzgs.model import GaussianTable
-from blitzgs.ops.project import RowRoom, holds
+from blitzgs.ops.capacity import CapacityEstimate, Sizes
+from blitzgs.ops.splat_gradients import gradient_columns
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.helpers import parameter_gradients
 from tests.training.tiny import random_gaussians
 
 
@@ -24,23 +27,24 @@ def test_gradients_are_those_from_columns(degree):
     views = cameras(3, device="cuda")
     frame = pipeline.forward(table, views, options)
     v_renders = torch.randn_like(frame.renders)
-    v = pipeline.backward_rows(frame, v_renders)
-    assert v.means2d.stride(0) == v.colors.stride(0) == 12  # nobody has unpacked them
+    (packed,) = pipeline.backward_splats(frame, v_renders).parts
+    assert packed.shape == (len(frame.splats.depths), 12)
     rows, splats = frame.rows, frame.splats
     *unpacked, _ = ops.rasterize_bwd(
         splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
         frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders, None,
         len(views), views.width, views.height, options.tile_size, 0, -1, False, True,
     )  # fmt: skip
-    for x, y in zip(v[:4], unpacked, strict=True):
+    for x, y in zip(gradient_columns(packed), unpacked, strict=True):
         assert y.any() and torch.equal(x, y)
     scale_reg = torch.linspace(0.1, 0.3, 3, device="cuda")
+    projection = options.projection(views)
     *expected, _ = ops.project_bwd(
-        *table.parameters, views.viewmats, views.Ks, rows.camera_ids, rows.visible_ids, rows.row_offsets,
-        views.width, views.height, degree, options.eps2d, options.antialiased, True, *unpacked[:2], None,
-        *unpacked[2:], scale_reg, False,
+        list(table.parameters), [views.viewmats, views.Ks],
+        [rows.camera_ids, rows.visible_ids, rows.row_offsets], projection.ints, projection.floats, unpacked,
+        None, scale_reg, False,
     )  # fmt: skip
-    gradients = pipeline.backward(table, frame, v_renders, scale_reg)
+    gradients = parameter_gradients(table, frame, v_renders, scale_reg)
     for x, y in zip(gradients, expected, strict=True):
         assert relative_error(x, y) < 1e-6
 
@@ -53,11 +57,11 @@ def test_a_second_backward_pass_starts_from_zeros_too():
     frame = pipeline.forward(table, views, options, backward_follows=True)
     assert torch.equal(frame.renders, plain.renders)
     v_renders = torch.randn_like(frame.renders)
-    expected = pipeline.backward_rows(plain, v_renders)
-    assert expected.colors.any()
+    (expected,) = pipeline.backward_splats(plain, v_renders).parts
+    assert expected.any()
     for _ in range(2):
-        for x, y in zip(pipeline.backward_rows(frame, v_renders)[:4], expected[:4], strict=True):
-            assert torch.equal(x, y)
+        (found,) = pipeline.backward_splats(frame, v_renders).parts
+        assert torch.equal(found, expected)
 
 
 def test_frames_do_not_depend_on_the_room_that_was_guessed():
@@ -67,25 +71,24 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
     plain = pipeline.forward(table, views, options)
     needed = plain.rows.counts.tolist()
     v_renders = torch.randn_like(plain.renders)
-    expected = pipeline.backward(table, plain, v_renders)
+    expected = parameter_gradients(table, plain, v_renders)
     rooms = [tuple(n * k // 100 for n in needed) for k in (100, 101, 250)]
     rooms += [tuple(n - (i == short) for i, n in enumerate(needed)) for short in range(3)]
     for sizes in [*rooms, (1, 1, 1)]:
-        room, attempts = RowRoom(), []
-        room.sizes = sizes
-        enough = holds(sizes, needed)
+        transport, attempts = LocalTransport(CapacityEstimate(Sizes(*sizes))), []
+        enough = Sizes(*sizes).holds(needed)
         frame = pipeline.forward(
-            table, views, options, room=room, mark=attempts.append, backward_follows=True
+            table, views, options, transport=transport, mark=attempts.append, backward_follows=True
         )
         assert attempts.count("raster") == (1 if enough else 2)
-        assert holds(room.sizes, needed)
+        assert transport.capacity.sizes.holds(needed)
         for x, y in zip(frame.rows, plain.rows, strict=True):
             assert torch.equal(x, y)
         for x, y in zip(frame.splats, plain.splats, strict=True):
             assert torch.equal(x, y)
         for name in ("renders", "transmittances", "last_ids", "tile_work", "tile_offsets", "visible"):
             assert torch.equal(getattr(frame, name), getattr(plain, name)), name
-        for x, y in zip(pipeline.backward(table, frame, v_renders), expected, strict=True):
+        for x, y in zip(parameter_gradients(table, frame, v_renders), expected, strict=True):
             assert torch.equal(x, y)
 
 
@@ -93,10 +96,10 @@ def test_a_frame_without_rows_takes_no_room_and_any():
     small = random_gaussians(500)
     table = GaussianTable({name: small[name].cuda() for name in small})
     table["means"].add_(1e6)
-    views, room = cameras(2, device="cuda"), RowRoom()
-    room.sizes = (10, 10, 10)
-    for _ in range(3):
-        frame = pipeline.forward(table, views, OPTIONS, room=room, backward_follows=True)
+    views = cameras(2, device="cuda")
+    for sizes in (Sizes(10, 10, 10), Sizes(1, 1, 1), None):
+        transport = LocalTransport(CapacityEstimate(sizes))
+        frame = pipeline.forward(table, views, OPTIONS, transport=transport, backward_follows=True)
         assert len(frame.rows.gaussian_ids) == 0 and (frame.transmittances == 1).all()
-        assert not any(g.any() for g in pipeline.backward(table, frame, torch.ones_like(frame.renders)))
-        room.sizes = (0, 0, 0)
+        v_renders = torch.ones_like(frame.renders)
+        assert not any(g.any() for g in parameter_gradients(table, frame, v_renders))

@@ -5,7 +5,8 @@ import pytest
 import torch
 from cuda_scenes import Scene, ops, relative_error
 
-from blitzgs.ops.project import rows_of
+from blitzgs.ops.capacity import Sizes
+from blitzgs.ops.projection import rows_of
 
 NAMES = ("gaussian_ids", "camera_ids", "visible_ids", "row_offsets")
 NAMES += ("means2d", "conics", "depths", "opacities", "colors")
@@ -57,12 +58,14 @@ def test_gradients_match_float64(scene, degree, antialiased):
     regularizer = torch.tensor([0.5, -2.0])
 
     def backward(device, dtype):
-        p = scene.parameters(device, dtype)
+        inputs = scene.inputs(device, dtype, antialiased=antialiased)
         structure = [rows[i].to(device) for i in (1, 2, 3)]
-        gradients = [t.to(device, dtype) for t in (*v, regularizer)]
+        *gradients, scale_reg = [t.to(device, dtype) for t in (*v, regularizer)]
+        means2d, conics, depths, opacities, colors = gradients
         return ops.project_bwd(
-            *p, *structure, scene.width, scene.height, degree, 0.3, antialiased, True, *gradients, True
-        )
+            inputs.gaussians, list(inputs.cameras), structure, inputs.options.ints, inputs.options.floats,
+            [means2d, conics, opacities, colors], depths, scale_reg, True,
+        )  # fmt: skip
 
     expected, gradients = backward("cpu", torch.float64), backward("cuda", torch.float32)
     names = ("means", "quats", "scales", "opacities", "sh", "viewmats")
@@ -83,9 +86,10 @@ def test_nothing_visible(case):
     rows = scene.project("cuda")
     assert rows.counts.tolist() == [0, 0, 0]
     assert rows[3].tolist() == [0]
+    inputs = scene.inputs("cuda")
     gradients = ops.project_bwd(
-        *scene.parameters("cuda"), *(rows[i] for i in (1, 2, 3)), 150, 100, 3, 0.3, False, True,
-        *(rows[i] for i in (4, 5, 6, 7, 8)), None, True,
+        inputs.gaussians, list(inputs.cameras), [rows[i] for i in (1, 2, 3)], inputs.options.ints,
+        inputs.options.floats, [rows[i] for i in (4, 5, 7, 8)], rows.depths, None, True,
     )  # fmt: skip
     assert gradients[0].shape == (0, 3)
     assert not gradients[5].any()
@@ -112,18 +116,13 @@ def test_rows_with_nan_vanish_and_spread_nowhere(scene):
 
 
 def test_ranks_of_rows_match_the_cpu(scene):
-    arguments = (
-        *scene.parameters("cpu"), None, None, scene.width, scene.height, 16, scene.degree, 0.1, 1e10, 0.3,
-        0.0, False, True, [0, 30, 30, 50], [40, 30, 90, 140],
-    )  # fmt: skip
-    plan, carry, totals, _ = ops.project_count(*arguments)
-    expected = ops.project_emit(*arguments, None, plan, carry, totals)
-    on_gpu = [a.cuda() if torch.is_tensor(a) else a for a in arguments]
-    plan, carry, counted, _ = ops.project_count(*on_gpu)
-    assert torch.equal(counted.cpu(), totals)
-    rows = ops.project_emit(*on_gpu, None, plan, carry, counted.cpu())
-    assert torch.equal(rows[11].cpu(), expected[11])
-    assert totals[5::2].tolist() == [(expected[11] >> m & 1).sum().item() for m in range(4)]
+    tiles = [(0, 40), (30, 30), (30, 90), (50, 140)]
+    expected = scene.inputs("cpu").run(None, tiles)
+    found = scene.inputs("cuda").run(None, tiles)
+    assert torch.equal(found.totals.cpu(), expected.totals)
+    masks = expected.rows.rank_masks
+    assert torch.equal(found.rows.rank_masks.cpu(), masks)
+    assert expected.totals[5::2].tolist() == [(masks >> m & 1).sum().item() for m in range(4)]
 
 
 @pytest.mark.parametrize("views", [1, 4, 9])
@@ -144,31 +143,28 @@ def test_rows_are_written_in_order(views, n):
 
 
 @pytest.mark.parametrize("rows_seen", [True, False])
-def test_rows_do_not_depend_on_the_room_that_was_guessed(scene, rows_seen):
-    arguments = [
-        *scene.parameters("cuda"), None, None, scene.width, scene.height, 16, scene.degree, 0.1, 1e10, 0.3,
-        0.0, False, True, [], [], None,
-    ]  # fmt: skip
+def test_rows_do_not_depend_on_the_capacity_that_was_guessed(scene, rows_seen):
+    inputs = scene.inputs("cuda")
     if not rows_seen:
-        arguments[0] = torch.full_like(arguments[0], 1e6)
-    plan, carry, totals, none = ops.project_count(*arguments)
-    counts = totals.cpu()
-    assert none == []
-    visible, rows = counts[:2].tolist()
+        inputs = inputs._replace(gaussians=[torch.full_like(inputs.gaussians[0], 1e6), *inputs.gaussians[1:]])
+    ids = 7919 * torch.arange(len(inputs.gaussians[0]), device="cuda")
+    inputs = inputs._replace(ids=ids)
+    expected, expected_ids, totals = inputs.run(None)
+    counts = totals.cpu()[:3]
+    visible, rows, _ = counts.tolist()
     assert (rows > visible > 100) == rows_seen
-    expected = ops.project_emit(*arguments, plan, carry, counts)
-    ids = 7919 * torch.arange(len(arguments[0]), device="cuda")
-    assert len(expected[0]) == rows and len(expected[2]) == visible
-    rooms = [(visible, rows), (visible - 1, rows), (visible, rows - 1), (1, 1), (visible + 1, rows + 200)]
-    for room in [*rooms, (2 * visible + 3, 3 * rows + 1000)]:
-        plan, carry, counted, written = ops.project_count(*arguments, *room, ids)
+    assert len(expected.gaussian_ids) == rows and len(expected.visible_ids) == visible
+    assert torch.equal(expected_ids, ids[expected.gaussian_ids.long()])
+    sizes = [(visible, rows), (visible - 1, rows), (visible, rows - 1), (1, 1), (visible + 1, rows + 200)]
+    for size in [*sizes, (2 * visible + 3, 3 * rows + 1000)]:
+        if min(size) < 1:
+            with pytest.raises(RuntimeError, match="how many visible Gaussians and rows there is room for"):
+                inputs.run(Sizes(*size, 0))
+            continue
+        written, row_ids, counted = inputs.run(Sizes(*size, 0))
         assert torch.equal(counted, totals)
-        ops.project_colors_(*arguments[:7], scene.width, scene.height, scene.degree, counted, written)
-        if written and room[0] >= visible and room[1] >= rows:
-            columns = [*rows_of(written, counts)[:12], written[12][:rows]]
-        else:
-            columns = ops.project_emit(*arguments, plan, carry, counts, ids)
-        *columns, row_ids = columns
-        for a, b in zip(columns, expected, strict=False):
+        if size[0] < visible or size[1] < rows:
+            continue
+        for a, b in zip(rows_of(written[:12], counts)[:12], expected[:12], strict=True):
             assert a.is_contiguous() and torch.equal(a, b)
-        assert torch.equal(row_ids, ids[columns[0].long()])
+        assert torch.equal(row_ids[:rows], expected_ids)

@@ -5,7 +5,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import (
-    LOSS_REACH,
+    LOSS_HALO,
     TILE_COST,
     TileOwners,
     TileRanges,
@@ -76,7 +76,7 @@ def test_costs_are_those_of_the_last_visit():
 
 
 def test_pixel_rows_and_composited_tiles():
-    ranges = TileRanges((0, 9, 9, 40, 56), 2, 100, 60, reach=LOSS_REACH)  # 7 x 4 tiles a view
+    ranges = TileRanges((0, 9, 9, 40, 56), 2, 100, 60, halo=LOSS_HALO)  # 7 x 4 tiles a view
     assert ranges.of(2) == (9, 40)
     assert ranges.composited(0) == (0, 17)
     assert ranges.composited(1) == (1, 1)  # owns nothing, needs nothing
@@ -98,7 +98,7 @@ def test_all_that_the_loss_reads_is_composited(tile_size, bounds):
     n_views, width, height = 3, 71, 50
     per_view = -(-width // tile_size) * -(-height // tile_size)
     cuts = (0, *(round(n_views * per_view * at) for at in bounds), n_views * per_view)
-    ranges = TileRanges(cuts, n_views, width, height, tile_size, LOSS_REACH)
+    ranges = TileRanges(cuts, n_views, width, height, tile_size, LOSS_HALO)
     firsts = [ranges.composited(rank)[0] for rank in range(len(cuts) - 1)]
     assert firsts == sorted(firsts)
     for rank in range(len(cuts) - 1):
@@ -113,7 +113,7 @@ def test_all_that_the_loss_reads_is_composited(tile_size, bounds):
         if low == high:
             assert begin == end
             continue
-        ring = -(-LOSS_REACH // tile_size)
+        ring = -(-LOSS_HALO // tile_size)
         assert low - begin <= ring * (ranges.tiles_x + 1) and end - high <= ring * (ranges.tiles_x + 1)
         # No view is entered in which nothing is owned.
         views_owned = owned.flatten(1).any(1)

@@ -9,8 +9,9 @@ import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import LOSS_REACH, Share, TileOwners, TileRanges
+from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileOwners, TileRanges
 from blitzgs.distributed.pixels import collect_images
+from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.report import sum_parts
 from blitzgs.pipeline import RenderOptions, Views
@@ -18,6 +19,7 @@ from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
 from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.helpers import parameter_gradients
 from tests.training.tiny import look_at_origin, random_gaussians
 
 WIDTH, HEIGHT = 150, 90
@@ -59,7 +61,7 @@ def uneven(world_size, n_views):
     """Borders in the middle of a tile row, ranks without tiles, a rank with more than a view."""
     total = TileRanges((0,), n_views, WIDTH, HEIGHT).tiles_per_view * n_views
     bounds = (0, *[0, 34, 34][: world_size - 1], total)
-    return TileRanges(bounds, n_views, WIDTH, HEIGHT, reach=LOSS_REACH)
+    return TileRanges(bounds, n_views, WIDTH, HEIGHT, halo=LOSS_HALO)
 
 
 def _render(ranks):
@@ -76,17 +78,17 @@ def _render(ranks):
     ]:
         views = cameras(n_views, blind, ranks.device)
         keys = [(n_views, blind, view) for view in range(n_views)]
-        share, ranges = None, None
+        assignment, ranges = None, None
         if ranks.world_size > 1:
             ranges = uneven(ranks.world_size, n_views)
             if even:
-                ranges = owners.divide(keys, WIDTH, HEIGHT, reach=LOSS_REACH)
-            share = Share(ranks, ranges)
-        frame = pipeline.forward(table, views, OPTIONS, share=share)
+                ranges = owners.divide(keys, WIDTH, HEIGHT, halo=LOSS_HALO)
+            assignment = TileAssignment(ranks, ranges)
+        frame = pipeline.forward(table, views, OPTIONS, assignment=assignment)
         image, tile_work = frame.renders.clone(), frame.tile_work
         if ranges is not None:
             collect_images(image, ranges, ranks, 0)
-            tile_work = tile_work[slice(*share.tiles)]
+            tile_work = tile_work[slice(*assignment.tiles)]
         targets, masks, samples = photographs(n_views)
         if ranges is not None:
             for view in range(n_views):  # pixels that this rank was never given
@@ -98,12 +100,12 @@ def _render(ranks):
         sums = torch.cat(sum_parts(terms.parts)).cpu()
         if ranges is not None:
             sums = owners.record(keys, frame.tile_work, ranges, terms.parts).read()[: 2 * n_views]
-        gradients = pipeline.backward(table, frame, terms.v_renders, terms.scale_reg)
+        gradients = parameter_gradients(table, frame, terms.v_renders, terms.scale_reg)
         dense = [torch.zeros_like(column) for column in table.parameters]
         for column, gradient in zip(dense, gradients, strict=True):
             column[frame.rows.visible_ids.long()] = gradient
-        tiles = (0, len(frame.tile_work)) if share is None else share.tiles
-        composited = tiles if share is None else share.composited
+        tiles = (0, len(frame.tile_work)) if assignment is None else assignment.tiles
+        composited = tiles if assignment is None else assignment.composited
         out.append(
             {
                 "image": image.cpu(),
@@ -166,12 +168,12 @@ def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device, tr
 def _render_plain(ranks):
     table, views = shard(ranks), cameras(3)
     ranges = TileOwners(ranks).divide(range(3), WIDTH, HEIGHT)
-    share = Share(ranks, ranges)
-    frame = pipeline.forward(table, views, OPTIONS, share=share)
+    assignment = TileAssignment(ranks, ranges)
+    frame = pipeline.forward(table, views, OPTIONS, assignment=assignment)
     with pytest.raises(ValueError, match="the loss reads 10 px beyond"):
         loss_terms(frame, Batch([0, 1, 2], views, *photographs(3), ranges), LossConfig(), 3.0)
     collect_images(frame.renders, ranges, ranks, 1)
-    return share.composited == ranges.of(ranks.rank), frame.renders
+    return assignment.composited == ranges.of(ranks.rank), frame.renders
 
 
 def test_rendering_alone_composites_no_ring():
@@ -186,8 +188,14 @@ def _render_half(ranks):
     ranges = TileOwners(ranks).divide(range(4), WIDTH, HEIGHT)
     results = []
     for half in (False, True):
-        frame = pipeline.forward(table, views, OPTIONS, share=Share(ranks, ranges, half))
-        gradients = pipeline.backward(table, frame, torch.ones_like(frame.renders))
+        frame = pipeline.forward(
+            table,
+            views,
+            OPTIONS,
+            assignment=TileAssignment(ranks, ranges),
+            transport=open_transport(ranks, half),
+        )
+        gradients = parameter_gradients(table, frame, torch.ones_like(frame.renders))
         own = ranges.pixel_mask(ranks.rank, ranks.device)[..., None]
         results.append((frame.renders.where(own, 0.0).cpu(), gradients[4].cpu()))
     return results

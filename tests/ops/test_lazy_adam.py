@@ -332,13 +332,13 @@ def test_opcheck():
     grads = [torch.randn(s) for s in shapes(2)]
     ids = torch.tensor([1, 3], dtype=torch.int32)
     columns = state.params, *state.moments()
-    steps = state.last_step, state.moment_step, table, lr_table
+    steps, tables, decays = [state.last_step, state.moment_step], [table, lr_table], [BETA1, BETA2, EPS]
     torch.library.opcheck(
         torch.ops.blitzgs.lazy_adam_step_,
-        (*columns, grads, ids, *steps, 2, 100, BETA1, BETA2, EPS, False),
+        (*columns, steps, grads, ids, tables, [2, 100, 0], decays),
     )
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_catch_up_, (*columns, ids, *steps, 9, 100, BETA1, BETA2, EPS)
+        torch.ops.blitzgs.lazy_adam_catch_up_, (*columns, steps, ids, tables, [9, 100, 0], decays)
     )
 
 

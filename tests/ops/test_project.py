@@ -4,8 +4,9 @@ import math
 import pytest
 import torch
 
+from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
-from blitzgs.ops.route import route_count
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions
 from tests.helpers import BACKENDS, PARAMETERS, orbit_camera, random_scene, reference_images, relative_error
 
 FLOATS = ("means2d", "conics", "depths", "opacities", "colors")
@@ -178,14 +179,18 @@ def test_dense_gradients_are_the_compact_ones_where_they_belong(backend, degree,
     sh = None if degree is None else scene.colors[:, :coefficients].contiguous()
     rows = project_scene(scene, sh=sh, sh_degree=degree or 0)
     generator = torch.Generator().manual_seed(1)
-    v = [
-        None if width == 0 else torch.randn(len(rows.depths), width, generator=generator).to(device, dtype)
-        for width in (2, 3, 1, 1, 3 if sh is not None else 0)
-    ]
+    means2d, conics, depths, opacities, colors = (
+        torch.randn(len(rows.depths), width, generator=generator).to(device, dtype)
+        for width in (2, 3, 1, 1, 3)
+    )
+    options = ProjectionOptions(scene.width, scene.height, sh_degree=degree or 0, antialiased=True, raw=False)
+    gaussians = [scene.means, scene.quats, scene.scales, scene.opacities]
+    v_splats = [means2d, conics, opacities[:, 0]]
+    if sh is not None:
+        gaussians, v_splats = [*gaussians, sh], [*v_splats, colors]
     arguments = (
-        scene.means, scene.quats, scene.scales, scene.opacities, sh, scene.viewmats, scene.Ks,
-        rows.camera_ids, rows.visible_ids, rows.row_offsets, scene.width, scene.height, degree or 0, 0.3,
-        True, False, v[0], v[1], v[2][:, 0], v[3][:, 0], v[4], None, True,
+        gaussians, [scene.viewmats, scene.Ks], [rows.camera_ids, rows.visible_ids, rows.row_offsets],
+        options.ints, options.floats, v_splats, depths[:, 0], None, True,
     )  # fmt: skip
     compact = torch.ops.blitzgs.project_bwd(*arguments)
     dense = torch.ops.blitzgs.project_bwd(*arguments, dense=True)
@@ -204,10 +209,11 @@ def test_scale_regulariser_adds_the_slope_of_the_smallest_axis():
     P = len(rows.depths)
     zeros = torch.zeros(P, 3, dtype=torch.float64)
     weights = torch.tensor([0.5, 2.0], dtype=torch.float64)
+    options = ProjectionOptions(scene.width, scene.height)
     v_scales = torch.ops.blitzgs.project_bwd(
-        scene.means, scene.quats, scene.scales, scene.opacities, None, scene.viewmats, scene.Ks,
-        rows.camera_ids, rows.visible_ids, rows.row_offsets, scene.width, scene.height, 0, 0.3, False, True,
-        zeros[:, :2], zeros, None, zeros[:, 0], None, weights, False,
+        [scene.means, scene.quats, scene.scales, scene.opacities], [scene.viewmats, scene.Ks],
+        [rows.camera_ids, rows.visible_ids, rows.row_offsets], options.ints, options.floats,
+        [zeros[:, :2], zeros, zeros[:, 0]], None, weights, False,
     )[2]  # fmt: skip
     log_scales = scene.scales.requires_grad_()
     smallest = log_scales.exp().amin(dim=1)[rows.gaussian_ids.long()]
@@ -245,16 +251,21 @@ def test_nothing_finite_is_lost_and_nothing_else_spreads():
 
 def test_each_row_knows_the_ranks_that_composite_its_tiles():
     scene = random_scene(n=500, cameras=2, width=70, height=40)  # 5 x 3 tiles a view
-    arguments = opcheck_arguments(scene)
     ranges = [(0, 18), (12, 12), (12, 30)]
-    begins, ends = [begin for begin, _ in ranges], [end for _, end in ranges]
-    plan, carry, totals, _ = torch.ops.blitzgs.project_count(*arguments, begins, ends)
-    rows = torch.ops.blitzgs.project_emit(*arguments, begins, ends, None, plan, carry, totals)
-    masks, counts = route_count(rows[4], rows[5], rows[7], rows[1], ranges, 70, 40)
-    assert torch.equal(rows[11], masks) and masks.unique().numel() > 2
-    assert torch.equal(totals[5:].view(3, 2), counts)
-    assert torch.equal(totals[3:5], torch.bincount(rows[1], minlength=2))
-    assert totals[:3].tolist() == [len(rows[2]), len(rows[0]), rows[10].sum()]
+    inputs = inputs_of(scene)
+    rows, ids, totals = inputs._replace(ids=torch.arange(500) + 7).run(None, ranges)
+    assert torch.equal(ids, rows.gaussian_ids + 7)
+    masks = torch.zeros_like(rows.rank_masks)
+    for rank, (begin, end) in enumerate(ranges):
+        listed, _ = intersect(
+            rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, n_cameras=2, width=70,
+            height=40, tile_begin=begin, tile_end=end,
+        )  # fmt: skip
+        masks[listed.long().unique()] |= 1 << rank
+        assert totals[5 + 2 * rank :][:2].tolist() == [len(listed.unique()), len(listed)]
+    assert torch.equal(rows.rank_masks, masks) and masks.unique().numel() > 2
+    assert torch.equal(totals[3:5], torch.bincount(rows.camera_ids, minlength=2))
+    assert totals[:3].tolist() == [len(rows.visible_ids), len(rows.depths), rows.tiles_touched.sum()]
 
 
 @pytest.mark.parametrize("quat", [[0.0, 0, 0, 0], [1e30, -1e30, 2e30, 0], [1e-30, 0, 3e-30, 1e-30]])
@@ -303,7 +314,7 @@ def test_radius_clip_drops_small_splats_only():
 
 def test_errors_name_the_argument():
     scene = random_scene(n=4, cameras=1)
-    with pytest.raises(RuntimeError, match=r"project_count: quats must have shape \[4, 4\], got \[4, 3\]"):
+    with pytest.raises(RuntimeError, match=r"project_fwd: quats must have shape \[4, 4\], got \[4, 3\]"):
         project(
             scene.means, scene.means, scene.scales, scene.opacities, None, scene.viewmats, scene.Ks, 8, 8
         )  # fmt: skip
@@ -317,35 +328,40 @@ def test_errors_name_the_argument():
         project_scene(scene, active_ids=torch.arange(2))
 
 
-def opcheck_arguments(scene):
-    return (
-        *scene.arguments()[:7],
-        None,
-        None,
-        scene.width,
-        scene.height,
-        16,
-        3,
-        0.01,
-        1e10,
-        0.3,
-        0.0,
-        True,
-        False,
-    )
+def inputs_of(scene):
+    options = ProjectionOptions(scene.width, scene.height, sh_degree=3, antialiased=True, raw=False)
+    gaussians = [scene.means, scene.quats, scene.scales, scene.opacities, scene.colors]
+    return ProjectionInputs(gaussians, [scene.viewmats, scene.Ks], options)
 
 
 def test_opcheck():
-    scene = random_scene(n=10, cameras=2)
-    count, emit = torch.ops.blitzgs.project_count, torch.ops.blitzgs.project_emit
-    arguments = (*opcheck_arguments(scene), [0], [6])
-    torch.library.opcheck(count, arguments)
-    counted = (None, *count(*arguments)[:3])
-    torch.library.opcheck(emit, (*arguments, *counted))
-    # With gradients opcheck's own traced comparison cannot sum integer outputs; the next test is that check.
-    utilities = ("test_schema", "test_autograd_registration", "test_faketensor")
-    arguments = (*opcheck_arguments(scene.leaves()), [0], [6])
-    torch.library.opcheck(emit, (*arguments, *counted), test_utils=utilities)
+    op = torch.ops.blitzgs.project_fwd
+    for with_gradients in (False, True):
+        scene = random_scene(n=10, cameras=2)
+        inputs = inputs_of(scene.leaves() if with_gradients else scene)
+        options = inputs.options
+        ids = torch.arange(10)
+        arguments = (inputs.gaussians, inputs.cameras, [], options.ints, options.floats, [0, 6], [], ids)
+        # With gradients opcheck's own traced comparison cannot sum integer outputs; the next test is that
+        # check.
+        utilities = ("test_schema", "test_autograd_registration", "test_faketensor")
+        if not with_gradients:
+            utilities = (*utilities, "test_aot_dispatch_dynamic")
+        torch.library.opcheck(op, arguments, test_utils=utilities)
+
+
+def test_groups_of_arguments_are_checked():
+    inputs = inputs_of(random_scene(n=4, cameras=1))
+    for change, text in (
+        ({"gaussians": inputs.gaussians[:3]}, r"\(means, quats, scales, opacities\[, sh\]\), got 3 entries"),
+        ({"cameras": inputs.cameras[:1]}, r"\(viewmats, Ks\), got 1 entries"),
+        ({"active": [torch.arange(2, dtype=torch.int32)] * 4}, "got 4 entries"),
+        ({"ids": torch.arange(3)}, r"ids must have shape \[4\], got \[3\]"),
+    ):
+        with pytest.raises(RuntimeError, match=text):
+            inputs._replace(**change).run(None)
+    with pytest.raises(RuntimeError, match="a begin and an end for each of at most 63 ranks, got 128"):
+        inputs.run(None, [(0, 1)] * 64)
 
 
 def test_compiles_into_one_graph_with_the_same_gradients():

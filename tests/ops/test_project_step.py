@@ -7,9 +7,10 @@ import torch
 from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.project import project
 from blitzgs.ops.project_step import project_bwd_step_
-from blitzgs.ops.rasterize import gradient_columns
-from blitzgs.ops.scatter import NO_TABLES, RowTables, scatter_rows
-from tests.helpers import DEVICES, needs_cuda, sum_tables
+from blitzgs.ops.projection import ProjectionOptions
+from blitzgs.ops.scatter import scatter_rows
+from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
+from tests.helpers import DEVICES, needs_cuda, sum_of_ranks
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
 STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
@@ -53,54 +54,63 @@ class Scene:
             antialiased=antialiased,
         )  # fmt: skip
         shapes = (self.rows.means2d, self.rows.conics, self.rows.opacities, self.rows.colors)
-        self.v = [torch.randn(s.shape, generator=self.seed, dtype=torch.float64).to(s) for s in shapes]
-        self.tables = NO_TABLES
+        self.v = SplatGradients(
+            [torch.randn(s.shape, generator=self.seed, dtype=torch.float64).to(s) for s in shapes]
+        )
+        self.options = ProjectionOptions(
+            WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D, antialiased=antialiased
+        )
 
-    def backward(self, antialiased, need_viewmats=False):
-        r = self.rows
-        return torch.ops.blitzgs.project_bwd(
-            *self.params, self.viewmats, self.Ks, r.camera_ids, r.visible_ids, r.row_offsets, WIDTH, HEIGHT,
-            self.degree, EPS2D, antialiased, True, *self.v[:2], None, *self.v[2:], self.scale_reg,
-            need_viewmats, *self.tables,
+    def row_ids(self):
+        return [self.rows.camera_ids, self.rows.visible_ids, self.rows.row_offsets]
+
+    def backward_arguments(self, need_viewmats=False):
+        return (
+            self.params, [self.viewmats, self.Ks], self.row_ids(), self.options.ints, self.options.floats,
+            list(self.v.parts), None, self.scale_reg, need_viewmats,
         )  # fmt: skip
 
-    def one_after_the_other(self, antialiased, sparse):
+    def backward(self, need_viewmats=False):
+        return torch.ops.blitzgs.project_bwd(*self.backward_arguments(need_viewmats))
+
+    def one_after_the_other(self, sparse):
         r = self.rows
-        *gradients, _ = self.backward(antialiased)
+        *gradients, _ = self.backward()
         lazy_adam_step_(*self.columns(), gradients, r.visible_ids, *self.stands(), *self.optimiser, sparse)
 
-    def at_once(self, antialiased, sparse, means2d_sums=None):
+    def at_once(self, sparse, means2d_sums=None):
         project_bwd_step_(
-            *self.columns(), *self.stands(), *self.optimiser, sparse, self.rows, self.viewmats, self.Ks,
-            WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D, antialiased=antialiased, v_means2d=self.v[0],
-            v_conics=self.v[1], v_opacities=self.v[2], v_colors=self.v[3], scale_reg=self.scale_reg,
-            tables=self.tables, means2d_sums=means2d_sums,
+            *self.columns(), *self.stands(), *self.optimiser, sparse, self.rows, (self.viewmats, self.Ks),
+            self.options, self.v, self.scale_reg, means2d_sums,
         )  # fmt: skip
 
     def pack(self, width):
         """Put the gradients into one table, with something that is none of them behind."""
-        columns = [v[:, None] if v.dim() == 1 else v for v in self.v]
-        table = torch.full((len(self.v[0]), width), 1e9).to(self.v[0])
-        table[:, :9] = torch.cat(columns, 1)
-        self.v = gradient_columns(table)
+        parts = self.v.parts
+        table = torch.full((len(parts[0]), width), 1e9).to(parts[0])
+        table[:, :9] = torch.cat([v[:, None] if v.dim() == 1 else v for v in parts], 1)
+        if width == 12 and table.is_cuda:
+            self.v = SplatGradients([table])
+        else:  # columns that are not contiguous
+            self.v = SplatGradients([table[:, :2], table[:, 2:5], table[:, 5], table[:, 6:9]])
 
     def spread(self):
         """Replace the gradients by others, in tables of ranks amid what is of no use; return their sums."""
-        rows, sizes, starts, offset, ranks = len(self.v[0]), [], [5, 0, 900, 1], 16, 4
+        rows, starts, ranks = len(self.rows.camera_ids), [5, 0, 900, 1], 4
         masks = torch.randint(0, 2**ranks, (rows,), generator=self.seed) & ~2  # rank 1 had nothing
         alone = torch.rand(rows, generator=self.seed) < 0.6  # as most rows are
         masks[alone] = 2 ** (2 * (masks[alone] % 2))
         sizes = [int((masks >> m & 1).sum()) for m in range(ranks)]
-        numbers = torch.arange(rows, dtype=torch.int32, device=self.v[0].device)
+        numbers = torch.arange(rows, dtype=torch.int32, device=self.rows.means2d.device)
         _, places = scatter_rows([numbers], masks.to(numbers.device), sizes)
-        words = offset + 12 * (max(starts) + max(sizes) + 1)
-        buffers = [torch.full((words,), -1, dtype=torch.int32, device=numbers.device) for _ in sizes]
-        for buffer, start, size in zip(buffers, starts, sizes, strict=True):
-            part = torch.randn(size, 12, generator=self.seed)
-            buffer[offset:][12 * start :][: 12 * size] = part.flatten().to(buffer.device).view(torch.int32)
-        self.tables = RowTables(places, sizes, starts, buffers, offset)
-        self.v = [None] * 4
-        return [column.contiguous() for column in gradient_columns(sum_tables(self.tables, rows))]
+        parts = []
+        for start, size in zip(starts, sizes, strict=True):
+            table = torch.full((start + size + 1, 12), torch.nan)
+            table[start : start + size] = torch.randn(size, 12, generator=self.seed)
+            parts.append(table.to(numbers.device)[start : start + size])
+        self.v = SplatGradients(parts, places)
+        sums = gradient_columns(sum_of_ranks(self.v, rows))
+        return SplatGradients([column.contiguous() for column in sums])
 
 
 def compare(a, b, exact):
@@ -128,8 +138,8 @@ def test_equals_backward_and_step(device, sparse, n, k, degree, views):
         scene.degree = degree
         scene.render(antialiased)
     before = [p.clone() for p in scenes[0].params]
-    scenes[0].one_after_the_other(antialiased, sparse)
-    scenes[1].at_once(antialiased, sparse)
+    scenes[0].one_after_the_other(sparse)
+    scenes[1].at_once(sparse)
     compare(*scenes, exact=device == "cpu")
     visible = scenes[0].rows.visible_ids.long()
     assert len(visible) and bool((scenes[1].moment_step[visible] == STEP).all())
@@ -175,16 +185,17 @@ def test_gradients_in_tables_of_ranks(n, k, degree, views):
     plain.v = other.spread()
     sums = torch.full_like(plain.rows.means2d, torch.nan)
     agree(plain, other, False, sums)
-    assert torch.equal(sums, plain.v[0])
+    assert torch.equal(sums, plain.v.parts[0])
 
 
 def agree(plain, other, exact, means2d_sums=None):
     """Compare backward passes, and steps."""
-    for x, y in zip(plain.backward(False, True), other.backward(False, True), strict=True):
-        assert len(x) and (torch.equal(x, y) or not exact)
-        torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(x.abs().max()))
-    plain.at_once(False, False)
-    other.at_once(False, False, means2d_sums)
+    if other.v.places is None:  # only the step reads gradients at ranks
+        for x, y in zip(plain.backward(True), other.backward(True), strict=True):
+            assert len(x) and (torch.equal(x, y) or not exact)
+            torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(x.abs().max()))
+    plain.at_once(False)
+    other.at_once(False, means2d_sums)
     compare(plain, other, exact)
 
 
@@ -193,7 +204,7 @@ def test_repeats_bit_for_bit(device):
     scenes = [Scene(5000, 16, 2, device, torch.float32) for _ in range(2)]
     for scene in scenes:
         scene.render(False)
-        scene.at_once(False, False)
+        scene.at_once(False)
     compare(*scenes, exact=True)
 
 
@@ -201,14 +212,14 @@ def test_float64_and_nothing_visible():
     scenes = [Scene(200, 16, 1, "cpu", torch.float64) for _ in range(2)]
     for scene in scenes:
         scene.render(False)
-    scenes[0].one_after_the_other(False, False)
-    scenes[1].at_once(False, False)
+    scenes[0].one_after_the_other(False)
+    scenes[1].at_once(False)
     compare(*scenes, exact=True)
     scene = scenes[1]
     scene.viewmats[:, 2, 3] = -100  # all behind the camera
     scene.render(False)
     before = [p.clone() for p in scene.params]
-    scene.at_once(False, False)
+    scene.at_once(False)
     assert len(scene.rows.visible_ids) == 0
     assert all(torch.equal(x, y) for x, y in zip(before, scene.params, strict=True))
 
@@ -216,28 +227,28 @@ def test_float64_and_nothing_visible():
 def test_errors_name_the_value():
     scene = Scene(20, 16, 1, "cpu", torch.float32)
     scene.render(False)
-    scene.v[1] = scene.v[1][:, :2]
+    scene.v.parts[1] = scene.v.parts[1][:, :2]
     with pytest.raises(RuntimeError, match=r"project_bwd_step_: v_conics must have shape \[\d+, 3\]"):
-        scene.at_once(False, False)
+        scene.at_once(False)
     scene.render(False)
     scene.exp_avgs[4] = scene.exp_avgs[4][:, :4].contiguous()
     with pytest.raises(RuntimeError, match=r"the moments of sh must have its shape \[20, 16, 3\]"):
-        scene.at_once(False, False)
+        scene.at_once(False)
 
 
 def test_errors_name_what_is_wrong_with_tables():
     scene = Scene(20, 16, 1, "cpu", torch.float32)
     scene.render(False)
     scene.spread()
-    with pytest.raises(RuntimeError, match="project_bwd_step_: tables of ranks need CUDA"):
-        scene.at_once(False, False)
+    with pytest.raises(RuntimeError, match="project_bwd_step_: tables of gradients need CUDA"):
+        scene.at_once(False)
     scene.render(False)
-    scene.v[1] = None
-    with pytest.raises(RuntimeError, match="gradients of rows must be columns .* or, with places, in tables"):
-        scene.backward(False)
+    del scene.v.parts[1:3]
+    with pytest.raises(RuntimeError, match="v_splats must be v_means2d, .* or one table, got 2 tensors"):
+        scene.backward()
     scene.render(False)
-    with pytest.raises(RuntimeError, match="means2d_sums needs tables"):
-        scene.at_once(False, False, torch.zeros_like(scene.rows.means2d))
+    with pytest.raises(RuntimeError, match="means2d_sums needs gradients at ranks"):
+        scene.at_once(False, torch.zeros_like(scene.rows.means2d))
 
 
 @pytest.mark.cuda
@@ -246,32 +257,27 @@ def test_errors_name_what_does_not_fit():
     scene = Scene(20, 16, 1, "cuda", torch.float32)
     scene.render(False)
     scene.spread()
-    whole = scene.tables
+    whole = scene.v
     for change, text in (
         ({"places": whole.places[:, :-1]}, r"places must have shape \[\d+, 4\], got \[\d+, 3\]"),
-        ({"offset": -1}, "offset must lie in the buffers, got -1"),
-        ({"offset": 17}, "tables must lie at a multiple of 16 bytes"),
-        ({"starts": [5, 0, 10_000, 1]}, r"rows \[10000, \d+\) do not fit into the \d+ of rank 2"),
-        ({"buffers": whole.buffers[:3]}, "4 groups need as many buffers and starts, got 3 and 4"),
+        ({"parts": whole.parts[:3]}, r"places must have shape \[\d+, 3\], got \[\d+, 4\]"),
+        ({"parts": [part[:, :9] for part in whole.parts]}, r"must have shape \[\*, 12\], got \[\d+, 9\]"),
+        ({"parts": [part.double() for part in whole.parts]}, "must be Float, got Double"),
+        ({"parts": [part.t().contiguous().t() for part in whole.parts]}, "must be contiguous"),
     ):
-        scene.tables = whole._replace(**change)
+        scene.v = whole._replace(**change)
         with pytest.raises(RuntimeError, match=text):
-            scene.at_once(False, False)
+            scene.at_once(False)
 
 
 def test_opcheck():
     scene = Scene(20, 16, 1, "cpu", torch.float32)
     scene.render(False)
+    tables = [schedule_table(scene.lr_table, BETA1, BETA2), scene.lr_table]
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,
-        (*scene.columns(), *scene.stands(), schedule_table(scene.lr_table, BETA1, BETA2), scene.lr_table,
-         STEP, explicit_steps(BETA1, BETA2, torch.float32), BETA1, BETA2, EPS, False, scene.viewmats,
-         scene.Ks, scene.rows.camera_ids, scene.rows.visible_ids, scene.rows.row_offsets, WIDTH, HEIGHT, 3,
-         EPS2D, False, *scene.v, scene.scale_reg),
+        (*scene.columns(), [*scene.stands()], tables, [STEP, explicit_steps(BETA1, BETA2, torch.float32), 0],
+         [BETA1, BETA2, EPS], [scene.viewmats, scene.Ks], scene.row_ids(), scene.options.ints,
+         scene.options.floats, list(scene.v.parts), None, scene.scale_reg),
     )  # fmt: skip
-    torch.library.opcheck(
-        torch.ops.blitzgs.project_bwd,
-        (*scene.params, scene.viewmats, scene.Ks, scene.rows.camera_ids, scene.rows.visible_ids,
-         scene.rows.row_offsets, WIDTH, HEIGHT, 3, EPS2D, False, True, *scene.v[:2], None, *scene.v[2:],
-         scene.scale_reg, True),
-    )  # fmt: skip
+    torch.library.opcheck(torch.ops.blitzgs.project_bwd, scene.backward_arguments(True))

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
-from blitzgs.ops.rasterize import GradientRoom, rasterize
+from blitzgs.ops.rasterize import rasterize
+from blitzgs.ops.splat_gradients import GradientBuffer
 from tests.ops.splats import Splats, dense_composite, near_a_cut, random_splats
 
 WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
@@ -341,13 +342,13 @@ def test_errors_name_the_value():
 
 def test_zeros_for_gradients_serve_once():
     means2d, zeros = torch.ones(5, 2), torch.zeros(5, 12)
-    room = GradientRoom(zeros)
+    room = GradientBuffer(zeros)
     assert room.take(means2d) is zeros
-    for others in (room, GradientRoom(torch.zeros(0, 12))):  # taken, or never written
+    for others in (room, GradientBuffer(torch.zeros(0, 12))):  # taken, or never written
         taken = others.take(means2d)
         assert taken is not zeros and taken.shape == (5, 12) and not taken.any()
-    assert GradientRoom(torch.zeros(0, 12)).take(means2d[:0]).shape == (0, 12)
-    assert GradientRoom(zeros).take(means2d[:3]).data_ptr() == zeros.data_ptr()
+    assert GradientBuffer(torch.zeros(0, 12)).take(means2d[:0]).shape == (0, 12)
+    assert GradientBuffer(zeros).take(means2d[:3]).data_ptr() == zeros.data_ptr()
 
 
 def test_the_images_do_not_depend_on_a_backward_pass_to_follow():

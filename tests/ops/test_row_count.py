@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.ops.intersect import intersect
-from blitzgs.ops.rasterize import PACKED_GRADIENT
+from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
 from tests.helpers import DEVICES, needs_cuda
 from tests.ops.splats import Splats, random_splats, with_room
 
@@ -113,7 +113,7 @@ def test_images_and_gradients_are_those_of_the_rows_alone(n, channels, composite
 def test_a_table_of_gradients_is_zeroed_for_the_rows(n, room, tiles):
     """Also where tiles are too few to write the zeros."""
     rows = Rows(n, room, "cuda")
-    memory = torch.full((room + 100, PACKED_GRADIENT), float("nan"), device="cuda")
+    memory = torch.full((room + 100, SPLAT_GRADIENT), float("nan"), device="cuda")
     table = memory[40 : room + 60]
     lists = ops.intersect(*rows.alone.rows(), None, *VIEW, *tiles, -1)
     plain = ops.rasterize_fwd(*rows.alone.values(), None, *lists, *VIEW, *tiles, None, False)
@@ -179,7 +179,7 @@ def test_errors(device):
                 *VIEW,
                 0,
                 -1,
-                torch.zeros(149, PACKED_GRADIENT, device=device),
+                torch.zeros(149, SPLAT_GRADIENT, device=device),
             )
 
 

@@ -8,6 +8,7 @@ from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import cull_blocks, morton_keys
 from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.project import project
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions
 from blitzgs.view.blocks import BlockIndex, morton_order
 from tests.helpers import DEVICES
 
@@ -168,13 +169,11 @@ def caught_up_and_projected(table, ids, views, count, viewmats, Ks):
         *([after[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)), ids,
         after["last_step"], after["moment_step"], rates, 50, 0.9, 0.999, 1e-15, count,
     )  # fmt: skip
-    arguments = (
-        *(after[name] for name in PARAMETERS), viewmats, Ks, ids, views, WIDTH, HEIGHT, 16, 0, NEAR, FAR, 0.3,
-        0.0, False, True, [0], [50], count,
-    )  # fmt: skip
-    plan, carry, totals, _ = torch.ops.blitzgs.project_count(*arguments)
-    rows = torch.ops.blitzgs.project_emit(*arguments, plan, carry, totals.cpu())
-    return [*after.values(), totals, *rows]
+    active = [tensor for tensor in (ids, views, count) if tensor is not None]
+    options = ProjectionOptions(WIDTH, HEIGHT, near_plane=NEAR, far_plane=FAR)
+    inputs = ProjectionInputs([after[name] for name in PARAMETERS], (viewmats, Ks), options, active)
+    rows, _, totals = inputs.run(None, [(0, 50)])
+    return [*after.values(), totals, *rows[:12]]
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gradients of a frame's parameters, which training never stores: for tests and for measuring errors."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from blitzgs import pipeline
+from blitzgs.model import GaussianTable
+from blitzgs.ops.splat_gradients import SplatGradients
+
+
+def sum_of_ranks(gradients: SplatGradients, splats: int) -> Tensor:
+    """Return the gradients of a rank's splats that lie at several ranks, added up: [P, 12]."""
+    assert gradients.places is not None
+    total = torch.zeros(splats, 12, device=gradients.places.device)
+    for m, part in enumerate(gradients.parts):
+        runs = gradients.places[:, m, None]
+        first, bits = runs.bitwise_and(0xFFFFFFFF), runs >> 32
+        here = bits >> torch.arange(32, device=runs.device) & 1
+        at = (first + here.cumsum(1) - here).flatten()[:splats]
+        here = here.flatten()[:splats].bool()
+        total[here] += part[at[here]]
+    return total
+
+
+def parameter_gradients(
+    table: GaussianTable, frame: pipeline.Frame, v_renders: Tensor, scale_reg: Tensor | None = None
+) -> list[Tensor]:
+    """Return the gradients of the U visible Gaussians' parameters, from those of a frame's images."""
+    gradients, rows = pipeline.backward_splats(frame, v_renders), frame.rows
+    options = frame.options.projection(frame.views)
+    parts = gradients.parts
+    if gradients.places is not None:
+        parts = [sum_of_ranks(gradients, len(rows.means2d))]
+    *parameters, _ = torch.ops.blitzgs.project_bwd(
+        list(table.parameters), [frame.views.viewmats, frame.views.Ks],
+        [rows.camera_ids, rows.visible_ids, rows.row_offsets], options.ints, options.floats, list(parts),
+        None, scale_reg, False,
+    )  # fmt: skip
+    return parameters

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How projected splats reach the ranks that composite them, and how their gradients return."""
+
+from __future__ import annotations
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Traffic, Transport
+from blitzgs.distributed.transport.collective import CollectiveTransport
+from blitzgs.distributed.transport.local import LocalTransport
+from blitzgs.distributed.transport.peer import PeerTransport
+
+__all__ = [
+    "Arrived",
+    "CollectiveTransport",
+    "Exchange",
+    "HostCounts",
+    "LocalTransport",
+    "PeerTransport",
+    "Splats",
+    "Traffic",
+    "Transport",
+    "open_transport",
+]
+
+
+def open_transport(ranks: Ranks, half: bool = False) -> Transport:
+    """Return the fastest transport of a job.
+
+    Args:
+        ranks: the job; the transport is valid until it ends.
+        half: send splats in half precision, see `collective.HalfCodec`. Such travel by collectives.
+    """
+    if ranks.world_size == 1:
+        return LocalTransport()
+    if ranks.memory is None or half:
+        return CollectiveTransport(ranks, half)
+    return PeerTransport(ranks)

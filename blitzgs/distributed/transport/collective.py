@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splats carried by an all-to-all of NCCL or Gloo, and their gradients by another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileAssignment
+from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Traffic, Transport
+from blitzgs.ops.capacity import Sizes
+from blitzgs.ops.projection import Projected, ProjectionInputs, rows_of
+from blitzgs.ops.scatter import RUN, as_column, gather_rows, scatter_rows, sum_rows, words_of, words_per_row
+from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
+
+
+class CollectiveTransport(Transport):
+    """For ranks that do not reach each other's memory.
+
+    The ranks show each other how many splats each has for whom; the host waits for these numbers. Splats are
+    then packed by rank, carried, and unpacked; their gradients likewise. They are added up at the owner in
+    the order of ranks, so that the sum does not depend on which was faster. The places of splats among those
+    of a rank are kept in 8 bytes per 32 splats, and serve the way back too.
+    """
+
+    def __init__(self, ranks: Ranks, half: bool = False) -> None:
+        """Serve `ranks`; with `half`, send splats through a `HalfCodec`."""
+        super().__init__()
+        self._ranks, self._codec = ranks, HalfCodec() if half else None
+
+    def start(
+        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
+    ) -> Exchange:
+        """See `Transport.start`."""
+        if assignment is None:
+            raise ValueError("several ranks need an assignment of tiles")
+        ranks, tiles = self._ranks, assignment.all_composited
+        # Waiting may mean to wait for other ranks, whose collectives are queued before.
+        projected = ranks.reading(partial(inputs.run, capacity, tiles))
+        everyone = ranks.share(projected.totals)
+        visible = everyone[:, 3 : 3 + inputs.n_views].sum(0)
+        traffic = Traffic.of(ranks.read(everyone), inputs.n_views, ranks.rank)
+        if capacity is not None and not capacity.holds(traffic.counts[:2].tolist()):
+            projected = ranks.reading(partial(inputs.run, None, tiles))
+        return _CollectiveExchange(ranks, self._codec, projected, traffic, visible)
+
+
+def carry_sums(sums: Tensor, places: Tensor, traffic: Traffic, splats: int, ranks: Ranks) -> Tensor:
+    """Carry integer sums of splats to their owners by a collective: `Exchange.return_sums`.
+
+    Args:
+        sums: int64 [R, C], of the splats that arrived here.
+        places: of this rank's splats, as `scatter_rows` returns them.
+        traffic: what went where.
+        splats: P.
+        ranks: the job.
+    """
+    returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
+    total = sums.new_zeros(splats, sums.shape[1])
+    lanes = torch.arange(RUN, device=sums.device)
+    for group, runs in zip(returned.split(traffic.sent), places.unbind(1), strict=True):
+        # The splats of a run lie together: the first one's place, and which of them are there (csrc/scatter).
+        here = runs[:, None] >> (32 + lanes) & 1
+        at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
+        rows = here.flatten().nonzero().squeeze(1)
+        total.index_add_(0, rows, group[at.flatten()[rows]])
+    return total
+
+
+class HalfCodec:
+    """Splats in half precision, for slow links.
+
+    Conics (as Cholesky factors, which stay positive definite), opacities and colours travel in float16, and
+    gradients in bfloat16; positions and depths stay as they are. A splat of three colours then takes 40 bytes
+    instead of 52 one way, and 20 instead of 36 back. The tiles that a splat touches are found before it is
+    rounded: one whose border moves over that of a tile may be missing there, where its alpha is about 1/255.
+    """
+
+    def encode(self, conics: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
+        """Return what is sent for them, float16 [P, 4 + D]."""
+        a, b, c = conics.double().unbind(1)
+        l11 = a.sqrt()
+        l21 = b / l11
+        l22 = (c - l21 * l21).clamp(min=0).sqrt()
+        factors = torch.stack((l11, l21, l22), 1).to(conics.dtype)
+        return torch.cat((factors, opacities[:, None], colors), 1).half()
+
+    def decode(self, halves: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """Return conics, opacities and colours; the same bits wherever it is called."""
+        values = halves.to(dtype)
+        l11, l21, l22 = values[:, :3].unbind(1)
+        conics = torch.stack((l11 * l11, l11 * l21, l21 * l21 + l22 * l22), 1)
+        return conics, values[:, 3].contiguous(), values[:, 4:].contiguous()
+
+
+class _CollectiveExchange(Exchange):
+    def __init__(
+        self, ranks: Ranks, codec: HalfCodec | None, projected: Projected, traffic: Traffic, visible: Tensor
+    ) -> None:
+        super().__init__()
+        self._ranks, self._codec, self._traffic, self._visible = ranks, codec, traffic, visible
+        self._rows = rows_of(projected.rows[:12], traffic.counts)
+        self._own = Splats.of(self._rows, projected.ids[: len(self._rows.camera_ids)])
+        self.needed = Sizes._make(traffic.counts.tolist())
+
+    def _receive(self) -> Arrived:
+        own, codec, traffic = self._own, self._codec, self._traffic
+        shape = (own.conics, own.opacities, own.colors)
+        columns = [own.means2d, own.depths, own.camera_ids, own.ids]
+        columns += [codec.encode(*shape)] if codec is not None else shape
+        sent, received = traffic.sent, traffic.received
+        packed, self._places = scatter_rows(columns, self._rows.rank_masks, sent)
+        words = sum(map(words_per_row, columns))
+        arrived = self._ranks.all_to_all(packed, [words * n for n in sent], [words * n for n in received])
+        means2d, depths, camera_ids, ids, *rest = gather_rows(arrived, columns, received)
+        conics, opacities, colors = rest if codec is None else codec.decode(rest[0], means2d.dtype)
+        self._splats = Splats(means2d, conics, opacities, colors, depths, camera_ids, ids)
+        # Rounding may let splats touch some tiles more.
+        return Arrived(self._splats, None, traffic.n_isects if codec is None else -1)
+
+    def _finish(self) -> HostCounts:
+        return HostCounts(self._rows, self._splats, self._visible, self._traffic)
+
+    def _return_gradients(self, parts: Sequence[Tensor]) -> SplatGradients:
+        columns = gradient_columns(parts[0]) if len(parts) == 1 else parts
+        flat = [g.reshape(len(g), math.prod(g.shape[1:])) for g in columns]
+        widths, dtype = [g.shape[1] for g in flat], flat[0].dtype
+        sent, received = self._traffic.sent, self._traffic.received
+        if self._codec is None:
+            returned = self._ranks.all_to_all(torch.cat(flat, 1), received, sent).view(-1, sum(widths))
+        else:
+            # Gradients span too many magnitudes for float16.
+            halves = torch.cat(flat, 1).bfloat16()
+            carried = self._ranks.all_to_all(words_of(halves), received, sent)
+            returned = as_column(carried, halves).to(dtype)
+        sums = sum_rows(returned, self._places, sent, len(self._rows.camera_ids), widths)
+        return SplatGradients([s.reshape(-1, *g.shape[1:]) for s, g in zip(sums, columns, strict=True)])
+
+    def _return_sums(self, sums: Tensor) -> Tensor:
+        return carry_sums(sums, self._places, self._traffic, len(self._rows.camera_ids), self._ranks)

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A projection's arguments in groups, as the ops take them, and the rows that it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.capacity import CapacityEstimate, Sizes
+from blitzgs.ops.host import HostCopy
+
+
+class Rows(NamedTuple):
+    """What the views see, ordered by (Gaussian, view): P rows of U different Gaussians."""
+
+    gaussian_ids: Tensor  # int32 [P]
+    camera_ids: Tensor  # int32 [P]
+    visible_ids: Tensor  # int32 [U], ascending
+    row_offsets: Tensor  # int32 [U + 1]: rows row_offsets[u] to row_offsets[u + 1] are of visible_ids[u]
+    means2d: Tensor  # [P, 2], px; the centre of pixel (i, j) is (i + 0.5, j + 0.5)
+    conics: Tensor  # [P, 3]: a, b, c of the inverse 2D covariance, 1/px^2
+    depths: Tensor  # [P]: camera-space z
+    opacities: Tensor  # [P]: compensated in antialiased mode
+    colors: Tensor  # [P, 3]; [0, 3] without SH
+    radii: Tensor  # int32 [P, 2]: half width and height of the box around alpha >= 1/255, rounded up
+    tiles_touched: Tensor  # int32 [P]
+    rank_masks: Tensor  # int64 [P]: bit m set where rank m wants the row; [0] where no rank asked
+    counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
+
+
+def rows_of(columns: Sequence[Tensor], counts: Tensor) -> Rows:
+    """Return the rows that lie in columns with room behind them.
+
+    Args:
+        columns: those of `Rows` but the last, and perhaps more.
+        counts: `Rows.counts`.
+    """
+    visible, rows = counts[:2].tolist()
+    lengths = (rows, rows, visible, visible + 1, *(rows,) * 8)
+    # No views to autograd: a Function may return those, but a caller could not change them in place.
+    with torch._C._AutoDispatchBelowADInplaceOrView():
+        return Rows._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
+
+
+class ProjectionOptions(NamedTuple):
+    """How Gaussians are projected; the arguments of `project` of these names."""
+
+    width: int
+    height: int
+    tile_size: int = 16
+    sh_degree: int = 0
+    near_plane: float = 0.01
+    far_plane: float = 1e10
+    eps2d: float = 0.3
+    radius_clip: float = 0.0
+    antialiased: bool = False
+    raw: bool = True
+
+    @classmethod
+    def of(cls, ints: Sequence[int], floats: Sequence[float]) -> ProjectionOptions:
+        """Return what `ints` and `floats` were of."""
+        width, height, tile_size, sh_degree, antialiased, raw = ints
+        near_plane, far_plane, eps2d, radius_clip = floats
+        return cls(
+            width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip,
+            bool(antialiased), bool(raw),
+        )  # fmt: skip
+
+    @property
+    def ints(self) -> list[int]:
+        """As the ops take them, with `floats`."""
+        return [
+            self.width, self.height, self.tile_size, self.sh_degree, int(self.antialiased), int(self.raw)
+        ]  # fmt: skip
+
+    @property
+    def floats(self) -> list[float]:
+        """As the ops take them, with `ints`."""
+        return [self.near_plane, self.far_plane, self.eps2d, self.radius_clip]
+
+
+class ProjectionInputs(NamedTuple):
+    """What is projected, in the groups of arguments that the ops take.
+
+    Attributes:
+        gaussians: means, quats, scales, opacities and, unless there are none, sh.
+        cameras: viewmats, Ks.
+        options: the rest.
+        active: which Gaussians to consider, `ActiveRows`: ids, the views of each, how many ids there are;
+            those behind the first may be left out. Empty: all Gaussians in all views.
+        ids: int64 [N], persistent, of the Gaussians; None: the rows' are not wanted.
+    """
+
+    gaussians: Sequence[Tensor]
+    cameras: Sequence[Tensor]
+    options: ProjectionOptions
+    active: Sequence[Tensor] = ()
+    ids: Tensor | None = None
+
+    @property
+    def n_views(self) -> int:
+        """B."""
+        return len(self.cameras[0])
+
+    def run(self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()) -> Projected:
+        """Project.
+
+        Args:
+            capacity: how many visible Gaussians and rows to have room for: CUDA then does not wait for their
+                number. None: as many as there are.
+            rank_tiles: the [begin, end) of the tiles that each rank composites, begins ascending.
+        """
+        *columns, row_ids, totals = torch.ops.blitzgs.project_fwd(
+            list(self.gaussians),
+            list(self.cameras),
+            list(self.active),
+            self.options.ints,
+            self.options.floats,
+            [tile for tiles in rank_tiles for tile in tiles],
+            [] if capacity is None else [capacity.visible, capacity.rows],
+            self.ids,
+        )
+        return Projected(Rows._make((*columns, None)), row_ids, totals)
+
+
+class Projected(NamedTuple):
+    """What `ProjectionInputs.run` returns.
+
+    Attributes:
+        rows: with room behind them where a capacity was given; counts are None. Where the capacity was too
+            small they mean nothing.
+        ids: int64 [P], persistent, of the rows' Gaussians; [0] where none were given.
+        totals: int64 [3 + B + 2 M], on the device, right in any case: U, P and the sum of tiles_touched; the
+            rows of each view; and for each rank its rows and the tiles that these touch there.
+    """
+
+    rows: Rows
+    ids: Tensor
+    totals: Tensor
+
+
+def project_rows(inputs: ProjectionInputs) -> Rows:
+    """`project` of grouped arguments, without gradients."""
+
+    def attempt(capacity: Sizes | None) -> tuple[Rows | None, list[int]]:
+        projected = inputs.run(capacity)
+        with HostCopy(projected.totals) as copy:
+            counts = copy.read()[:3]
+        needed = counts.tolist()
+        if capacity is not None and not capacity.holds(needed[:2]):
+            return None, needed
+        return rows_of(projected.rows[:12], counts), needed
+
+    with torch._C._AutoDispatchBelowAutograd():
+        return capacity_for(inputs).run(attempt)
+
+
+def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:
+    """Return the estimate that is kept for calls of a size."""
+    means = inputs.gaussians[0]
+    return _estimate(means.device, len(means), inputs.n_views)
+
+
+@lru_cache(maxsize=16)
+def _estimate(_device: torch.device, _gaussians: int, _views: int) -> CapacityEstimate:
+    return CapacityEstimate()

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gradients of projected splats, in the forms in which they go from compositing to the projection."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+# Where the parts of a splat gradient begin in its floats (csrc/common/splat_gradient.h), and how many these
+# are.
+_MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT = torch.ops.blitzgs.splat_gradient_layout()
+
+
+def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """View a table of splat gradients as columns.
+
+    Args:
+        packed: [P, 12], of the op `rasterize_bwd_packed_`.
+
+    Returns:
+        Gradients of means2d [P, 2], conics [P, 3], opacities [P] and colors [P, 3].
+    """
+    return (
+        packed[:, _MEAN2D : _MEAN2D + 2],
+        packed[:, _CONIC : _CONIC + 3],
+        packed[:, _OPACITY],
+        packed[:, _COLOR : _COLOR + 3],
+    )
+
+
+def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the table that columns are `gradient_columns` of; None: they are not of one table."""
+    table = None if columns[0] is None else columns[0]._base
+    if table is None or table.dim() != 2 or table.shape[1] != SPLAT_GRADIENT or not table.is_contiguous():
+        return None
+    for column, view in zip(columns, gradient_columns(table), strict=True):
+        if column is None or column._base is not table or column.shape != view.shape:
+            return None
+        if (column.storage_offset(), column.stride()) != (view.storage_offset(), view.stride()):
+            return None
+    return table
+
+
+class SplatGradients(NamedTuple):
+    """Gradients of a rank's P splats in one of three forms.
+
+    Attributes:
+        parts: columns (v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]); or (CUDA) one
+            table [P, 12]; or, with `places`, this rank's part of such a table at each of the M ranks that
+            composited splats, in memory that they share. A splat's gradient is then the sum over the ranks,
+            in their order.
+        places: int64 [ceil(P / 32), M], where each splat is among those that a rank had of this one, as
+            `scatter_rows` returns it. Such gradients are valid until the next frame, or the next backward
+            pass of this one.
+    """
+
+    parts: Sequence[Tensor]
+    places: Tensor | None = None
+
+    @property
+    def means2d(self) -> Tensor | None:
+        """The gradient of means2d, [P, 2] per pixel; None: it is at several ranks."""
+        if self.places is not None:
+            return None
+        return gradient_columns(self.parts[0])[0] if len(self.parts) == 1 else self.parts[0]
+
+
+class GradientBuffer:
+    """Where the backward pass adds up the gradients of splats on CUDA: zeros that the forward pass wrote.
+
+    They are good for one backward pass; later ones get others.
+    """
+
+    def __init__(self, zeros: Tensor | None, others: Callable[[], Tensor] | None = None) -> None:
+        """Keep the zeros.
+
+        Args:
+            zeros: [P or more, 12], the last output of `rasterize_fwd`, or none, [0, 12] or None.
+            others: makes others; None: they are allocated.
+        """
+        self._zeros, self._others = zeros, others
+
+    def take(self, means2d: Tensor) -> Tensor:
+        """Return zeros [P, 12] for the P splats."""
+        zeros, self._zeros = self._zeros, None
+        if zeros is not None and len(zeros) >= len(means2d):
+            return zeros if len(zeros) == len(means2d) else zeros[: len(means2d)]
+        return means2d.new_zeros(len(means2d), SPLAT_GRADIENT) if self._others is None else self._others()
+
+
+@torch.library.register_fake("blitzgs::splat_gradient_layout")
+def _() -> list[int]:
+    return [_MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT]

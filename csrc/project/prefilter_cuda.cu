@@ -1,0 +1,124 @@
+// SPDX-License-Identifier: Apache-2.0
+// The first kernel of the projection: a quick test of every candidate, from its mean and its largest scale.
+#include <algorithm>
+
+#include "common/multiprocessors.h"
+#include "common/warp.cuh"
+#include "project/prefilter.cuh"
+#include "project/project_cull.cuh"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kWarps = kPrefilterThreads / 32, kMostOfWarp = kMostAtOnce / kWarps;
+constexpr int kBlocksPerMultiprocessor = 8;
+
+// The views that may see each of kPrefilterBatch candidates first, first + 32, ..., from the mean, then the
+// scale.
+__device__ void quick_views(const Inputs& in, std::int64_t n_candidates, const Frustum* frusta,
+                            std::int64_t first, std::uint32_t* maybe, std::int32_t* ids) {
+  Vec3<float> means[kPrefilterBatch];
+  float norms[kPrefilterBatch];
+#pragma unroll
+  for (int k = 0; k < kPrefilterBatch; ++k) {
+    const std::int64_t c = first + 32 * k;
+    const bool present = c < n_candidates;
+    ids[k] = present ? static_cast<std::int32_t>(candidate_id(in, c)) : 0;
+    maybe[k] = !present ? 0u : in.active_views ? static_cast<std::uint32_t>(in.active_views[c]) : ~0u;
+    if (in.n_views < 32) maybe[k] &= (1u << in.n_views) - 1u;
+    means[k] = maybe[k] ? load3(in.means + std::int64_t{3} * ids[k]) : Vec3<float>{0.f, 0.f, 0.f};
+    norms[k] = norm1(means[k]);
+  }
+  for (int view = 0; view < in.n_views; ++view) {
+    const Frustum& frustum = frusta[view];
+#pragma unroll
+    for (int k = 0; k < kPrefilterBatch; ++k) {
+      if (!may_be_in_depth(frustum, means[k], norms[k])) maybe[k] &= ~(1u << view);
+    }
+  }
+  float scales[kPrefilterBatch];
+#pragma unroll
+  for (int k = 0; k < kPrefilterBatch; ++k) scales[k] = maybe[k] ? largest_scale(in, ids[k]) : 0.f;
+  for (int view = 0; view < in.n_views; ++view) {
+    const Frustum& frustum = frusta[view];
+#pragma unroll
+    for (int k = 0; k < kPrefilterBatch; ++k) {
+      if (!may_overlap(frustum, means[k], norms[k], scales[k])) maybe[k] &= ~(1u << view);
+    }
+  }
+}
+
+// A block takes candidates turn by turn; those that some view may see are listed behind those of the turns
+// before.
+__global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
+    prefilter_kernel(const Inputs in, const Prefiltered kept, const RunningSum before) {
+  __shared__ Camera<float> cameras[kMaxViews];
+  __shared__ Frustum frusta[kMaxViews];
+  __shared__ std::uint32_t left_views[kWarps][kMostOfWarp];
+  __shared__ std::int32_t left_ids[kWarps][kMostOfWarp];
+  __shared__ int left[kWarps];
+  const std::int64_t n_candidates = candidates_of(in);
+  const int at_once = prefiltered_at_once(n_candidates), of_warp = at_once / kWarps;
+  const std::int64_t n_turns = (n_candidates + at_once - 1) / at_once;
+  if (blockIdx.x == 0 && threadIdx.x == 0 && n_turns == 0) *kept.count = 0;
+  if (blockIdx.x >= n_turns) return;
+  load_cameras(in, cameras);
+  __syncthreads();
+  for (int view = threadIdx.x; view < in.n_views; view += kPrefilterThreads)
+    frusta[view] = make_frustum(cameras[view], in.options);
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const unsigned below = (1u << lane) - 1u;
+  for (;;) {
+    const int turn = before.take_turn();
+    if (turn >= n_turns) return;
+    const std::int64_t first = turn * std::int64_t{at_once} + warp * of_warp;
+    int n_left = 0;
+    for (int batch = 0; batch < of_warp; batch += 32 * kPrefilterBatch) {
+      std::uint32_t maybe[kPrefilterBatch];
+      std::int32_t ids[kPrefilterBatch];
+      quick_views(in, n_candidates, frusta, first + batch + lane, maybe, ids);
+#pragma unroll
+      for (int k = 0; k < kPrefilterBatch; ++k) {
+        const unsigned some = __ballot_sync(kFullWarp, maybe[k] != 0);
+        if (maybe[k]) {
+          const int at = n_left + __popc(some & below);
+          left_views[warp][at] = maybe[k];
+          left_ids[warp][at] = ids[k];
+        }
+        n_left += __popc(some);
+      }
+    }
+    if (lane == 0) left[warp] = n_left;
+    __syncthreads();
+    int at = 0, of_block = 0;
+#pragma unroll
+    for (int other = 0; other < kWarps; ++other) {
+      if (other < warp) at += left[other];
+      of_block += left[other];
+    }
+    const std::int64_t base = before.sum_before<kPrefilterThreads>(turn, of_block);
+    if (turn == n_turns - 1 && threadIdx.x == 0) *kept.count = base + of_block;
+    for (int i = lane; i < n_left; i += 32) {
+      kept.views[base + at + i] = left_views[warp][i];
+      kept.ids[base + at + i] = left_ids[warp][i];
+    }
+  }
+}
+
+}  // namespace
+
+void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, CudaStream stream) {
+  const std::int64_t turns = in.n_views > 0 ? most_prefilter_turns(in.n_candidates) : 0;
+  if (turns == 0) {
+    check(cudaMemsetAsync(kept.count, 0, sizeof(*kept.count), stream), "project");
+    return;
+  }
+  const std::int64_t blocks = std::min<std::int64_t>(turns, kBlocksPerMultiprocessor * multiprocessors());
+  auto* zeros = turn_zeros(turns, workspace, stream);
+  prefilter_kernel<<<static_cast<unsigned>(blocks), kPrefilterThreads, 0, stream>>>(in, kept,
+                                                                                    RunningSum(zeros));
+  check_launch("project");
+}
+
+}  // namespace blitzgs::cuda

@@ -1,0 +1,54 @@
+// SPDX-License-Identifier: Apache-2.0
+// Compiled without FMA contraction (cmake/cuda.cmake), as write_rows_cuda.cu.
+#include "project/prefilter.cuh"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kColorThreads = 128, kColorBlocks = 5;  // such blocks fill a multiprocessor
+constexpr int kRowsOfBlock = 2 * kColorThreads;
+
+template <int DEGREE, bool QUADS>
+__global__ void __launch_bounds__(kColorThreads, kColorBlocks)
+    color_kernel(const Inputs in, const ProjectIds ids, const ProjectRoom room,
+                 const ProjectOutputs<float> out) {
+  __shared__ ShStage<DEGREE> stages[QUADS ? kColorThreads / 32 : 1];
+  __shared__ Camera<float> cameras[kMaxViews];
+  __shared__ TripleStage triples[kColorThreads / 32];
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
+  const std::int64_t n_rows = fitting(room).rows, step = gridDim.x * std::int64_t{kRowsOfBlock};
+  const std::int64_t of_block = blockIdx.x * std::int64_t{kRowsOfBlock};
+  if (of_block >= n_rows) return;
+  load_cameras(in, cameras);
+  __syncthreads();
+  for (std::int64_t begin = of_block; begin < n_rows; begin += step) {
+#pragma unroll 1
+    for (int first = 0; first < kRowsOfBlock; first += kColorThreads) {
+      const std::int64_t i = begin + first + threadIdx.x;
+      const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
+      int sh_slot = 0;
+      if constexpr (QUADS) sh_slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
+      const int view = id < 0 ? 0 : ids.camera_ids[i];
+      const Vec3<float> mean = triples[warp].gather(in.means, id, lane);
+      emit_color<DEGREE, QUADS>(in, cameras[view], mean, stage, sh_slot, out, i, id);
+      __syncwarp();
+    }
+  }
+}
+
+}  // namespace
+
+void write_colors(const Inputs& in, const ProjectRoom& room, const ProjectColumns<float>& columns,
+                  CudaStream stream) {
+  if (room.sizes.rows == 0 || !in.sh) return;
+  const std::int64_t blocks = (room.sizes.rows + kRowsOfBlock - 1) / kRowsOfBlock;
+  dispatch_sh(in, [&](auto degree, auto quads) {
+    color_kernel<degree.value, quads.value>
+        <<<static_cast<unsigned>(blocks), kColorThreads, 0, stream>>>(in, columns.ids, room, columns.values);
+  });
+  check_launch("project");
+}
+
+}  // namespace blitzgs::cuda

@@ -1,0 +1,275 @@
+// SPDX-License-Identifier: Apache-2.0
+// The second kernel of the projection: the exact test of what the prefilter kept, and the rows.
+// Compiled without FMA contraction (cmake/cuda.cmake): rows that are projected twice must get the same bits.
+#include <algorithm>
+
+#include "common/multiprocessors.h"
+#include "common/warp.cuh"
+#include "project/prefilter.cuh"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kWarps = kRowThreads / 32, kBlocksPerMultiprocessor = 6;
+
+// A block's sums for project_totals. Adding 64-bit numbers in shared memory is slow, so tiles carry by hand.
+struct Sums {
+  unsigned views[kMaxViews], rank_rows[kMaxRanks], tiles_low[kMaxRanks], tiles_high[kMaxRanks];
+  unsigned long long visible, rows, tiles;
+
+  __device__ void add_tiles(int rank, unsigned tiles) {
+    const unsigned before = atomicAdd(&tiles_low[rank], tiles);
+    if (before + tiles < before) atomicAdd(&tiles_high[rank], 1u);
+  }
+};
+
+// Adds a block's sums to the totals of the launch.
+__device__ void store_sums(const Sums& sums, const Inputs& in, int n_ranks, unsigned long long* totals) {
+  const int thread = threadIdx.x;
+  if (thread == 0) {
+    atomicAdd(totals + kTotalVisible, sums.visible);
+    atomicAdd(totals + kTotalRows, sums.rows);
+    atomicAdd(totals + kTotalTiles, sums.tiles);
+  }
+  if (thread < in.n_views && sums.views[thread]) {
+    atomicAdd(totals + kTotalViews + thread, static_cast<unsigned long long>(sums.views[thread]));
+  }
+  if (thread < n_ranks && sums.rank_rows[thread]) {
+    unsigned long long* target = totals + kTotalViews + in.n_views + 2 * thread;
+    atomicAdd(target, static_cast<unsigned long long>(sums.rank_rows[thread]));
+    atomicAdd(target + 1,
+              static_cast<unsigned long long>(sums.tiles_high[thread]) << 32 | sums.tiles_low[thread]);
+  }
+}
+
+// Pairs that turned out to be rows, until it is known where they belong.
+constexpr std::uint16_t kNoRow = 0xffff;
+struct Pending {
+  float2 means2d[kMostPairs];
+  float conics[3][kMostPairs], depths[kMostPairs], opacities[kMostPairs];
+  int2 radii[kMostPairs];
+  std::int32_t tiles[kMostPairs];
+  std::int64_t ranks[kMostPairs];
+  std::uint16_t pairs[kMostPairs];  // kMaxViews * Gaussian + view; kNoRow: not a row
+};
+// Tiles of a row, and which ranks want it; what each of them wants goes to `sums`.
+__device__ __forceinline__ std::int32_t find_tiles(const Row<float>& row, int view, const Inputs& in,
+                                                   const RankTiles& rank_tiles, std::int64_t* ranks,
+                                                   Sums& sums) {
+  int current = -1;  // most rows are of one rank: its pieces are added up here
+  unsigned of_rank = 0;
+  const std::int32_t tiles =
+      row_tiles(row, view, in.options, rank_tiles, ranks, [&](int rank, std::int64_t count) {
+        if (rank != current) {
+          if (current >= 0) sums.add_tiles(current, of_rank);
+          current = rank;
+          of_rank = 0;
+        }
+        of_rank += static_cast<unsigned>(count);
+      });
+  if (current >= 0) sums.add_tiles(current, of_rank);
+  for (std::int64_t rest = *ranks; rest; rest &= rest - 1) {
+    atomicAdd(&sums.rank_rows[__ffsll(rest) - 1], 1u);
+  }
+  return tiles;
+}
+
+// Gaussians that a block projects together.
+struct Group {
+  std::uint32_t seen[kRowThreads];  // views that do see them
+  std::int32_t ids[kRowThreads];
+  std::int32_t before[kRowThreads];  // visible ones << 16 | rows of those before
+  int of_warps[kWarps];
+  int next_turn;
+  std::int64_t of_turns_before;  // visible << 31 | rows
+};
+
+// The sum of `value` over the threads before, and of all. A barrier, and wants one between two calls.
+__device__ __forceinline__ int sum_of_threads_before(int value, Group& group, int* all) {
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const int until = sum_of_lanes_until(value, lane);
+  if (lane == 31) group.of_warps[warp] = until;
+  __syncthreads();
+  int before = until - value, total = 0;
+#pragma unroll
+  for (int other = 0; other < kWarps; ++other) {
+    if (other < warp) before += group.of_warps[other];
+    total += group.of_warps[other];
+  }
+  *all = total;
+  return before;
+}
+
+// Closes the rows of the last visible Gaussian; all: visible << 31 | rows.
+__device__ __forceinline__ void end_rows(std::int64_t all, const ProjectSizes& room, const ProjectIds& ids) {
+  const std::int64_t visible = all >> 31;
+  if (room.rows > 0 && visible <= room.visible) {
+    ids.row_offsets[visible] = static_cast<std::int32_t>(all & 0x7fffffff);
+  }
+}
+
+// Writes a group's rows, as far as there is room. before: visible << 31 | rows of the turns before.
+__device__ __forceinline__ void write_rows(const Group& group, std::int64_t before, const Pending& pending,
+                                           int n_pairs, const ProjectSizes& room, const ProjectIds& ids,
+                                           const ProjectOutputs<float>& out) {
+  const int thread = threadIdx.x;
+  const std::int64_t visible_before = before >> 31, rows_before = before & 0x7fffffff;
+  const std::int32_t in_group = group.before[thread];
+  const std::int64_t u = visible_before + (in_group >> 16);
+  if (group.seen[thread] && u < room.visible) {
+    ids.visible_ids[u] = group.ids[thread];
+    ids.row_offsets[u] = static_cast<std::int32_t>(rows_before + (in_group & 0xffff));
+  }
+  for (int p = thread; p < n_pairs; p += kRowThreads) {
+    const int pair = pending.pairs[p], slot = pair / kMaxViews, view = pair % kMaxViews;
+    if (pair == kNoRow) continue;
+    const std::uint32_t of_slot = group.seen[slot];
+    const std::int64_t i =
+        rows_before + (group.before[slot] & 0xffff) + __popc(of_slot & ((1u << view) - 1u));
+    if (i >= room.rows) continue;
+    ids.gaussian_ids[i] = group.ids[slot];
+    ids.camera_ids[i] = view;
+    reinterpret_cast<float2*>(out.means2d)[i] = pending.means2d[p];
+    for (int k = 0; k < 3; ++k) out.conics[3 * i + k] = pending.conics[k][p];
+    out.depths[i] = pending.depths[p];
+    out.opacities[i] = pending.opacities[p];
+    reinterpret_cast<int2*>(out.radii)[i] = pending.radii[p];
+    out.tiles_touched[i] = pending.tiles[p];
+    if (out.rank_masks) out.rank_masks[i] = pending.ranks[p];
+    if (out.row_ids) out.row_ids[i] = out.ids[group.ids[slot]];
+  }
+}
+
+// A block takes Gaussians turn by turn, a thread each, and writes their rows behind those of the turns
+// before. Which pairs are rows takes every block about the same time; the tiles that they touch, which take
+// some much longer, it finds between telling the others how many rows it has and asking how many they have:
+// so nobody waits for the slowest.
+__global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
+    rows_kernel(const Inputs in, const __grid_constant__ RankTiles rank_tiles, const Prefiltered kept,
+                const ProjectSizes room, const ProjectIds ids, const ProjectOutputs<float> out,
+                unsigned long long* totals, const TurnSums turns) {
+  __shared__ Camera<float> cameras[kMaxViews];
+  __shared__ TripleStage triples[kWarps];
+  __shared__ Sums sums;
+  __shared__ Group group;
+  __shared__ Pending pending;
+  const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
+  const std::int64_t n_gaussians = *kept.count;
+  const int at_once = projected_at_once(in.n_views);
+  const int n_turns = static_cast<int>((n_gaussians + at_once - 1) / at_once);
+  if (blockIdx.x == 0 && thread == 0 && n_turns == 0) end_rows(0, room, ids);
+  if (static_cast<int>(blockIdx.x) > n_turns) return;
+  const bool writes = room.rows > 0;
+  for (int i = thread; i < static_cast<int>(sizeof(Sums) / 4); i += kRowThreads) {
+    reinterpret_cast<unsigned*>(&sums)[i] = 0;
+  }
+  load_cameras(in, cameras);
+  std::int64_t tiles = 0;
+  unsigned of_view = 0;  // rows of view `lane`
+  int turn = turns.first();
+  if (turn < 0) {
+    if (warp == 0 && writes) turns.add_up(n_turns);
+    return;
+  }
+  for (; turn < n_turns; turn = group.next_turn) {
+    const std::int64_t first = turn * std::int64_t{at_once};
+    std::uint32_t maybe = 0;
+    std::int32_t id = -1;
+    if (thread < at_once && first + thread < n_gaussians) {
+      maybe = kept.views[first + thread];
+      id = kept.ids[first + thread];
+    }
+    int n_pairs, p = sum_of_threads_before(__popc(maybe), group, &n_pairs);
+    const Vec3<float> mean = triples[warp].gather(in.means, id, lane),
+                      scale = triples[warp].gather(in.scales, id, lane);
+    std::uint32_t seen = 0;
+    if (maybe) {
+      const ActiveGaussian<float> gaussian = make_gaussian(in, id, mean, scale);
+      for (; maybe; maybe &= maybe - 1, ++p) {
+        const int view = __ffs(maybe) - 1;
+        Row<float> row{};
+        pending.pairs[p] = kNoRow;
+        if (!project_row(cameras[view], gaussian, in.options, &row)) continue;
+        seen |= 1u << view;
+        pending.pairs[p] = static_cast<std::uint16_t>(kMaxViews * thread + view);
+        pending.means2d[p] = {row.mean2d[0], row.mean2d[1]};
+        for (int k = 0; k < 3; ++k) pending.conics[k][p] = row.conic[k];
+        pending.depths[p] = row.depth;
+        pending.opacities[p] = row.opacity;
+        pending.radii[p] = {pixel_radius(row.extent[0]), pixel_radius(row.extent[1])};
+      }
+    }
+    for (int view = 0; view < in.n_views; ++view) {
+      const unsigned seeing = __ballot_sync(kFullWarp, seen >> view & 1u);
+      if (lane == view) of_view += __popc(seeing);
+    }
+    group.seen[thread] = seen;
+    group.ids[thread] = id;
+    __syncthreads();
+    int all;
+    group.before[thread] = sum_of_threads_before((seen != 0) << 16 | __popc(seen), group, &all);
+    const std::int64_t own = std::int64_t{all >> 16} << 31 | (all & 0xffff);
+    if (thread == 0) {
+      if (writes) turns.publish(turn, own);
+      sums.visible += all >> 16;
+      sums.rows += all & 0xffff;
+    }
+    for (p = thread; p < n_pairs; p += kRowThreads) {
+      const int pair = pending.pairs[p];
+      if (pair == kNoRow) continue;
+      const float2 mean2d = pending.means2d[p];
+      const Row<float> row{{mean2d.x, mean2d.y},
+                           {pending.conics[0][p], pending.conics[1][p], pending.conics[2][p]},
+                           pending.depths[p],
+                           pending.opacities[p],
+                           {}};
+      pending.tiles[p] = find_tiles(row, pair % kMaxViews, in, rank_tiles, &pending.ranks[p], sums);
+      tiles += pending.tiles[p];
+    }
+    int next = 0;
+    if (thread == 0) {
+      if (writes) group.of_turns_before = turns.before(turn);
+      next = turns.next();  // not sooner, as others wait for what it will publish
+    }
+    __syncthreads();
+    if (writes) {
+      const std::int64_t before = group.of_turns_before;
+      write_rows(group, before, pending, n_pairs, room, ids, out);
+      if (turn == n_turns - 1 && thread == 0) end_rows(before + own, room, ids);
+    }
+    if (thread == 0) group.next_turn = next;
+    __syncthreads();
+  }
+  if (!totals) return;
+  if (of_view) atomicAdd(&sums.views[lane], of_view);
+  for (int step = 16; step > 0; step /= 2) tiles += __shfl_xor_sync(kFullWarp, tiles, step);
+  if (lane == 0) atomicAdd(&sums.tiles, static_cast<unsigned long long>(tiles));
+  __syncthreads();
+  if (sums.rows > 0) store_sums(sums, in, rank_tiles.n_ranks, totals);
+}
+
+}  // namespace
+
+void write_rows(const Inputs& in, const RankTiles& rank_tiles, const Prefiltered& kept,
+                const ProjectSizes& room, const ProjectColumns<float>& columns, std::int64_t* totals,
+                Workspace& workspace, CudaStream stream) {
+  const ProjectIds& ids = columns.ids;
+  if (totals) {
+    const std::size_t bytes = project_totals(in.n_views, rank_tiles.n_ranks) * sizeof(std::int64_t);
+    check(cudaMemsetAsync(totals, 0, bytes, stream), "project");
+  }
+  if (room.rows == 0 && ids.row_offsets) {
+    check(cudaMemsetAsync(ids.row_offsets, 0, sizeof(*ids.row_offsets), stream), "project");
+    if (!totals) return;
+  }
+  const int at_once = projected_at_once(in.n_views);
+  const std::int64_t turns = std::max<std::int64_t>(1, (in.n_candidates + at_once - 1) / at_once);
+  const std::int64_t blocks = std::min<std::int64_t>(1 + turns, kBlocksPerMultiprocessor * multiprocessors());
+  rows_kernel<<<static_cast<unsigned>(blocks), kRowThreads, 0, stream>>>(
+      in, rank_tiles, kept, room, ids, columns.values, reinterpret_cast<unsigned long long*>(totals),
+      TurnSums(turn_zeros(turns, workspace, stream)));
+  check_launch("project");
+}
+
+}  // namespace blitzgs::cuda

@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splats reach the ranks that composite them, once each, and their gradients return."""
+
+import pytest
+import torch
+
+from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.distributed.transport import LocalTransport, PeerTransport, open_transport
+from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
+from blitzgs.distributed.transport.testing import LoneMemory, RecordingTransport
+from blitzgs.ops.capacity import CapacityEstimate, Sizes
+from blitzgs.ops.intersect import intersect
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_rows
+from blitzgs.ops.scatter import scatter_rows
+from tests.distributed.rank_harness import run_ranks
+from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.helpers import parameter_gradients, sum_of_ranks
+from tests.training.tiny import random_gaussians
+
+WIDTH, HEIGHT, CAMERAS = 100, 60, 2
+TILES = CAMERAS * 7 * 4
+
+
+def scene(n=240, dtype=torch.float32):
+    g = torch.Generator().manual_seed(1)
+    means = torch.randn(n, 3, generator=g) * torch.tensor([1.5, 1.0, 0.5])
+    quats = torch.randn(n, 4, generator=g)
+    scales = torch.randn(n, 3, generator=g) * 0.5 - 3
+    opacities, sh = torch.randn(n, generator=g), torch.randn(n, 1, 3, generator=g)
+    viewmats = torch.eye(4).repeat(CAMERAS, 1, 1)
+    viewmats[:, 2, 3] = torch.tensor([3.0, 4.0])
+    K = torch.tensor([[80.0, 0, 51], [0, 80, 29], [0, 0, 1]])
+    ids = torch.randperm(n, generator=g) + 2**40
+    return ProjectionInputs(
+        [t.to(dtype) for t in (means, quats, scales, opacities, sh)],
+        [t.to(dtype) for t in (viewmats, K.repeat(CAMERAS, 1, 1))],
+        ProjectionOptions(WIDTH, HEIGHT),
+        ids=ids,
+    )
+
+
+def ranges_for(world_size):
+    bounds = {1: (0, TILES), 2: (0, 17, TILES), 4: (0, 9, 9, 40, TILES)}[world_size]
+    return TileRanges(bounds, CAMERAS, WIDTH, HEIGHT, halo=LOSS_HALO)
+
+
+def owned_by(inputs, rank, world_size):
+    """The Gaussians of one rank; at four ranks rank 2 has none."""
+    owner = torch.arange(len(inputs.ids)) % world_size
+    if world_size == 4:
+        owner[owner == 2] = 3
+    mine = owner == rank
+    return inputs._replace(gaussians=[t[mine] for t in inputs.gaussians], ids=inputs.ids[mine])
+
+
+def weight_of(splats):
+    """A number per splat that depends on its id alone."""
+    return (((splats.ids * 2654435761) >> 7) % 1000).to(splats.means2d.dtype) / 1000
+
+
+def gradients_of(splats, rank):
+    """Gradients that depend on a splat and the rank that had it."""
+    w = weight_of(splats)[:, None] * (1 + rank)
+    return [
+        2 * w * splats.means2d, w.expand(-1, 3), 3 * w[:, 0] * splats.opacities**2, 2 * w * splats.colors
+    ]  # fmt: skip
+
+
+def _round_trip(ranks, half, capacity):
+    inputs = owned_by(scene(dtype=torch.float32 if half else torch.float64), ranks.rank, ranks.world_size)
+    transport = open_transport(ranks, half)
+    assignment = TileAssignment(ranks, ranges_for(ranks.world_size))
+    with transport.start(inputs, assignment, capacity) as exchange:
+        got = exchange.receive().splats
+        assert exchange.gradient_table() is None
+        rows, splats, visible, traffic = exchange.finish()
+    assert splats is got and sum(traffic.received) == len(got.ids)
+    for _ in range(2):
+        exchange.expect_gradients()
+        returned = exchange.return_gradients(gradients_of(got, ranks.rank))
+    assert returned.places is None
+    ids = (inputs.ids[rows.gaussian_ids.long()] - 2**40) * CAMERAS + rows.camera_ids
+    return ids, returned.parts, got._asdict(), visible
+
+
+def masks_by_lists(rows, world_size):
+    """Which ranks a splat has to reach, by what intersection lists for each."""
+    masks, ranges = torch.zeros(len(rows.depths), dtype=torch.int64), ranges_for(world_size)
+    for rank in range(world_size):
+        begin, end = ranges.composited(rank)
+        listed, _ = intersect(
+            rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, n_cameras=CAMERAS,
+            width=WIDTH, height=HEIGHT, tile_begin=begin, tile_end=end,
+        )  # fmt: skip
+        masks[listed.long().unique()] |= 1 << rank
+    return masks
+
+
+@pytest.mark.parametrize("world_size", [2, 4])
+@pytest.mark.parametrize("capacity", [None, Sizes(1, 1, 1), Sizes(500, 1000, 1)])
+def test_splats_reach_their_tiles_and_gradients_return(world_size, capacity):
+    whole = scene(dtype=torch.float64)
+    rows = project_rows(whole)
+    masks = masks_by_lists(rows, world_size)
+    assert masks.unique().numel() > 2
+    answers = run_ranks(_round_trip, world_size, False, capacity)
+    ids = torch.cat([a[0] for a in answers])
+    keys = (whole.ids[rows.gaussian_ids.long()] - 2**40) * CAMERAS + rows.camera_ids
+    order, reference = ids.argsort(), keys.argsort()
+    assert torch.equal(ids[order], keys[reference])
+    times = sum(((masks >> m) & 1) * (1 + m) for m in range(world_size)).double()
+    w = times * ((whole.ids[rows.gaussian_ids.long()] * 2654435761 >> 7) % 1000).double() / 1000
+    wanted = [
+        2 * w[:, None] * rows.means2d, w[:, None].expand(-1, 3), 3 * w * rows.opacities**2,
+        2 * w[:, None] * rows.colors,
+    ]  # fmt: skip
+    for i, want in enumerate(wanted):
+        got = torch.cat([a[1][i] for a in answers])[order]
+        torch.testing.assert_close(got, want[reference], rtol=1e-12, atol=1e-12)
+    place = {int(key): row for row, key in enumerate(keys)}
+    for rank, (_, _, received, visible) in enumerate(answers):
+        key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
+        at = torch.tensor([place[int(k)] for k in key], dtype=torch.int64)
+        # Exactly the splats that touch this rank's tiles, once each, unchanged.
+        assert torch.equal(at.sort().values, ((masks >> rank) & 1).nonzero().squeeze(1))
+        for name, column in received.items():
+            if name != "ids":
+                assert torch.equal(column, getattr(rows, name)[at]), name
+        assert torch.equal(visible, torch.bincount(rows.camera_ids, minlength=CAMERAS))
+
+
+def test_half_precision_is_close():
+    answers = run_ranks(_round_trip, 2, True, None)
+    rows = project_rows(scene())
+    keys = (scene().ids[rows.gaussian_ids.long()] - 2**40) * CAMERAS + rows.camera_ids
+    place = {int(key): row for row, key in enumerate(keys)}
+    for _, gradients, received, _ in answers:
+        key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
+        at = torch.tensor([place[int(k)] for k in key])
+        assert torch.equal(received["means2d"], rows.means2d[at])
+        assert torch.equal(received["depths"], rows.depths[at])
+        torch.testing.assert_close(received["colors"], rows.colors[at], rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(received["opacities"], rows.opacities[at], rtol=1e-3, atol=1e-6)
+        scale = (rows.conics[at, 0] * rows.conics[at, 2]).sqrt()[:, None]
+        assert ((received["conics"] - rows.conics[at]).abs() / scale).max() < 4e-3
+        a, b, c = received["conics"].unbind(1)
+        assert (a * c - b * b > 0).all()
+        assert all(g.isfinite().all() for g in gradients)
+    exact = [project_rows(owned_by(scene(), rank, 2)) for rank in range(2)]
+    for rank, (_, gradients, _, _) in enumerate(answers):
+        mine, inputs = exact[rank], owned_by(scene(), rank, 2)
+        masks = masks_by_lists(mine, 2)
+        times = ((masks & 1) + (masks >> 1) * 2).float()
+        ids = inputs.ids[mine.gaussian_ids.long()]
+        w = times * ((ids * 2654435761 >> 7) % 1000).float() / 1000
+        torch.testing.assert_close(gradients[0], 2 * w[:, None] * mine.means2d, rtol=2e-2, atol=1e-4)
+        torch.testing.assert_close(gradients[2], 3 * w * mine.opacities**2, rtol=2e-2, atol=1e-4)
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    """One rank that writes to its own memory, without a GPU: the op that sends is played by another."""
+
+    def send(columns, masks, everyone, rank, buffers, capacity):
+        rows = int(everyone[0, 1])
+        plan = torch.tensor([int(everyone[0, -2]) if rows <= capacity else 0])
+        goes = (masks[:rows] == 1).nonzero().squeeze(1) if rows <= capacity else masks[:0]
+        begin = 0
+        for column in columns:
+            words = column.reshape(len(column), -1).view(torch.int32)
+            target = buffers[0][begin:][: capacity * words.shape[1]].view(capacity, words.shape[1])
+            target[: len(goes)] = words[goes]
+            begin += capacity * words.shape[1]
+        number = torch.arange(rows, dtype=torch.int32)
+        return scatter_rows([number], masks[:rows], [int((masks[:rows] == 1).sum())])[1], plan
+
+    monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", send)
+
+    class Event:
+        def record(self):
+            pass
+
+        def synchronize(self):
+            pass
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", _rasterize_into)
+    return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
+
+
+def _rasterize_into(*arguments):
+    *rest, table, n_rows = arguments
+    table[: int(n_rows)] = 0
+    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_rows)[:5]
+
+
+def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
+    ranges = ranges_for(1)
+    assignment, inputs = TileAssignment(alone, ranges), scene()
+    transport = PeerTransport(alone)
+
+    def attempt(capacity):
+        with transport.start(inputs, assignment, capacity) as exchange:
+            arrived = exchange.receive()
+            assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(exchange.gradient_table())
+            counts = exchange.finish()
+        return (exchange, counts) if counts is not None else None, exchange.needed
+
+    exchange, counts = transport.capacity.run(attempt)
+    assert alone.memory.generation == 2  # the first had no room
+    assert len(alone.memory.buffers[0]) >= len(counts.rows.depths) * WORDS_PER_SPLAT
+    rows = project_rows(inputs)
+    assert all(torch.equal(a, b) for a, b in zip(counts.rows[:11], rows[:11], strict=True))
+    masks = masks_by_lists(rows, 1)
+    assert torch.equal(counts.splats.means2d, rows.means2d[masks == 1])
+    table = exchange.cleared_table()
+    table.copy_(torch.arange(table.numel()).view_as(table))
+    returned = exchange.return_gradients([table])
+    sums = sum_of_ranks(returned, len(rows.depths))
+    assert torch.equal(sums[masks == 1], table) and not sums[masks == 0].any()
+    later, _ = transport.capacity.run(attempt)
+    later.expect_gradients()
+    with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
+        exchange.expect_gradients()
+    # One entry more than there is room for: once more, with room.
+    short = CapacityEstimate(Sizes(1, 1, exchange.needed.isects - 1))
+    again = PeerTransport(alone, short)
+    transport, before = again, alone.memory.generation
+    transport.capacity.run(attempt)
+    assert alone.memory.generation == before + 2
+
+
+def test_a_frame_by_shared_memory_is_the_local_one(alone):
+    table, views = random_gaussians(700), cameras(3)
+    ranges = TileRanges((0, 3 * 60), 3, views.width, views.height)
+    expected = pipeline.forward(table, views, OPTIONS)
+    assignment, transport = TileAssignment(alone, ranges), PeerTransport(alone)
+    for backward_follows in (False, True):
+        frame = pipeline.forward(
+            table, views, OPTIONS, assignment=assignment, transport=transport,
+            backward_follows=backward_follows,
+        )  # fmt: skip
+        assert torch.equal(frame.renders, expected.renders)
+        assert torch.equal(frame.visible, expected.visible)
+
+
+def test_calls_out_of_order_are_refused():
+    exchange = LocalTransport().start(scene(), None, None)
+    with pytest.raises(RuntimeError, match="finish\\(\\) needs an exchange that is RECEIVED, .* STARTED"):
+        exchange.finish()
+    with exchange:
+        exchange.receive()
+        with pytest.raises(RuntimeError, match="receive\\(\\) needs an exchange that is STARTED"):
+            exchange.receive()
+        with pytest.raises(RuntimeError, match="return_gradients\\(\\) needs an exchange that is FINISHED"):
+            exchange.return_gradients([])
+    with pytest.raises(RuntimeError, match="this one is CLOSED"):
+        exchange.finish()
+    with pytest.raises(ValueError, match="serves one rank"):
+        LocalTransport().start(scene(), TileAssignment(Ranks(), ranges_for(1)), None)
+    with pytest.raises(ValueError, match="share no memory"):
+        PeerTransport(Ranks())
+
+
+def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
+    table, views = random_gaussians(300), cameras(2)
+    expected = pipeline.forward(table, views, OPTIONS)
+    transport = RecordingTransport(LocalTransport(), too_small=2)
+    frame = pipeline.forward(table, views, OPTIONS, transport=transport)
+    names = [name for name, _ in transport.calls]
+    assert names == ["start", "receive", "finish"] * 3
+    capacities = [capacity for name, capacity in transport.calls if name == "start"]
+    assert capacities[0] is None and capacities[1].holds(expected.rows.counts)
+    assert torch.equal(frame.renders, expected.renders)
+    v_renders = torch.ones_like(frame.renders)
+    gradients = parameter_gradients(table, frame, v_renders)
+    for got, want in zip(gradients, parameter_gradients(table, expected, v_renders), strict=True):
+        assert torch.equal(got, want)
+    assert transport.calls[-1][0] == "return_gradients"
+    transport.too_small = 10
+    with pytest.raises(RuntimeError, match="4 attempts have each needed more .* needs \\("):
+        pipeline.forward(table, views, OPTIONS, transport=transport)
+    assert transport.too_small == 6

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+import threading
+
+import pytest
+
+from blitzgs.ops.capacity import MOST_ATTEMPTS, CapacityEstimate, Sizes
+
+
+def test_an_estimate_follows_the_largest_of_late():
+    estimate = CapacityEstimate()
+    assert estimate.sizes is None
+    estimate.learn((800, 1600, 0))
+    assert estimate.sizes == (900, 1800, 1)  # some more, and never nothing
+    estimate.learn((80, 3200, 16))
+    assert estimate.sizes == (900 - 900 // 256, 3600, 18)
+    assert estimate.sizes.holds((897, 3600, 18)) and not estimate.sizes.holds((898,))
+    for _ in range(3000):  # forgotten slowly
+        estimate.learn((80, 80, 16))
+    assert estimate.sizes.rows < 400
+
+
+def test_attempts_are_given_what_the_last_one_needed():
+    given = []
+
+    def attempt(capacity):
+        given.append(capacity)
+        needed = Sizes(10, 100, 1000)
+        return ("done" if capacity is not None and capacity.holds(needed) else None), needed
+
+    estimate = CapacityEstimate(Sizes(10, 99, 2000))
+    assert estimate.run(attempt) == "done" and len(given) == 2
+    assert given[1].holds((10, 100, 1000))
+
+
+def test_a_need_that_grows_for_ever_is_an_error():
+    calls = []
+
+    def attempt(capacity):
+        calls.append(capacity)
+        return None, Sizes(1, 10 ** len(calls), 1)
+
+    with pytest.raises(RuntimeError, match=f"{MOST_ATTEMPTS} attempts .* needs \\(1, 10000, 1\\)"):
+        CapacityEstimate().run(attempt)
+    assert len(calls) == MOST_ATTEMPTS
+
+
+def test_an_attempt_that_fails_leaves_the_estimate():
+    estimate = CapacityEstimate(Sizes(1, 2, 3))
+
+    def attempt(capacity):
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        estimate.run(attempt)
+    assert estimate.sizes == (1, 2, 3)
+
+
+def test_threads_may_share_an_estimate():
+    estimate = CapacityEstimate()
+
+    def learn(rows):
+        for _ in range(2000):
+            estimate.learn((1, rows, 1))
+
+    threads = [threading.Thread(target=learn, args=(rows,)) for rows in (8, 80, 80_000)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    estimate.learn((1, 80_000, 1))
+    assert estimate.sizes.rows >= 80_000
