@@ -47,7 +47,8 @@ from quality_plan import RunSpec, parse_named, read_plan, runs_of
 from quality_run import describe, write
 
 EVALUATE_AT = (1_000, 2_000, 4_000, 7_000, 10_000, 15_000, 20_000)
-LOG_LINES = 12
+LOG_LINES = 12  # of a process that died, kept in its result
+TELL_EVERY = 60.0  # seconds between two lines about the runs that are going
 
 
 @dataclass
@@ -148,6 +149,12 @@ def summary(result: dict[str, Any]) -> str:
     )
 
 
+def last_line(job: Job) -> str:
+    """Return what a run printed last."""
+    lines = Path(job.log.name).read_text(errors="replace").split("\n")
+    return next((line.strip() for line in reversed(lines) if line.strip()), "starting")
+
+
 def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
     """Do the runs that are not done, and write the tables as each one ends."""
     left = [spec for spec in specs if not quality_report.is_done(pool.out, spec.name)]
@@ -155,10 +162,11 @@ def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
         f"{len(specs)} runs, {len(specs) - len(left)} of them done before; {len(pool.slots)} at a time",
         flush=True,
     )
-    begin, count, total = time.monotonic(), 0, len(left)
+    begin, count, total, told = time.monotonic(), 0, len(left), 0.0
     try:
         while left or pool.jobs:
-            is_late = minutes is not None and time.monotonic() - begin > 60 * minutes
+            elapsed = time.monotonic() - begin
+            is_late = minutes is not None and elapsed > 60 * minutes
             while left and pool.slots and not is_late:
                 # A result of an earlier try would look like this run's.
                 pool.result_path(left[0]).unlink(missing_ok=True)
@@ -166,11 +174,12 @@ def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
             for job in pool.ended():
                 count += 1
                 result = json.loads(pool.result_path(job.spec).read_text())
-                print(
-                    f"[{count}/{total}, {time.monotonic() - begin:.0f} s] {job.spec.name}: {summary(result)}",
-                    flush=True,
-                )
+                print(f"[{count}/{total}, {elapsed:.0f} s] {job.spec.name}: {summary(result)}", flush=True)
                 quality_report.report(pool.out, plot=False)
+            if elapsed > told + TELL_EVERY:
+                told = elapsed
+                for job in pool.jobs:
+                    print(f"  {elapsed:.0f} s: {job.spec.name}: {last_line(job)}", flush=True)
             if is_late and left and not pool.jobs:
                 print(
                     f"{minutes:g} minutes are over: {len(left)} runs left; the same command continues",

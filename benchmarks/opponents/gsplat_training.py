@@ -109,14 +109,13 @@ def load_strategies() -> Any:
     """
     try:
         import gsplat.strategy as strategies
-        from gsplat.cuda import _torch_impl
         from gsplat.strategy import ops
     except ImportError as error:
         raise ImportError(
             "the opponents gsplat-* need gsplat's strategies: pip install --no-deps gsplat==1.5.3, or put "
             f"its wheel, which is importable as it is, on PYTHONPATH ({error})"
         ) from error
-    relocation.use_in(ops, _torch_impl)
+    relocation.use_in(ops)
     return strategies
 
 

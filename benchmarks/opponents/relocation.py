@@ -52,12 +52,38 @@ def compute_relocation(
     return new.to(opacities.dtype), scales * factor[:, None]
 
 
-def use_in(strategy_ops: Any, torch_reference: Any) -> None:
-    """Let gsplat's strategies call plain PyTorch where they would call CUDA kernels.
+def covariances(
+    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
+) -> tuple[Tensor, None]:
+    """Return R S S^T R^T of each Gaussian, [N, 3, 3], where gsplat calls `quat_scale_to_covar_preci`.
+
+    Written out, because a batched product of matrices this small would take most of a step.
 
     Args:
-        strategy_ops: the module `gsplat.strategy.ops`.
-        torch_reference: the module `gsplat.cuda._torch_impl`, gsplat's own reference of its kernels.
+        quats: [N, 4] (w, x, y, z), need not be normalised.
+        scales: [N, 3], standard deviations.
+        compute_covar: only True.
+        compute_preci: only False.
+        triu: only False.
     """
+    if not compute_covar or compute_preci or triu:
+        raise NotImplementedError("only whole covariance matrices")
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(dim=1)
+    rotation = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    variances = scales.square().unbind(dim=1)
+    entries = [
+        sum(a * b * v for a, b, v in zip(rotation[i], rotation[j], variances, strict=True))
+        for i in range(3)
+        for j in range(3)
+    ]
+    return torch.stack(entries, dim=1).view(-1, 3, 3), None
+
+
+def use_in(strategy_ops: Any) -> None:
+    """Let gsplat's strategies (the module `gsplat.strategy.ops`) call these where they would call CUDA."""
     strategy_ops.compute_relocation = compute_relocation
-    strategy_ops.quat_scale_to_covar_preci = torch_reference._quat_scale_to_covar_preci
+    strategy_ops.quat_scale_to_covar_preci = covariances

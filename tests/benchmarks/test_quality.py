@@ -20,6 +20,7 @@ from opponents import relocation  # noqa: E402
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer  # noqa: E402
 from quality_plan import RunSpec, runs_of  # noqa: E402
 
+from blitzgs.reference.gaussians import covariance_factors  # noqa: E402
 from tests.helpers import DEVICES  # noqa: E402
 from tests.training.tiny import OVERRIDES, tiny_scene, write_tiny_capture  # noqa: E402
 
@@ -160,6 +161,15 @@ def test_relocation_is_equation_9():
     )
 
 
+def test_covariances_are_those_of_the_definition():
+    g = torch.Generator().manual_seed(0)
+    quats, scales = torch.randn(20, 4, generator=g), torch.rand(20, 3, generator=g)
+    factors = covariance_factors(quats.double(), scales.double())
+    found, none = relocation.covariances(quats, scales, compute_preci=False)
+    torch.testing.assert_close(found.double(), factors @ factors.mT, rtol=1e-5, atol=1e-6)
+    assert none is None
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("strategy", ["default", "default-reset", "mcmc"])
 def test_gsplats_strategies_train(capture, strategy, device):
@@ -176,6 +186,7 @@ def test_gsplats_strategies_train(capture, strategy, device):
     assert end["train"]["psnr"] > start["psnr"] and end["train"]["psnr"] > 18
     assert result["peak_gaussians"] >= result["gaussians"] != 400
     assert strategy != "mcmc" or result["gaussians"] == 450
+    assert "gsplat.cuda._backend" not in sys.modules  # which would compile gsplat's extension
 
 
 @pytest.mark.parametrize("reset", [False, True])
