@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `blitzgs train | eval | render | export | synth`, one file per command."""
+"""The command line: `blitzgs train | eval | render | export | gate | synth`, one file per command."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from blitzgs import __version__
-from blitzgs.cli import evaluate, export, render, train
+from blitzgs.cli import evaluate, export, gate, render, train
 from blitzgs.cli.arguments import add_command
 from blitzgs.distributed.group import MismatchError
 from blitzgs.scene.synth import command as synth
@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="blitzgs", description="City-scale 3D Gaussian Splatting.")
     parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for command in (train, evaluate, render, export):
+    for command in (train, evaluate, render, export, gate):
         command.add_to(commands)
     city = add_command(commands, "synth", synth.run, "generate a synthetic city to train on")
     synth.add_arguments(city)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +47,7 @@ class Spawns:
         survived: bool [K].
         parents: int64 [K].
         positions: float32 [K, 3], where they were born.
+        initial_survival: share of the run's initial Gaussians that reached its final model.
     """
 
     name: str
@@ -54,12 +57,23 @@ class Spawns:
     survived: NDArray[np.bool_]
     parents: NDArray[np.int64]
     positions: NDArray[np.float32]
+    initial_survival: float = math.nan
 
     @property
     def times(self) -> NDArray[np.float32]:
         """When they were born, images."""
         times: NDArray[np.float32] = self.features[:, FEATURES.index("time")]
         return times
+
+    def only(self, rows: NDArray[np.bool_]) -> Spawns:
+        """Return some of the spawns."""
+        return dataclasses.replace(
+            self,
+            features=self.features[rows],
+            survived=self.survived[rows],
+            parents=self.parents[rows],
+            positions=self.positions[rows],
+        )
 
 
 def read_spawns(folder: Path) -> Spawns:
@@ -77,7 +91,8 @@ def read_spawns(folder: Path) -> Spawns:
     about = json.loads((folder / ABOUT).read_text())
     births, deaths = tables["births"], tables["deaths"]
     spawned = births["parent"] >= 0
-    survived = ~np.isin(births["id"][spawned], deaths["id"])
+    alive = ~np.isin(births["id"], deaths["id"])
+    survived = alive[spawned]
     if not len(survived) or survived.all() or not survived.any():
         raise ValueError(
             f"{folder}: {int(survived.sum()):,} of {len(survived):,} spawns survived; a gate needs a "
@@ -91,6 +106,7 @@ def read_spawns(folder: Path) -> Spawns:
         survived=survived,
         parents=births["parent"][spawned],
         positions=np.stack([births[axis][spawned] for axis in "xyz"], 1),
+        initial_survival=float(alive[~spawned].mean()),
     )
 
 
@@ -155,16 +171,7 @@ def fit(runs: Sequence[Spawns], path: Path, seed: int = 0) -> dict[str, Any]:
 def judge(run: Spawns, scores: NDArray[Any], rows: NDArray[np.bool_] | None = None) -> dict[str, Any]:
     """Return how scores separate the spawns of a run (or some of them) that survived from the others."""
     if rows is not None:
-        run = Spawns(
-            run.name,
-            run.scene,
-            run.schedule,
-            run.features[rows],
-            run.survived[rows],
-            run.parents[rows],
-            run.positions[rows],
-        )
-        scores = scores[rows]
+        run, scores = run.only(rows), scores[rows]
     name, single = best_feature(run)
     return {
         "run": run.name,

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from blitzgs.charts import line_chart
 from blitzgs.output import write_file
 from blitzgs.training.run import peak_memory_bytes
 from blitzgs.training.run_log import LOG
@@ -67,11 +67,11 @@ def describe(report: dict[str, Any]) -> str:
 
 def write_picture(state: TrainingState, report: dict[str, Any]) -> None:
     """Draw the population over time into the run's folder, from its log; on rank 0."""
-    points = [(0, report["initial"])] if "initial" in report else []
+    points: list[tuple[float, float]] = [(0, report["initial"])] if "initial" in report else []
     points += _logged(state.folder / LOG)
     points.append((state.images_seen, report["final"]))
     try:
-        write_file(state.folder / PICTURE, draw(points))
+        write_file(state.folder / PICTURE, line_chart({"": points}, "images", "Gaussians"))
     except OSError as error:
         warnings.warn(f"the population's picture was not written: {error}", stacklevel=2)
 
@@ -88,43 +88,3 @@ def _logged(path: Path) -> list[tuple[int, int]]:
         if record.get("event") in ("densify", "pass_1", "pass_2"):
             points.append((record["t"], record["gaussians"]))
     return points
-
-
-def draw(points: Sequence[tuple[int, int]]) -> str:
-    """Return a line chart of (images, Gaussians) as SVG."""
-    width, height, left, top, bottom = 720, 360, 70, 30, 45
-    last = max(max(t for t, _ in points), 1)
-    most = _nice(max(max(n for _, n in points), 1))
-    inner_width, inner_height = width - left - 20, height - top - bottom
-
-    def place(t: float, n: float) -> tuple[float, float]:
-        return left + inner_width * t / last, top + inner_height * (1 - n / most)
-
-    lines = []
-    for k in range(5):
-        (x, y), (column, _) = place(0, most * k / 4), place(last * k / 4, 0)
-        lines.append(f'<path d="M{x:.1f} {y:.1f}H{width - 20}" stroke="#ddd"/>')
-        lines.append(f'<text x="{x - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{_short(most * k / 4)}</text>')
-        below = height - bottom + 18
-        lines.append(f'<text x="{column:.1f}" y="{below}" text-anchor="middle">{_short(last * k / 4)}</text>')
-    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(t, n) for t, n in points))
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif" '
-        f'font-size="12"><rect width="{width}" height="{height}" fill="white"/>{"".join(lines)}'
-        f'<polyline points="{path}" fill="none" stroke="#1f77b4" stroke-width="2"/>'
-        f'<text x="{left}" y="18">Gaussians</text>'
-        f'<text x="{width - 20}" y="{height - 8}" text-anchor="end">images</text></svg>\n'
-    )
-
-
-def _nice(value: float) -> float:
-    """Round up to 1, 2 or 5 times a power of ten."""
-    size = 10.0 ** (len(str(int(value))) - 1)
-    return next(step * size for step in (1, 2, 5, 10) if step * size >= value)
-
-
-def _short(value: float) -> str:
-    for size, unit in ((1e6, "M"), (1e3, "k")):
-        if value >= size:
-            return f"{value / size:.3g}{unit}"
-    return f"{value:.3g}"

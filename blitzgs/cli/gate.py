@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs gate fit | evaluate | replay`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device
+from blitzgs.distributed.group import Ranks
+from blitzgs.population import gate_evaluation, gate_fit
+from blitzgs.population.spawn_gate import SpawnGate
+from blitzgs.training import run as run_folder
+from blitzgs.training.config_io import ConfigError, load_config
+from blitzgs.training.gate_replay import replay
+from blitzgs.training.inputs import open_capture
+
+HELP = """\
+The spawn gate: a predictor, fitted on the lineage of finished runs, that withholds candidates of
+densification which are not going to survive.
+
+  blitzgs train ... --population.lineage=true       log births and deaths (for each scene)
+  blitzgs gate fit RUN RUN RUN --out gate.json      fit on them; figures of scenes left out
+  blitzgs gate evaluate gate.json RUN --out DIR     judge it on a scene that it has not seen
+  blitzgs gate replay gate.json RUN --out DIR       compare it with an oracle and with chance
+  blitzgs train ... --population.gate=gate.json     use it
+"""
+
+
+def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = add_command(commands, "gate", lambda _: 2, "fit and judge spawn gates", HELP)
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
+    fit.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage")
+    fit.add_argument("--out", type=Path, required=True, metavar="FILE", help="model, .json or .ubj")
+    judge = add_command(actions, "evaluate", run_evaluate, "judge a gate on the lineage of runs")
+    judge.add_argument("gate", type=Path, metavar="GATE", help="model file")
+    judge.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage")
+    judge.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets figures and pictures")
+    again = add_command(actions, "replay", run_replay, "train from one checkpoint with several vetoes")
+    again.add_argument("gate", type=Path, metavar="GATE", help="model file")
+    again.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
+    again.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a run for each veto")
+    again.add_argument("--rate", type=float, default=0.6, help="share that is vetoed (%(default)s)")
+    add_capture(again)
+    add_device(again)
+
+
+def run_fit(args: argparse.Namespace) -> int:
+    """Fit a gate; returns the exit status."""
+    if args.out.suffix not in (".json", ".ubj"):
+        raise ValueError(f"--out {args.out}: a gate's file ends in .json or .ubj")
+    runs = [gate_fit.read_spawns(_lineage(folder)) for folder in args.runs]
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    figures = gate_fit.fit(runs, args.out)
+    print(f"{args.out}: fitted on {len(runs)} runs; {figures['protocol']}:")
+    for entry in figures["held_out"]:
+        print(f"  {_judgement(entry)}")
+    return 0
+
+
+def run_evaluate(args: argparse.Namespace) -> int:
+    """Judge a gate; returns the exit status."""
+    gate = SpawnGate(args.gate)
+    runs = [gate_fit.read_spawns(_lineage(folder)) for folder in args.runs]
+    args.out.mkdir(parents=True, exist_ok=True)
+    schedule = load_config(args.runs[0] / run_folder.CONFIG).schedule
+    results = gate_evaluation.evaluate(gate, runs, schedule.gate_from * schedule.scale, args.out)
+    (args.out / "evaluation.json").write_text(json.dumps(results, indent=1) + "\n")
+    for result in results:
+        seen = "  (the gate was fitted on this scene)" if result["seen"] else ""
+        regions = f"  regions r {result['regions']['r']:.2f}" if "regions" in result else ""
+        print(_judgement(result) + regions + seen)
+    print(f"{args.out}: evaluation.json, survival.svg and maps of regions")
+    return 0
+
+
+def run_replay(args: argparse.Namespace) -> int:
+    """Train the arms; returns the exit status."""
+    if not 0 <= args.rate <= 1:
+        raise ValueError(f"--rate: must be in [0, 1], got {args.rate}")
+    gate = SpawnGate(args.gate)
+    if not (args.folder / run_folder.CONFIG).exists():
+        raise ConfigError(f"{args.folder} is not a run: it has no {run_folder.CONFIG}")
+    overrides = [] if args.data is None else [f"data.path={json.dumps(args.data)}"]
+    config = load_config(args.folder / run_folder.CONFIG, overrides)
+    results: list[dict[str, Any]] = []
+    with Ranks.from_environment(
+        args.device, config.ranks.timeout_seconds, "auto", config.ranks.share_gpus
+    ) as ranks:
+        capture, images = open_capture(config, ranks)
+        for result in replay(config, capture, images, args.folder, args.out, gate, args.rate, ranks):
+            results.append(result)
+            if ranks.rank == 0:
+                (args.out / "replay.json").write_text(json.dumps(results, indent=1) + "\n")
+                (args.out / "replay.md").write_text(_table(results))
+        if ranks.rank == 0:
+            print(_table(results))
+    return 0
+
+
+def _lineage(folder: Path) -> Path:
+    return folder / run_folder.LINEAGE
+
+
+def _judgement(entry: dict[str, Any]) -> str:
+    return (
+        f"{entry['run']}: AUC {entry['auc']:.3f}, best single feature {entry['best_feature']} "
+        f"{entry['best_feature_auc']:.3f}; {entry['spawns']:,} spawns, {entry['survived']:.0%} survived"
+    )
+
+
+def _table(results: Sequence[dict[str, Any]]) -> str:
+    """Return the arms as a Markdown table, against the first."""
+    first = results[0]
+    lines = ["| arm | PSNR | difference | SSIM | peak | difference | final | s | known |", "|---" * 9 + "|"]
+    for row in results:
+        known = f"{row['matched']:.0%}" if "matched" in row else ""
+        lines.append(
+            f"| {row['arm']} | {row['psnr']:.3f} | {row['psnr'] - first['psnr']:+.3f} | {row['ssim']:.4f} "
+            f"| {row['peak']:,} | {row['peak'] / first['peak'] - 1:+.1%} | {row['final']:,} "
+            f"| {row['seconds']:.1f} | {known} |"
+        )
+    return "\n".join(lines) + "\n"

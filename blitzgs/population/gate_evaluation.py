@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well a gate tells which spawns of a run survive: transfer AUC, survival by birth time and by region."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from blitzgs.charts import line_chart, maps
+from blitzgs.population.gate_fit import Spawns, judge
+from blitzgs.population.spawn_gate import SpawnGate
+
+COHORTS = 15
+# Cells of a map along its longer side, and the spawns without which a cell says nothing.
+CELLS, LEAST_IN_CELL = 32, 30
+
+
+def evaluate(gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, folder: Path) -> list[dict[str, Any]]:
+    """Judge a gate on runs, and draw survival.svg and regions_NAME.svg.
+
+    Args:
+        gate: the gate.
+        runs: each with a schedule of its own, perhaps, such as a conservative one.
+        gate_from: only spawns born from here on are in the maps, images; those that a gate would judge.
+        folder: gets the pictures.
+
+    Returns:
+        For each run: `gate_fit.judge` of all its spawns, whether the gate was fitted on its scene, the share
+        of initial Gaussians and of each birth cohort that survived, and `regions`.
+    """
+    results, curves = [], {}
+    for run in runs:
+        scores = gate.scores(torch.from_numpy(run.features)).double().numpy()
+        late = run.times >= gate_from
+        cohorts = survival_by_cohort(run)
+        result = judge(run, scores) | {
+            "seen": run.scene in gate.info.scenes.values(),
+            "initial_survival": run.initial_survival,
+            "cohorts": cohorts,
+        }
+        if late.any():
+            where, actual, predicted = region_rates(run.only(late), scores[late])
+            result["regions"] = {"cells": int(where.sum()), "r": correlation(actual[where], predicted[where])}
+            picture = maps({"survived": actual, "predicted at birth, as many": predicted})
+            (folder / f"regions_{run.name}.svg").write_text(picture)
+        curves[run.name] = [(entry["until"], entry["survived"]) for entry in cohorts]
+        results.append(result)
+    chart = line_chart(curves, "born at, images", "share that reaches the final model", most=1.0)
+    (folder / "survival.svg").write_text(chart)
+    return results
+
+
+def survival_by_cohort(run: Spawns) -> list[dict[str, float]]:
+    """Return, for equal stretches of birth time, how many were born and which share of them survived."""
+    edges = np.linspace(run.times.min(), run.times.max(), COHORTS + 1)
+    cohort = np.clip(np.searchsorted(edges, run.times, side="left") - 1, 0, COHORTS - 1)
+    found = []
+    for k in range(COHORTS):
+        mine = run.survived[cohort == k]
+        if len(mine):
+            found.append({"until": float(edges[k + 1]), "born": len(mine), "survived": float(mine.mean())})
+    return found
+
+
+def region_rates(
+    run: Spawns, scores: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Return survival by region, seen from the side that shows most.
+
+    The predicted survivors are as many as there were, those of the highest scores.
+
+    Returns:
+        Which cells have enough spawns, bool [rows, columns]; their actual and predicted shares of survivors,
+        NaN in the others.
+    """
+    predicted = np.zeros(len(scores), bool)
+    predicted[np.argsort(-scores, kind="stable")[: int(run.survived.sum())]] = True
+    low, high = np.quantile(run.positions, (0.01, 0.99), axis=0)
+    axes = np.sort(np.argsort(high - low)[1:])
+    size = max(float((high - low)[axes].max()) / CELLS, 1e-12)
+    shape = [max(1, math.ceil(float((high - low)[axis]) / size)) for axis in axes]
+    columns, rows = (
+        np.clip(((run.positions[:, axis] - low[axis]) / size).astype(int), 0, length - 1)
+        for axis, length in zip(axes, shape, strict=True)
+    )
+    cell = rows * shape[0] + columns
+    counts, actual, expected = (
+        np.bincount(cell, weights, minlength=shape[0] * shape[1]).reshape(shape[1], shape[0])
+        for weights in (None, run.survived.astype(float), predicted.astype(float))
+    )
+    where = counts >= LEAST_IN_CELL
+    empty = np.where(where, counts, np.nan)
+    return where, actual / empty, expected / empty
+
+
+def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Return Pearson's r; NaN where one of the two does not vary."""
+    if len(a) < 2 or a.std() == 0 or b.std() == 0:
+        return math.nan
+    return float(np.corrcoef(a, b)[0, 1])

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a gate is worth: arms that all go on from one checkpoint before its onset (paper, oracle analysis).
+
+- reference: no veto. Its lineage labels each spawn event, (parent, time, clone or split): non-surviving if
+  and only if none of its children is in the final model.
+- oracle: vetoes exactly the candidates so labelled; oracle_rate: of these, no more than the gate's share.
+- gate: the learned ranking; random: as many at random.
+
+Where training repeats bit for bit (on the CPU, or with model.deterministic), the first vetoes of the oracle
+meet exactly the events of the reference; later ones may differ, because what is withheld changes the rest.
+Candidates that the reference did not have are never vetoed by an oracle, and `matched` says how many it knew.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.selection import smallest
+from blitzgs.ops.counter_random import hash_keys, uniform
+from blitzgs.population.candidates import Candidates, Veto
+from blitzgs.population.lineage import read_lineage
+from blitzgs.population.spawn_gate import RandomVeto, RankVeto, SpawnGate
+from blitzgs.scene.capture import Capture
+from blitzgs.training import run
+from blitzgs.training.batches import Images
+from blitzgs.training.checkpoint import MANIFEST
+from blitzgs.training.config import Config
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.trainer import Trainer
+
+REFERENCE = "reference"
+
+
+class OracleVeto:
+    """Vetoes candidates that did not survive in another run.
+
+    Attributes:
+        seen: candidates so far, on this rank.
+        matched: those that the other run had, too.
+    """
+
+    def __init__(self, known: Tensor, dead: Tensor, rate: float | None, seed: int) -> None:
+        """Remember a run.
+
+        Args:
+            known: int64 [K], `event_keys` of its spawn events.
+            dead: int64 [D], those of its non-surviving ones.
+            rate: of the candidates, clones and splits apart, veto at most this share; None: any number.
+            seed: of the draws among the dead where there are more.
+        """
+        self._known, self._dead, self._rate, self._seed = known, dead, rate, seed
+        self.seen = self.matched = 0
+
+    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Tell which candidates are vetoed, bool [M]. Collective."""
+        keys = event_keys(candidates.parents, candidates.time, candidates.is_split)
+        self.seen += len(keys)
+        self.matched += int(torch.isin(keys, self._known.to(keys.device)).sum())
+        dead = torch.isin(keys, self._dead.to(keys.device))
+        if self._rate is None:
+            return dead
+        vetoed = torch.zeros_like(dead)
+        for group in (~candidates.is_split, candidates.is_split):
+            counts = torch.stack((group.sum(), (group & dead).sum()))
+            total, dying = ranks.all_reduce(counts).tolist()
+            most = math.ceil(Fraction(repr(self._rate)) * total)
+            rows = (group & dead).nonzero().squeeze(1)
+            draws = uniform(self._seed, candidates.time, candidates.parents[rows]).float()
+            vetoed[rows] = smallest(draws, candidates.parents[rows], min(most, dying), ranks)
+        return vetoed
+
+
+def event_keys(parents: Tensor, times: Tensor | int, is_split: Tensor) -> Tensor:
+    """Return a hash, int64, of the spawn events (parent, time, clone or split)."""
+    return hash_keys(parents, times, is_split.long())
+
+
+def label_events(lineage: Path) -> tuple[Tensor, Tensor]:
+    """Read the spawn events of a run: the keys of all, and of those none of whose children survived."""
+    tables = read_lineage(lineage)
+    births, deaths = tables["births"], tables["deaths"]
+    spawned = births["parent"] >= 0
+    parents, times, splits = (
+        torch.from_numpy(births[name][spawned]) for name in ("parent", "time", "is_split")
+    )
+    keys = event_keys(parents, times.long(), splits.bool()).numpy()
+    survived = ~np.isin(births["id"][spawned], deaths["id"])
+    known = np.unique(keys)
+    alive = np.unique(keys[survived])
+    return torch.from_numpy(known), torch.from_numpy(np.setdiff1d(known, alive))
+
+
+def branch_point(folder: Path, config: Config) -> Path:
+    """Return the last checkpoint of a run before the gate's onset.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    schedule, found = Schedule(config.schedule), []
+    for manifest in (folder / run.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
+        step = json.loads(manifest.read_text())["state"]["progress"]["step"]
+        # Events before the end of a step belong to it.
+        if not schedule.gates(step * schedule.batch_size - 1):
+            found.append((step, manifest.parent))
+    if not found:
+        raise FileNotFoundError(
+            f"{folder} has no checkpoint from before the gate's onset (schedule.gate_from "
+            f"{config.schedule.gate_from}): train it with --population.lineage=true "
+            f"--schedule.checkpoint_every={max(config.schedule.gate_from // 2, 1)} --log.keep_checkpoints=100"
+        )
+    return max(found)[1]
+
+
+def replay(
+    config: Config,
+    capture: Capture,
+    images: Images,
+    source: Path,
+    out: Path,
+    gate: SpawnGate,
+    rate: float,
+    ranks: Ranks,
+) -> Iterator[dict[str, Any]]:
+    """Train every arm to the end, one after the other. Collective.
+
+    Args:
+        config: of the run that is branched, with `population.lineage`.
+        capture: of the run.
+        images: of the capture.
+        source: folder of the run.
+        out: gets a folder for each arm.
+        gate: the learned ranking.
+        rate: share that is vetoed.
+        ranks: the job.
+
+    Yields:
+        For each arm, when it is trained: its name, psnr, ssim, peak and final Gaussians, the seconds of
+        training since the branch, the reference's share of non-surviving events (`dead`), and of an oracle
+        the share of the candidates that it knew (`matched`).
+
+    Raises:
+        ValueError: the run logged no lineage.
+        FileNotFoundError: it has no checkpoint from before the onset.
+    """
+    if not config.population.lineage:
+        raise ValueError(
+            f"{source} was trained without --population.lineage=true: there is nothing to branch"
+        )
+    point = branch_point(source, config)
+
+    def train(name: str, veto: Veto | None) -> dict[str, Any]:
+        folder = out / name
+        if ranks.rank == 0:
+            shutil.copytree(point, folder / run.CHECKPOINTS / point.name)
+        ranks.barrier()
+        trainer = Trainer(config, capture, images, folder, ranks, resume=True)
+        trainer.state.veto, began = veto, trainer.state.progress.seconds
+        summary = trainer.train()
+        if summary is None:
+            raise InterruptedError(f"arm {name} was stopped by a signal")
+        return {
+            "arm": name,
+            "psnr": summary["psnr"],
+            "ssim": summary["ssim"],
+            "peak": summary["peak_gaussians"],
+            "final": summary["gaussians"],
+            "seconds": summary["seconds"] - began,
+        }
+
+    reference = train(REFERENCE, None)
+    known, dead = label_events(out / REFERENCE / run.LINEAGE)
+    yield reference | {"dead": len(dead) / max(1, len(known))}
+    for name, cap in (("oracle", None), ("oracle_rate", rate)):
+        oracle = OracleVeto(known, dead, cap, config.seed)
+        result = train(name, oracle)
+        counts = torch.tensor([oracle.matched, oracle.seen], device=ranks.device)
+        matched, seen = ranks.all_reduce(counts).tolist()
+        yield result | {"matched": matched / max(1, seen)}
+    yield train("gate", RankVeto(gate, rate))
+    yield train("random", RandomVeto(rate, config.seed))

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blitzgs gate`: from the lineage of runs to a gate, its figures and its replay."""
+
+import json
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.cli import main
+from blitzgs.distributed.group import Ranks
+from blitzgs.population.candidates import Candidates
+from blitzgs.population.gate_evaluation import correlation, region_rates, survival_by_cohort
+from blitzgs.population.gate_fit import read_spawns
+from blitzgs.training.gate_replay import OracleVeto, event_keys, label_events
+from tests.population.test_spawn_gate import candidates, spawns
+from tests.training.tiny import OVERRIDES, write_tiny_capture
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("xgboost")
+# Density events at 20, 40, 60 and 80; the gate judges from 60 on, a checkpoint lies at 50.
+SETTINGS = (
+    "population.lineage=true",
+    "population.grad_threshold=1e-4",
+    "population.importance=true",
+    "schedule.t1=40",
+    "schedule.t2=90",
+    "schedule.gate_from=60",
+    "schedule.checkpoint_every=50",
+    "log.keep_checkpoints=9",
+    "log.pictures=0",
+)
+
+
+@pytest.fixture(scope="module")
+def lineage_run(tmp_path_factory):
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("gate")
+    write_tiny_capture(folder / "capture")
+    flags = [f"--{text}" for text in (*OVERRIDES, *SETTINGS)]
+    assert main(["train", "--data", str(folder / "capture"), "--out", str(folder / "run"), *flags]) == 0
+    return folder
+
+
+def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
+    folder, run = lineage_run, str(lineage_run / "run")
+    gate = str(tmp_path / "gates" / "tiny.json")
+    assert main(["gate", "fit", run, "--out", gate]) == 0
+    assert "a quarter of the parents held out:\n  capture: AUC 0." in capsys.readouterr().out
+    assert main(["gate", "evaluate", gate, run, "--out", str(tmp_path / "judged")]) == 0
+    assert "the gate was fitted on this scene" in capsys.readouterr().out
+    (entry,) = json.loads((tmp_path / "judged" / "evaluation.json").read_text())
+    own = read_spawns(folder / "run" / "lineage")
+    assert entry["spawns"] == len(own.survived) and entry["seen"]
+    assert sum(cohort["born"] for cohort in entry["cohorts"]) == entry["spawns"]
+    for name in ("survival.svg", "regions_capture.svg"):
+        ElementTree.parse(tmp_path / "judged" / name)
+
+    assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay"), "--rate", "0.5"]) == 0
+    arms = {row["arm"]: row for row in json.loads((tmp_path / "replay" / "replay.json").read_text())}
+    assert list(arms) == ["reference", "oracle", "oracle_rate", "gate", "random"]
+    # Training repeats: the reference is the run itself.
+    summary = json.loads((folder / "run" / "summary.json").read_text())
+    assert arms["reference"]["psnr"] == summary["psnr"]
+    assert arms["reference"]["final"] == summary["gaussians"]
+    assert 0 < arms["reference"]["dead"] < 1
+    assert arms["oracle"]["matched"] > 0.5
+    for name in ("oracle", "oracle_rate", "gate", "random"):
+        assert arms[name]["peak"] < arms["reference"]["peak"]
+    table = (tmp_path / "replay" / "replay.md").read_text()
+    assert table.count("\n") == 7 and table in capsys.readouterr().out
+    # The first gated event is that of the reference, so the oracle knows each candidate there.
+    records = [
+        json.loads(line) for line in (tmp_path / "replay" / "oracle" / "log.jsonl").read_text().splitlines()
+    ]
+    assert [r["t"] for r in records if r.get("event") == "densify"] == [60, 80]
+
+
+def test_what_is_missing_is_named(lineage_run, tmp_path, capsys):
+    assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.json")]) == 1
+    assert "holds no lineage: train with --population.lineage=true" in capsys.readouterr().err
+    assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.txt")]) == 1
+    assert "a gate's file ends in .json or .ubj" in capsys.readouterr().err
+    assert main(["gate", "evaluate", str(tmp_path / "g.json"), "x", "--out", str(tmp_path)]) == 1
+    assert "g.meta.json is missing: a gate is a model and its metadata" in capsys.readouterr().err
+
+
+def test_events_are_labelled_by_their_children(lineage_run):
+    known, dead = label_events(lineage_run / "run" / "lineage")
+    own = read_spawns(lineage_run / "run" / "lineage")
+    lives = {}
+    for parent, row, survived in zip(own.parents, own.features, own.survived, strict=True):
+        lives.setdefault((parent, row[6], row[7]), []).append(survived)
+    assert len(known) == len(lives)
+    assert len(dead) == sum(not any(children) for children in lives.values())
+    parent, time, split = next(key for key, children in lives.items() if not any(children))
+    key = event_keys(torch.tensor([parent]), int(time), torch.tensor([bool(split)]))
+    assert torch.isin(key, dead).all()
+
+
+def test_an_oracle_vetoes_the_dead_it_knows():
+    some = candidates(200)
+    keys = event_keys(some.parents, some.time, some.is_split)
+    known, dead = keys[:150], keys[:120]
+    oracle = OracleVeto(known, dead, None, 0)
+    assert torch.equal(oracle(some, Ranks()), torch.arange(200) < 120)
+    assert (oracle.seen, oracle.matched) == (200, 150)
+    capped = OracleVeto(known, dead, 0.3, 0)(some, Ranks())
+    assert not capped[120:].any()
+    for group in (some.is_split, ~some.is_split):
+        assert capped[group].sum() == -int(-0.3 * int(group.sum()) // 1)
+    later = Candidates(some.parents, some.is_split, some.features, some.time + 100)
+    assert not OracleVeto(known, dead, None, 0)(later, Ranks()).any()
+
+
+def test_regions_and_cohorts_of_a_known_picture():
+    run = spawns("a", 60_000)
+    run.positions[:, 2] *= 0.01  # seen from above
+    run.survived[:] = run.positions[:, 0] > 0.5
+    where, actual, predicted = region_rates(run, run.positions[:, 0].astype(float))
+    assert where.all() and 30 <= actual.shape[1] <= 32
+    assert (actual[:, :10] == 0).all() and (actual[:, -10:] == 1).all()
+    assert correlation(actual[where], predicted[where]) > 0.99
+    assert np.isnan(correlation(np.ones(3), np.arange(3.0)))
+    assert sum(c["born"] for c in survival_by_cohort(run)) == 60_000
