@@ -25,6 +25,7 @@ _MANTISSA_BITS = 23
 # An integer weight as a key: its exponent, then all the bits behind the leading one.
 _WEIGHT_BITS = 56
 _WEIGHT_DIGITS = (12, 13, 13, 12, 12)
+_SPREAD = 256
 
 
 def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor:
@@ -150,10 +151,11 @@ def integer_mass_prefix(
         raise ValueError(
             f"integer_mass_prefix: fraction must be in [0, 1] with at most 9 decimals, got {fraction}"
         )
-    totals = weights.new_zeros(n_segments + 1)
-    totals.index_add_(0, segments, weights)
-    totals[-1] = ((weights < 0) | (weights >> (_WEIGHT_BITS + 1) > 0)).sum()
-    ranks.all_reduce(totals)
+    # Spread over many sums for each segment, because additions to one address wait for each other.
+    lanes = segments * _SPREAD + torch.arange(len(weights), device=weights.device) % _SPREAD
+    spread = weights.new_zeros(n_segments * _SPREAD).index_add_(0, lanes, weights)
+    invalid = ((weights < 0) | (weights >> (_WEIGHT_BITS + 1) > 0)).sum()
+    totals = ranks.all_reduce(torch.cat((spread.view(n_segments, _SPREAD).sum(1), invalid[None])))
     if n_invalid := int(totals[-1]):
         raise ValueError(f"integer_mass_prefix: {n_invalid} weights are negative or not below 2^57")
     totals = totals[:-1]
@@ -301,7 +303,12 @@ def _with_ties(
     """Mark the rows below their segment's threshold and, of those equal to it, the `left` smallest ids."""
     limit = threshold[segments]
     tied = (keys == limit).nonzero().squeeze(1)
-    last, _ = _kth(ids[tied], _ID_DIGITS, left, segments[tied], ranks)
     chosen = keys < limit
+    counts = torch.zeros_like(left).index_add_(0, segments[tied], torch.ones_like(tied))
+    if not bool((ranks.all_reduce(counts) > left).any()):
+        # The usual case: nobody has to go without.
+        chosen[tied] = True
+        return chosen
+    last, _ = _kth(ids[tied], _ID_DIGITS, left, segments[tied], ranks)
     chosen[tied] = ids[tied] <= last[segments[tied]]
     return chosen
