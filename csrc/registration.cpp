@@ -151,6 +151,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
       "weight) -> ()");
 
+  // Noise on the means of almost transparent Gaussians.
+  m.def(
+      "position_noise_(Tensor(a!) means, Tensor quats, Tensor scales, Tensor opacities, Tensor ids, Tensor "
+      "visible_ids, int seed, int step, float threshold, float strength) -> ()");
+
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
 

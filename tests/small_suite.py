@@ -70,6 +70,7 @@ TESTS = [
         "scatter.py::test_rows_reach_their_groups[6000-cuda]",
         "scatter.py::test_sums_follow_the_rows_back[5000-cuda]",
         "density_stats.py::test_matches_the_definition[True-cuda]",
+        "position_noise.py::test_matches_the_formula[cuda]",
         "knn_distances.py::test_matches_a_kd_tree[uniform-3-cuda]",
         "knn_distances.py::test_small_clouds[cuda]",
         "take_rows.py::test_bits_and_unaligned_columns[cuda]",

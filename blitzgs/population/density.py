@@ -36,6 +36,9 @@ class DensityRules:
         max_screen_radius: pixels; Gaussians larger on screen since the last event are pruned. None: not.
         max_scale: Gaussians with a larger axis are pruned. None: not.
         max_gaussians: the event's growth stops here. None: no cap.
+        min_observations: a Gaussian is judged once it has been seen this often; until then its statistics go
+            on growing over events. A mean of few gradients is noise, and the largest of many such means would
+            turn noise into Gaussians.
     """
 
     grad_threshold: float
@@ -44,6 +47,7 @@ class DensityRules:
     max_screen_radius: float | None = None
     max_scale: float | None = None
     max_gaussians: int | None = None
+    min_observations: int = 1
 
 
 @dataclass(frozen=True)
@@ -70,9 +74,10 @@ def densify(
     veto: Veto | None = None,
     lineage: Lineage | None = None,
 ) -> DensityReport:
-    """Run one density event on a table whose rows have all been caught up, and reset its statistics.
+    """Run one density event on a table whose rows have all been caught up, and reset the statistics it used.
 
-    A candidate's mean gradient `grad_sum / grad_count` reaches the threshold. A small one gets a copy; a
+    A candidate has been seen `min_observations` times, and its mean gradient `grad_sum / grad_count` reaches
+    the threshold. A small one gets a copy; a
     large one gives way to two children drawn from it, 1.6 times smaller. Children take their parent's level
     (copy) or the next one (split), its phi and cull row, fresh moments, and an id that follows from the
     parent's id, `time` and the child's slot alone, as do their random positions: the outcome does not depend
@@ -92,7 +97,7 @@ def densify(
         lineage: logs births and deaths, or None.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
-    candidates = gradient >= rules.grad_threshold
+    candidates = (gradient >= rules.grad_threshold) & (table["grad_count"] >= rules.min_observations)
     wanted, vetoed = candidates.sum(), 0
     small = table["scales"].amax(dim=1) <= math.log(rules.clone_scale)
     if veto is not None:
@@ -123,8 +128,10 @@ def densify(
     )
     means = torch.cat((table["means"], new["means"])).index_select(0, rows)
     table.renew(rows[morton_order(means)], new)
-    for name in ("grad_sum", "grad_count", "max_radii"):
-        table[name].zero_()
+    judged = table["grad_count"] >= rules.min_observations
+    for name in ("grad_sum", "grad_count"):
+        table[name].masked_fill_(judged, 0)
+    table["max_radii"].zero_()
     return report
 
 

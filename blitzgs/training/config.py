@@ -131,6 +131,8 @@ class OptimiserConfig:
         position, position_final: learning rates of the means, relative to extent, at the start and after
             `schedule.position_decay`.
         sh_dc, sh_rest, opacity, scale, rotation: learning rates.
+        position_noise: random steps of almost transparent Gaussians along their own axes, relative to the
+            position rate (3DGS-MCMC's noise, whose lengths are relative to extent here); 0: none.
         final_share: the share of these five rates that is left at the end of the run, reached exponentially;
             1 keeps them constant.
         beta1, beta2, eps: Adam's constants for B = 1.
@@ -145,6 +147,7 @@ class OptimiserConfig:
     opacity: float = 2.5e-2
     scale: float = 5e-3
     rotation: float = 1e-3
+    position_noise: float = 0.0
     final_share: float = 1.0
     beta1: float = 0.9
     beta2: float = 0.999
@@ -193,6 +196,9 @@ class PopulationConfig:
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).
+        pixels_per_gaussian: nor does it exceed the pixels of all training photographs over this. 0: no cap.
+        min_observations: a Gaussian is densified by the mean of at least so many gradients, one for each view
+            of a step that sees it; they are gathered over as many density events as that takes.
     """
 
     grad_threshold: float = 2e-4
@@ -210,6 +216,8 @@ class PopulationConfig:
     gate: str | None = None
     gate_rate: float = 0.6
     lineage: bool = False
+    pixels_per_gaussian: float = 24.0
+    min_observations: int = 1
 
 
 @dataclass(frozen=True)

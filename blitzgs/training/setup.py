@@ -11,6 +11,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
+from blitzgs.population.exploration import PositionNoise
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.lineage import Lineage, initial_births, ledger_of
 from blitzgs.scene.capture import Capture
@@ -91,7 +92,15 @@ def set_up(
         progress=progress,
         views=ViewSet(list(capture.cameras), space, ranks.device),
         optimiser=optimiser,
-        stepper=Stepper(table, optimiser, owners, config.loss, length_unit, config.ranks.half_exchange),
+        stepper=Stepper(
+            table,
+            optimiser,
+            owners,
+            config.loss,
+            length_unit,
+            config.ranks.half_exchange,
+            _position_noise(config, schedule, space.extent),
+        ),
         owners=owners,
         lpips=lpips,
         run_id=run_id,
@@ -101,6 +110,15 @@ def set_up(
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
+
+
+def _position_noise(config: Config, schedule: Schedule, extent: float) -> PositionNoise | None:
+    """Return the noise that a configuration asks for."""
+    factor = config.optimiser.position_noise
+    if factor == 0:
+        return None
+    rates = schedule.learning_rates(config.optimiser, extent)[:, 0].tolist()
+    return PositionNoise(factor, rates, extent, config.population.min_opacity, config.seed)
 
 
 def _start_lineage(

@@ -55,6 +55,7 @@ class TrainingState:
         save_clock: says when the next checkpoint by wall time is due.
         veto: withholds candidates of densification from `schedule.gate_from` on, or None.
         lineage: logs births and deaths, or None.
+        growth_was_limited: whether the log has said already that a limit holds growth back.
         log: where the run reports; silent until the loop opens the run's own.
     """
 
@@ -78,6 +79,7 @@ class TrainingState:
     veto: Veto | None
     lineage: Lineage | None
     log: RunLog
+    growth_was_limited: bool = False
     _started: float = field(default_factory=time.monotonic)
 
     @property

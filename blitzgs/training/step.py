@@ -12,6 +12,7 @@ from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
+from blitzgs.population.exploration import PositionNoise
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms
@@ -30,6 +31,7 @@ class Stepper:
         loss: LossConfig,
         length_unit: float,
         half_exchange: bool = False,
+        noise: PositionNoise | None = None,
     ) -> None:
         """Prepare to step.
 
@@ -40,9 +42,10 @@ class Stepper:
             loss: weights of the loss.
             length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
             half_exchange: send splats in half precision, see `open_transport`.
+            noise: of the means, after each step; None: none.
         """
         self._table, self._optimiser, self._owners = table, optimiser, owners
-        self._loss, self._length_unit = loss, length_unit
+        self._loss, self._length_unit, self._noise = loss, length_unit, noise
         self._transport = open_transport(owners.ranks, half_exchange)
         self.reindex()
 
@@ -108,6 +111,8 @@ class Stepper:
         if v_means2d is None and keep_means2d:
             v_means2d = sums = torch.empty_like(frame.rows.means2d)
         self._optimiser.step(table, frame, gradients, terms.scale_reg, step, sums)
+        if self._noise is not None:
+            self._noise.add(table, frame.rows.visible_ids, step)
         mark("optimiser")
         self._blocks.update(table, frame.rows.visible_ids)
         mark("other")

@@ -18,6 +18,7 @@ from blitzgs.training.config_io import load_config
 WIDTH, HEIGHT, COUNT = 48, 32, 400
 
 OVERRIDES = (
+    "population.pixels_per_gaussian=0",
     "schedule.iterations=100",
     "schedule.densify_from=20",
     "schedule.densify_until=90",

@@ -8,6 +8,7 @@ import dataclasses
 import torch
 
 from blitzgs.population.density import DensityRules, decay_opacities, densify
+from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import redistribute
 from blitzgs.training.guard import ModelLostError, check_table
 from blitzgs.training.schedule import Event
@@ -26,9 +27,17 @@ def run(state: TrainingState, event: Event) -> None:
     check_table(state.table, step)
     if state.config.population.opacity_decay > 0:
         decay_opacities(state.table, state.config.population.opacity_decay)
+    population = state.config.population
+    pixels = training_pixels(state)
+    limit = growth_limit(
+        population.max_gaussians,
+        pixels,
+        population.pixels_per_gaussian,
+        memory_limit(state.table, state.ranks),
+    )
     report = densify(
         state.table,
-        density_rules(state, event.time),
+        density_rules(state, event.time, limit),
         time=event.time,
         step=step,
         seed=state.config.seed,
@@ -47,16 +56,33 @@ def run(state: TrainingState, event: Event) -> None:
             "and points belong together, or prune less (population.min_opacity, prune_screen_radius, "
             "prune_world_scale; schedule.size_prune_after)"
         )
+    held_back = counts["held_back"]
     if redistribute(state.table, state.ranks, state.config.ranks.max_imbalance):
         counts["redistributed"] = 1
         state.sort()
     state.stepper.reindex()
     peak = max(state.progress.peak_gaussians, counts["gaussians"])
     state.progress = dataclasses.replace(state.progress, peak_gaussians=peak)
-    state.log.event(event.time, "densify", counts)
+    record = counts | {"pixels_per_gaussian": pixels / max(1, counts["gaussians"])}
+    text = None
+    if limit is not None:
+        record |= {"limit": limit.count, "limited_by": limit.reason}
+        if held_back and not state.growth_was_limited:
+            text = (
+                f"{limit.reason} limits the model to {limit.count:,} Gaussians: "
+                f"{held_back:,} weaker candidates wait"
+            )
+            state.growth_was_limited = True
+    state.log.event(event.time, "densify", record, text)
 
 
-def density_rules(state: TrainingState, time: int) -> DensityRules:
+def training_pixels(state: TrainingState) -> int:
+    """Count the pixels of all training photographs."""
+    cameras = state.capture.cameras
+    return sum(cameras[i].width * cameras[i].height for i in state.capture.train)
+
+
+def density_rules(state: TrainingState, time: int, limit: GrowthLimit | None) -> DensityRules:
     """Return the rules of a density event at `time`, with lengths in the unit of the means."""
     population, extent = state.config.population, state.space.extent
     by_size = state.schedule.prunes_by_size(time)
@@ -66,5 +92,6 @@ def density_rules(state: TrainingState, time: int) -> DensityRules:
         min_opacity=population.min_opacity,
         max_screen_radius=(population.prune_screen_radius or None) if by_size else None,
         max_scale=(population.prune_world_scale * extent or None) if by_size else None,
-        max_gaussians=population.max_gaussians or None,
+        max_gaussians=None if limit is None else limit.count,
+        min_observations=population.min_observations,
     )

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise on the means of almost transparent Gaussians, so that they look for a place where they are needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+
+@torch.no_grad()
+def position_noise_(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    ids: Tensor,
+    visible_ids: Tensor,
+    *,
+    seed: int,
+    step: int,
+    threshold: float,
+    strength: float,
+) -> None:
+    """Move each listed Gaussian at random along its own axes, in place; the less opaque, the farther.
+
+    ``means += strength * sigmoid(100 (threshold - opacity)) * Sigma n`` with the covariance Sigma and n
+    standard normal (Kheradmand et al. 2024, eq. 8 and 9). The draws depend on (id, seed, step) alone.
+
+    Args:
+        means: [N, 3], float32 (CPU also float64).
+        quats: [N, 4], (w, x, y, z), unnormalised.
+        scales: [N, 3], logarithms.
+        opacities: [N], logits.
+        ids: int64 [N], persistent.
+        visible_ids: int32 [U], the rows to move, each once.
+        seed: of the run.
+        step: of the optimiser; another step draws other numbers.
+        threshold: opacity at which half of the noise is left, in [0, 1].
+        strength: inverse length in the unit of the means.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    torch.ops.blitzgs.position_noise_(
+        means, quats, scales, opacities, ids, visible_ids, seed, step, threshold, strength
+    )
+
+
+@torch.library.register_fake("blitzgs::position_noise_")
+def _(*_args: Any) -> None:
+    return None

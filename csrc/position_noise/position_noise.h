@@ -1,0 +1,77 @@
+// SPDX-License-Identifier: Apache-2.0
+// Noise on the means of almost transparent Gaussians (stochastic gradient Langevin dynamics; Kheradmand et
+// al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", eq. 8 and 9).
+//
+// For every listed row i, with opacity o = sigmoid(opacities[i]) and covariance Sigma = A A^T, A = R(q)
+// diag(exp(s)):
+//   gate = sigmoid(100 (threshold - o))
+//   means[i] += strength * gate * Sigma n,   n = three standard normal numbers of (ids[i], seed, step)
+//
+// So a Gaussian moves along its own axes, and one that the images need (o well above the threshold) stays
+// where it is: a gate below 2^-24 changes no mean, and such rows are left unread. The draws are float64 and
+// depend on the persistent id alone, so the noise is the same for any order of the rows and any number of
+// ranks. In place, one thread a row: deterministic. O(U).
+//
+// means [N, 3], quats [N, 4], scales [N, 3] (log), opacities [N] (logit), ids int64 [N], visible_ids int32
+// [U] (each row once). strength has the unit of an inverse length.
+#pragma once
+#include <cstdint>
+
+#include "common/stream.h"
+#include "math/counter_random.h"
+#include "math/covariance.h"
+
+namespace blitzgs {
+
+constexpr double kGateSlope = 100;
+constexpr double kLeastGate = 0x1p-24;
+// Sets these draws apart from others of the same id and seed.
+constexpr std::int64_t kPositionNoise = 1;
+
+template <class T>
+struct PositionNoiseArgs {
+  T* means;            // [N, 3]
+  const T* quats;      // [N, 4]
+  const T* scales;     // [N, 3]
+  const T* opacities;  // [N]
+  const std::int64_t* ids;
+  const std::int32_t* visible_ids;
+  std::int64_t visible;
+  std::int64_t seed, step;
+  double threshold, strength;
+};
+
+template <class T>
+BLITZGS_HD void position_noise_of(const PositionNoiseArgs<T>& args, std::int64_t u) {
+  const std::int64_t row = args.visible_ids[u];
+  const double opacity = sigmoid(static_cast<double>(args.opacities[row]));
+  const double gate = sigmoid(kGateSlope * (args.threshold - opacity));
+  if (!(gate >= kLeastGate)) return;
+  const Columns3<T> rotation = rotation_columns(normalize_quaternion(args.quats + 4 * row));
+  const Vec3<T> log_scale = load3(args.scales + 3 * row);
+  const Columns3<T> axes =
+      scaled_axes(rotation, Vec3<T>{std::exp(log_scale.x), std::exp(log_scale.y), std::exp(log_scale.z)});
+  std::uint64_t hash = 0;
+  for (const std::int64_t key : {args.ids[row], args.seed, kPositionNoise, args.step}) {
+    hash = hash_key(hash, key);
+  }
+  const Vec3<T> draw = {static_cast<T>(normal_of(hash_key(hash, 0))),
+                        static_cast<T>(normal_of(hash_key(hash, 1))),
+                        static_cast<T>(normal_of(hash_key(hash, 2)))};
+  const T factor = static_cast<T>(args.strength * gate);
+  const Vec3<T> moved =
+      load3(args.means + 3 * row) +
+      factor * (dot(axes.x, draw) * axes.x + dot(axes.y, draw) * axes.y + dot(axes.z, draw) * axes.z);
+  store3(moved, args.means + 3 * row);
+}
+
+namespace cpu {
+template <class T>
+void position_noise(const PositionNoiseArgs<T>& args, Workspace&, CudaStream);
+}
+namespace cuda {
+template <class T>
+void position_noise(const PositionNoiseArgs<T>& args, Workspace&, CudaStream);
+}
+
+}  // namespace blitzgs

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How many Gaussians a run may have."""
+
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.population.density import DensityRules, densify
+from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit, rows_that_fit
+from tests.helpers import needs_cuda
+from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
+
+
+def test_the_tightest_limit_wins_and_is_named():
+    assert growth_limit(0, 1_000_000, 0.0, None) is None
+    assert growth_limit(500, 1_000_000, 24.0, None) == GrowthLimit(500, "population.max_gaussians")
+    assert growth_limit(0, 1_000_000, 24.0, None) == GrowthLimit(41_666, "population.pixels_per_gaussian")
+    assert growth_limit(50_000, 1_000_000, 24.0, 40_000) == GrowthLimit(40_000, "memory")
+
+
+def test_memory_holds_the_table_a_copy_of_its_widest_column_and_the_scratch():
+    # 700 bytes a row and 300 of scratch a row: a thousandth of the memory each, but for the share kept free.
+    assert rows_that_fit(100, 500, 200, available=1_000_000, scratch=30_000) == 900
+    assert rows_that_fit(0, 500, 200, available=1_000_000, scratch=0) == int(0.9 * 1_000_000 / 700)
+
+
+def test_the_cpu_has_no_limit_of_memory():
+    assert memory_limit(random_table(10), Ranks()) is None
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_a_gpu_holds_more_than_a_small_table_and_less_than_its_memory():
+    table = random_table(100_000)
+    table = type(table)({name: table[name].cuda() for name in table})
+    count = memory_limit(table, Ranks(device=torch.device("cuda")))
+    _, total = torch.cuda.mem_get_info()
+    assert 100_000 < count < total // 500
+
+
+def test_statistics_are_gathered_until_there_are_enough():
+    table = random_table(300)
+    seen, sums = table["grad_count"].clone(), table["grad_sum"].clone()
+    by_id = {int(i): (int(n), float(s)) for i, n, s in zip(table["id"], seen, sums, strict=True)}
+    enough = DensityRules(2e-4, 0.05, 0.0, min_observations=3)
+    gradient = sums / seen.clamp(min=1)
+    expected = int(((gradient >= enough.grad_threshold) & (seen >= 3)).sum())
+    assert 0 < expected < int((gradient >= enough.grad_threshold).sum())
+    report = densify(table, enough, time=TIME, step=STEP, seed=SEED, level_count=LEVELS, ranks=Ranks())
+    assert report.cloned + report.split == expected
+    old = [row for row in range(len(table)) if int(table["id"][row]) in by_id]
+    for row in old:
+        count, total = by_id[int(table["id"][row])]
+        left = (count, total) if count < 3 else (0, 0.0)
+        assert (int(table["grad_count"][row]), float(table["grad_sum"][row])) == pytest.approx(left)
+    assert not table["max_radii"].any()
