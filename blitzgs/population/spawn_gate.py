@@ -29,7 +29,7 @@ FORMAT = 1
 # Leaf values enter as integers in units of 2^-32.
 _LEAF_BITS = 32
 # Candidates x trees that are walked at once.
-_CHUNK = 1 << 24
+_CHUNK = 1 << 23
 
 
 class GateError(ValueError):
@@ -119,7 +119,8 @@ class SpawnGate:
         Returns:
             int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.
         """
-        return self._trees.to(features.device).sum(features)
+        self._trees = self._trees.to(features.device)
+        return self._trees.sum(features)
 
 
 class RankVeto:

@@ -17,7 +17,7 @@ from blitzgs.training.run import peak_memory_bytes
 from blitzgs.training.run_log import LOG
 from blitzgs.training.state import TrainingState
 
-PICTURE = "population.svg"
+PICTURE = "trajectory.svg"
 _STAGES = ("before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2", "final")
 
 

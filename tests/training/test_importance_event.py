@@ -80,7 +80,7 @@ def test_the_population_is_reported(whole_run):
     assert {name: report[name] for name in milestones} == milestones
     assert report["final"] == summary["gaussians"] and report["peak"] == summary["peak_gaussians"]
     assert len(report["peak_memory_bytes"]) == 1 and report["peak_memory_bytes"][0] > 0
-    picture = ElementTree.parse(folder / "population.svg").getroot()
+    picture = ElementTree.parse(folder / "trajectory.svg").getroot()
     (line,) = picture.iter("{http://www.w3.org/2000/svg}polyline")
     points = [tuple(map(float, p.split(","))) for p in line.get("points").split()]
     # The start, density events at 20, 40, 60 and 80, before and after each pass, and the end.
