@@ -43,7 +43,7 @@ class Drift:
         self.betas = betas
         self.reach = explicit_steps(*betas, dtype)
         self.table = torch.zeros(0, _ORDERS * _GROUPS, dtype=torch.float64, device=device)
-        self.lr_table = torch.zeros(0, _GROUPS, device=device)
+        self.lr_table = torch.zeros(0, _GROUPS, dtype=torch.float32, device=device)
         self._grow(_FIRST_CAPACITY)
         ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
         distances = np.arange(self.reach, 0, -1)[:, None]
@@ -52,7 +52,7 @@ class Drift:
 
     def _grow(self, capacity: int) -> None:
         device, known = self.lr_table.device, len(self.lr_table)
-        rates = torch.zeros(capacity + 1, _GROUPS)
+        rates = torch.zeros(capacity + 1, _GROUPS, dtype=torch.float32)
         # Without rates the tails are zero: what is left are the powers and corrections of the steps.
         table, rates = schedule_table(rates, *self.betas).to(device), rates.to(device)
         table[:known, : _ORDERS * _GROUPS] = self.table[:, : _ORDERS * _GROUPS]

@@ -194,7 +194,7 @@ class LazyAdam(torch.optim.Optimizer):
             group.setdefault("lr_rest", None)
             state = self.state.get(param)
             if state:
-                state["step"] = torch.tensor(float(state["step"]))
+                state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32)
                 stand = torch.full((len(param),), int(state["step"]), dtype=torch.int32, device=param.device)
                 state.update({name: stand.clone() for name in _STEPS})
 
@@ -294,7 +294,7 @@ class LazyAdam(torch.optim.Optimizer):
                 f"LazyAdam: a parameter of shape {list(param.shape)} is not contiguous; clone it"
             )
         if not state:
-            state["step"] = torch.tensor(0.0)
+            state["step"] = torch.tensor(0.0, dtype=torch.float32)
             state.update({name: torch.zeros_like(param) for name in _MOMENTS})
             steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
             state.update({name: steps.clone() for name in _STEPS})
