@@ -64,6 +64,19 @@ def test_links_lead_somewhere(name):
             assert anchor in anchors(target), f"{name} links to {link}; {path or name} has {anchors(target)}"
 
 
+def test_every_page_can_be_reached_from_the_readme():
+    found, left = set(), [ROOT / "README.md"]
+    while left:
+        page = left.pop()
+        if page in found:
+            continue
+        found.add(page)
+        links = re.findall(r"\]\(([^)\s#]+)(?:#[^)]*)?\)", text_of(page))
+        left += [path for link in links if (path := (page.parent / link).resolve()) in PAGES]
+    orphans = [name for name in NAMES if ROOT / name not in found and "decisions" not in name]
+    assert not orphans, f"no page links to {orphans}"
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_files_exist(name):
     for code in inline_code(ROOT / name):
