@@ -3,14 +3,21 @@
 
 #include <algorithm>
 #include <array>
+#include <utility>
 #include <vector>
 
 namespace blitzgs::io {
 
 namespace {
 
-constexpr std::uint8_t kSof0 = 0xc0, kSof1 = 0xc1, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8, kEoi = 0xd9,
-                       kSos = 0xda, kDri = 0xdd;
+constexpr std::uint8_t kSof0 = 0xc0, kSof1 = 0xc1, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8,
+                       kEoi = 0xd9, kSos = 0xda, kDri = 0xdd;
+
+// Coefficients out of so many zero bytes in a row are damage. An encoder writes flat areas as zeros, but
+// never hundreds of equal coefficients. The look-ahead of 8 bytes counts, too.
+constexpr unsigned kHoleBytes = 64 + 8;
+
+constexpr std::uint64_t kMostBlocks = 1 << 24;
 
 // The code that the highest of 16 bits begin with: its length and its symbol. Length 0: no code begins so.
 struct Code {
@@ -22,6 +29,8 @@ using CodeTable = std::vector<Code>;
 struct Component {
   std::uint8_t id;
   unsigned h, v;
+  // Of each block of a progressive file, which coefficients are not zero so far, in zigzag order.
+  std::vector<std::uint64_t> nonzero;
 };
 
 std::uint64_t ceil_div(std::uint64_t a, std::uint64_t b) { return (a + b - 1) / b; }
@@ -96,24 +105,25 @@ class Checker {
 
   void read_frame(std::uint8_t marker, std::span<const std::uint8_t> payload) {
     if (payload.size() < 6 || payload.size() < 6 + 3u * payload[5]) fail("damaged JPEG: its size is cut off");
-    sequential_ = (marker == kSof0 || marker == kSof1) && payload[0] == 8;
+    walked_ = marker >= kSof0 && marker <= kSof2 && payload[0] == 8;
+    progressive_ = marker == kSof2;
     height_ = payload[1] * 256u + payload[2];
     width_ = payload[3] * 256u + payload[4];
     components_.clear();
     h_max_ = v_max_ = 1;
     for (unsigned k = 0; k < payload[5]; ++k) {
       const std::uint8_t* p = payload.data() + 6 + 3 * k;
-      const Component component{p[0], unsigned{p[1]} >> 4, p[1] & 15u};
+      Component component{p[0], unsigned{p[1]} >> 4, p[1] & 15u, {}};
       if (component.h < 1 || component.v < 1 || component.h > 4 || component.v > 4) {
         fail("damaged JPEG: impossible sampling factors");
       }
       h_max_ = std::max(h_max_, component.h);
       v_max_ = std::max(v_max_, component.v);
-      components_.push_back(component);
+      components_.push_back(std::move(component));
     }
     // A height of 0 means that the height follows after the first scan. Only the markers of such files are
     // walked.
-    sequential_ = sequential_ && width_ > 0 && height_ > 0;
+    walked_ = walked_ && width_ > 0 && height_ > 0 && width_ * height_ / 64 <= kMostBlocks;
   }
 
   void read_scan(std::span<const std::uint8_t> payload) {
@@ -121,7 +131,8 @@ class Checker {
     if (components_.empty()) fail("damaged JPEG: image data come before the size");
     if (payload.empty() || payload.size() < 1 + 2u * payload[0])
       fail("damaged JPEG: a scan header is cut off");
-    if (!sequential_) return skip_entropy_data();
+    if (!walked_) return skip_entropy_data();
+    const Band band = read_band(payload);
     std::vector<Block> blocks;
     std::uint64_t units = 0;
     for (unsigned k = 0; k < payload[0]; ++k) {
@@ -131,34 +142,122 @@ class Checker {
       if (found == components_.end() || (tables >> 4) > 3 || (tables & 15) > 3) {
         fail("damaged JPEG: a scan names a component or table that is not there");
       }
-      const Block block{&tables_[0][tables >> 4], &tables_[1][tables & 15]};
-      if (block.dc->empty() || block.ac->empty()) fail("damaged JPEG: a Huffman table is missing");
+      const Block block{&tables_[0][tables >> 4], &tables_[1][tables & 15], &*found};
+      const bool needs_dc = band.first == 0 && !band.refines, needs_ac = band.last > 0;
+      if ((needs_dc && block.dc->empty()) || (needs_ac && block.ac->empty())) {
+        fail("damaged JPEG: a Huffman table is missing");
+      }
       const bool alone = payload[0] == 1;
       blocks.insert(blocks.end(), alone ? 1 : found->h * found->v, block);
       units = alone ? ceil_div(ceil_div(width_ * found->h, h_max_), 8) *
                           ceil_div(ceil_div(height_ * found->v, v_max_), 8)
                     : ceil_div(width_, 8 * h_max_) * ceil_div(height_, 8 * v_max_);
     }
-    read_units(blocks, units);
+    read_units(blocks, units, band);
   }
 
   struct Block {
     const CodeTable* dc;
     const CodeTable* ac;
+    Component* component;
   };
 
-  void read_units(const std::vector<Block>& blocks, std::uint64_t units) {
+  // The coefficients that a scan is about, in zigzag order, and whether it adds a bit to what earlier ones
+  // gave.
+  struct Band {
+    unsigned first = 0, last = 63;
+    bool refines = false;
+  };
+
+  Band read_band(std::span<const std::uint8_t> payload) {
+    if (!progressive_) return {};
+    const std::size_t at = 1 + 2u * payload[0];
+    if (payload.size() < at + 3) fail("damaged JPEG: a scan header is cut off");
+    const Band band{payload[at], payload[at + 1], (payload[at + 2] >> 4) != 0};
+    const bool is_dc = band.first == 0;
+    if (band.last > 63 || (is_dc ? band.last != 0 : band.last < band.first || payload[0] != 1)) {
+      fail("damaged JPEG: a scan has an impossible band");
+    }
+    return band;
+  }
+
+  void read_units(const std::vector<Block>& blocks, std::uint64_t units, const Band& band) {
     bits_ = 0;
-    held_ = padding_ = 0;
+    held_ = padding_ = zeros_ = 0;
+    end_run_ = 0;
     unsigned restarts = 0;
+    if (band.first > 0) blocks[0].component->nonzero.resize(units);
     for (std::uint64_t unit = 0; unit < units; ++unit) {
       if (restart_interval_ > 0 && unit > 0 && unit % restart_interval_ == 0) {
         end_of_interval();
         if (next_marker() != kRst0 + restarts++ % 8) fail("damaged JPEG: restart markers are out of order");
       }
-      for (const Block& block : blocks) read_block(block);
+      for (const Block& block : blocks) {
+        if (!progressive_) {
+          read_block(block);
+        } else if (band.first == 0) {
+          take(band.refines ? 1 : next_symbol(*block.dc) & 15u);
+        } else if (band.refines) {
+          refine_band(*block.ac, band, block.component->nonzero[unit]);
+        } else {
+          read_band(*block.ac, band, block.component->nonzero[unit]);
+        }
+      }
     }
     end_of_interval();
+  }
+
+  // The first scan of a band, of one block.
+  void read_band(const CodeTable& table, const Band& band, std::uint64_t& nonzero) {
+    if (end_run_ > 0) {
+      --end_run_;
+      return;
+    }
+    for (unsigned k = band.first; k <= band.last; ++k) {
+      const std::uint8_t symbol = next_symbol(table);
+      const unsigned size = symbol & 15u, run = symbol >> 4;
+      k += size == 0 && run < 15 ? 0 : run;
+      if (size > 0) {
+        if (k > band.last) fail("damaged JPEG: a block has too many coefficients");
+        check_hole();
+        nonzero |= std::uint64_t{1} << k;
+        take(size);
+      } else if (run < 15) {
+        end_run_ = (1u << run) + take(run) - 1;
+        return;
+      }
+    }
+  }
+
+  // A further bit for the coefficients of a band that are not zero, and those that are no longer, of one
+  // block.
+  void refine_band(const CodeTable& table, const Band& band, std::uint64_t& nonzero) {
+    unsigned k = band.first;
+    for (; end_run_ == 0 && k <= band.last; ++k) {
+      const std::uint8_t symbol = next_symbol(table);
+      const unsigned size = symbol & 15u;
+      unsigned run = symbol >> 4;
+      if (size == 0 && run < 15) {
+        end_run_ = (1u << run) + take(run);
+        break;
+      }
+      if (size > 0) take(1);
+      for (; k <= band.last; ++k) {
+        if (nonzero >> k & 1) {
+          take(1);
+        } else if (run-- == 0) {
+          break;
+        }
+      }
+      if (size == 0) continue;
+      if (k > band.last) fail("damaged JPEG: a block has too many coefficients");
+      nonzero |= std::uint64_t{1} << k;
+    }
+    if (end_run_ == 0) return;
+    for (; k <= band.last; ++k) {
+      if (nonzero >> k & 1) take(1);
+    }
+    --end_run_;
   }
 
   void read_block(const Block& block) {
@@ -169,8 +268,13 @@ class Checker {
       if (size == 0 && run != 15) return;
       k += run;
       if (k > 63) fail("damaged JPEG: a block has too many coefficients");
+      if (size > 0) check_hole();
       take(size);
     }
+  }
+
+  void check_hole() const {
+    if (zeros_ >= kHoleBytes) fail("damaged JPEG: a hole of zeros");
   }
 
   // Keeps at least 16 bits available. Behind a marker these are padding, which no code may use.
@@ -180,6 +284,7 @@ class Checker {
       if (at_ < file_.size() && (file_[at_] != 0xff || (at_ + 1 < file_.size() && file_[at_ + 1] == 0))) {
         byte = file_[at_];
         at_ += byte == 0xff ? 2 : 1;
+        zeros_ = byte == 0 ? zeros_ + 1 : 0;
       } else {
         padding_ += 8;
       }
@@ -188,11 +293,14 @@ class Checker {
     }
   }
 
-  void take(unsigned n) {
+  // Returns the next n bits, at most 16, as a number.
+  unsigned take(unsigned n) {
     if (held_ < 16) refill();
+    const unsigned value = n > 0 ? static_cast<unsigned>(bits_ >> (64 - n)) : 0;
     bits_ <<= n;
     held_ -= n;
     if (held_ < padding_) fail("truncated or damaged JPEG: image data end before the last block");
+    return value;
   }
 
   std::uint8_t next_symbol(const CodeTable& table) {
@@ -216,7 +324,8 @@ class Checker {
       fail("damaged JPEG: image data go on after the last block");
     }
     bits_ = 0;
-    held_ = padding_ = 0;
+    held_ = padding_ = zeros_ = 0;
+    end_run_ = 0;
   }
 
   void skip_entropy_data() {
@@ -236,11 +345,14 @@ class Checker {
   std::uint64_t width_ = 0, height_ = 0;
   unsigned h_max_ = 1, v_max_ = 1;
   unsigned restart_interval_ = 0;
-  bool sequential_ = false;
+  bool walked_ = false;  // whether every code of the image data is read
+  bool progressive_ = false;
   unsigned scans_ = 0;
   std::uint64_t bits_ = 0;  // the next bits, highest first
   unsigned held_ = 0;       // how many bits `bits_` holds, padding included
   unsigned padding_ = 0;    // how many of the last of them are padding
+  unsigned zeros_ = 0;      // bytes of zero in a row that were read last
+  unsigned end_run_ = 0;    // further blocks of a progressive scan that end where they begin
 };
 
 }  // namespace

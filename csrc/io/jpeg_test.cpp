@@ -32,16 +32,34 @@ Bytes table(std::uint8_t number, const std::vector<Bytes>& symbols) {
 
 // Grey. DC codes: 0 (no bits), 10 (one bit). AC codes: 0 (end of block), 10 (one bit), 110 (sixteen zeros).
 // The flattest block is the bits 00.
-Bytes jpeg(std::uint8_t width, std::uint8_t height, const Bytes& data, std::uint8_t frame = 0xc0,
-           std::uint8_t restart = 0) {
+Bytes head(std::uint8_t width, std::uint8_t height, std::uint8_t frame, std::uint8_t restart = 0) {
   Bytes out = {0xff, 0xd8};
   append(out, segment(0xe0, {'a', 'n', 'y', 0xff, 0xd9}));
   append(out, table(0x00, {{0x00}, {0x01}}));
   append(out, table(0x10, {{0x00}, {0x01}, {0xf0}}));
   if (restart) append(out, segment(0xdd, {0, restart}));
   append(out, segment(frame, {8, 0, height, 0, width, 1, 1, 0x11, 0}));
+  return out;
+}
+
+Bytes jpeg(std::uint8_t width, std::uint8_t height, const Bytes& data, std::uint8_t frame = 0xc0,
+           std::uint8_t restart = 0) {
+  Bytes out = head(width, height, frame, restart);
   append(out, segment(0xda, {1, 1, 0x00, 0, 63, 0}));
   append(out, data);
+  append(out, {0xff, 0xd9});
+  return out;
+}
+
+// A progressive file of four blocks, of which the first has one coefficient beside the DC, in three scans.
+Bytes progressive(const Bytes& dc, const Bytes& first, const Bytes& refinement) {
+  Bytes out = head(16, 16, 0xc2);
+  append(out, segment(0xda, {1, 1, 0x00, 0, 0, 0x00}));
+  append(out, dc);
+  append(out, segment(0xda, {1, 1, 0x00, 1, 63, 0x01}));
+  append(out, first);
+  append(out, segment(0xda, {1, 1, 0x00, 1, 63, 0x10}));
+  append(out, refinement);
   append(out, {0xff, 0xd9});
   return out;
 }
@@ -68,7 +86,7 @@ TEST_CASE("whole JPEGs pass") {
   REQUIRE(problem(jpeg(16, 16, {0x00, 0x00, 0x00})).empty());  // zeros that a camera appended
   REQUIRE(problem(jpeg(8, 8, {0xb1})).empty());                // a DC and an AC code with a bit each
   REQUIRE(problem(jpeg(24, 8, {0x3f, 0xff, 0xd0, 0x3f, 0xff, 0xd1, 0x3f}, 0xc0, 1)).empty());
-  REQUIRE(problem(jpeg(8, 8, {0x12, 0xff, 0x00, 0x34}, 0xc2)).empty());  // progressive: markers alone
+  REQUIRE(problem(jpeg(8, 8, {0x12, 0xff, 0x00, 0x34}, 0xc9)).empty());  // arithmetic codes: markers alone
   Bytes followed = jpeg(16, 16, {0x00});
   append(followed, {0xff, 0xd8, 1, 2, 3});  // another picture after the end
   REQUIRE(problem(followed).empty());
@@ -91,6 +109,34 @@ TEST_CASE("damaged image data are refused with the reason") {
   REQUIRE(mentions(jpeg(24, 8, {0x3f, 0xff, 0xd0, 0x3f, 0xff, 0xd2, 0x3f}, 0xc0, 1), "out of order"));
   REQUIRE(mentions({1, 2, 3}, "f: at byte 0: not a JPEG"));
   REQUIRE(mentions({0xff, 0xd8, 0xff, 0xd9}, "it has no image data"));
+}
+
+TEST_CASE("every code of a progressive JPEG is read") {
+  // DC: 0 four times. First AC scan: 10 1 0, then 0 three times. Refinement: 0 and the coefficient's bit, 0 0
+  // 0.
+  REQUIRE(problem(progressive({0x0f}, {0xa1}, {0x47})).empty());
+  REQUIRE(mentions(progressive({}, {0xa1}, {0x47}), "image data end before the last block"));
+  REQUIRE(mentions(progressive({0x0f}, {0xbf}, {0x47}), "no such Huffman code"));
+  REQUIRE(mentions(progressive({0x0f}, {0xa1, 0x55}, {0x47}), "image data go on after the last block"));
+  // Without its bit the last block's code is missing: bits 0000, and 0 more than the scan has.
+  REQUIRE(mentions(progressive({0x0f}, {0xa1}, {}), "image data end before the last block"));
+  Bytes file = progressive({0x0f}, {0xa1}, {0x47});
+  for (std::size_t n = 0; n < file.size(); ++n)
+    REQUIRE_FALSE(problem(Bytes(file.begin(), file.begin() + n)).empty());
+}
+
+TEST_CASE("coefficients out of a hole of zeros are damage, flat areas are not") {
+  // The code 0 ends a block in `jpeg`, so zeros are flat blocks: 160 x 160 pixels are 400 of them, 100 bytes.
+  REQUIRE(problem(jpeg(160, 160, Bytes(100, 0x00))).empty());
+  // Where 0 is a coefficient of one bit instead, zeros are 63 of them in each block.
+  Bytes file = {0xff, 0xd8};
+  append(file, table(0x00, {{0x00}, {0x01}}));
+  append(file, table(0x10, {{0x01}, {0x00}}));
+  append(file, segment(0xc0, {8, 0, 64, 0, 64, 1, 1, 0x11, 0}));
+  append(file, segment(0xda, {1, 1, 0x00, 0, 63, 0}));
+  append(file, Bytes(1016, 0x00));  // 64 blocks of 127 bits
+  append(file, {0xff, 0xd9});
+  REQUIRE(mentions(file, "a hole of zeros"));
 }
 
 TEST_CASE("JPEGs with wrong bytes pass or are refused, never worse") {

@@ -5,6 +5,8 @@ import resource
 import tempfile
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -84,3 +86,33 @@ def test_every_truncation_of_a_binary_file_is_refused(samples, tmp_path, name):
         path.write_bytes(data[:length])
         with pytest.raises(ValueError, match=f"{name}: "):
             READERS[name](str(path))
+
+
+@pytest.mark.parametrize("kind", ["BASELINE", "OPTIMIZE", "PROGRESSIVE", "RST_INTERVAL"])
+def test_a_lost_sector_of_a_jpeg_is_noticed(tmp_path, kind):
+    """512 bytes of zeros, as a disk leaves them, wherever they lie in the image data."""
+    flags = [cv2.IMWRITE_JPEG_QUALITY, 93]
+    if kind != "BASELINE":
+        flags += [getattr(cv2, f"IMWRITE_JPEG_{kind}"), 7]
+    random = np.random.default_rng(3)
+    pixels = cv2.GaussianBlur(random.integers(0, 256, (240, 320, 3), dtype=np.uint8), (0, 0), 2)
+    pixels = np.clip((pixels.astype(np.float32) - 128) * 5 + random.normal(128, 4, pixels.shape), 0, 255)
+    ok, data = cv2.imencode(".jpg", pixels.astype(np.uint8), flags)
+    data, path = data.tobytes(), tmp_path / "a.jpg"
+    path.write_bytes(data)
+    read_whole(path)
+    for at in random.integers(700, len(data) - 514, 60):
+        path.write_bytes(data[:at] + bytes(512) + data[at + 512 :])
+        with pytest.raises(ValueError, match="JPEG"):
+            read_whole(path)
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_flat_areas_are_no_holes(tmp_path, progressive):
+    """Black borders compress to long runs of zeros."""
+    pixels = np.zeros((900, 900, 3), dtype=np.uint8)
+    pixels[400:500, 400:500] = np.random.default_rng(1).integers(0, 256, (100, 100, 3))
+    for flags in ([], [cv2.IMWRITE_JPEG_OPTIMIZE, 1]):
+        flags += [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive]
+        assert cv2.imwrite(str(tmp_path / "a.jpg"), pixels, flags)
+        read_whole(tmp_path / "a.jpg")
