@@ -13,8 +13,9 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-INTERSECT, PROJECT, RASTERIZE, PEERS = (
-    f"tests/cuda/test_{name}_cuda.py::test_" for name in ("intersect", "project", "rasterize", "peers")
+INTERSECT, PROJECT, RASTERIZE, IMPORTANCE, PEERS = (
+    f"tests/cuda/test_{name}_cuda.py::test_"
+    for name in ("intersect", "project", "rasterize", "importance", "peers")
 )
 OPS, BLOCKS = "tests/ops/test_", "tests/view/test_blocks.py::test_"
 TESTS = [
@@ -40,6 +41,10 @@ TESTS = [
         "gradients_match_float64[True-True-9-32]", "packed_gradients_are_the_same[3]",
         "gradients_of_some_of_the_composited_tiles[False]", "empty_lists_give_the_background",
         "entries_of_no_tile_name_any_row[True]",
+    )),
+    *(IMPORTANCE + test for test in (
+        "close_to_float64[8]", "close_to_float64[16]", "close_to_float64[32]",
+        "room_behind_the_rows_is_not_read",
     )),
     *(PEERS + test for test in (
         "rows_arrive_and_their_gradients_are_found",

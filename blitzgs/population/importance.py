@@ -15,7 +15,7 @@ world size and for any division of the work.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -47,10 +47,12 @@ class ViewBatch:
     Attributes:
         columns: of the cull matrix, one for each view, ascending.
         views: the same views.
+        keys: what `TileOwners` knows the views by; None: their columns.
     """
 
     columns: Sequence[int]
     views: Views
+    keys: Sequence[Hashable] | None = None
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,8 @@ def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Til
     """Divide the tiles of a batch among the ranks; no loss looks beyond their borders."""
     if owners.ranks.world_size == 1:
         return None
-    views = batch.views
-    ranges = owners.divide(list(batch.columns), views.width, views.height, options.tile_size)
+    views, keys = batch.views, batch.columns if batch.keys is None else batch.keys
+    ranges = owners.divide(list(keys), views.width, views.height, options.tile_size)
     return TileAssignment(owners.ranks, ranges)
 
 

@@ -174,3 +174,30 @@ def test_any_file_is_taken_or_refused(content):
             load_config(file)
         except ConfigError as error:
             assert "config.yaml" in str(error) or ":" in str(error)
+
+
+def test_the_papers_configuration_has_the_papers_values():
+    config = load_config(Path(__file__).parents[2] / "configs" / "paper.yaml", [])
+    schedule, rates, population, loss = config.schedule, config.optimiser, config.population, config.loss
+    assert config.data.downscale == 4
+    assert (schedule.iterations, schedule.batch_size, schedule.scale) == (90_000, 4, 1)
+    assert (schedule.densify_from, schedule.densify_until, schedule.densify_every) == (2_000, 32_000, 1_000)
+    assert (schedule.t1, schedule.t2, schedule.gate_from) == (16_000, 34_000, 24_000)
+    assert (schedule.size_prune_after, schedule.sh_every, schedule.position_decay) == (3_000, 1_000, 50_000)
+    assert schedule.reset_every == 0 and population.opacity_decay == 0
+    assert (rates.position, rates.position_final) == (1.6e-4, 1.6e-6)
+    assert (rates.sh_dc, rates.sh_rest) == (7.5e-3, pytest.approx(7.5e-3 / 20))
+    assert (rates.opacity, rates.scale, rates.rotation) == (2e-2, 7e-3, 1e-3)
+    assert (rates.beta1, rates.beta2, rates.eps, rates.final_share) == (0.9, 0.999, 1e-15, 1)
+    assert rates.position_noise == 0 and not rates.sparse
+    assert (population.grad_threshold, population.min_opacity, population.clone_scale) == (1e-4, 0.005, 0.01)
+    assert (population.prune_screen_radius, population.prune_world_scale) == (20, 0.1)
+    assert population.importance and population.phi
+    assert (population.pass1_keep, population.pass2_mass, population.gate_rate) == (0.7, 0.99, 0.6)
+    assert (population.max_gaussians, population.pixels_per_gaussian, population.min_observations) == (
+        0,
+        0,
+        1,
+    )
+    assert (loss.ssim, loss.scale) == (0.2, 10)
+    assert not config.model.antialiased and config.model.sh_degree == 3

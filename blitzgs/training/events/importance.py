@@ -67,7 +67,8 @@ def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
     for columns in by_size.values():
         for begin in range(0, len(columns), length):
             some = columns[begin : begin + length]
-            yield ViewBatch(some, state.views.pick([state.capture.train[column] for column in some]))
+            indices = [state.capture.train[column] for column in some]
+            yield ViewBatch(some, state.views.pick(indices), indices)
 
 
 def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Tensor:
