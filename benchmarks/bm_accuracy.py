@@ -77,8 +77,6 @@ def options_for(device: str) -> list[Option]:
     options = [
         Option("default"),
         Option("antialiased", antialiased=True),
-        Option("tiles of 8", tile_size=8),
-        Option("tiles of 32", tile_size=32),
         Option("batch of 4 views", views=4),
         Option("exchange", exchanged=True),
         Option("exchange in half precision", exchanged=True, half=True),

@@ -109,10 +109,10 @@ def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, 
     lists = (frame.isect_rows, frame.tile_offsets)
 
     def composite() -> None:
-        torch.ops.blitzgs.rasterize_fwd(*shapes, splats.colors, None, *lists, *grid, None, False, False, None)
+        torch.ops.blitzgs.rasterize_fwd(*shapes, splats.colors, None, *lists, grid, None, False, False, None)
 
     def contribute() -> None:
-        torch.ops.blitzgs.contributions(*shapes, *lists, *grid)
+        torch.ops.blitzgs.contributions(*shapes, *lists, grid)
 
     works = {"renders": renders, "survey": surveys, "sweep": sweeps}
     kernels = {"rasterize_fwd, one batch": composite, "contributions, one batch": contribute}

@@ -107,7 +107,9 @@ def run(scene: BenchmarkScene, repeats: int) -> list[dict[str, object]]:
     leaves = [t.clone().requires_grad_() for t in values]
     options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     v_image = torch.randn(HEIGHT, WIDTH, 3)
-    last_ids = torch.ops.blitzgs.rasterize_fwd(*values, None, rows, offsets, 1, WIDTH, HEIGHT, TILE, 0, -1)[2]
+    last_ids = torch.ops.blitzgs.rasterize_fwd(*values, None, rows, offsets, [1, WIDTH, HEIGHT, TILE, 0, -1])[
+        2
+    ]
     blends = count_blends(values, rows, offsets, last_ids)
 
     def ours(inputs: list[Tensor]) -> Tensor:

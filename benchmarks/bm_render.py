@@ -53,7 +53,7 @@ class OurRender:
         self.parameters = [raw[k].contiguous() for k in ("means", "quats", "scales", "opacities", "sh")]
         self.cameras = [scene.viewmats, scene.Ks]
         self.options = ProjectionOptions(scene.width, scene.height, TILE_SIZE, sh_degree=3)
-        self.grid = (len(scene.viewmats), scene.width, scene.height, TILE_SIZE, 0, -1)
+        self.grid = [len(scene.viewmats), scene.width, scene.height, TILE_SIZE, 0, -1]
 
     def project(self) -> None:
         """Run the projection."""
@@ -63,19 +63,19 @@ class OurRender:
         """List the rows of each tile."""
         r = self.rows
         count = int(r.counts[2])
-        self.lists = ops.intersect(r[4], r[5], r[7], r[6], r[1], None, *self.grid, count)
+        self.lists = ops.intersect(r[4], r[5], r[7], r[6], r[1], None, self.grid, count)
 
     def rasterize(self) -> None:
         """Composite the tiles."""
         r = self.rows
         self.splats = (r[4], r[5], r[7], r[8], None, *self.lists)
-        self.saved = rasterize_fwd(*self.splats, *self.grid, None, True, True)
+        self.saved = rasterize_fwd(*self.splats, self.grid, None, True, True)
 
     def rasterize_backward(self, v_renders: Tensor) -> None:
         """Differentiate the compositing."""
-        renders, rest, last, _, aux, packed = self.saved
+        _, rest, last, _, packed_splats, tile_order, packed = self.saved
         ops.rasterize_bwd_packed_(
-            *self.splats, renders, rest, last, aux, v_renders, *self.grid, False, packed
+            *self.splats, [rest, last, packed_splats, tile_order], v_renders, self.grid, False, packed
         )
         self.v_rows = [packed]
 

@@ -111,7 +111,8 @@ class Frame(NamedTuple):
         transmittances: [B, H, W], share of the background that shows.
         last_ids: int32 [B, H, W], for the backward pass.
         tile_work: int32 [B * T], list entries each composited tile went through.
-        aux: the backend's own.
+        packed_splats: uint8 [.., bytes], the splats as the backend's kernels read them.
+        tile_order: int32 [.., 16], in which order the backend's kernels took the tiles.
         gradients: where those of the splats are added up.
     """
 
@@ -130,7 +131,8 @@ class Frame(NamedTuple):
     transmittances: Tensor
     last_ids: Tensor
     tile_work: Tensor
-    aux: Tensor
+    packed_splats: Tensor
+    tile_order: Tensor
     gradients: GradientBuffer
 
 
@@ -196,14 +198,14 @@ class _Render:
             splats = arrived.splats
             backgrounds = _backgrounds(self.options.background, len(views), splats.means2d.device)
             arguments = (
-                splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, *lists, *grid
+                splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, *lists, grid
             )  # fmt: skip
             composited, gradients = self._composite(exchange, arguments, arrived.n_splats)
             self.mark("raster")
             counts = exchange.finish()
         if counts is None:
             return None, exchange.needed
-        renders, transmittances, last_ids, tile_work, aux = composited
+        renders, transmittances, last_ids, tile_work, packed_splats, tile_order = composited
         frame = Frame(
             views=views,
             options=self.options,
@@ -220,7 +222,8 @@ class _Render:
             transmittances=transmittances,
             last_ids=last_ids,
             tile_work=tile_work,
-            aux=aux,
+            packed_splats=packed_splats,
+            tile_order=tile_order,
             gradients=gradients,
         )
         return frame, exchange.needed
@@ -249,18 +252,18 @@ def inputs_of(
     return ProjectionInputs(table.parameters, cameras, options.projection(views), active or (), table["id"])
 
 
-def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> tuple[int, ...]:
+def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:
     """Return the tiles that this rank composites, as the ops take them."""
     tiles = (0, -1) if assignment is None else assignment.composited
-    return (len(views), views.width, views.height, options.tile_size, *tiles)
+    return [len(views), views.width, views.height, options.tile_size, *tiles]
 
 
-def list_splats(arrived: Arrived, grid: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+def list_splats(arrived: Arrived, grid: list[int]) -> tuple[Tensor, Tensor]:
     """Return the lists of the tiles of `tile_grid`: isect_rows and tile_offsets, as `Frame` has them."""
     splats = arrived.splats
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
-        *grid, arrived.n_isects, arrived.n_splats,
+        grid, arrived.n_isects, arrived.n_splats,
     )  # fmt: skip
     return isect_rows, tile_offsets
 
@@ -286,16 +289,17 @@ def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> S
     tiles = (0, -1) if frame.assignment is None else frame.assignment.tiles
     arguments = (
         splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
-        frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders,
+        frame.tile_offsets,
+        [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order], v_renders,
     )  # fmt: skip
-    grid = (len(views), views.width, views.height, options.tile_size, *tiles)
+    grid = [len(views), views.width, views.height, options.tile_size, *tiles]
     frame.exchange.expect_gradients()
     if v_renders.is_cuda:
         packed = frame.gradients.take(splats.means2d)
-        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, *grid, options.deterministic, packed)
+        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, grid, options.deterministic, packed)
         parts = [packed]
     else:
-        *parts, _ = torch.ops.blitzgs.rasterize_bwd(*arguments, None, *grid, False, options.deterministic)
+        *parts, _ = torch.ops.blitzgs.rasterize_bwd(*arguments, None, grid, False, options.deterministic)
     mark("raster back")
     gradients = frame.exchange.return_gradients(parts)
     mark("exchange back")

@@ -62,7 +62,7 @@ def survey(
             arrived = exchange.receive()
             splats = arrived.splats
             weights, pixels = torch.ops.blitzgs.contributions(
-                splats.means2d, splats.conics, splats.opacities, *list_splats(arrived, grid), *grid,
+                splats.means2d, splats.conics, splats.opacities, *list_splats(arrived, grid), grid,
                 arrived.n_splats,
             )  # fmt: skip
             counts = exchange.finish()

@@ -64,11 +64,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // opacity, color, mean2d_abs.
   m.def("splat_gradient_layout() -> int[]");
 
-  // Which rows each tile composites, front to back by (depth, id).
+  // Which rows each tile composites, front to back by (depth, id). grid: n_cameras, width, height, tile_size,
+  // tile_begin, tile_end (-1: all tiles).
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor depths, Tensor camera_ids, "
-      "Tensor? ids, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
-      "int n_isects, Tensor? n_rows=None) -> (Tensor isect_rows, Tensor tile_offsets)");
+      "Tensor? ids, int[] grid, int n_isects, Tensor? n_rows=None) -> (Tensor isect_rows, "
+      "Tensor tile_offsets)");
 
   // Rows on their way between ranks, packed for a collective or written straight into peers' memory (CUDA).
   m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
@@ -85,40 +86,34 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Writes a small tensor into pinned memory of the host, behind what is queued (CUDA).
   m.def("tell_host_(Tensor(a!) known, Tensor values) -> ()");
 
-  // Alpha compositing.
+  // Alpha compositing. composited: (transmittances, last_ids, packed_splats, tile_order) of the forward pass.
   m.def(
-      "rasterize_fwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
-      "backgrounds, "
-      "Tensor isect_rows, Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, "
-      "int tile_begin, int tile_end, Tensor? means2d_abs=None, bool clear_rest=True, "
-      "bool backward_follows=False, Tensor? n_rows=None) -> (Tensor renders, Tensor transmittances, "
-      "Tensor last_ids, Tensor tile_work, Tensor aux, Tensor row_gradients)");
-  // The same for a backward pass that adds up gradients in `packed`, which is zeroed; pixels that nobody owns
-  // are left as they are (CUDA).
+      "rasterize_fwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_rows, Tensor tile_offsets, int[] grid, Tensor? means2d_abs=None, "
+      "bool clear_rest=True, bool backward_follows=False, Tensor? n_rows=None) -> (Tensor renders, "
+      "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
+      "Tensor splat_gradients)");
+  // The same for a backward pass that adds up gradients in `packed`, which is zeroed; pixels of tiles that
+  // are not owned are left as they are (CUDA).
   m.def(
-      "rasterize_fwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
-      "backgrounds, Tensor isect_rows, Tensor tile_offsets, int n_cameras, int width, int height, "
-      "int tile_size, int tile_begin, int tile_end, Tensor(a!) packed, Tensor? n_rows=None) -> ("
-      "Tensor renders, Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor aux)");
+      "rasterize_fwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_rows, Tensor tile_offsets, int[] grid, Tensor(a!) packed, "
+      "Tensor? n_rows=None) -> (Tensor renders, Tensor transmittances, Tensor last_ids, Tensor tile_work, "
+      "Tensor packed_splats, Tensor tile_order)");
   m.def(
-      "rasterize_bwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
-      "backgrounds, "
-      "Tensor isect_rows, Tensor tile_offsets, Tensor renders, Tensor transmittances, Tensor last_ids, "
-      "Tensor aux, Tensor v_renders, Tensor? v_alphas, int n_cameras, int width, int height, int tile_size, "
-      "int tile_begin, int tile_end, bool absgrad, bool deterministic) -> (Tensor v_means2d, Tensor "
-      "v_conics, "
-      "Tensor v_row_opacities, Tensor v_colors, Tensor v_means2d_abs)");
+      "rasterize_bwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_rows, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
+      "Tensor? v_alphas, int[] grid, bool absgrad, bool deterministic) -> (Tensor v_means2d, "
+      "Tensor v_conics, Tensor v_row_opacities, Tensor v_colors, Tensor v_means2d_abs)");
   m.def(
-      "rasterize_bwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, Tensor? "
-      "backgrounds, Tensor isect_rows, Tensor tile_offsets, Tensor renders, Tensor transmittances, Tensor "
-      "last_ids, Tensor aux, Tensor v_renders, int n_cameras, int width, int height, int tile_size, "
-      "int tile_begin, int tile_end, bool deterministic, Tensor(a!) packed) -> ()");
+      "rasterize_bwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_rows, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
+      "int[] grid, bool deterministic, Tensor(a!) packed) -> ()");
 
   // What each row contributes to the pixels, without colours.
   m.def(
       "contributions(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor isect_rows, "
-      "Tensor tile_offsets, int n_cameras, int width, int height, int tile_size, int tile_begin, "
-      "int tile_end, Tensor? n_rows=None) -> (Tensor weights, Tensor pixels)");
+      "Tensor tile_offsets, int[] grid, Tensor? n_rows=None) -> (Tensor weights, Tensor pixels)");
 
   // L1 and SSIM of the owned tiles; fwd_bwd does both at once when the weights of the sums are known.
   m.def(

@@ -44,7 +44,7 @@ def row_contributions(
         n_cameras: number of views B.
         width: of every view, pixels.
         height: of every view, pixels.
-        tile_size: edge of a tile in pixels, as given to ``intersect``; 8, 16 or 32 on CUDA.
+        tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.
         tile_begin: first tile to composite.
         tile_end: end of the tiles to composite, -1 for all.
         n_rows: int64 [1] on the device of the rows: only the first so many are there. None: all.
@@ -56,8 +56,8 @@ def row_contributions(
         RuntimeError: wrong shapes or dtypes, a tile range outside the images, or a tile size that CUDA lacks.
     """
     weights, pixels = torch.ops.blitzgs.contributions(
-        means2d, conics, row_opacities, isect_rows, tile_offsets, n_cameras, width, height, tile_size,
-        tile_begin, tile_end, n_rows,
+        means2d, conics, row_opacities, isect_rows, tile_offsets,
+        [n_cameras, width, height, tile_size, tile_begin, tile_end], n_rows,
     )  # fmt: skip
     return weights, pixels
 
@@ -135,11 +135,11 @@ def contributions(
 def _of_rows(rows: Rows, n_views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Return the weights and pixels of all rows of a projection."""
     splats = rows.means2d, rows.conics, rows.opacities
-    grid = (n_views, width, height, _TILE_SIZE, 0, -1)
+    grid = [n_views, width, height, _TILE_SIZE, 0, -1]
     lists = torch.ops.blitzgs.intersect(
-        *splats, rows.depths, rows.camera_ids, None, *grid, int(rows.counts[2])
+        *splats, rows.depths, rows.camera_ids, None, grid, int(rows.counts[2])
     )
-    weights, pixels = torch.ops.blitzgs.contributions(*splats, *lists, *grid)
+    weights, pixels = torch.ops.blitzgs.contributions(*splats, *lists, grid)
     return weights, pixels
 
 

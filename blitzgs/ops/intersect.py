@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -68,12 +70,12 @@ def intersect(
             more, or more intersections than ``n_isects``.
     """
     rows = (means2d, conics, row_opacities, depths, camera_ids, ids)
-    grid = (n_cameras, width, height, tile_size, tile_begin, tile_end)
-    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(*rows, *grid, n_isects, n_rows)
+    grid = [n_cameras, width, height, tile_size, tile_begin, tile_end]
+    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(*rows, grid, n_isects, n_rows)
     # Lists that are not full have all intersections; on CUDA full ones may have lost some.
     checked = means2d.is_cuda and n_isects >= 0 and not torch.compiler.is_compiling()
     if checked and int(tile_offsets[-1]) == n_isects:
-        needed = len(torch.ops.blitzgs.intersect(*rows, *grid, -1, n_rows)[0])
+        needed = len(torch.ops.blitzgs.intersect(*rows, grid, -1, n_rows)[0])
         if needed > n_isects:
             raise RuntimeError(
                 f"blitzgs::intersect: n_isects is {n_isects} but there are {needed} intersections; pass the "
@@ -90,15 +92,11 @@ def _(
     depths: Tensor,
     camera_ids: Tensor,
     ids: Tensor | None,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
+    grid: Sequence[int],
     n_isects: int,
     n_rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
+    n_cameras, width, height, tile_size, *_ = grid
     tiles_x, tiles_y = tile_counts(width, height, tile_size)
     size = n_isects if n_isects >= 0 else torch.library.get_ctx().new_dynamic_size()
     return (

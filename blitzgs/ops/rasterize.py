@@ -74,11 +74,11 @@ def rasterize(
         ValueError: `tell_absgrad` under `torch.compile`.
     """
     splats = (means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets)
-    grid = (n_cameras, width, height, tile_size, tile_begin, tile_end)
+    grid = [n_cameras, width, height, tile_size, tile_begin, tile_end]
     if torch.compiler.is_compiling():
         if tell_absgrad is not None:
             raise ValueError("absolute gradients are not supported under torch.compile")
-        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, *grid)
+        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, grid, None, True, False, None)
         alphas = 1 - transmittances
     else:
         # Whose gradients stay packed, see `_gradients`.
@@ -108,26 +108,24 @@ def _(
     backgrounds: Tensor | None,
     isect_rows: Tensor,
     tile_offsets: Tensor,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
+    grid: Sequence[int],
     means2d_abs: Tensor | None = None,
     clear_rest: bool = True,
     backward_follows: bool = False,
     n_rows: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    pixels = (n_cameras, height, width)
-    aux_size = torch.library.get_ctx().new_dynamic_size()  # each backend's own business
-    n_ready = torch.library.get_ctx().new_dynamic_size() if backward_follows else 0
+) -> tuple[Tensor, ...]:
+    n_cameras, width, height, *_ = grid
+    pixels, context = (n_cameras, height, width), torch.library.get_ctx()
+    # The layout of what is packed is the backend's own.
+    row_bytes, n_ordered = context.new_dynamic_size(), context.new_dynamic_size()
+    n_ready = context.new_dynamic_size() if backward_follows else 0
     return (
         means2d.new_empty(*pixels, colors.shape[1]),
         means2d.new_empty(pixels),
         means2d.new_empty(pixels, dtype=torch.int32),
         means2d.new_empty(tile_offsets.shape[0] - 1, dtype=torch.int32),
-        means2d.new_empty(aux_size, dtype=torch.uint8),
+        means2d.new_empty(means2d.shape[0], row_bytes, dtype=torch.uint8),
+        means2d.new_empty(n_ordered, 16, dtype=torch.int32),
         means2d.new_empty(n_ready, SPLAT_GRADIENT),
     )
 
@@ -141,18 +139,10 @@ def _(
     backgrounds: Tensor | None,
     isect_rows: Tensor,
     tile_offsets: Tensor,
-    renders: Tensor,
-    transmittances: Tensor,
-    last_ids: Tensor,
-    aux: Tensor,
+    composited: Sequence[Tensor],
     v_renders: Tensor,
     v_alphas: Tensor | None,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int,
-    tile_begin: int,
-    tile_end: int,
+    grid: Sequence[int],
     absgrad: bool,
     deterministic: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -167,18 +157,19 @@ def _(
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    *_, last_ids, tile_work, aux, row_gradients = output
-    ctx.mark_non_differentiable(last_ids, tile_work, aux, row_gradients)
-    _save(ctx, inputs[:7], inputs[7:13], output)
-    ctx.absgrad = inputs[13] is not None and inputs[13].requires_grad
+    _, _, *others = output
+    ctx.mark_non_differentiable(*others)
+    *splats, grid, means2d_abs, _, _, _ = inputs
+    _save(ctx, splats, grid, output)
+    ctx.absgrad = means2d_abs is not None and means2d_abs.requires_grad
 
 
 def _save(ctx: Any, splats: Any, grid: Any, output: tuple[Tensor, ...]) -> None:
     # Not the renders, which callers may change in place: the backward pass does not need them.
-    _, transmittances, last_ids, _, aux, row_gradients = output
+    _, transmittances, last_ids, _, packed_splats, tile_order, splat_gradients = output
     ctx.set_materialize_grads(False)
-    ctx.gradients = GradientBuffer(row_gradients)
-    ctx.save_for_backward(*splats, transmittances, last_ids, aux)
+    ctx.gradients = GradientBuffer(splat_gradients)
+    ctx.save_for_backward(*splats, transmittances, last_ids, packed_splats, tile_order)
     ctx.grid = grid
 
 
@@ -187,7 +178,7 @@ def _backward(
 ) -> tuple[Tensor | None, ...]:
     v_alphas = None if v_transmittances is None else -v_transmittances
     *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, ctx.absgrad)
-    return (*splat_gradients, *(None,) * 8, v_abs, None, None, None)
+    return (*splat_gradients, None, None, None, v_abs, None, None, None)
 
 
 def _gradients(
@@ -213,22 +204,21 @@ def _first_gradients(
     absgrad: bool,
     may_pack: bool,
 ) -> tuple[Tensor | None, ...]:
-    *splats, transmittances, last_ids, aux = saved
-    colors = splats[3]
+    *splats, transmittances, last_ids, packed_splats, tile_order = saved
+    means2d, _, _, colors, *_ = splats
     if v_renders is None:
         v_renders = transmittances.new_zeros(*transmittances.shape, colors.shape[1])
-    # The op looks at the renders' shape and dtype alone, which are those of their gradient.
-    arguments = (*splats, v_renders, transmittances, last_ids, aux, v_renders)
+    arguments = (*splats, [transmittances, last_ids, packed_splats, tile_order], v_renders)
     deterministic = torch.are_deterministic_algorithms_enabled()
     v_abs = v_backgrounds = None
     v_splats: Sequence[Tensor]
     if may_pack and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
-        packed = ctx.gradients.take(splats[0])
-        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, *ctx.grid, deterministic, packed)
+        packed = ctx.gradients.take(means2d)
+        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, ctx.grid, deterministic, packed)
         v_splats = gradient_columns(packed)
     else:
         *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *arguments, v_alphas, *ctx.grid, absgrad, deterministic
+            *arguments, v_alphas, ctx.grid, absgrad, deterministic
         )
     if ctx.needs_input_grad[4]:
         v_backgrounds = torch.einsum("bhwd,bhw->bd", v_renders, transmittances)
@@ -245,7 +235,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
         *splats, grid, tell_absgrad, backward_follows, output = arguments
         if output is None:
-            output = rasterize_fwd(*splats, *grid, None, True, backward_follows)
+            output = rasterize_fwd(*splats, grid, None, True, backward_follows)
         _save(ctx, splats, grid, output)
         ctx.tell_absgrad = tell_absgrad
         return output[0], 1 - output[1]

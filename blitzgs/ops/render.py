@@ -43,7 +43,7 @@ def render_queued(
         sizes: what is needed, if that is known; None: as much as calls of this size needed before.
     """
     options = inputs.options
-    grid = (inputs.n_views, options.width, options.height, options.tile_size, 0, -1)
+    grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
 
     def attempt(capacity: Sizes | None) -> tuple[Rendered | None, list[int]]:
         projected = inputs.run(capacity)
@@ -52,10 +52,10 @@ def render_queued(
             n_isects = int(copy.read()[2]) if capacity is None else capacity.isects
             splats = rows.means2d, rows.conics, rows.opacities
             isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
-                *splats, rows.depths, rows.camera_ids, None, *grid, n_isects, n_rows
+                *splats, rows.depths, rows.camera_ids, None, grid, n_isects, n_rows
             )
             composited = torch.ops.blitzgs.rasterize_fwd(
-                *splats, channels(rows), backgrounds, isect_rows, tile_offsets, *grid, None, True,
+                *splats, channels(rows), backgrounds, isect_rows, tile_offsets, grid, None, True,
                 backward_follows, n_rows,
             )  # fmt: skip
             counts = copy.read()[:3]

@@ -77,8 +77,7 @@ __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& en
 }
 
 template <int TILE>
-__global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
-    contributions_kernel(const ContributionArguments args) {
+__global__ void __launch_bounds__(TILE* TILE, 4) contributions_kernel(const ContributionArguments args) {
   constexpr int kBatch = kForwardBatch<TILE>;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
   auto& shared = *reinterpret_cast<ContributionShared<TILE>*>(shared_bytes);
@@ -155,11 +154,7 @@ void launch_contributions(const ContributionArguments& args, CudaStream stream) 
 template <>
 void contributions<float>(const ContributionInput<float>& in, const ContributionSums& sums,
                           Workspace& workspace, CudaStream stream) {
-  const int size = in.grid.tile_size;
-  if (size != 8 && size != 16 && size != 32) {
-    throw std::runtime_error("blitzgs::contributions: tile_size must be 8, 16 or 32 on CUDA, got " +
-                             std::to_string(size));
-  }
+  check_tile_size("contributions", in.grid);
   check(cudaMemsetAsync(sums.weights, 0, in.n_rows * sizeof(*sums.weights), stream), "contributions");
   check(cudaMemsetAsync(sums.pixels, 0, in.n_rows * sizeof(*sums.pixels), stream), "contributions");
   const std::int64_t owned = in.grid.tile_end - in.grid.tile_begin;
@@ -168,16 +163,10 @@ void contributions<float>(const ContributionInput<float>& in, const Contribution
                                    nullptr,    in.isect_rows, in.tile_offsets, in.n_rows,
                                    0,          in.grid,       in.known_rows};
   auto* packed = static_cast<PackedRow*>(workspace.allocate_bytes(in.n_rows * sizeof(PackedRow)));
-  const TileOrder order(in.grid, owned, workspace.allocate_bytes(TileOrder::bytes(in.grid, owned)));
+  const TileOrder order(in.grid, owned, workspace.allocate<std::int32_t>(TileOrder::words(in.grid, owned)));
   prepare("contributions", rows, packed, nullptr, order, stream);
   const ContributionArguments args{packed, in.isect_rows, in.tile_offsets, in.grid, order, sums};
-  if (size == 8) {
-    launch_contributions<8>(args, stream);
-  } else if (size == 16) {
-    launch_contributions<16>(args, stream);
-  } else {
-    launch_contributions<32>(args, stream);
-  }
+  launch_contributions<kTileSize>(args, stream);
 }
 
 }  // namespace blitzgs::cuda

@@ -15,11 +15,10 @@ constexpr const char* kOp = "contributions";
 
 std::tuple<Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor& conics_in,
                                          const Tensor& opacities_in, const Tensor& isect_rows_in,
-                                         const Tensor& tile_offsets_in, std::int64_t n_cameras,
-                                         std::int64_t width, std::int64_t height, std::int64_t tile_size,
-                                         std::int64_t tile_begin, std::int64_t tile_end,
+                                         const Tensor& tile_offsets_in,
+                                         const std::vector<std::int64_t>& grid_numbers,
                                          const std::optional<Tensor>& n_rows) {
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const std::int64_t rows = means2d_in.size(0);
   check_floating(kOp, "means2d", means2d_in);
   check_shape(kOp, "means2d", means2d_in, {rows, 2});

@@ -104,7 +104,7 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
 #pragma unroll 1
   for (std::uint32_t i = blockIdx.x * kDepthThreads + threadIdx.x; i < n; i += gridDim.x * kDepthThreads) {
     const float depth = in.depths[i];
-    const Splat splat = load_splat(in, i);
+    const SplatShape splat = load_splat(in, i);
     const std::uint32_t key = digits.key(ordered_bits(depth) - range.low, splat.camera);
     keys[i] = key;
 #pragma unroll

@@ -89,7 +89,7 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t row,
     const int source = __ffs(left) - 1;
     const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
     std::int64_t at = turn + __shfl_sync(kFullWarp, start, source);
-    const Splat splat = load_splat(in, of_row);
+    const SplatShape splat = load_splat(in, of_row);
     for_each_owned(in.grid, splat, [&](const Owned& owned) {
       const int n = owned.last - owned.first;
       for (int k = lane; k < n && at + k < capacity; k += 32) {

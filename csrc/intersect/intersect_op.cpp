@@ -14,9 +14,8 @@ namespace {
 
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
                                      const Tensor& depths, const Tensor& camera_ids,
-                                     const std::optional<Tensor>& ids, std::int64_t n_cameras,
-                                     std::int64_t width, std::int64_t height, std::int64_t tile_size,
-                                     std::int64_t tile_begin, std::int64_t tile_end, std::int64_t n_isects,
+                                     const std::optional<Tensor>& ids,
+                                     const std::vector<std::int64_t>& grid_numbers, std::int64_t n_isects,
                                      const std::optional<Tensor>& known_rows) {
   constexpr const char* kOp = "intersect";
   check_floating(kOp, "means2d", means2d);
@@ -36,7 +35,7 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
     check_dtype(kOp, "ids", *ids, ScalarType::Long);
   }
   const RowCount row_count = checked_row_count(kOp, known_rows, means2d);
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   STD_TORCH_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(),
                   "blitzgs::intersect: tile numbers are 32-bit, got ", grid.count(),
                   " tiles; use larger tiles or render fewer views at once");

@@ -14,15 +14,15 @@ struct Owned {
   int ty;           // the tile row in its image
 };
 
-struct Splat {
+struct SplatShape {
   float mean[2], conic[3], opacity;
   int camera;
 };
 
-__device__ __forceinline__ Splat load_splat(const IntersectInput<float>& in, std::int64_t row) {
+__device__ __forceinline__ SplatShape load_splat(const IntersectInput<float>& in, std::int64_t row) {
   const float2 mean = reinterpret_cast<const float2*>(in.means2d)[row];
   const float* const conic = in.conics + 3 * row;
-  const Splat s{{mean.x, mean.y}, {conic[0], conic[1], conic[2]}, in.opacities[row], in.camera_ids[row]};
+  const SplatShape s{{mean.x, mean.y}, {conic[0], conic[1], conic[2]}, in.opacities[row], in.camera_ids[row]};
   // This makes the thread wait for all loads together. Otherwise the compiler moves each load behind the
   // tests before it.
   asm volatile("" ::"f"(s.mean[0]), "f"(s.mean[1]), "f"(s.conic[0]), "f"(s.conic[1]), "f"(s.conic[2]),
@@ -32,7 +32,7 @@ __device__ __forceinline__ Splat load_splat(const IntersectInput<float>& in, std
 
 // Calls f(owned tiles) for each tile row the splat touches.
 template <class F>
-__device__ __forceinline__ void for_each_owned(const TileGrid& grid, const Splat& splat, const F& f) {
+__device__ __forceinline__ void for_each_owned(const TileGrid& grid, const SplatShape& splat, const F& f) {
   const int n_owned = static_cast<int>(grid.tile_end - grid.tile_begin);
   const int image = splat.camera * static_cast<int>(grid.per_image()) - static_cast<int>(grid.tile_begin);
   for_each_tile_row(splat.mean, splat.conic, splat.opacity, grid.width, grid.height, grid.tile_size,
@@ -90,7 +90,7 @@ struct alignas(16) Touched {
   }
 };
 
-__device__ __forceinline__ Touched find_touched(const TileGrid& grid, const Splat& splat) {
+__device__ __forceinline__ Touched find_touched(const TileGrid& grid, const SplatShape& splat) {
   int count = 0, first = 0, top = 0;
   bool compact = true;
   Touched touched{};

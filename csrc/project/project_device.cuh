@@ -199,30 +199,6 @@ struct ShStage {
   }
 };
 
-// Writes the colour of row i, of Gaussian id (-1: none), and hides the row if it is not finite; the whole
-// warp takes part. sh_slot: where `stage` gathers its SH row.
-template <int DEGREE, bool QUADS>
-__device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>& camera,
-                                           const Vec3<float>& mean, ShStage<DEGREE>& stage, int sh_slot,
-                                           const ProjectOutputs<float>& out, std::int64_t i,
-                                           std::int32_t id) {
-  bool shown = true;
-  if constexpr (QUADS) {
-    stage.wait();
-    if (id < 0) return;
-    ShRow<DEGREE> sh;
-    stage.read(sh_slot, &sh);
-    shown = row_color(camera, mean, sh.values, DEGREE, out.colors + 3 * i);
-  } else if (id >= 0) {
-    shown = row_color(camera, mean, in.sh + 3 * in.options.sh_stride * std::int64_t{id}, DEGREE,
-                      out.colors + 3 * i);
-  }
-  if (shown) return;
-  out.opacities[i] = 0.f;
-  reinterpret_cast<int2*>(out.radii)[i] = {0, 0};
-  out.tiles_touched[i] = 0;
-}
-
 // Calls f(degree, quads) with both as types: the SH degree (0 without SH), and whether rows move by 16 bytes.
 template <class F>
 void dispatch_sh(const Inputs& in, const F& f) {

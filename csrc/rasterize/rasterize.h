@@ -70,7 +70,6 @@ struct RasterizeOutput {
 
 template <class T>
 struct RasterizeSaved {
-  const T* renders;
   const T* transmittances;
   const std::int32_t* last_ids;
   const T* v_renders;
@@ -86,20 +85,25 @@ struct RasterizeGradients {
   T* v_means2d_abs;  // null: not wanted
 };
 
-// The backend's own memory between forward and backward, 64-byte aligned. Its size, rasterize_aux_bytes(),
-// depends on shapes, not on values on the device; it fits the backward pass of rows and a grid if a forward
-// pass with room for these rows, or more, over these tiles, or more of them, can have left it.
+// Tiles composited in no plain order are listed by class of length (CUDA), so many numbers for each tile.
+inline constexpr int kTileOrderClasses = 16;
+
+// What forward leaves for backward besides its outputs, in the backend's own layout. Backward may have fewer
+// rows than forward had room for, and may differentiate fewer tiles than were composited.
 struct RasterizeAux {
-  const void* data;
-  std::int64_t bytes;
+  void* packed;             // rows as the kernels read them, rows * rasterize_row_bytes(), 64-byte aligned
+  std::int64_t rows;        // that forward had room for
+  std::int32_t* order;      // [1 + composited, kTileOrderClasses], or null: in the order of their numbers
+  std::int64_t composited;  // tiles
 };
 
 namespace cpu {
-std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, int n_channels);
-bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes);
+std::int64_t rasterize_row_bytes(int n_channels);
+// Whether forward leaves an order of the tiles that it composites.
+bool rasterize_orders_tiles(const TileGrid& grid);
 template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, void* aux, Workspace&,
-                   CudaStream);
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
+                   Workspace&, CudaStream);
 template <class T>
 void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
                    const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
@@ -107,11 +111,12 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
 }  // namespace cpu
 
 namespace cuda {
-std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, int n_channels);
-bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes);
+std::int64_t rasterize_row_bytes(int n_channels);
+// Whether forward leaves an order of the tiles that it composites.
+bool rasterize_orders_tiles(const TileGrid& grid);
 template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, void* aux, Workspace&,
-                   CudaStream);
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
+                   Workspace&, CudaStream);
 template <class T>
 void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
                    const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,

@@ -11,7 +11,6 @@
 
 #include "common/launch.cuh"
 #include "common/warp.cuh"
-#include "rasterize/aux_layout.cuh"
 #include "rasterize/backward_pixel.cuh"
 #include "rasterize/row_entries.cuh"
 #include "rasterize/unpack_gradients.cuh"
@@ -35,7 +34,7 @@ struct BackwardArguments {
 
 template <int TILE, int CHANNELS, bool DETERMINISTIC>
 struct BackwardShared {
-  static constexpr int kBatch = DETERMINISTIC ? (TILE == 32 ? 32 : 64) : TILE == 8 ? 64 : 256;
+  static constexpr int kBatch = DETERMINISTIC ? 64 : 256;
   static constexpr int kWarps = Tile<TILE>::kWarps, kSubtiles = Tile<TILE>::kSubtiles;
   EntryBatch<TILE, kBatch> batch;
   SubtileGradient<CHANNELS> v_render[kSubtiles];
@@ -133,7 +132,7 @@ __device__ __noinline__ float wide_dot(const BackwardArguments& args, const Pixe
 
 // WIDE: g is of all channels, not of the chunk's alone, which absolute sums need.
 template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
-__global__ void __launch_bounds__(TILE* TILE, TILE <= 16 ? 768 / (TILE * TILE) : 1)
+__global__ void __launch_bounds__(TILE* TILE, 768 / (TILE * TILE))
     backward_kernel(const BackwardArguments args) {
   using Shared = BackwardShared<TILE, CHANNELS, DETERMINISTIC>;
   constexpr int kBatch = Shared::kBatch;
@@ -250,14 +249,6 @@ void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream 
   }
 }
 
-void check_supported(const RasterizeInput<float>& in) {
-  const int size = in.grid.tile_size;
-  if (size != 8 && size != 16 && size != 32) {
-    throw std::runtime_error("blitzgs::rasterize_bwd: tile_size must be 8, 16 or 32 on CUDA, got " +
-                             std::to_string(size));
-  }
-}
-
 // The gradients of each row, a chunk of channels at a time.
 class PackedRows {
  public:
@@ -265,20 +256,19 @@ class PackedRows {
              const RasterizeAux& aux, bool deterministic, Workspace& workspace, CudaStream stream)
       : in_(in),
         saved_(saved),
-        layout_(in.grid, in.n_channels, aux.bytes),
-        aux_(const_cast<void*>(aux.data)),
+        aux_(aux),
         n_isects_(n_isects),
         stream_(stream),
         empty_(n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin) {
-    check_supported(in);
+    check_tile_size("rasterize_bwd", in.grid);
     if (empty_ || !deterministic) return;
     entries_ = static_cast<PackedGradient*>(workspace.allocate_bytes(n_isects * sizeof(PackedGradient)));
     sorted_ = sort_entries(in.isect_rows, n_isects, in.n_rows, workspace, stream);
   }
 
   ChannelChunk chunk(int first) const {
-    return {layout_.colors(aux_, in_.n_channels), in_.colors, in_.n_channels, first,
-            std::min(4, in_.n_channels - first)};
+    return {packed_colors(aux_, in_.n_channels), in_.colors, in_.n_channels, first,
+            std::min(kChunkChannels, in_.n_channels - first)};
   }
 
   // packed: zeros.
@@ -287,23 +277,17 @@ class PackedRows {
     if (entries_) {
       check(cudaMemsetAsync(entries_, 0, n_isects_ * sizeof(PackedGradient), stream_), "rasterize_bwd");
     }
-    const BackwardArguments args{layout_.rows(aux_),
+    const BackwardArguments args{packed_rows(aux_),
                                  chunk,
                                  in_.backgrounds,
                                  in_.isect_rows,
                                  in_.tile_offsets,
                                  in_.grid,
-                                 layout_.order(in_.grid, aux_),
+                                 TileOrder(in_.grid, aux_.composited, aux_.order),
                                  saved_,
                                  packed,
                                  entries_};
-    if (in_.grid.tile_size == 8) {
-      dispatch_backward<8>(args, absolute, stream_);
-    } else if (in_.grid.tile_size == 16) {
-      dispatch_backward<16>(args, absolute, stream_);
-    } else {
-      dispatch_backward<32>(args, absolute, stream_);
-    }
+    dispatch_backward<kTileSize>(args, absolute, stream_);
     if (!entries_) return;
     sum_entries_kernel<<<blocks_for(3 * n_isects_, 256), 256, 0, stream_>>>(
         sorted_.rows, sorted_.entries, n_isects_, in_.tile_offsets + in_.grid.count(), entries_, packed);
@@ -313,8 +297,7 @@ class PackedRows {
  private:
   const RasterizeInput<float>& in_;
   const RasterizeSaved<float>& saved_;
-  AuxLayout layout_;
-  void* aux_;  // not written
+  const RasterizeAux& aux_;
   std::int64_t n_isects_;
   CudaStream stream_;
   bool empty_;
@@ -333,7 +316,7 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
   const bool absolute = gradients.v_means2d_abs != nullptr;
   const PackedRows rows(in, saved, n_isects, aux, deterministic, workspace, stream);
   auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(in.n_rows * sizeof(PackedGradient)));
-  for (int first = 0; first < in.n_channels; first += 4) {
+  for (int first = 0; first < in.n_channels; first += kChunkChannels) {
     const ChannelChunk chunk = rows.chunk(first);
     check(cudaMemsetAsync(packed, 0, in.n_rows * sizeof(PackedGradient), stream), "rasterize_bwd");
     rows.add(chunk, absolute, packed);

@@ -101,20 +101,16 @@ void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
 }  // namespace
 
 // The prepared rows of float32; float64, which is for checking, prepares them again in the backward pass.
-std::int64_t rasterize_aux_bytes(const TileGrid&, std::int64_t n_rows, int) {
-  return n_rows * static_cast<std::int64_t>(sizeof(SplatRow<float>));
-}
+std::int64_t rasterize_row_bytes(int) { return sizeof(SplatRow<float>); }
 
-bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes) {
-  return bytes >= rasterize_aux_bytes(grid, n_rows, n_channels);
-}
+bool rasterize_orders_tiles(const TileGrid&) { return false; }
 
 template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, void* aux,
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
                    Workspace& workspace, CudaStream) {
   if (out.clear_rest) clear_unowned(in, out);
-  const SplatRow<T>* splats =
-      pack_rows(in, sizeof(T) == 4 ? static_cast<SplatRow<T>*>(aux) : allocate_rows<T>(in.n_rows, workspace));
+  const SplatRow<T>* splats = pack_rows(
+      in, sizeof(T) == 4 ? static_cast<SplatRow<T>*>(aux.packed) : allocate_rows<T>(in.n_rows, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, false);
   const TileMemory<T> memory(in, workspace);
   parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](std::int64_t task, int worker) {
@@ -144,7 +140,7 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   parallel_for(0, in.n_rows * width, 1 << 16,
                [&](std::int64_t begin, std::int64_t end) { std::fill(sums + begin, sums + end, T(0)); });
 
-  const SplatRow<T>* splats = sizeof(T) == 4 ? static_cast<const SplatRow<T>*>(aux.data)
+  const SplatRow<T>* splats = sizeof(T) == 4 ? static_cast<const SplatRow<T>*>(aux.packed)
                                              : pack_rows(in, allocate_rows<T>(in.n_rows, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, absgrad);
   const TileMemory<T> memory(in, workspace);
@@ -163,11 +159,11 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   write_gradients(in, sums, width, gradients);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                           \
-  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, void*, Workspace&, \
-                                 CudaStream);                                                            \
-  template void rasterize_bwd<T>(const RasterizeInput<T>&, const RasterizeSaved<T>&, std::int64_t,       \
-                                 const RasterizeAux&, bool, const RasterizeGradients<T>&, Workspace&,    \
+#define BLITZGS_INSTANTIATE(T)                                                                             \
+  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, const RasterizeAux&, \
+                                 Workspace&, CudaStream);                                                  \
+  template void rasterize_bwd<T>(const RasterizeInput<T>&, const RasterizeSaved<T>&, std::int64_t,         \
+                                 const RasterizeAux&, bool, const RasterizeGradients<T>&, Workspace&,      \
                                  CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)

@@ -4,7 +4,6 @@
 
 #include "common/launch.cuh"
 #include "common/warp.cuh"
-#include "rasterize/aux_layout.cuh"
 #include "rasterize/compositor.cuh"
 #include "rasterize/pack_rows.cuh"
 
@@ -75,8 +74,7 @@ __device__ __forceinline__ void zero_share(const ForwardArguments& args, std::in
 
 // The first blocks are the owned tiles; the rest, if wanted, write zeros.
 template <int TILE, int CHANNELS>
-__global__ void __launch_bounds__(TILE* TILE, TILE == 16 ? 4 : 1)
-    forward_kernel(const ForwardArguments args) {
+__global__ void __launch_bounds__(TILE* TILE, 4) forward_kernel(const ForwardArguments args) {
   constexpr int kBatch = kForwardBatch<TILE>;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
   auto& batch = *reinterpret_cast<EntryBatch<TILE, kBatch>*>(shared_bytes);
@@ -169,49 +167,39 @@ void launch_forward(ForwardArguments args, CudaStream stream) {
 
 }  // namespace
 
-std::int64_t rasterize_aux_bytes(const TileGrid& grid, std::int64_t n_rows, int n_channels) {
-  return AuxLayout::bytes(grid, n_rows, n_channels);
+std::int64_t rasterize_row_bytes(int n_channels) {
+  return sizeof(PackedRow) + (n_channels <= kChunkChannels ? sizeof(float4) : 0);
 }
 
-bool rasterize_aux_fits(const TileGrid& grid, std::int64_t n_rows, int n_channels, std::int64_t bytes) {
-  return AuxLayout(grid, n_channels, bytes).holds(grid, n_rows);
-}
+bool rasterize_orders_tiles(const TileGrid& grid) { return grid.tile_end - grid.tile_begin != grid.count(); }
 
 template <>
-void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out, void* aux,
-                          Workspace&, CudaStream stream) {
+void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out,
+                          const RasterizeAux& aux, Workspace&, CudaStream stream) {
+  check_tile_size("rasterize_fwd", in.grid);
   const std::int64_t zero_rows = out.row_gradients ? in.n_rows : 0;
   if (in.grid.count() == 0) {
     zero_gradients(out, zero_rows, stream);
     return;
   }
-  const AuxLayout layout(in.grid, in.n_channels, AuxLayout::bytes(in.grid, in.n_rows, in.n_channels));
-  PackedRow* const rows = layout.rows(aux);
-  float4* const colors = layout.colors(aux, in.n_channels);
-  const TileOrder order = layout.order(in.grid, aux);
+  PackedRow* const rows = packed_rows(aux);
+  float4* const colors = packed_colors(aux, in.n_channels);
+  const TileOrder order(in.grid, aux.composited, aux.order);
   prepare("rasterize_fwd", in, rows, colors, order, stream);
-  for (int first = 0; first < in.n_channels; first += 4) {
-    const ForwardArguments args{rows,
-                                {colors, in.colors, in.n_channels, first, std::min(4, in.n_channels - first)},
-                                in.backgrounds,
-                                in.isect_rows,
-                                in.tile_offsets,
-                                in.grid,
-                                order,
-                                out,
-                                zero_rows,
-                                0,
-                                in.known_rows};
-    if (in.grid.tile_size == 8) {
-      launch_forward<8>(args, stream);
-    } else if (in.grid.tile_size == 16) {
-      launch_forward<16>(args, stream);
-    } else if (in.grid.tile_size == 32) {
-      launch_forward<32>(args, stream);
-    } else {
-      throw std::runtime_error("blitzgs::rasterize_fwd: tile_size must be 8, 16 or 32 on CUDA, got " +
-                               std::to_string(in.grid.tile_size));
-    }
+  for (int first = 0; first < in.n_channels; first += kChunkChannels) {
+    const ForwardArguments args{
+        rows,
+        {colors, in.colors, in.n_channels, first, std::min(kChunkChannels, in.n_channels - first)},
+        in.backgrounds,
+        in.isect_rows,
+        in.tile_offsets,
+        in.grid,
+        order,
+        out,
+        zero_rows,
+        0,
+        in.known_rows};
+    launch_forward<kTileSize>(args, stream);
   }
 }
 

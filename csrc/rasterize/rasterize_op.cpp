@@ -78,19 +78,24 @@ struct Splats {
   std::optional<Tensor> backgrounds;
 };
 
+using CompositedTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
 // Zeroes row_gradients, if there are any.
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> composite(const Splats& splats,
-                                                             std::optional<Tensor> row_gradients,
-                                                             bool clear_rest) {
+CompositedTensors composite(const Splats& splats, std::optional<Tensor> row_gradients, bool clear_rest) {
   const TileGrid& grid = splats.grid;
   Tensor renders = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width, splats.n_channels});
   Tensor transmittances = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width});
   Tensor last_ids = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width}, ScalarType::Int);
   Tensor tile_work = make_empty(splats.means2d, {grid.count()}, ScalarType::Int);
-  Tensor aux =
-      make_empty(splats.means2d,
-                 {backend::rasterize_aux_bytes(grid, splats.n_rows, static_cast<int>(splats.n_channels))},
-                 ScalarType::Byte);
+  const std::int64_t composited = grid.tile_end - grid.tile_begin;
+  Tensor packed = make_empty(
+      splats.means2d, {splats.n_rows, backend::rasterize_row_bytes(static_cast<int>(splats.n_channels))},
+      ScalarType::Byte);
+  Tensor order = make_empty(splats.means2d,
+                            {backend::rasterize_orders_tiles(grid) ? 1 + composited : 0, kTileOrderClasses},
+                            ScalarType::Int);
+  const RasterizeAux aux{mutable_data<void>(packed), splats.n_rows,
+                         order.size(0) > 0 ? mutable_data<std::int32_t>(order) : nullptr, composited};
   DeviceScope scope(splats.means2d);
   dispatch_floating(splats.means2d, [&](auto zero) {
     using T = decltype(zero);
@@ -100,19 +105,18 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> composite(const Splats& splat
                                  mutable_data<std::int32_t>(tile_work),
                                  row_gradients ? mutable_data<T>(*row_gradients) : nullptr,
                                  clear_rest};
-    backend::rasterize_fwd(splats.input<T>(), out, mutable_data<void>(aux), scope.workspace, scope.stream);
+    backend::rasterize_fwd(splats.input<T>(), out, aux, scope.workspace, scope.stream);
   });
-  return {renders, transmittances, last_ids, tile_work, aux};
+  return {renders, transmittances, last_ids, tile_work, packed, order};
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
-    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t tile_begin, std::int64_t tile_end, const std::optional<Tensor>&, bool clear_rest,
+    const std::vector<std::int64_t>& grid_numbers, const std::optional<Tensor>&, bool clear_rest,
     bool backward_follows, const std::optional<Tensor>& known_rows) {
   constexpr const char* kOp = "rasterize_fwd";
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid, known_rows);
   const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
@@ -121,22 +125,24 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
   return std::tuple_cat(std::move(composited), std::tuple(row_gradients));
 }
 
-// The arguments that the backward ops share, checked and contiguous.
+// What the backward ops need of the forward pass, checked and contiguous: (transmittances, last_ids,
+// packed_splats, tile_order), and the gradients of the images.
 struct Composited {
-  Composited(const char* op, const Splats& splats, const Tensor& renders_in, const Tensor& transmittances_in,
-             const Tensor& last_ids_in, const Tensor& aux_in, const Tensor& v_renders_in,
-             const std::optional<Tensor>& v_alphas_in, std::int64_t width, std::int64_t height)
-      : renders(as_contiguous(renders_in)),
-        transmittances(as_contiguous(transmittances_in)),
-        last_ids(as_contiguous(last_ids_in)),
-        v_renders(as_contiguous(v_renders_in)),
-        aux(aux_in) {
-    const std::int64_t B = splats.grid.n_cameras;
+  Composited(const char* op, const Splats& splats, const std::vector<Tensor>& composited,
+             const Tensor& v_renders_in, const std::optional<Tensor>& v_alphas_in)
+      : v_renders(as_contiguous(v_renders_in)), grid_count(splats.grid.count()) {
+    STD_TORCH_CHECK(composited.size() == 4, "blitzgs::", op,
+                    ": composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
+                    composited.size(), " tensors");
+    transmittances = as_contiguous(composited[0]);
+    last_ids = as_contiguous(composited[1]);
+    packed = composited[2];
+    order = composited[3];
+    const TileGrid& grid = splats.grid;
+    const std::int64_t B = grid.n_cameras, height = grid.height, width = grid.width;
     const ScalarType dtype = splats.means2d.scalar_type();
-    for (const auto& [name, tensor] : {std::pair{"renders", &renders}, std::pair{"v_renders", &v_renders}}) {
-      check_shape(op, name, *tensor, {B, height, width, splats.n_channels});
-      check_dtype(op, name, *tensor, dtype);
-    }
+    check_shape(op, "v_renders", v_renders, {B, height, width, splats.n_channels});
+    check_dtype(op, "v_renders", v_renders, dtype);
     check_shape(op, "transmittances", transmittances, {B, height, width});
     check_dtype(op, "transmittances", transmittances, dtype);
     check_shape(op, "last_ids", last_ids, {B, height, width});
@@ -146,39 +152,50 @@ struct Composited {
       check_dtype(op, "v_alphas", *v_alphas_in, dtype);
       v_alphas = as_contiguous(*v_alphas_in);
     }
-    check_shape(op, "aux", aux, {-1});
-    STD_TORCH_CHECK(backend::rasterize_aux_fits(splats.grid, splats.n_rows,
-                                                static_cast<int>(splats.n_channels), aux.size(0)) &&
-                        reinterpret_cast<std::uintptr_t>(aux.const_data_ptr()) % 64 == 0,
-                    "blitzgs::", op, ": aux must be as rasterize_fwd returned it for these tiles and ",
-                    splats.n_rows, " rows, or more, got ", aux.size(0), " bytes");
+    check_shape(op, "packed_splats", packed,
+                {-1, backend::rasterize_row_bytes(static_cast<int>(splats.n_channels))});
+    check_dtype(op, "packed_splats", packed, ScalarType::Byte);
+    check_shape(op, "tile_order", order, {-1, kTileOrderClasses});
+    check_dtype(op, "tile_order", order, ScalarType::Int);
+    STD_TORCH_CHECK(packed.size(0) >= splats.n_rows && tiles() >= grid.tile_end - grid.tile_begin &&
+                        packed.is_contiguous() && order.is_contiguous() &&
+                        reinterpret_cast<std::uintptr_t>(packed.const_data_ptr()) % 64 == 0,
+                    "blitzgs::", op,
+                    ": packed_splats and tile_order must be as rasterize_fwd returned them, ", "for ",
+                    splats.n_rows, " rows and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
+                    packed.size(0), " and ", tiles());
   }
 
-  RasterizeAux own() const { return {data<void>(aux), aux.size(0)}; }
+  RasterizeAux aux() const {
+    return {const_cast<void*>(packed.const_data_ptr()), packed.size(0),
+            order.size(0) > 0 ? const_cast<std::int32_t*>(data<std::int32_t>(order)) : nullptr, tiles()};
+  }
 
   template <class T>
   RasterizeSaved<T> saved() const {
-    return {data<T>(renders), data<T>(transmittances), data<std::int32_t>(last_ids), data<T>(v_renders),
+    return {data<T>(transmittances), data<std::int32_t>(last_ids), data<T>(v_renders),
             data_or_null<T>(v_alphas)};
   }
 
-  Tensor renders, transmittances, last_ids, v_renders, aux;
+  Tensor transmittances, last_ids, v_renders, packed, order;
   std::optional<Tensor> v_alphas;
+  std::int64_t grid_count;
+
+ private:
+  // How many were composited.
+  std::int64_t tiles() const { return order.size(0) > 0 ? order.size(0) - 1 : grid_count; }
 };
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
-    const Tensor& renders, const Tensor& transmittances, const Tensor& last_ids, const Tensor& aux,
-    const Tensor& v_renders, const std::optional<Tensor>& v_alphas, std::int64_t n_cameras,
-    std::int64_t width, std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
-    std::int64_t tile_end, bool absgrad, bool deterministic) {
+    const std::vector<Tensor>& composited_in, const Tensor& v_renders, const std::optional<Tensor>& v_alphas,
+    const std::vector<std::int64_t>& grid_numbers, bool absgrad, bool deterministic) {
   constexpr const char* kOp = "rasterize_bwd";
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid);
-  const Composited composited(kOp, splats, renders, transmittances, last_ids, aux, v_renders, v_alphas, width,
-                              height);
+  const Composited composited(kOp, splats, composited_in, v_renders, v_alphas);
   const std::int64_t n_rows = splats.n_rows;
   Tensor v_means2d = make_empty(splats.means2d, {n_rows, 2});
   Tensor v_conics = make_empty(splats.means2d, {n_rows, 3});
@@ -192,7 +209,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
                                           mutable_data<T>(v_opacities), mutable_data<T>(v_colors),
                                           absgrad ? mutable_data<T>(v_means2d_abs) : nullptr};
     backend::rasterize_bwd(splats.input<T>(), composited.saved<T>(), splats.isect_rows.size(0),
-                           composited.own(), deterministic, gradients, scope.workspace, scope.stream);
+                           composited.aux(), deterministic, gradients, scope.workspace, scope.stream);
   });
   return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
 }
@@ -208,13 +225,14 @@ void check_packed(const char* op, const Splats& splats, const Tensor& packed) {
   STD_TORCH_CHECK(packed.is_contiguous(), "blitzgs::", op, ": packed must be contiguous");
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd_packed(
-    const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
-    const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
-    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t tile_begin, std::int64_t tile_end, Tensor packed, const std::optional<Tensor>& known_rows) {
+CompositedTensors rasterize_fwd_packed(const Tensor& means2d, const Tensor& conics,
+                                       const Tensor& row_opacities, const Tensor& colors,
+                                       const std::optional<Tensor>& backgrounds, const Tensor& isect_rows,
+                                       const Tensor& tile_offsets,
+                                       const std::vector<std::int64_t>& grid_numbers, Tensor packed,
+                                       const std::optional<Tensor>& known_rows) {
   constexpr const char* kOp = "rasterize_fwd_packed_";
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid, known_rows);
   check_packed(kOp, splats, packed);
@@ -223,21 +241,18 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd_packed(
 
 void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
                           const Tensor& colors, const std::optional<Tensor>& backgrounds,
-                          const Tensor& isect_rows, const Tensor& tile_offsets, const Tensor& renders,
-                          const Tensor& transmittances, const Tensor& last_ids, const Tensor& aux,
-                          const Tensor& v_renders, std::int64_t n_cameras, std::int64_t width,
-                          std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
-                          std::int64_t tile_end, bool deterministic, Tensor packed) {
+                          const Tensor& isect_rows, const Tensor& tile_offsets,
+                          const std::vector<Tensor>& composited_in, const Tensor& v_renders,
+                          const std::vector<std::int64_t>& grid_numbers, bool deterministic, Tensor packed) {
   constexpr const char* kOp = "rasterize_bwd_packed_";
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
+  const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
                       grid);
   check_packed(kOp, splats, packed);
-  const Composited composited(kOp, splats, renders, transmittances, last_ids, aux, v_renders, std::nullopt,
-                              width, height);
+  const Composited composited(kOp, splats, composited_in, v_renders, std::nullopt);
   DeviceScope scope(splats.means2d);
   cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_rows.size(0),
-                             composited.own(), deterministic, mutable_data<float>(packed), scope.workspace,
+                             composited.aux(), deterministic, mutable_data<float>(packed), scope.workspace,
                              scope.stream);
 }
 #endif

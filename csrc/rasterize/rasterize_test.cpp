@@ -58,7 +58,7 @@ struct Scene {
 
   // The sum of all colours of the image.
   double render() {
-    cpu::rasterize_fwd(input(), {renders.data(), rest.data(), last.data(), work.data()}, nullptr, workspace,
+    cpu::rasterize_fwd(input(), {renders.data(), rest.data(), last.data(), work.data()}, {}, workspace,
                        nullptr);
     double sum = 0;
     for (const T value : renders) sum += value;
@@ -96,7 +96,7 @@ TEST_CASE("the gradient predicts a small step") {
   const std::vector<double> ones(2400, 1.0);
   std::vector<double> v_means(4), v_conics(6), v_opacities(2), v_colors(6), v_abs(4);
   cpu::rasterize_bwd<double>(
-      scene.input(), {scene.renders.data(), scene.rest.data(), scene.last.data(), ones.data(), nullptr},
+      scene.input(), {scene.rest.data(), scene.last.data(), ones.data(), nullptr},
       static_cast<std::int64_t>(scene.rows.size()), {}, true,
       {v_means.data(), v_conics.data(), v_opacities.data(), v_colors.data(), v_abs.data()}, scene.workspace,
       nullptr);

@@ -9,6 +9,8 @@
 // pixel.
 #pragma once
 #include <cstdint>
+#include <stdexcept>
+#include <string>
 
 #include "common/cuda_check.h"
 #include "common/warp.cuh"
@@ -40,9 +42,25 @@ struct __align__(16) PackedGradient {
 };
 static_assert(sizeof(PackedGradient) == sizeof(SplatGradient));
 
+// Edge of the tiles that the kernels composite, and how many channels a launch does.
+inline constexpr int kTileSize = 16, kChunkChannels = 4;
+
+inline void check_tile_size(const char* op, const TileGrid& grid) {
+  if (grid.tile_size == kTileSize) return;
+  throw std::runtime_error(std::string("blitzgs::") + op + ": tile_size must be 16 on CUDA, got " +
+                           std::to_string(grid.tile_size));
+}
+
+inline PackedRow* packed_rows(const RasterizeAux& aux) { return static_cast<PackedRow*>(aux.packed); }
+
+// The colours, behind all rows; null where there are too many channels to pack.
+inline float4* packed_colors(const RasterizeAux& aux, int n_channels) {
+  return n_channels <= kChunkChannels ? reinterpret_cast<float4*>(packed_rows(aux) + aux.rows) : nullptr;
+}
+
 // The channels of one launch: up to 4 of n_channels, from `first`.
 struct ChannelChunk {
-  const float4* packed;  // colors of aux (aux_layout.cuh), or null
+  const float4* packed;  // packed_colors(), or null
   const float* colors;   // [P, n_channels] otherwise
   int n_channels, first, count;
 };

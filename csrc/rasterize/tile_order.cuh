@@ -10,11 +10,12 @@
 #include "common/warp.cuh"
 #include "common/zeros.cuh"
 #include "math/tiles.h"
+#include "rasterize/rasterize.h"
 
 namespace blitzgs::cuda {
 
 // By the power of two below their length; the first class has the longest lists, the last the empty ones.
-inline constexpr int kLengthClasses = 16;
+inline constexpr int kLengthClasses = kTileOrderClasses;
 
 // The composited tiles by class: how many each class has, and which, in any order, n_tiles places for each.
 // Null where all tiles are composited, which come one after the other.
@@ -24,16 +25,16 @@ struct TileOrder {
   std::int64_t first;
   int n_tiles;
 
-  // Memory for the order of so many of the tiles of a grid's images.
-  static std::int64_t bytes(const TileGrid& grid, std::int64_t composited) {
-    return composited == grid.count() ? 0 : (1 + composited) * kBytesPerTile;
+  // Numbers of the order of so many of the tiles of a grid's images.
+  static std::int64_t words(const TileGrid& grid, std::int64_t composited) {
+    return composited == grid.count() ? 0 : (1 + composited) * kLengthClasses;
   }
 
   // In such memory, for tiles that are all among the composited ones.
-  TileOrder(const TileGrid& grid, std::int64_t composited, void* memory)
+  TileOrder(const TileGrid& grid, std::int64_t composited, std::int32_t* memory)
       : first(grid.tile_begin), n_tiles(static_cast<int>(grid.tile_end - grid.tile_begin)) {
     if (composited == grid.count()) return;
-    counts = static_cast<std::int32_t*>(memory);
+    counts = memory;
     tiles = counts + kLengthClasses;
     n_tiles = static_cast<int>(composited);
   }
@@ -82,9 +83,6 @@ struct TileOrder {
     }
     return 0;  // not reached: the counts add up to n_tiles
   }
-
- private:
-  static constexpr std::int64_t kBytesPerTile = kLengthClasses * sizeof(std::int32_t);
 };
 
 }  // namespace blitzgs::cuda

@@ -72,7 +72,7 @@ def test_table_and_figures(scene, tmp_path):
 
 def test_what_was_measured_stays_when_a_run_is_cut_off(scene, tmp_path, monkeypatch, capsys):
     def measure(option, *_):
-        if option.name == "tiles of 8":
+        if option.name == "batch of 4 views":
             raise KeyboardInterrupt
         return bm_accuracy.Figures(option.name, 1.0, 1e-6, 1e-5, 0.01)
 

@@ -51,8 +51,8 @@ class Scene:
     def project(self, device: str, dtype: torch.dtype = torch.float32, **changes: Any) -> Rows:
         return project_rows(self.inputs(device, dtype, **changes))
 
-    def grid(self, tile_size: int = 16, begin: int = 0, end: int = -1) -> tuple[int, ...]:
-        return (len(self.Ks), self.width, self.height, tile_size, begin, end)
+    def grid(self, tile_size: int = 16, begin: int = 0, end: int = -1) -> list[int]:
+        return [len(self.Ks), self.width, self.height, tile_size, begin, end]
 
 
 def _viewmat(angle: float, distance: float) -> Tensor:

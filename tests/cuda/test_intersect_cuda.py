@@ -10,7 +10,7 @@ def lists(rows, grid, device, ids=None, count=-1):
     means2d, conics, depths, opacities = (rows[i].to(device) for i in (4, 5, 6, 7))
     entries, offsets = ops.intersect(
         means2d, conics, opacities, depths, rows[1].to(device), ids if ids is None else ids.to(device),
-        *grid, count,
+        grid, count,
     )  # fmt: skip
     offsets = offsets.cpu()
     return entries[: offsets[-1]].cpu(), offsets  # behind these nothing was written

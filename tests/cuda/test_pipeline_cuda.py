@@ -32,8 +32,9 @@ def test_gradients_are_those_from_columns(degree):
     rows, splats = frame.rows, frame.splats
     *unpacked, _ = ops.rasterize_bwd(
         splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
-        frame.tile_offsets, frame.renders, frame.transmittances, frame.last_ids, frame.aux, v_renders, None,
-        len(views), views.width, views.height, options.tile_size, 0, -1, False, True,
+        frame.tile_offsets,
+        [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order], v_renders, None,
+        [len(views), views.width, views.height, options.tile_size, 0, -1], False, True,
     )  # fmt: skip
     for x, y in zip(gradient_columns(packed), unpacked, strict=True):
         assert y.any() and torch.equal(x, y)

@@ -193,7 +193,7 @@ def alone(monkeypatch):
 def _rasterize_into(*arguments):
     *rest, table, n_rows = arguments
     table[: int(n_rows)] = 0
-    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_rows)[:5]
+    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_rows)[:6]
 
 
 def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):

@@ -39,6 +39,8 @@ def crowded(device="cpu", dtype=torch.float32):
 @pytest.mark.parametrize("tile_size", [8, 16, 32])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
+    if backend[0] == "cuda" and tile_size != 16:
+        pytest.skip("CUDA composites tiles of 16 pixels")
     """One channel per row: its image is alpha T of that row."""
     splats, lists, grid = lists_of(crowded(*backend), tile_size)
     count = len(splats[0])

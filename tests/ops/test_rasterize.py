@@ -26,17 +26,25 @@ def forward(splats, n_cameras=1, tile_size=16, backgrounds=None, tile_begin=0, t
     """All outputs of the op."""
     tile_lists = lists(splats, n_cameras, tile_size=tile_size)
     return torch.ops.blitzgs.rasterize_fwd(
-        *splats.values(), backgrounds, *tile_lists, n_cameras, WIDTH, HEIGHT, tile_size, tile_begin, tile_end
+        *splats.values(),
+        backgrounds,
+        *tile_lists,
+        [n_cameras, WIDTH, HEIGHT, tile_size, tile_begin, tile_end],
     )
+
+
+def kept_by(outputs):
+    """What the backward pass takes of the outputs of the forward pass."""
+    _, transmittances, last_ids, _, packed_splats, tile_order, _ = outputs
+    return [transmittances, last_ids, packed_splats, tile_order]
 
 
 def backward(
     splats, outputs, v_renders, v_alphas=None, n_cameras=1, backgrounds=None, absgrad=True, tiles=(0, -1)
 ):
-    renders, transmittances, last_ids, _, aux, _ = outputs
     return torch.ops.blitzgs.rasterize_bwd(
-        *splats.values(), backgrounds, *lists(splats, n_cameras), renders, transmittances, last_ids, aux,
-        v_renders, v_alphas, n_cameras, WIDTH, HEIGHT, 16, *tiles, absgrad, True,
+        *splats.values(), backgrounds, *lists(splats, n_cameras), kept_by(outputs), v_renders, v_alphas,
+        [n_cameras, WIDTH, HEIGHT, 16, *tiles], absgrad, True,
     )  # fmt: skip
 
 
@@ -175,7 +183,7 @@ def test_last_ids_and_tile_work():
         alone = torch.zeros_like(offsets)
         alone[tile + 1 :] = work
         again = torch.ops.blitzgs.rasterize_fwd(
-            *splats.values(), None, shorter, alone, 1, WIDTH, HEIGHT, 16, tile, tile + 1
+            *splats.values(), None, shorter, alone, [1, WIDTH, HEIGHT, 16, tile, tile + 1]
         )
         assert torch.equal(again[2][0, y : y + 16, x : x + 16], last)
         assert again[3][tile] == work
@@ -184,7 +192,7 @@ def test_last_ids_and_tile_work():
             pixel = (last == last.max()).nonzero()[0]
             cut = alone.clamp(max=int(last.max()) - 1)
             less = torch.ops.blitzgs.rasterize_fwd(
-                *splats.values(), None, shorter, cut, 1, WIDTH, HEIGHT, 16, tile, tile + 1
+                *splats.values(), None, shorter, cut, [1, WIDTH, HEIGHT, 16, tile, tile + 1]
             )
             where = (0, y + pixel[0], x + pixel[1])
             assert less[1][where] > transmittances[where]
@@ -301,19 +309,21 @@ def test_zero_rows_and_empty_lists():
 def test_a_row_that_is_not_finite_leaves_the_others_alone():
     splats = random_splats(40, WIDTH, HEIGHT)
     tile_lists = lists(splats)
-    clean = torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1)
+    clean = torch.ops.blitzgs.rasterize_fwd(
+        *splats.values(), None, *tile_lists, [1, WIDTH, HEIGHT, 16, 0, -1]
+    )
     victim = int(tile_lists[0][0])
     others = tile_lists[0] != victim
     kept = torch.tensor([int(others[: int(end)].sum()) for end in tile_lists[1]])
     expected = torch.ops.blitzgs.rasterize_fwd(
-        *splats.values(), None, tile_lists[0][others], kept, 1, WIDTH, HEIGHT, 16, 0, -1
+        *splats.values(), None, tile_lists[0][others], kept, [1, WIDTH, HEIGHT, 16, 0, -1]
     )
     assert not torch.equal(clean[0], expected[0])
     for column in ("means2d", "conics", "opacities"):
         broken = Splats(*(t.clone() for t in vars(splats).values()))
         getattr(broken, column)[victim] = float("nan")
         found = torch.ops.blitzgs.rasterize_fwd(
-            *broken.values(), None, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1
+            *broken.values(), None, *tile_lists, [1, WIDTH, HEIGHT, 16, 0, -1]
         )
         assert torch.equal(found[0], expected[0])
         outputs = backward_with(broken, tile_lists, found)
@@ -321,10 +331,9 @@ def test_a_row_that_is_not_finite_leaves_the_others_alone():
 
 
 def backward_with(splats, tile_lists, outputs):
-    renders, transmittances, last_ids, _, aux, _ = outputs
     return torch.ops.blitzgs.rasterize_bwd(
-        *splats.values(), None, *tile_lists, renders, transmittances, last_ids, aux, torch.ones_like(renders),
-        None, 1, WIDTH, HEIGHT, 16, 0, -1, True, True,
+        *splats.values(), None, *tile_lists, kept_by(outputs), torch.ones_like(outputs[0]), None,
+        [1, WIDTH, HEIGHT, 16, 0, -1], True, True,
     )  # fmt: skip
 
 
@@ -353,14 +362,14 @@ def test_zeros_for_gradients_serve_once():
 
 def test_the_images_do_not_depend_on_a_backward_pass_to_follow():
     splats = random_splats(100, WIDTH, HEIGHT)
-    grid = (1, WIDTH, HEIGHT, 16, 0, -1, None, True)
+    grid = [1, WIDTH, HEIGHT, 16, 0, -1]
     plain, prepared = (
-        torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *lists(splats), *grid, follows)
+        torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *lists(splats), grid, None, True, follows)
         for follows in (False, True)
     )
     for x, y in zip(plain[:4], prepared[:4], strict=True):
         assert torch.equal(x, y)
-    assert plain[5].shape == prepared[5].shape == (0, 12)  # on the CPU nothing is left packed
+    assert plain[6].shape == prepared[6].shape == (0, 12)  # on the CPU nothing is left packed
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
@@ -370,14 +379,13 @@ def test_opcheck(absgrad):
     backgrounds = torch.rand(1, 3, requires_grad=True)
     probe = torch.zeros(6, 2, requires_grad=True) if absgrad else None
     tile_lists = lists(splats)
-    arguments = (*values, backgrounds, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1, probe)
+    arguments = (*values, backgrounds, *tile_lists, [1, WIDTH, HEIGHT, 16, 0, -1], probe)
     torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, arguments)
     torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, (*arguments, False, True))
     with torch.no_grad():
         outputs = forward(splats)
-        renders, transmittances, last_ids, _, aux, _ = outputs
         torch.library.opcheck(
             torch.ops.blitzgs.rasterize_bwd,
-            (*(t.detach() for t in values), None, *tile_lists, renders, transmittances, last_ids, aux,
-             renders, None, 1, WIDTH, HEIGHT, 16, 0, -1, absgrad, False),
+            (*(t.detach() for t in values), None, *tile_lists, kept_by(outputs), outputs[0], None,
+             [1, WIDTH, HEIGHT, 16, 0, -1], absgrad, False),
         )  # fmt: skip

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the CUDA kernels' bits and order rest on: compiler flags, and a wait at the start of kernels."""
+
+import json
+import re
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+CSRC = ROOT / "csrc"
+# Two kernels that compute the same of these must get the same bits.
+EXACT = ("project_row", "row_color", "row_tiles", "for_each_tile_row", "for_each_tile")
+DEFINED_IN = ("math/tiles.h", "project/project_row.h")
+LIBRARY = ROOT / "blitzgs" / "_lib" / "libblitzgs_cuda.so"
+# In SASS: the wait for the kernel in front, and what touches global memory.
+WAIT = "ACQBULK"
+GLOBAL_ACCESS = re.compile(r"\b(LDG|STG|ATOMG|REDG|RED|ATOM|LD\.E|ST\.E|LDGSTS)\b")
+
+
+@cache
+def source(path):
+    """The text without comments."""
+    return re.sub(r"//[^\n]*", "", (CSRC / path).read_text())
+
+
+@cache
+def closure(path):
+    """A file of csrc/ and all that it includes from there."""
+    found = {path}
+    for name in re.findall(r'#include "([^"]+)"', source(path)):
+        if name not in found:
+            found |= closure(name)
+    return found
+
+
+def kernel_files():
+    return sorted(str(path.relative_to(CSRC)) for path in CSRC.glob("*/*_cuda.cu"))
+
+
+def files_that_must_agree():
+    call = re.compile(rf"\b({'|'.join(EXACT)})\(")
+    return {
+        file
+        for file in kernel_files()
+        if any(call.search(source(part)) for part in closure(file) - set(DEFINED_IN))
+    }
+
+
+def files_without_contraction():
+    text = (ROOT / "cmake" / "cuda.cmake").read_text()
+    blocks = re.findall(
+        r"set_source_files_properties\((.*?)\)", text.replace("${CMAKE_SOURCE_DIR}", ""), re.S
+    )
+    (block,) = [block for block in blocks if "-fmad=false" in block]
+    return set(re.findall(r"/csrc/(\S+\.cu)", block))
+
+
+def test_kernels_whose_bits_must_agree_are_compiled_without_contraction():
+    needed = files_that_must_agree()
+    assert {"project/write_rows_cuda.cu", "intersect/intersect_cuda.cu"} <= needed
+    assert needed <= files_without_contraction()
+
+
+@pytest.mark.parametrize("folder", ["build"])
+def test_the_compiler_was_given_these_flags(folder):
+    commands = ROOT / folder / "compile_commands.json"
+    if not commands.exists():
+        pytest.skip("nothing was built in this checkout")
+    seen = set()
+    for entry in json.loads(commands.read_text()):
+        file = Path(entry["file"])
+        if CSRC not in file.parents:
+            continue
+        name = str(file.relative_to(CSRC))
+        if file.suffix == ".cpp":
+            assert "-ffp-contract=off" in entry["command"], name
+        elif name in files_that_must_agree():
+            assert re.search(r"-fmad=false|--fmad=false", entry["command"]), name
+        assert "fast-math" not in entry["command"].replace("--use_fast_math=false", ""), name
+        seen.add(name)
+    assert "project/project_cpu.cpp" in seen
+
+
+def kernels_launched_early():
+    """Names of the kernels that are given to `launch_early`, directly or by a local name."""
+    names = {}
+    for path in sorted([*CSRC.glob("*/*.cu"), *CSRC.glob("*/*.cuh")]):
+        file = str(path.relative_to(CSRC))
+        if file == "common/launch.cuh":
+            continue
+        text = source(file)
+        for match in re.finditer(r"launch_early\(\s*[^,]+,\s*([A-Za-z_]\w*)", text):
+            given = match.group(1)
+            # The last assignment of a local name before the launch, or the kernel itself.
+            assigned = re.findall(rf"\bauto {given}\s*=\s*([^;]+);", text[: match.start()])
+            if given == "kernel":
+                assert assigned, f"{file}: what does launch_early launch as {given}?"
+                for name in re.findall(r"\b([a-z]\w*)\s*<", assigned[-1]):
+                    names[name] = file
+            else:
+                names[given] = file
+    return names
+
+
+def body_of(name, file):
+    """The kernel of this name that a file launches."""
+    for part in sorted(closure(file), key=lambda part: part != file):
+        text = source(part)
+        for match in re.finditer(rf"__global__[^;{{]*?\b{name}\(", text):
+            begin = text.index("{", text.index(")", match.end()))
+            depth, at = 0, begin
+            while True:
+                depth += {"{": 1, "}": -1}.get(text[at], 0)
+                at += 1
+                if depth == 0:
+                    return text[begin:at]
+    raise AssertionError(f"{file} launches {name}, which it does not include")
+
+
+def test_kernels_that_are_launched_early_wait_for_the_one_in_front():
+    kernels = kernels_launched_early()
+    assert {"forward_kernel", "backward_kernel", "sweep_kernel", "tell_kernel"} <= set(kernels)
+    for name, file in kernels.items():
+        before, wait, _ = body_of(name, file).partition("wait_for_earlier_kernels();")
+        assert wait, f"{file}: {name} is launched early and does not wait"
+        assert not re.search(r"\breturn\b", before), f"{file}: {name} may return before it waits"
+
+
+@pytest.mark.slow
+def test_compiled_kernels_wait_before_they_touch_memory():
+    """Of what the compiler made: the wait comes before the first access to global memory."""
+    if shutil.which("cuobjdump") is None or not LIBRARY.exists():
+        pytest.skip("needs the CUDA library and cuobjdump")
+    listing = subprocess.run(
+        ["cuobjdump", "-sass", str(LIBRARY)], capture_output=True, text=True, check=True
+    ).stdout
+    early, checked = kernels_launched_early(), 0
+    for function in listing.split("Function : ")[1:]:
+        mangled, _, code = function.partition("\n")
+        if not any(re.search(rf"\d{name}(I|E|P|R|N|l|i|K|\b)", mangled) for name in early):
+            continue
+        wait, access = code.find(WAIT), GLOBAL_ACCESS.search(code)
+        assert wait >= 0, mangled
+        assert access is None or wait < access.start(), mangled
+        checked += 1
+    assert checked >= len(early)
