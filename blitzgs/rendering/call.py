@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from blitzgs.rendering.arguments import (
+    Gaussians,
     background_rows,
     check_further,
     check_options,
@@ -17,6 +18,7 @@ from blitzgs.rendering.arguments import (
 )
 from blitzgs.rendering.groups import ProjectOptions
 from blitzgs.rendering.images import ImageOptions, render
+from blitzgs.rendering.ranks import gather_views
 
 DEFAULT_TILE_SIZE = 16
 
@@ -77,8 +79,8 @@ def rasterization(
         sh_degree: degree to evaluate, 0 to 3; None when `colors` holds values.
         packed: whether meta's per-splat tensors hold only what is visible ([nnz, ...]) or all
             ([..., C, N, ...], zero where invisible). The image is the same.
-        tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding; 8, 16
-            and 32 are fastest there.
+        tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding; 16 is
+            fastest there.
         backgrounds: [..., C, D] behind everything; None for zero. Depth channels have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
         sparse_grad: whether means, quats and scales, and with `sh_degree` opacities and colors that are
@@ -86,7 +88,10 @@ def rasterization(
         absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased".
         channel_chunk: accepted and not needed: any channel count is rendered in one pass.
-        distributed: only False is supported.
+        distributed: whether Gaussians and views are divided among the ranks of the process group: each rank
+            gives its own, as many views as the others, and gets the images of its views, of the Gaussians of
+            all ranks. Every rank has to call this, and to run its backward pass. As in gsplat, meta's rows
+            are of this rank's Gaussians in the views of all ranks, and its lists of what this rank renders.
         camera_model: only "pinhole" is supported.
         segmented: accepted and not needed: it selects a sort in gsplat, never the result.
         covars: [..., N, 3, 3] covariances instead of quats and scales, of which the upper triangles are read.
@@ -115,8 +120,6 @@ def rasterization(
     check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(render_mode, rasterize_mode, camera_model, tile_size)
-    if distributed:
-        raise ValueError("blitzgs.rasterization does not support distributed=True; leave it out")
     check_tensors({"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks})
     if covars is not None:
         check_tensors({"covars": covars})
@@ -136,4 +139,16 @@ def rasterization(
     )
     background = background_rows(backgrounds, gaussians, render_mode)
     image = ImageOptions(render_mode, background, packed, sparse_grad, absgrad)
-    return render("rasterization", gaussians, project, image)
+    job = None
+    if distributed:
+        _check_distributed(gaussians, absgrad)
+        channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
+        gaussians, job = gather_views(gaussians, (width, height, tile_size, render_mode, channels))
+    return render("rasterization", gaussians, project, image, job=job)
+
+
+def _check_distributed(gaussians: Gaussians, absgrad: bool) -> None:
+    if len(gaussians.lead) > 1 or gaussians.per_view or absgrad:
+        raise ValueError(
+            "distributed=True supports no batch dimensions, colours per view or absgrad, as gsplat's does not"
+        )

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from blitzgs.rendering.finite import warn_of_non_finite
 from blitzgs.rendering.groups import Group, ProjectOptions, groups_of, project_groups
 from blitzgs.rendering.layout import Layout
 from blitzgs.rendering.meta import Lists, make_meta
+from blitzgs.rendering.ranks import Job, send_rows
 
 # What the CUDA kernels composite; for any other size, meta's lists are of the tiles asked for alone.
 CUDA_TILE_SIZE = 16
@@ -48,6 +50,7 @@ def render(
     project: ProjectOptions,
     image: ImageOptions,
     sizes: Sizes | None = None,
+    job: Job | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render; returns what `blitzgs.rasterization` does.
 
@@ -57,36 +60,41 @@ def render(
         project: how it is projected.
         image: how it is composited.
         sizes: how much room rows and lists need, if that is known.
+        job: the ranks among which the Gaussians and their views are divided; None: all of them are here.
     """
     compiling = torch.compiler.is_compiling()
     by_value = gaussians.colors is not None and gaussians.sh_degree is None
     hidden = _without_non_finite(gaussians) if by_value else gaussians
     groups = groups_of(hidden, project)
     ready = None
-    if len(groups) == 1 and groups[0].covariances is None and not by_value and not compiling:
+    if len(groups) == 1 and groups[0].covariances is None and not by_value and job is None and not compiling:
         ready = _queued(groups[0], gaussians, project, image, sizes)
     rows = project_groups(groups, image.sparse_grad, None if ready is None else ready.rows)
     layout = Layout(rows, gaussians.lead, gaussians.count, image.packed)
     laid = _laid(layout, gaussians, project, image)
     means2d, conics, opacities, depths = layout.take(*laid.values())
     rendered = rows._replace(means2d=means2d, conics=conics, opacities=opacities, depths=depths)
-    lists, composited_lists = _lists(rendered, gaussians, project, ready)
+    channels, lead = _channels(rendered, layout, gaussians, image.render_mode), gaussians.lead
+    if job is not None:
+        (rendered, channels), lead = send_rows(rendered, channels, job), (job.views,)
+    count = -1 if compiling or job is not None else int(rows.counts[2])
+    lists, composited_lists = _lists(rendered, math.prod(lead), project, ready, count)
     renders, alphas = rasterize(
-        means2d, conics, opacities, _channels(rendered, layout, gaussians, image.render_mode),
-        composited_lists.rows, composited_lists.offsets, n_cameras=gaussians.images, width=project.width,
+        rendered.means2d, rendered.conics, rendered.opacities, channels,
+        composited_lists.rows, composited_lists.offsets, n_cameras=math.prod(lead), width=project.width,
         height=project.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
         tell_absgrad=_absgrad_teller(layout, laid["means2d"]) if image.absgrad else None,
         composited=None if ready is None else ready.composited,
     )  # fmt: skip
     if not compiling:
         warn_of_non_finite(gaussians, layout, function)
-    size = (*gaussians.lead, project.height, project.width)
+    size = (*lead, project.height, project.width)
     alphas = alphas[..., None]
     if image.render_mode.endswith("ED"):
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    if len(gaussians.lead) > 1:
+    if len(lead) > 1:
         renders, alphas = renders.view(*size, renders.shape[-1]), alphas.view(*size, 1)
-    return renders, alphas, make_meta(gaussians, layout, laid, lists)
+    return renders, alphas, make_meta(gaussians, layout, laid, lists, lead, None if job is None else rendered)
 
 
 def _queued(
@@ -129,9 +137,9 @@ def _laid(
 
 
 def _lists(
-    rows: Rows, gaussians: Gaussians, project: ProjectOptions, ready: Rendered | None
+    rows: Rows, images: int, project: ProjectOptions, ready: Rendered | None, count: int
 ) -> tuple[Lists, Lists]:
-    """Return the tiles' lists for meta, and those that are composited."""
+    """Return the tiles' lists for meta, and those that are composited; count: entries, -1: not known."""
     width, height, tile_size = project.width, project.height, project.tile_size
     if ready is not None:
         lists = Lists(ready.isect_rows, ready.tile_offsets, width, height, tile_size)
@@ -140,11 +148,11 @@ def _lists(
     def lists_of(size: int, n_isects: int) -> Lists:
         isect_rows, offsets = torch.ops.blitzgs.intersect(
             rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, None,
-            [gaussians.images, width, height, size, 0, -1], n_isects,
+            [images, width, height, size, 0, -1], n_isects,
         )  # fmt: skip
         return Lists(isect_rows, offsets, width, height, size)
 
-    lists = lists_of(tile_size, -1 if torch.compiler.is_compiling() else int(rows.counts[2]))
+    lists = lists_of(tile_size, count)
     if not rows.means2d.is_cuda or tile_size == CUDA_TILE_SIZE:
         return lists, lists
     return lists, lists_of(CUDA_TILE_SIZE, -1)

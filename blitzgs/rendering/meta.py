@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.lazy_dict import Later, LazyDict
+from blitzgs.ops.projection import Rows
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.finite import non_finite
 from blitzgs.rendering.layout import Layout
@@ -50,7 +52,14 @@ class Lists:
         return self.rows[: int(self.offsets[-1])]
 
 
-def make_meta(gaussians: Gaussians, layout: Layout, laid: dict[str, Tensor], lists: Lists) -> dict[str, Any]:
+def make_meta(
+    gaussians: Gaussians,
+    layout: Layout,
+    laid: dict[str, Tensor],
+    lists: Lists,
+    lead: tuple[int, ...],
+    arrived: Rows | None,
+) -> dict[str, Any]:
     """Return `meta`; what the image did not need is worked out when it is first read.
 
     Under `torch.compile` it is a plain dict: what the caller does not read is not computed.
@@ -60,12 +69,14 @@ def make_meta(gaussians: Gaussians, layout: Layout, laid: dict[str, Tensor], lis
         layout: of its rows.
         laid: what is rendered, as it lies in `meta`.
         lists: of the tiles.
+        lead: dimensions of the batch, and the views that are rendered here.
+        arrived: the rows that the lists are of, where ranks have exchanged them; None: those laid out.
     """
     rows, packed = layout.rows, layout.packed
     views = gaussians.views
 
     def flatten_ids() -> Tensor:
-        if layout.places is None:
+        if layout.places is None or arrived is not None:
             return lists.listed()
         return layout.places.index_select(0, lists.listed()).int()
 
@@ -78,16 +89,14 @@ def make_meta(gaussians: Gaussians, layout: Layout, laid: dict[str, Tensor], lis
         "tile_width": lists.tiles_x,
         "tile_height": lists.tiles_y,
         "tiles_per_gauss": Later(lambda: layout.lay(rows.tiles_touched)[0]),
-        "isect_ids": Later(lambda: _isect_ids(layout, lists, gaussians.images)),
+        "isect_ids": Later(lambda: _isect_ids((arrived or rows).depths, lists, math.prod(lead))),
         "flatten_ids": Later(flatten_ids),
-        "isect_offsets": Later(
-            lambda: lists.offsets[:-1].reshape(*gaussians.lead, lists.tiles_y, lists.tiles_x)
-        ),
+        "isect_offsets": Later(lambda: lists.offsets[:-1].reshape(*lead, lists.tiles_y, lists.tiles_x)),
         "width": lists.width,
         "height": lists.height,
         "tile_size": lists.tile_size,
         "n_batches": len(gaussians.scenes),
-        "n_cameras": views,
+        "n_cameras": lead[-1],
     }
     if torch.compiler.is_compiling():
         return {key: value.compute() if isinstance(value, Later) else value for key, value in entries.items()}
@@ -95,9 +104,9 @@ def make_meta(gaussians: Gaussians, layout: Layout, laid: dict[str, Tensor], lis
     return LazyDict(**entries)
 
 
-def _isect_ids(layout: Layout, lists: Lists, images: int) -> Tensor:
+def _isect_ids(depths: Tensor, lists: Lists, images: int) -> Tensor:
     """Return gsplat's sort keys, int64: image | tile | float32 depth bits, from high to low."""
-    depths = layout.rows.depths.detach().index_select(0, lists.listed())
+    depths = depths.detach().index_select(0, lists.listed())
     entries = torch.arange(len(depths), device=depths.device)
     keys = torch.searchsorted(lists.offsets[1:], entries, right=True)
     n_tiles = lists.tiles_x * lists.tiles_y
