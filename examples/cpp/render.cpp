@@ -75,13 +75,12 @@ int main(int argc, char** argv) {
                &depths = rows[6], &alphas = rows[7], &colors = rows[8];
 
   constexpr std::int64_t kFirstTile = 0, kAllTiles = -1, kCountThem = -1;
-  const auto lists =
-      call<2>("blitzgs::intersect", means2d, conics, alphas, depths, camera_ids, std::nullopt, kViews, kWidth,
-              kHeight, kTileSize, kFirstTile, kAllTiles, kCountThem, std::nullopt);
+  const std::vector<std::int64_t> grid{kViews, kWidth, kHeight, kTileSize, kFirstTile, kAllTiles};
+  const auto lists = call<2>("blitzgs::intersect", means2d, conics, alphas, depths, camera_ids, std::nullopt,
+                             grid, kCountThem, std::nullopt);
   const auto images =
-      call<6>("blitzgs::rasterize_fwd", means2d, conics, alphas, colors, std::nullopt, lists[0], lists[1],
-              kViews, kWidth, kHeight, kTileSize, kFirstTile, kAllTiles, std::nullopt,
-              /*clear_rest=*/true, /*backward_follows=*/false, std::nullopt);
+      call<7>("blitzgs::rasterize_fwd", means2d, conics, alphas, colors, std::nullopt, lists[0], lists[1],
+              grid, std::nullopt, /*clear_rest=*/true, /*backward_follows=*/false, std::nullopt);
 
   const Tensor& image = images[0];
   std::ofstream file(argv[1], std::ios::binary);
