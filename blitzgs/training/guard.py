@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 
@@ -44,38 +44,61 @@ class LossGuard:
             NonFiniteError: this loss (or, on CUDA, the previous step's) is not finite.
         """
         if frame.renders.device.type != "cuda":
-            _check_loss(step, names, sums, table, frame)
+            _check_loss(step, names, sums, lambda: _origin(table, frame, names))
             return
         previous, self._pending = self._pending, (step, names, sums)
         if previous is not None:
-            _check_loss(*previous, table, None)
+            _check_loss(*previous, lambda: _later_origin(previous[0], step, table, frame, names))
 
 
-def _check_loss(
-    step: int, names: Sequence[str], sums: HostSum, table: GaussianTable, frame: Frame | None
-) -> None:
+def _check_loss(step: int, names: Sequence[str], sums: HostSum, origin: Callable[[], str]) -> None:
     # Plain numbers: every step comes here while the GPU waits, and an op takes longer than they all.
     finite = [math.isfinite(value) for value in sums.read().numpy()[: 2 * len(names)].tolist()]
     if not all(finite):
         l1, ssim = finite[: len(names)], finite[len(names) :]
         views = ", ".join(f"'{name}'" for name, *good in zip(names, l1, ssim, strict=True) if not all(good))
-        raise NonFiniteError(f"step {step}: the loss of view {views} is not finite; {_origin(table, frame)}")
+        raise NonFiniteError(f"step {step}: the loss of view {views} is not finite; {origin()}")
 
 
-def _origin(table: GaussianTable, frame: Frame | None) -> str:
+def _origin(table: GaussianTable, frame: Frame, names: Sequence[str]) -> str:
     """Say where the first non-finite value sits, walking from the parameters to the image."""
+    found = _first_in(table, frame, names)
+    return found or "parameters, projected Gaussians and images are finite: it comes from op photometric"
+
+
+def _later_origin(step: int, later: int, table: GaussianTable, frame: Frame, names: Sequence[str]) -> str:
+    """The same where what `step` rendered is gone, and the table and the frame of step `later` are there."""
+    if (found := _first_in(table, frame, names)) is not None:
+        return f"looked at in step {later}: {found}"
+    views = ", ".join(f"'{name}'" for name in names)
+    return (
+        f"of step {step} nothing is left to look at; in step {later} the parameters are finite, and so are "
+        f"the projected Gaussians and images of view {views}. It came from op photometric or from a Gaussian "
+        "that these views do not see: train on the CPU, where every step is looked at at once"
+    )
+
+
+def _first_in(table: GaussianTable, frame: Frame, names: Sequence[str]) -> str | None:
+    """Name the column, or the op with the Gaussian and view, of the first value that is not finite."""
     if (culprit := bad_column(table)) is not None:
         return culprit
-    if frame is not None:
-        for name in ("means2d", "conics", "depths", "opacities", "colors"):
-            if not bool(getattr(frame.rows, name).isfinite().all()):
-                return f"it first appears in op project, output {name}"
-        finite, assignment = frame.renders.isfinite(), frame.assignment
-        if assignment is not None:
-            finite = finite[assignment.ranges.pixel_mask(assignment.ranks.rank, finite.device)]
-        if not bool(finite.all()):
-            return "it first appears in op rasterize, output renders"
-    return "parameters and images are finite: it comes from op photometric"
+    rows = frame.rows
+    for name in ("means2d", "conics", "depths", "opacities", "colors"):
+        bad = ~getattr(rows, name).isfinite().view(len(rows.depths), -1).all(1)
+        if bool(bad.any()):
+            row = int(bad.nonzero()[0])
+            gaussian, view = int(rows.gaussian_ids[row]), int(rows.camera_ids[row])
+            return (
+                f"it first appears in op project, output {name}: Gaussian id {int(table['id'][gaussian])} in "
+                f"view '{names[view]}', and {int(bad.sum()) - 1} more"
+            )
+    bad, assignment = ~frame.renders.isfinite().all(-1), frame.assignment
+    if assignment is not None:
+        bad &= assignment.ranges.pixel_mask(assignment.ranks.rank, bad.device)
+    if bool(bad.any()):
+        view, y, x = bad.nonzero()[0].tolist()
+        return f"it first appears in op rasterize, output renders: view '{names[view]}', pixel ({x}, {y})"
+    return None
 
 
 def bad_column(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> str | None:

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is not finite is found, and the message says what was looked at."""
+
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training.guard import LossGuard, NonFiniteError
+from blitzgs.training.trainer import Trainer
+from tests.training.tiny import tiny_config, tiny_scene
+
+
+class Broken:
+    """A frame's device says CUDA, so that the guard looks a step late, as it does there."""
+
+    def __init__(self, frame, device="cpu"):
+        self._frame, self._device = frame, device
+
+    def __getattr__(self, name):
+        found = getattr(self._frame, name)
+        if name == "renders" and self._device == "cuda":
+            return OnCuda(found)
+        return found
+
+
+class OnCuda:
+    device = torch.device("cuda")
+
+    def __init__(self, tensor):
+        self._tensor = tensor
+
+    def __getattr__(self, name):
+        return getattr(self._tensor, name)
+
+
+class Sums:
+    def __init__(self, *values):
+        self._values = values
+
+    def read(self):
+        return torch.tensor(self._values)
+
+
+@pytest.fixture(scope="module")
+def frame(tmp_path_factory):
+    config = tiny_config("schedule.batch_size=2")
+    running = Trainer(config, *tiny_scene(), tmp_path_factory.mktemp("frame"), Ranks())
+    batch = running._loader.get(0, 1)
+    rendered, *_ = running.state.stepper.forward(1, running.state.render_options, batch)
+    running.close()
+    return running.state.table, rendered
+
+
+@pytest.mark.parametrize("name", ["means2d", "conics", "depths", "opacities", "colors"])
+def test_the_guard_names_op_gaussian_and_view(frame, name):
+    table, rendered = frame
+    column = getattr(rendered.rows, name).clone()
+    column[5] = float("inf")
+    rows = rendered.rows._replace(**{name: column})
+    wanted = int(table["id"][rows.gaussian_ids[5]]), ("a", "b")[rows.camera_ids[5]]
+    with pytest.raises(NonFiniteError) as failure:
+        LossGuard().check(9, ("a", "b"), Sums(0, 0, float("nan"), 0), table, rendered._replace(rows=rows))
+    assert str(failure.value) == (
+        "step 9: the loss of view 'a' is not finite; it first appears in op project, output "
+        f"{name}: Gaussian id {wanted[0]} in view '{wanted[1]}', and 0 more"
+    )
+
+
+def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
+    table, rendered = frame
+    images = rendered.renders.clone()
+    images[1, 7, 11, 2] = float("nan")
+    bad = Sums(0, float("nan"), 0, 0)
+    with pytest.raises(NonFiniteError, match=r"op rasterize, output renders: view 'b', pixel \(11, 7\)"):
+        LossGuard().check(9, ("a", "b"), bad, table, rendered._replace(renders=images))
+    with pytest.raises(
+        NonFiniteError, match="projected Gaussians and images are finite: it comes from op photom"
+    ):
+        LossGuard().check(9, ("a", "b"), bad, table, rendered)
+    # A step late, it does not claim to have seen what is gone.
+    guard, late = LossGuard(), Broken(rendered, "cuda")
+    guard.check(9, ("a", "b"), bad, table, late)
+    with pytest.raises(NonFiniteError) as failure:
+        guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, late)
+    text = str(failure.value)
+    assert text.startswith(
+        "step 9: the loss of view 'b' is not finite; of step 9 nothing is left to look at;"
+    )
+    assert "in step 10 the parameters are finite" in text and "view 'c', 'd'" in text
+    guard.check(9, ("a", "b"), bad, table, late)
+    rows = rendered.rows._replace(depths=rendered.rows.depths * torch.inf)
+    spoiled = Broken(rendered._replace(rows=rows), "cuda")
+    with pytest.raises(NonFiniteError, match="looked at in step 10: .* op project, output depths"):
+        guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, spoiled)
