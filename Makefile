@@ -10,7 +10,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu')
 DEMO ?= runs/demo
 
-.PHONY: venv venv-test build io demo test test-python test-cxx test-slow sanitize lint format clean
+.PHONY: venv venv-test build io demo test test-python test-cxx test-slow sanitize fuzz lint format clean
 
 venv: $(VENV)/.installed
 venv-test: $(VENV)/.installed-test
@@ -86,6 +86,22 @@ sanitize-%:
 	PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool $* --error-exitcode 1 \
 	  $(PYTHON) tests/small_suite.py $(SANITIZE_TESTS)
 
+# The readers of foreign files under libFuzzer with AddressSanitizer and UBSan, FUZZ_SECONDS each. What it finds lies
+# in build-fuzz; add it to csrc/fuzz/corpus once it is mended. Needs clang (Debian: apt-get install clang).
+FUZZ_CXX ?= clang++
+FUZZ_SECONDS ?= 60
+FUZZERS = jpeg qoi ply colmap_binary colmap_text
+FUZZ_SOURCES = csrc/fuzz/readers_fuzz.cpp $(filter-out %_test.cpp %/module.cpp,$(wildcard csrc/io/*.cpp))
+fuzz: $(FUZZERS:%=fuzz-%)
+fuzz-%: build-fuzz/%
+	mkdir -p build-fuzz/corpus/$*
+	build-fuzz/$* -max_total_time=$(FUZZ_SECONDS) -max_len=16384 -timeout=10 -rss_limit_mb=2048 -print_final_stats=1 \
+	  -verbosity=0 -artifact_prefix=build-fuzz/$*- build-fuzz/corpus/$* csrc/fuzz/corpus/$*
+build-fuzz/%: $(FUZZ_SOURCES) $(wildcard csrc/io/*.h)
+	mkdir -p build-fuzz
+	$(FUZZ_CXX) -std=c++20 -O2 -g -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all -Icsrc \
+	  -DBLITZGS_FUZZ=$* $(FUZZ_SOURCES) -o $@
+
 lint:
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
@@ -101,4 +117,4 @@ format:
 	$(RUN) gersemi -i CMakeLists.txt cmake
 
 clean:
-	rm -rf build build-tests blitzgs/_lib runs
+	rm -rf build build-tests build-fuzz blitzgs/_lib runs

@@ -1,0 +1,85 @@
+// SPDX-License-Identifier: Apache-2.0
+// The readers of files that other programs write, under libFuzzer: `make fuzz`. One program for each target,
+// which the build names in BLITZGS_FUZZ. A reader may refuse its input with FormatError and do nothing else
+// but succeed: the sanitizers end the program where it reads beyond the input, and libFuzzer where it hangs
+// or allocates wildly.
+#include <cstddef>
+#include <cstdint>
+#include <span>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include "io/colmap.h"
+#include "io/jpeg.h"
+#include "io/ply.h"
+#include "io/qoi.h"
+
+namespace io = blitzgs::io;
+
+namespace {
+
+using Input = std::span<const std::uint8_t>;
+
+std::istringstream stream_of(Input input) {
+  return std::istringstream(std::string(input.begin(), input.end()));
+}
+
+[[maybe_unused]] void jpeg(Input input) { io::check_jpeg(input, "f"); }
+
+[[maybe_unused]] void qoi(Input input) {
+  const io::QoiSize size = io::qoi_size(input);
+  const std::uint64_t bytes = 3ull * size.width * size.height;
+  if (bytes > (64u << 20)) return;  // a run of pixels is small in the file; the limit is that of this program
+  std::vector<std::uint8_t> pixels(bytes);
+  io::decode_qoi(input, pixels.data());
+  // What can be read can be written and read again.
+  const std::vector<std::uint8_t> again = io::encode_qoi(pixels.data(), size);
+  std::vector<std::uint8_t> second(bytes);
+  io::decode_qoi(again, second.data());
+  if (second != pixels) __builtin_trap();
+}
+
+[[maybe_unused]] void ply(Input input) {
+  std::istringstream in = stream_of(input);
+  const io::PlyTable table = io::read_ply(in, "f");
+  if (table.rows.size() != table.count * table.row_bytes()) __builtin_trap();
+}
+
+// The first byte chooses the file and what of it is wanted.
+template <class Cameras, class Images, class Points>
+void colmap(Input input, Cameras cameras, Images images, Points points) {
+  if (input.empty()) return;
+  std::istringstream in = stream_of(input.subspan(1));
+  const std::uint8_t choice = input[0];
+  if (choice % 3 == 0) {
+    for (const io::ColmapCamera& camera : cameras(in, "f")) {
+      if (!io::find_camera_model(camera.model)) __builtin_trap();
+    }
+  } else if (choice % 3 == 1) {
+    const io::ColmapImages found = images(in, "f", (choice & 4) != 0);
+    if (found.quats.size() != 4 * found.ids.size() || found.names.size() != found.ids.size())
+      __builtin_trap();
+  } else {
+    const io::ColmapPoints found = points(in, "f", (choice & 4) != 0);
+    if (found.positions.size() != 3 * found.ids.size()) __builtin_trap();
+  }
+}
+
+[[maybe_unused]] void colmap_binary(Input input) {
+  colmap(input, io::read_cameras_binary, io::read_images_binary, io::read_points_binary);
+}
+
+[[maybe_unused]] void colmap_text(Input input) {
+  colmap(input, io::read_cameras_text, io::read_images_text, io::read_points_text);
+}
+
+}  // namespace
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+  try {
+    BLITZGS_FUZZ(Input(data, size));
+  } catch (const io::FormatError&) {
+  }
+  return 0;
+}
