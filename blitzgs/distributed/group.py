@@ -7,6 +7,7 @@ import os
 import re
 import socket
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from datetime import timedelta
 from types import TracebackType
@@ -17,7 +18,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.distributed.shared_memory import SharedMemory, connect
-from blitzgs.distributed.watchdog import Watchdog, open_store
+from blitzgs.distributed.watchdog import BUSY_SECONDS, Watchdog, open_store
 from blitzgs.ops.host import to_host
 
 T = TypeVar("T")
@@ -132,10 +133,11 @@ class Ranks:
             device_id=self.device if nccl else None,
         )
         self.barrier()
-        # The libraries' own timeouts say only which socket or operation; ours comes first and names a rank.
+        # The libraries' own timeouts say only which socket or operation; ours comes first and names a rank,
+        # and knows when one is at work on its host.
         margin = 2.0 * Watchdog.period_for(self.timeout_seconds) + 10.0
         dist.distributed_c10d._set_pg_timeout(
-            timedelta(seconds=self.timeout_seconds + margin), dist.group.WORLD
+            timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin), dist.group.WORLD
         )
         self.watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
         self._choose_transport(transport, self.timeout_seconds + margin)
@@ -190,6 +192,10 @@ class Ranks:
             raise RuntimeError(f"{self.watchdog.diagnose(name)} ({error})") from error
         self.watchdog.leave()
         return result
+
+    def working(self, what: str) -> AbstractContextManager[None]:
+        """Tell the other ranks what this one does on its host for long, so that they wait; see `Watchdog`."""
+        return nullcontext() if self.watchdog is None else self.watchdog.working(what)
 
     def all_reduce(self, tensor: Tensor, op: ReduceOp = "sum") -> Tensor:
         """Reduce `tensor` over the ranks in place and return it; every rank gets the same bits."""

@@ -4,7 +4,9 @@
 Each rank publishes what it is doing in the job's key-value store, from a thread of its own. A rank that has
 waited in a collective for longer than the timeout reads what the others published, prints which of them
 never arrived, and exits; torchrun then ends the job. A rank that raises publishes its error first, so that
-the others report the culprit's message and not a closed socket; those that wait for it end at once.
+the others report the culprit's message and not a closed socket; those that wait for it end at once. A rank
+that works on its host for long, on a slow disk for instance, says so, and the others wait for it as long as
+it shows signs of life.
 """
 
 from __future__ import annotations
@@ -14,6 +16,9 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import timedelta
 
 from torch._C._distributed_c10d import PrefixStore, TCPStore
@@ -21,6 +26,8 @@ from torch._C._distributed_c10d import PrefixStore, TCPStore
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
 # How long a rank goes on waiting when another is known to have failed.
 GRACE_SECONDS = 4.0
+# The longest that ranks wait for one that is alive and has said what it is busy with.
+BUSY_SECONDS = 3600.0
 
 
 def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
@@ -46,6 +53,23 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
     return PrefixStore(f"blitzgs/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}/{name}", store)
 
 
+@dataclass(frozen=True)
+class _Report:
+    """What a rank has last published.
+
+    Attributes:
+        calls: collectives entered.
+        name: of the last one.
+        stamp: when it was published, seconds since 1970 by the rank's own clock.
+        busy: the work on its host, or an empty string.
+    """
+
+    calls: int
+    name: str
+    stamp: float
+    busy: str
+
+
 class Watchdog:
     """The progress of one rank, published every few seconds and checked against the other ranks'.
 
@@ -65,7 +89,12 @@ class Watchdog:
         self.lock = threading.Lock()
         self.calls = 0
         self.name = "start"
+        self.busy = ""
         self.waiting_since: float | None = None
+        self._heard: dict[
+            int, tuple[float, float]
+        ] = {}  # of each rank: its last stamp, and when it was new here
+        self._announced = 0.0
         self.stopping = threading.Event()
         self.thread = threading.Thread(target=self._run, name="blitzgs-watchdog", daemon=True)
         self._publish()
@@ -86,6 +115,17 @@ class Watchdog:
         """Note that the collective is done."""
         self.waiting_since = None
 
+    @contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Tell the others that this rank is busy on its host while the context lasts, and with what."""
+        before, self.busy = self.busy, what
+        self._try_to_publish()
+        try:
+            yield
+        finally:
+            self.busy = before
+            self._try_to_publish()
+
     def report_failure(self, message: str) -> None:
         """Publish why this rank is about to end, for the others to quote; the first of the job counts."""
         try:
@@ -101,8 +141,10 @@ class Watchdog:
 
     def diagnose(self, name: str) -> str:
         """Say which rank broke the collective `name`, as far as the store knows."""
-        # The culprit's own message may still be on its way.
-        for _ in range(10):
+        # The culprit's own message may still be on its way, and a rank that lives reports within a period.
+        for _ in range(10 + int(5 * self.period)):
+            with suppress(RuntimeError):
+                self._listen()
             failure = self._first_failure()
             if failure:
                 return f"rank {self.rank}: {name} failed because {failure}"
@@ -125,24 +167,54 @@ class Watchdog:
             return None
         return None
 
+    def _listen(self) -> dict[int, _Report]:
+        """Read what the other ranks have published, and note which of them show signs of life."""
+        reports = {}
+        with self.lock:
+            for rank in range(self.world_size):
+                if rank != self.rank and self.store.check([f"progress/{rank}"]):
+                    reports[rank] = _Report(*json.loads(self.store.get(f"progress/{rank}")))
+        for rank, report in reports.items():
+            # By this host's clock: those of other hosts may go wrong.
+            if rank not in self._heard or self._heard[rank][0] != report.stamp:
+                self._heard[rank] = (report.stamp, time.monotonic())
+        return reports
+
+    def _is_silent(self, rank: int) -> bool:
+        return time.monotonic() - self._heard[rank][1] > 1.5 * self.period
+
     def _late_ranks(self) -> str:
         """List the ranks that have entered fewer collectives than this one, or stopped publishing."""
         late = []
-        with self.lock:
-            for rank in range(self.world_size):
-                if rank == self.rank or not self.store.check([f"progress/{rank}"]):
-                    continue
-                calls, name, stamp = json.loads(self.store.get(f"progress/{rank}"))
-                silent = time.time() - stamp
-                if silent > 3 * self.period + 1:
-                    late.append(f"rank {rank} has not been heard of for {silent:.0f} s (last in {name})")
-                elif calls < self.calls:
-                    late.append(f"rank {rank} has not arrived (last collective: {name}, number {calls})")
+        for rank, report in self._listen().items():
+            if self._is_silent(rank):
+                silent = time.monotonic() - self._heard[rank][1]
+                late.append(
+                    f"rank {rank} has stopped reporting {silent:.0f} s ago: it was killed or its host is gone"
+                )
+            elif report.calls < self.calls:
+                doing = report.busy or f"last collective: {report.name}, number {report.calls}"
+                late.append(f"rank {rank} has not arrived ({doing})")
         return "; ".join(late)
 
+    def _waits_for_work(self) -> str:
+        """Say what all late ranks are busy with; empty where one of them is silent or has said nothing."""
+        work = []
+        for rank, report in self._listen().items():
+            if self._is_silent(rank) or (report.calls < self.calls and not report.busy):
+                return ""
+            if report.calls < self.calls:
+                work.append(f"rank {rank} ({report.busy})")
+        return ", ".join(work)
+
     def _publish(self) -> None:
+        content = json.dumps([self.calls, self.name, time.time(), self.busy])
         with self.lock:
-            self.store.set(f"progress/{self.rank}", json.dumps([self.calls, self.name, time.time()]))
+            self.store.set(f"progress/{self.rank}", content)
+
+    def _try_to_publish(self) -> None:
+        with suppress(RuntimeError):  # the store's host ended first; the next collective says so
+            self._publish()
 
     def _run(self) -> None:
         while not self.stopping.wait(self.period):
@@ -151,14 +223,29 @@ class Watchdog:
                 since = self.waiting_since
                 if since is None:
                     continue
+                self._listen()
                 waited, limit = time.monotonic() - since, self.timeout_seconds
                 # A rank that has failed comes to no collective any more; Gloo may yet say so itself.
                 if waited > GRACE_SECONDS and self._first_failure():
                     limit = min(limit, GRACE_SECONDS)
+                if (
+                    limit < waited < BUSY_SECONDS
+                    and not self._first_failure()
+                    and (work := self._waits_for_work())
+                ):
+                    self._announce(work, waited)
+                    continue
                 if waited > limit:
                     self._abort(f"waited {limit:.0f} s in {self.name}")
             except RuntimeError:
                 return  # the store's host is gone; the collectives report that themselves
+
+    def _announce(self, work: str, waited: float) -> None:
+        """Say about once a minute what this rank waits for."""
+        if time.monotonic() - self._announced > 60:
+            self._announced = time.monotonic()
+            text = f"rank {self.rank}: has waited {waited:.0f} s in {self.name} for {work}"
+            print(text, file=sys.stderr, flush=True)
 
     def _abort(self, reason: str) -> None:
         blame = self._first_failure() or self._late_ranks() or "no rank is known to be late"

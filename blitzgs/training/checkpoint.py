@@ -90,7 +90,8 @@ def save(
         _check_space(unfinished, columns)
         _reached("folder made")
         file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
-        size, digest = write_shard(unfinished / file, columns, _reached)
+        with ranks.working("writing a checkpoint"):
+            size, digest = write_shard(unfinished / file, columns, _reached)
         mine = Shard(file, rows, size, digest)
     except OSError as error:
         problem = f"rank {ranks.rank} could not write: {_explain(error)}"
@@ -98,7 +99,8 @@ def save(
     problems = [text for _, text in results if text]
     if not problems and ranks.rank == 0:
         try:
-            _finish(directory, name, [shard for shard, _ in results if shard], state, ranks.world_size)
+            with ranks.working("finishing a checkpoint"):
+                _finish(directory, name, [shard for shard, _ in results if shard], state, ranks.world_size)
         except OSError as error:
             problems.append(f"rank 0 could not write: {_explain(error)}")
     problems = ranks.broadcast_object(problems)
@@ -198,8 +200,9 @@ def load(
     try:
         manifest = _read_manifest(path)
         # The files are shared out for checking, so that each is read for its digest once.
-        for shard in manifest.shards[ranks.rank :: ranks.world_size]:
-            _verify(path, shard)
+        with ranks.working("reading a checkpoint"):
+            for shard in manifest.shards[ranks.rank :: ranks.world_size]:
+                _verify(path, shard)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         problem = str(error) or type(error).__name__
     problems = [text for text in ranks.all_gather_object(problem) if text]

@@ -121,6 +121,17 @@ def render_view(
     return frame.renders[0] if ranks.rank == destination else None
 
 
+def _compare(render: Tensor, target: Tensor, mask: Tensor | None, lpips: Lpips | None) -> dict[str, float]:
+    """Return all metrics of one view; arguments as for `image_metrics`."""
+    metrics = image_metrics(render, target, None if mask is None else mask.to(target.device))
+    if lpips is not None:
+        pair = [
+            image.permute(2, 0, 1)[None].cpu() * 2 - 1 for image in (render.clamp(0, 1), target.float() / 255)
+        ]
+        metrics["lpips"] = float(lpips(pair[0], pair[1]))
+    return metrics
+
+
 def evaluate(
     table: GaussianTable,
     views: ViewSet,
@@ -176,21 +187,14 @@ def evaluate(
             report(position + 1, len(indices))
         if render is None:
             continue
-        target = images.get(index).to(table.device)
-        mask = images.mask(index)
-        if mask is not None and not bool(mask.any()):
-            continue  # nothing to compare
-        metrics = image_metrics(render, target, None if mask is None else mask.to(table.device))
-        if lpips is not None:
-            pair = [
-                image.permute(2, 0, 1)[None].cpu() * 2 - 1
-                for image in (render.clamp(0, 1), target.float() / 255)
-            ]
-            metrics["lpips"] = float(lpips(pair[0], pair[1]))
-        per_view[cameras[index].name] = metrics
-        if files is not None and index in chosen:
-            picture = comparison(render, target, mask)
-            files.write(chosen[index], encode_image(picture, ".jpg"))
+        with ranks.working(f"comparing view {cameras[index].name}"):
+            target, mask = images.get(index).to(table.device), images.mask(index)
+            if mask is not None and not bool(mask.any()):
+                continue  # nothing to compare
+            per_view[cameras[index].name] = _compare(render, target, mask, lpips)
+            if files is not None and index in chosen:
+                picture = comparison(render, target, mask)
+                files.write(chosen[index], encode_image(picture, ".jpg"))
     found = {name: view for part in ranks.all_gather_object(per_view) for name, view in part.items()}
     names = [cameras[index].name for index in indices]
     masked = [name for name in names if name not in found]

@@ -118,7 +118,7 @@ def _fail(ranks, how):
     [
         ("raise", "rank 1 failed: ValueError: shard 1 has a hole"),
         ("memory", "rank 1 failed: OutOfMemoryError: no room for shard 1"),
-        ("kill", "rank 1 has not arrived"),
+        ("kill", "rank 1 has stopped reporting"),
         ("hang", "exit code 75"),
     ],
 )
@@ -131,6 +131,27 @@ def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
         assert "waited 5 s in all_reduce: rank 1 has not arrived" in failure.value.blame
     assert expected in failure.value.messages[0]
     assert expected in failure.value.messages[2]
+
+
+def _work(ranks, hang):
+    announced = []
+    ranks.watchdog._announce = lambda work, waited: announced.append(work)
+    ranks.barrier()
+    if ranks.rank == 1:
+        with ranks.working("writing to a slow disk"):
+            time.sleep(9)
+        if hang:
+            time.sleep(60)
+    return ranks.all_reduce(torch.ones(1)).item(), announced[:1]
+
+
+def test_a_rank_that_is_at_work_is_waited_for():
+    """Longer than the timeout, as long as it says what it does and shows signs of life."""
+    first, second = run_ranks(_work, 2, False, timeout_seconds=3.0, limit=60)
+    assert first == (2.0, ["rank 1 (writing to a slow disk)"]) and second == (2.0, [])
+    with pytest.raises(RankError) as failure:
+        run_ranks(_work, 2, True, timeout_seconds=3.0, limit=60)
+    assert "rank 1 has not arrived (last collective: barrier" in failure.value.blame
 
 
 def _fail_and_stay(ranks):
