@@ -5,9 +5,12 @@ For view v and Gaussian i, w is the sum of alpha T over the pixels at which the 
 their number, c_rad tells whether i is visible, and c_vis whether it is in the smallest set, by descending w
 (ties by id), that holds 99 % of the view's total. Then::
 
-    score_i = sum over v with a > 0 of w / (a + SCORE_EPS)
+    score_i = sum over v with a > 0 of w / (a + SCORE_EPS)^p, p = 1 for "density", 1/2 "root", 0 "weight"
     phi_i   = (number of v with c_vis) / (number of v with c_rad + PHI_EPS)
     cull_iv = not c_vis
+
+"density" is the paper's. It rewards what a Gaussian gives each pixel, not how many pixels it covers, so large
+ones go first; "weight" is what an image loses with a Gaussian.
 
 The views see the Gaussians of all ranks. All sums are integers, so every result has the same bits at any
 world size and for any division of the work.
@@ -17,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -36,8 +40,9 @@ VIEW_MASS = 0.99
 # Columns of a table from the first pass on.
 PHI, CULL = "phi", "cull"
 _WORD = 32
-# A density w / (a + eps) < 1 counts in units of 2^-44, so that 2^19 views can be added up.
-_DENSITY_BITS = 44
+ScoreRule = Literal["density", "root", "weight"]
+# How a view's term grows with its pixels, of which there are less than 2^31: bits before the point.
+_TERM_BITS: dict[ScoreRule, int] = {"density": 0, "root": 16, "weight": 31}
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,7 @@ class Importance:
     """What a sweep found of this rank's N Gaussians.
 
     Attributes:
-        score: float32 [N], contribution per pixel, summed over the views.
+        score: float32 [N], summed over the views.
         phi: float32 [N], share of the views that see a Gaussian in which it counts, in [0, 1).
         cull: int32 [N, ceil(V / 32)]; bit v % 32 of word v / 32 is set where the Gaussian does not count in
             view v. Bits from V on are zero.
@@ -83,6 +88,7 @@ def sweep(
     options: RenderOptions,
     ranks: Ranks,
     owners: TileOwners | None = None,
+    rule: ScoreRule = "density",
 ) -> Importance:
     """Score the Gaussians by what they contribute to V views. Collective: every rank calls it.
 
@@ -93,8 +99,9 @@ def sweep(
         options: how the views are rendered.
         ranks: the job.
         owners: knows what tiles cost, to divide them well; the result does not depend on it.
+        rule: of the score.
     """
-    sums = _Sums(len(table), n_views, table.device)
+    sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
     transport = open_transport(ranks)
     for batch in batches:
@@ -121,8 +128,11 @@ def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Til
 class _Sums:
     """What the views surveyed so far add up to, for N Gaussians."""
 
-    def __init__(self, count: int, n_views: int, device: torch.device) -> None:
-        self._density = torch.zeros(count, dtype=torch.int64, device=device)
+    def __init__(self, count: int, n_views: int, device: torch.device, rule: ScoreRule) -> None:
+        self._rule = rule
+        # Terms are integers in units that let those of all views be added up in 62 bits.
+        self._unit = 2.0 ** -min(48, 62 - n_views.bit_length() - _TERM_BITS[rule])
+        self._score = torch.zeros(count, dtype=torch.int64, device=device)
         self._seen = torch.zeros(count, dtype=torch.int32, device=device)
         self._counted = torch.zeros(count, dtype=torch.int32, device=device)
         self._cull = _all_culled(n_views, device).repeat(count, 1)
@@ -131,8 +141,10 @@ class _Sums:
         """Add the rows of a batch of views."""
         rows, weights = found.rows, found.weights
         gaussians, views = rows.gaussian_ids.long(), rows.camera_ids.long()
-        density = weights.double() / UNITS / (found.pixels.double() + SCORE_EPS)
-        self._density.index_add_(0, gaussians, (density * 2.0**_DENSITY_BITS).round().long())
+        terms, pixels = weights.double() / UNITS, found.pixels.double() + SCORE_EPS
+        if self._rule != "weight":
+            terms = terms / (pixels if self._rule == "density" else pixels.sqrt())
+        self._score.index_add_(0, gaussians, (terms / self._unit).round().long())
         self._seen.index_add_(0, gaussians, (rows.radii > 0).any(1).int())
         counts = integer_mass_prefix(weights, ids[gaussians], VIEW_MASS, ranks, views, len(columns))
         self._counted.index_add_(0, gaussians, counts.int())
@@ -144,7 +156,7 @@ class _Sums:
 
     def result(self) -> Importance:
         phi = self._counted.double() / (self._seen.double() + PHI_EPS)
-        score = self._density.double() * 2.0**-_DENSITY_BITS
+        score = self._score.double() * self._unit
         return Importance(score.float(), phi.float(), self._cull)
 
 

@@ -186,6 +186,8 @@ class PopulationConfig:
         max_gaussians: the population never exceeds this; the strongest candidates come first. 0: no cap.
         importance: at `schedule.t1` and `schedule.t2` score all Gaussians by what they contribute to the
             training views, and keep those that matter.
+        score: what the passes score by, summed over the views: "density" (the paper's: contribution per
+            pixel), "weight" (contribution) or "root" (contribution over the root of the pixels).
         pass1_keep: share of the Gaussians that the first pass keeps, drawn by their scores; 1: all, the pass
             then makes its signals alone.
         pass2_mass: share of the total score that the second pass keeps, by the fewest Gaussians, of which
@@ -210,6 +212,7 @@ class PopulationConfig:
     prune_world_scale: float = 0.1
     max_gaussians: int = 0
     importance: bool = False
+    score: str = "density"
     pass1_keep: float = 0.7
     pass2_mass: float = 0.99
     phi: bool = True

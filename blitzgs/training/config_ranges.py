@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, get_args
 
 from blitzgs.distributed.group import Transport
+from blitzgs.population.importance import ScoreRule
 from blitzgs.training.config import Config
 
 
@@ -114,6 +115,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "data.undistort": ("crop", "mask"),
     "data.exif": ("auto", "apply", "ignore"),
     "ranks.transport": get_args(Transport),
+    "population.score": get_args(ScoreRule),
 }
 
 

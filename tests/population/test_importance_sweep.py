@@ -84,6 +84,12 @@ def test_sweep_is_the_definition(device):
     found = sweep(table, view_batches(device), N_VIEWS, OPTIONS, ranks)
     expected = by_definition(*dense_survey(table), table["id"].cpu(), SCORE_EPS, PHI_EPS)
     assert torch.allclose(found.score.cpu().double(), expected.score, rtol=1e-6, atol=1e-9)
+    units, pixels, _ = dense_survey(table)
+    for rule, power in (("root", 0.5), ("weight", 0.0)):
+        other = sweep(table, view_batches(device), N_VIEWS, OPTIONS, ranks, rule=rule)
+        wanted = (units.double() / 2.0**32 / (pixels.double() + SCORE_EPS) ** power).sum(0)
+        assert torch.allclose(other.score.cpu().double(), wanted, rtol=1e-6, atol=1e-5)
+        assert torch.equal(other.phi, found.phi) and torch.equal(other.cull, found.cull)
     assert torch.allclose(found.phi.cpu().double(), expected.phi, rtol=1e-6, atol=0)
     culled = torch.stack([is_culled(found.cull, v) for v in range(N_VIEWS)]).cpu()
     assert torch.equal(culled, ~expected.c_vis)

@@ -6,11 +6,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from blitzgs.population.importance import Importance, ViewBatch, sweep
+from blitzgs.population.importance import Importance, ScoreRule, ViewBatch, sweep
 from blitzgs.population.lineage import Cause
 from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.population.redistribution import redistribute
@@ -39,6 +40,7 @@ def run(state: TrainingState, event: Event) -> None:
         state.render_options,
         state.ranks,
         state.owners,
+        cast(ScoreRule, state.config.population.score),
     )
     found.store(state.table)
     before = state.population()
