@@ -182,9 +182,7 @@ def test_errors(device):
                 *rows.roomy.values(),
                 None,
                 *lists,
-                *VIEW,
-                0,
-                -1,
+                [*VIEW, 0, -1],
                 torch.zeros(149, SPLAT_GRADIENT, device=device),
             )
 
