@@ -79,15 +79,12 @@ class Layout:
         return taken
 
     def lay_opacities(self, opacities: Tensor) -> Tensor:
-        """Return the rows' opacities as [..., C, N], and for what a view does not see those given, [..., N].
+        """Return the rows' opacities as [..., C, N], over those given, [..., N], of what a view does not see.
 
-        A row in it has no other opacity than its Gaussian (without compensation), as in gsplat.
+        As in gsplat, whose dense opacities are those of all Gaussians.
         """
-        (rows,) = self.lay(self.rows.opacities)
-        assert self.places is not None
-        unseen = torch.ones(self.shape, dtype=torch.bool, device=rows.device)
-        unseen.view(-1)[self.places] = False
-        return rows + unseen * opacities[..., None, :]
+        laid: Tensor = _LayOver.apply(self.places, self.shape, self.rows.opacities, opacities)  # type: ignore[no-untyped-call]
+        return laid
 
 
 def _laid(places: Tensor, shape: tuple[int, ...], values: Tensor) -> Tensor:
@@ -114,6 +111,28 @@ class _Lay(torch.autograd.Function):
     def backward(ctx: Any, *v_laid: Tensor | None) -> Any:
         (places,) = ctx.saved_tensors
         return None, None, *(None if v is None else _taken(places, ctx.shape, v) for v in v_laid)
+
+
+class _LayOver(torch.autograd.Function):
+    """As `_Lay`, over values that all Gaussians have, [..., N]."""
+
+    @staticmethod
+    def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
+        ctx.save_for_backward(places)
+        ctx.shape = shape
+        laid = under[..., None, :].expand(shape).clone(memory_format=torch.contiguous_format)
+        laid.view(-1).index_copy_(0, places, values)
+        return laid
+
+    @staticmethod
+    def backward(ctx: Any, v_laid: Tensor) -> Any:
+        (places,) = ctx.saved_tensors
+        v_values, v_under = _taken(places, ctx.shape, v_laid), None
+        if ctx.needs_input_grad[3]:
+            covered = v_laid.clone(memory_format=torch.contiguous_format)
+            covered.view(-1).index_fill_(0, places, 0)
+            v_under = covered.sum(dim=-2)
+        return None, None, v_values, v_under
 
 
 class _Take(torch.autograd.Function):
