@@ -11,6 +11,7 @@ from torch import Tensor
 
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
+from blitzgs.ops.sparse_rows import sparse_rows
 from blitzgs.ops.splat_gradients import packed_table
 
 
@@ -248,9 +249,7 @@ def _first_gradients(
 def _of_all(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> Tensor:
     """Return the gradient of a whole parameter, from that of its rows `ids`."""
     if sparse:
-        return torch.sparse_coo_tensor(
-            ids[None], gradient, parameter.shape, is_coalesced=True, check_invariants=False
-        )
+        return sparse_rows(ids, gradient, parameter.shape)
     return torch.zeros_like(parameter).index_copy_(0, ids, gradient)
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
 
 # Of the state of a parameter: the step that its rows' parameters, and their moments, stand at.
@@ -125,8 +126,8 @@ class LazyAdam(torch.optim.Optimizer):
                     "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
                     f"{param.grad.sparse_dim()} of them"
                 )
-            gradient = param.grad.coalesce()
-            ids, values = gradient.indices()[0].int(), gradient.values()
+            rows, values = distinct_rows(param.grad)
+            ids = rows.int()
         else:
             ids = torch.arange(len(param), dtype=torch.int32, device=param.device)
             values = param.grad

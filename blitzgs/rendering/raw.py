@@ -14,6 +14,7 @@ from torch import Tensor
 from blitzgs.lazy_dict import Later
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection import ProjectionInputs, project_rows
+from blitzgs.ops.sparse_rows import sparse_rows
 from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
 from blitzgs.rendering.groups import ProjectOptions, groups_of
 from blitzgs.rendering.images import ImageOptions, render
@@ -178,5 +179,5 @@ class _Visible(torch.autograd.Function):
 def _of_all(ids: Tensor, v_rows: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
     """Return the gradient of a whole table, from that of its rows `ids`."""
     if sparse:
-        return torch.sparse_coo_tensor(ids[None], v_rows, shape, is_coalesced=True, check_invariants=False)
+        return sparse_rows(ids, v_rows, shape)
     return v_rows.new_zeros(shape).index_copy_(0, ids, v_rows)

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""gsplat's training loop with its own parts and with ours: time, quality, and what each exchange brings.
+
+    python benchmarks/bm_drop_in.py CAPTURE [--steps 7000] [--arms gsplat import four] [--device cuda]
+
+The loop, learning rates and density strategy are those of gsplat's `simple_trainer.py` 1.5.3
+(`opponents/gsplat_training.py`), with photographs on the device. Arms:
+
+- gsplat: `gsplat.rasterization`, `torch.optim.Adam(fused=True)`, and L1 and SSIM by fused_ssim, or by our
+  kernel where fused_ssim is not installed;
+- import: the same with `blitzgs.rasterization`, the one import exchanged;
+- four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order.
+
+Times are of the whole training, and of steps between two densifications at its end; PSNR is the mean over
+held-out views.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from harness import report
+from opponents.gsplat_training import GsplatOptions, GsplatTrainer
+from torch import Tensor
+
+import blitzgs
+from blitzgs.optim import LazyAdam
+from blitzgs.scene.capture import load_capture
+from blitzgs.scene.images import ImageStore
+
+
+class OneImport(GsplatTrainer):
+    """gsplat's loop with another renderer."""
+
+    rasterization: Any = staticmethod(blitzgs.rasterization)
+
+    def loss(self, renders: Tensor, target: Tensor) -> Tensor:
+        """L1 and SSIM, with the kernels that gsplat's trainer uses where they are installed."""
+        try:
+            from fused_ssim import fused_ssim
+        except ImportError:
+            return blitzgs.l1_ssim(renders, target)
+        target = target / 255.0
+        l1 = torch.nn.functional.l1_loss(renders, target)
+        similar = fused_ssim(renders.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2), padding="valid")
+        return torch.lerp(l1, 1.0 - similar, self.options.ssim_lambda)
+
+    def render(self, views: Any) -> tuple[Tensor, Any]:
+        """Return the image of a view and what the strategy needs of it."""
+        p = self.params
+        image, _, info = self.rasterization(
+            p["means"], p["quats"], torch.exp(p["scales"]), torch.sigmoid(p["opacities"]),
+            torch.cat([p["sh0"], p["shN"]], 1), views.viewmats, views.Ks, views.width, views.height,
+            sh_degree=self.sh_degree, packed=self.options.packed,
+        )  # fmt: skip
+        return image, info
+
+    def _take_step(self) -> None:
+        views, target, _ = self._batches[next(self._order)]
+        image, info = self.render(views)
+        self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
+        self.loss(image, target).backward()
+        for optimiser in self._optimisers.values():
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+        self._decay.step()
+        self._change_population(info)
+
+
+class FourSwaps(OneImport):
+    """The loop with our renderer of raw parameters, optimiser and loss, and rows in Morton order."""
+
+    def _initialise(self, capture: Any) -> Any:
+        params, adams = super()._initialise(capture)
+        lazy = {
+            name: LazyAdam([{**adam.param_groups[0], "lr_rest": None}], eps=1e-15)
+            for name, adam in adams.items()
+        }
+        return params, lazy
+
+    def loss(self, renders: Tensor, target: Tensor) -> Tensor:
+        """L1 and SSIM in one kernel."""
+        return blitzgs.l1_ssim(renders, target, ssim_weight=self.options.ssim_lambda)
+
+    def render(self, views: Any) -> tuple[Tensor, Any]:
+        """Return the image of a view and what the strategy needs of it."""
+        p = self.params
+        image, _, info = blitzgs.raw_rasterization(
+            p["means"], p["quats"], p["scales"], p["opacities"], p["sh0"], p["shN"], views.viewmats, views.Ks,
+            views.width, views.height, sh_degree=self.sh_degree, optimizers=self._optimisers,
+        )  # fmt: skip
+        return image, info
+
+    def _change_population(self, info: Any) -> None:
+        refines = self.step % self._strategy.refine_every == 0
+        if refines:  # then the strategy reads parameters
+            self.catch_up()
+        super()._change_population(info)
+        if refines:
+            order = blitzgs.morton_order(self.params["means"].detach())
+            for name, optimiser in self._optimisers.items():
+                self.params[name] = optimiser.permute(order)[name]
+            for key, value in self._state.items():
+                if isinstance(value, Tensor) and len(value) == len(order):
+                    self._state[key] = value[order]
+
+    def catch_up(self) -> None:
+        """Bring all parameters up to date."""
+        for optimiser in self._optimisers.values():
+            optimiser.catch_up()
+
+
+class Gsplat(OneImport):
+    """gsplat's loop as it is."""
+
+    def __init__(self, *arguments: Any) -> None:
+        from gsplat import rasterization
+
+        self.rasterization = rasterization
+        super().__init__(*arguments)
+
+
+ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps}
+
+
+def seconds_of(trainer: GsplatTrainer, until: int) -> float:
+    """Train on and return the seconds it took."""
+    synchronize = torch.cuda.synchronize if trainer.device.type == "cuda" else lambda: None
+    synchronize()
+    start = time.perf_counter()
+    trainer.train_to(until)
+    synchronize()
+    return time.perf_counter() - start
+
+
+@torch.no_grad()
+def psnr(trainer: OneImport, capture: Any, images: ImageStore) -> float:
+    """Return the mean PSNR of the held-out views, in dB."""
+    if isinstance(trainer, FourSwaps):
+        trainer.catch_up()
+    found = []
+    for index in capture.test:
+        image, _ = trainer.render(trainer.views.pick([index]))
+        error = image[0].clamp(0, 1) - images.get(index).to(image.device) / 255
+        found.append(-10 * error.square().mean().log10())
+    return float(torch.stack(found).mean())
+
+
+def measure(name: str, capture: Any, images: ImageStore, options: argparse.Namespace) -> dict[str, Any]:
+    """Train with one arm; returns a row of the report."""
+    device = torch.device(options.device)
+    changes = {"steps": options.steps, "packed": name == "four"}
+    trainer = ARMS[name]("default", GsplatOptions.of("default", changes), capture, images, device, 0)
+    last = min(99, options.steps // 10)  # between two densifications
+    first = seconds_of(trainer, options.steps - last)
+    rest = seconds_of(trainer, options.steps)
+    return {
+        "arm": name,
+        "training, s": first + rest,
+        "last steps, ms each": rest / last * 1e3,
+        "Gaussians": len(trainer.params["means"]),
+        "PSNR, dB": psnr(trainer, capture, images),
+    }
+
+
+def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
+    """Train with each arm in turn and report."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--steps", type=int, default=7000)
+    parser.add_argument("--downscale", type=float, default=1)
+    parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--json", type=Path, help="write the rows and the environment to this file")
+    options = parser.parse_args(arguments)
+    capture = load_capture(options.capture, downscale=options.downscale)
+    images = ImageStore(capture)
+    rows = [measure(name, capture, images, options) for name in options.arms]
+    images.close()
+    report(
+        f"gsplat's loop, {options.steps} steps of {options.capture.name}", rows, options.json, options.device
+    )
+    return rows
+
+
+if __name__ == "__main__":
+    main()
