@@ -18,6 +18,7 @@ constexpr int kThreads = kRows * (12 + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
 constexpr int kPrepareLanes = 8, kPrepareThreads = 64, kListThreads = 256;
 static_assert(kPrepareLanes > kAdamGroups);
+constexpr int kAlone = kAdamColumns - 1;  // the column of a parameter that is stepped alone
 
 // What rows need to catch up. All rows of a launch go to the same step, so it is computed once for each step
 // at which a row may stand, and not for each row.
@@ -112,15 +113,13 @@ __global__ void __launch_bounds__(kListThreads)
 }
 
 // Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every kRows rows.
-// ShPacks: packs in an SH row; 0: as many as there are. The other columns are empty where a parameter is
-// stepped alone.
+// ShPacks: packs in an SH row; 0: as many as `sh_packs` says.
 template <int ShWidth, int ShPacks, class F>
-__device__ __forceinline__ void for_each_pack(const AdamArgs<float>& args, const F& update) {
-  const int packs = ShPacks ? ShPacks : static_cast<int>(args.columns[4].width) / ShWidth;
-  const int others = args.columns[0].width > 0 ? 8 : 0;
+__device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
+  const int packs = ShPacks ? ShPacks : sh_packs;
   // Where the number of packs is known, a single round handles all of them.
   constexpr int kRound = ShPacks ? kRows * (ShPacks + 8) : kThreads;
-  for (int item = threadIdx.x; item < kRows * (packs + others); item += kRound) {
+  for (int item = threadIdx.x; item < kRows * (packs + 8); item += kRound) {
     const int rest = item - kRows * packs;
     if (rest < 0) {
       update.template operator()<4, ShWidth>(item / packs, item % packs);
@@ -177,7 +176,7 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
       if (debtor.row >= 0) pay_pack<Column, Width>(args, prepared.debts, debtor, pack);
     }
   };
-  for_each_pack<ShWidth, ShPacks>(args, pay);
+  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, pay);
 }
 
 template <int Column, int Width>
@@ -205,12 +204,79 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
     const std::int64_t row = args.ids ? args.ids[first + local] : first + local;
     step_pack<Column, Width>(args, step, row, first + local, pack);
   };
-  for_each_pack<ShWidth, ShPacks>(args, take_step);
+  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, take_step);
   __syncthreads();
   if (threadIdx.x >= count) return;
   const std::int64_t i = first + threadIdx.x, row = args.ids ? args.ids[i] : i;
   args.last_step[row] = args.step;
   args.moment_step[row] = args.step;
+}
+
+// A parameter that is stepped alone lies in the last column, of any width: a thread takes an element at a
+// time, so that neighbours in a warp read neighbours in memory.
+__device__ std::int64_t first_element() { return blockIdx.x * std::int64_t{kListThreads} + threadIdx.x; }
+__device__ std::int64_t element_stride() { return gridDim.x * std::int64_t{kListThreads}; }
+
+__global__ void __launch_bounds__(kListThreads)
+    catch_up_alone_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
+                          const Debtor* debtors) {
+  wait_for_earlier_kernels();
+  if (!*prepared.owing) return;
+  const AdamColumn<float>& column = args.columns[kAlone];
+  const std::int64_t elements = listed(args) * column.width;
+  for (std::int64_t e = first_element(); e < elements; e += element_stride()) {
+    const Debtor debtor = debtors[e / column.width];
+    if (debtor.row < 0) continue;
+    const std::int64_t j = e % column.width, at = debtor.row * column.width + j;
+    const AdamRule<float>& rule = prepared.debts[debtor.from].rules[adam_group(kAlone, j)];
+    column.param[at] -=
+        adam_ruled_drift(rule, column.exp_avg[at] * debtor.here.first,
+                         adam_root(column.exp_avg_sq[at] * debtor.here.second), static_cast<float>(args.eps));
+  }
+}
+
+__global__ void __launch_bounds__(kListThreads)
+    step_alone_kernel(const __grid_constant__ AdamArgs<float> args) {
+  __shared__ AdamStep<float> step;
+  wait_for_earlier_kernels();
+  if (threadIdx.x == 0) step = adam_step_scalars(args);
+  __syncthreads();
+  const AdamColumn<float>& column = args.columns[kAlone];
+  for (std::int64_t e = first_element(); e < args.n * column.width; e += element_stride()) {
+    const std::int64_t i = e / column.width, j = e % column.width, row = args.ids ? args.ids[i] : i;
+    const Decay decay = make_decay(args, args.sparse ? 0 : args.target() - args.moment_step[row]);
+    const std::int64_t at = row * column.width + j;
+    float p = column.param[at], m = column.exp_avg[at] * decay.first,
+          v = column.exp_avg_sq[at] * decay.second;
+    adam_update(step, adam_group(kAlone, j), column.grad[e], p, m, v);
+    column.param[at] = p;
+    column.exp_avg[at] = m;
+    column.exp_avg_sq[at] = v;
+  }
+}
+
+// After the step, as elements of a row are stepped by several blocks, which read where its moments stand.
+__global__ void __launch_bounds__(kListThreads)
+    mark_steps_kernel(const __grid_constant__ AdamArgs<float> args) {
+  wait_for_earlier_kernels();
+  for (std::int64_t i = first_element(); i < args.n; i += element_stride()) {
+    const std::int64_t row = args.ids ? args.ids[i] : i;
+    args.last_step[row] = args.step;
+    args.moment_step[row] = args.step;
+  }
+}
+
+bool is_alone(const AdamArgs<float>& args) { return args.columns[0].width == 0; }
+
+// As many blocks as the device runs at a time.
+unsigned filled_blocks(std::int64_t items, int items_per_block, int blocks_per_multiprocessor) {
+  return std::min(blocks_for(items, items_per_block),
+                  static_cast<unsigned>(blocks_per_multiprocessor * multiprocessors()));
+}
+
+LaunchShape alone_size(const AdamArgs<float>& args, CudaStream stream) {
+  return {filled_blocks(args.n * args.columns[kAlone].width, kListThreads, kListBlocks), kListThreads,
+          stream};
 }
 
 void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
@@ -221,15 +287,18 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
   launch_early("lazy_adam catch-up", prepare,
                {blocks_for(args.step + 1, kPrepareThreads / kPrepareLanes), kPrepareThreads, stream}, args,
                prepared);
-  // As many blocks as the device runs at a time: n may be far more than the number of valid ids.
-  const auto filled = [&](int items, int per_multiprocessor) {
-    return std::min(blocks_for(args.n, items), unsigned(per_multiprocessor * multiprocessors()));
-  };
-  launch_early("lazy_adam catch-up", list_debtors, {filled(kListThreads, kListBlocks), kListThreads, stream},
-               args, prepared, debtors);
+  // n may be far more than the number of valid ids.
+  launch_early("lazy_adam catch-up", list_debtors,
+               {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
+               debtors);
+  if (is_alone(args)) {
+    launch_early("lazy_adam catch-up", catch_up_alone_kernel, alone_size(args, stream), args, prepared,
+                 debtors);
+    return;
+  }
   const auto kernel = args.columns[4].width == 48 ? catch_up_kernel<4, 12> : catch_up_kernel<1, 0>;
-  launch_early("lazy_adam catch-up", kernel, {filled(kRows, kCatchUpBlocks), kThreads, stream}, args,
-               prepared, debtors);
+  launch_early("lazy_adam catch-up", kernel, {filled_blocks(args.n, kRows, kCatchUpBlocks), kThreads, stream},
+               args, prepared, debtors);
 }
 
 // Quaternions, and SH of degree 3, are moved 16 bytes at a time.
@@ -259,6 +328,12 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
   for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;
   if (!args.sparse) catch_up(behind, workspace, stream);
   if (!args.with_gradient()) return;
+  if (is_alone(args)) {
+    launch_early("lazy_adam step", step_alone_kernel, alone_size(args, stream), args);
+    launch_early("lazy_adam step", mark_steps_kernel,
+                 {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args);
+    return;
+  }
   const auto kernel = args.columns[4].width == 48 ? step_kernel<4, 12> : step_kernel<1, 0>;
   launch_early("lazy_adam step", kernel, {blocks_for(args.n, kRows), kThreads, stream}, args);
 }
