@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,6 +127,17 @@ class TileAssignment:
         return [self.ranges.composited(rank) for rank in range(self.ranks.world_size)]
 
 
+@dataclass(frozen=True)
+class _KeptSum:
+    """Costs out of a checkpoint, in the place of the sum that they were read from."""
+
+    values: Tensor
+
+    def read(self) -> Tensor:
+        """Return the costs."""
+        return self.values
+
+
 class TileOwners:
     """Divides the tiles of each batch by what they cost at the last visit of each view.
 
@@ -135,7 +146,56 @@ class TileOwners:
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks = ranks
-        self._costs: dict[Hashable, tuple[HostSum, int, int]] = {}  # where a view's tiles are in the sums
+        # Where a view's tiles are in the sums.
+        self._costs: dict[Hashable, tuple[HostSum | _KeptSum, int, int]] = {}
+        self._planned: dict[int, tuple[int, ...]] = {}
+
+    def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
+        """Divide the tiles of the batch of a later step, as `divide` does, and remember the borders.
+
+        Args:
+            step: of the batch; plans of steps before it are kept until `forget_before`.
+            keys: as for `divide`, like the others.
+            width: image width in pixels.
+            height: image height in pixels.
+            halo: see `TileRanges`.
+        """
+        if step in self._planned:
+            return TileRanges(self._planned[step], len(keys), width, height, halo=halo)
+        ranges = self.divide(keys, width, height, halo=halo)
+        self._planned[step] = ranges.bounds
+        return ranges
+
+    def forget_before(self, step: int) -> None:
+        """Drop the plans of steps before this one."""
+        self._planned = {other: bounds for other, bounds in self._planned.items() if other >= step}
+
+    def columns(self) -> dict[str, Tensor]:
+        """What a resumed run needs to draw the same borders; the same on every rank.
+
+        Returns:
+            views int64 [V], tiles int64 [V] and costs float32 [sum of tiles]: what was measured;
+            steps int64 [S] and bounds int64 [S, M + 1]: what was planned. Keys must be integers.
+        """
+        costs = [torch.from_numpy(self._read(key)) for key in self._costs]
+        return {
+            "views": torch.tensor([int(str(key)) for key in self._costs], dtype=torch.int64),
+            "tiles": torch.tensor([len(cost) for cost in costs], dtype=torch.int64),
+            "costs": torch.cat([torch.empty(0), *costs]),
+            "steps": torch.tensor(list(self._planned), dtype=torch.int64),
+            "bounds": torch.tensor(list(self._planned.values()), dtype=torch.int64),
+        }
+
+    def restore(self, columns: Mapping[str, Tensor]) -> None:
+        """Go on from `columns`; plans for another number of ranks are left out."""
+        kept, begin = _KeptSum(columns["costs"]), 0
+        for key, tiles in zip(columns["views"].tolist(), columns["tiles"].tolist(), strict=True):
+            self._costs[key] = (kept, begin, begin + tiles)
+            begin += tiles
+        bounds = columns["bounds"]
+        if bounds.dim() == 2 and bounds.shape[1] == self.ranks.world_size + 1:
+            rows = [tuple(row) for row in bounds.tolist()]
+            self._planned = dict(zip(columns["steps"].tolist(), rows, strict=True))
 
     def divide(
         self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, halo: int = 0

@@ -119,6 +119,7 @@ class Lineage:
         self._rows, self._parts = 0, 0
         self._writer = ThreadPoolExecutor(1, "lineage")
         self._writing: list[Future[None]] = []
+        self._unwritten: list[tuple[str, list[dict[str, Tensor]], OSError]] = []
 
     def born(self, births: Births, step: int) -> None:
         """Log births at the end of an optimiser step."""
@@ -152,12 +153,17 @@ class Lineage:
 
         Raises:
             LineageError: on every rank, when births - deaths is not the live population.
-            OSError: a part could not be written.
+            OSError: on every rank, when one could not write a part; a later call tries that part again.
         """
         self._flush(step)
-        for writing in self._writing:
-            writing.result()
-        self._writing.clear()
+        self._wait()
+        unwritten, self._unwritten = self._unwritten, []
+        for name, pieces, _ in unwritten:
+            self._write(name, pieces)
+        texts = [str(error) for _, _, error in self._unwritten]
+        problems = [text for part in self._ranks.all_gather_object(texts) for text in part]
+        if problems:
+            raise OSError(f"the lineage could not be written: {problems[0]}")
         live = torch.stack((torch.tensor(len(ids), device=ids.device), hash_keys(ids).sum()))
         totals = self._ranks.all_reduce(torch.cat((self._sums, live))).tolist()
         self._sums.zero_()
@@ -174,6 +180,11 @@ class Lineage:
             )
         self.ledger = ledger
         return ledger
+
+    def _wait(self) -> None:
+        for writing in self._writing:
+            writing.result()
+        self._writing.clear()
 
     def close(self) -> None:
         """Stop writing; what was not settled is lost, as is the training since then."""
@@ -205,8 +216,11 @@ class Lineage:
         columns = {key: torch.cat([piece[key] for piece in pieces]).numpy() for key in pieces[0]}
         unfinished = self._folder / f".{name}"
         arrow, parquet = self._parquet
-        parquet.write_table(arrow.table(columns), unfinished, compression="zstd")
-        unfinished.rename(self._folder / name)
+        try:
+            parquet.write_table(arrow.table(columns), unfinished, compression="zstd")
+            unfinished.rename(self._folder / name)
+        except OSError as error:
+            self._unwritten.append((name, pieces, error))
 
 
 def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:

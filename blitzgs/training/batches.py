@@ -185,11 +185,13 @@ class BatchLoader:
                 self._used.read.record(stream)
             self._free.append(self._used)
             self._used = None  # in case the next batch cannot be loaded
+        if self._owners is not None:
+            self._owners.forget_before(step)
         for ahead in range(step, max(step + 1, min(step + self._ahead + 1, last))):
             if ahead not in self._pending:
                 indices = [self._train[view] for view in self._sampler.batch(ahead)]
                 # Divided here and not in the thread: all ranks must know the same costs at this moment.
-                ranges = self._divide(indices)
+                ranges = self._divide(ahead, indices)
                 rows = self._rows(indices, ranges)
                 self._images.prefetch(
                     [index for index, (y0, y1) in zip(indices, rows, strict=True) if y0 < y1]
@@ -210,10 +212,10 @@ class BatchLoader:
         if self._stream is not None:
             torch.cuda.set_stream(self._stream)
 
-    def _divide(self, indices: list[int]) -> TileRanges | None:
+    def _divide(self, step: int, indices: list[int]) -> TileRanges | None:
         if self._owners is None:
             return None
-        return self._owners.divide(indices, *self._views.size(indices), halo=LOSS_HALO)
+        return self._owners.plan(step, indices, *self._views.size(indices), halo=LOSS_HALO)
 
     def _rows(self, indices: list[int], ranges: TileRanges | None) -> list[tuple[int, int]]:
         """Pixel rows [y0, y1) of each view that this rank needs."""

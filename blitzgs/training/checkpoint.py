@@ -33,6 +33,7 @@ from blitzgs.training.shard_file import file_digest, header_of, sync_folder, wri
 
 FORMAT = 2
 MANIFEST = "manifest.json"
+SHARED = "shared.safetensors"
 _NAME = re.compile(r"checkpoint_(\d{6})")
 _UNFINISHED = ".unfinished_"
 
@@ -57,6 +58,7 @@ def save(
     state: Mapping[str, Any],
     ranks: Ranks,
     keep: int = 3,
+    shared: Mapping[str, Tensor] | None = None,
 ) -> Path:
     """Write a checkpoint; returns on every rank when it is safely on disk.
 
@@ -66,6 +68,7 @@ def save(
         state: what else a resume needs, as JSON values; rank 0's is stored.
         ranks: the job.
         keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
+        shared: tensors that all ranks have alike; rank 0's are stored, in a file of their own.
 
     Returns:
         The folder of the new checkpoint, `directory/checkpoint_NNNNNN`.
@@ -83,7 +86,7 @@ def save(
         _delete_unfinished(directory)
     name = ranks.broadcast_object(name)
     unfinished = directory / (_UNFINISHED + name)
-    mine, problem = None, None
+    mine, common, problem = None, None, None
     try:
         _reached("begin")
         unfinished.mkdir(parents=True, exist_ok=True)
@@ -93,6 +96,8 @@ def save(
         with ranks.working("writing a checkpoint"):
             size, digest = write_shard(unfinished / file, columns, _reached)
         mine = Shard(file, rows, size, digest)
+        if shared and ranks.rank == 0:
+            common = Shard(SHARED, 0, *write_shard(unfinished / SHARED, shared, lambda point: None))
     except OSError as error:
         problem = f"rank {ranks.rank} could not write: {_explain(error)}"
     results = ranks.all_gather_object((mine, problem))
@@ -100,7 +105,8 @@ def save(
     if not problems and ranks.rank == 0:
         try:
             with ranks.working("finishing a checkpoint"):
-                _finish(directory, name, [shard for shard, _ in results if shard], state, ranks.world_size)
+                shards = [shard for shard, _ in results if shard]
+                _finish(directory, name, shards, common, state, ranks.world_size)
         except OSError as error:
             problems.append(f"rank 0 could not write: {_explain(error)}")
     problems = ranks.broadcast_object(problems)
@@ -123,12 +129,14 @@ class Loaded:
     Attributes:
         columns: of this rank's shard.
         state: what was saved with them.
+        shared: what all ranks have alike; empty where nothing was stored.
         name: of the checkpoint.
         refused: why each newer one was not taken.
     """
 
     columns: dict[str, Tensor]
     state: dict[str, Any]
+    shared: dict[str, Tensor]
     name: str
     refused: list[str]
 
@@ -160,7 +168,7 @@ def load_latest(
     refused = []
     for name in reversed(found):
         try:
-            columns, state = load(Path(directory) / name, ranks, device)
+            columns, state, shared = load(Path(directory) / name, ranks, device)
             wrong = [text for text in ranks.all_gather_object(problem(columns)) if text]
             if wrong:
                 raise CheckpointError(f"checkpoint {Path(directory) / name} is refused: {'; '.join(wrong)}")
@@ -169,7 +177,7 @@ def load_latest(
             continue
         if refused and ranks.rank == 0:
             warnings.warn(f"{'; '.join(refused)}; using {name}", stacklevel=2)
-        return Loaded(columns, state, name, refused)
+        return Loaded(columns, state, shared, name, refused)
     if refused:
         raise CheckpointError(f"no sound checkpoint in {directory}: {'; '.join(refused)}")
     return None
@@ -177,7 +185,7 @@ def load_latest(
 
 def load(
     path: str | os.PathLike[str], ranks: Ranks, device: torch.device | str
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
+) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Tensor]]:
     """Load this rank's share of one checkpoint.
 
     At the world size it was saved at, each rank gets its shard back as it was. At another one the rows are
@@ -190,7 +198,8 @@ def load(
         device: where the columns go.
 
     Returns:
-        The columns of this rank's shard, name -> [N_rank, ...], and the state.
+        The columns of this rank's shard, name -> [N_rank, ...], the state, and what all ranks have alike, on
+        the CPU.
 
     Raises:
         CheckpointError: on every rank, when a file is missing, torn or altered.
@@ -201,19 +210,25 @@ def load(
         manifest = _read_manifest(path)
         # The files are shared out for checking, so that each is read for its digest once.
         with ranks.working("reading a checkpoint"):
-            for shard in manifest.shards[ranks.rank :: ranks.world_size]:
+            files = [*manifest.shards, *([manifest.shared] if manifest.shared else [])]
+            for shard in files[ranks.rank :: ranks.world_size]:
                 _verify(path, shard)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         problem = str(error) or type(error).__name__
     problems = [text for text in ranks.all_gather_object(problem) if text]
     if problems or manifest is None:
         raise CheckpointError(f"checkpoint {path} is damaged: {'; '.join(sorted(set(problems)))}")
-    return _read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state
+    shared = {}
+    if manifest.shared is not None:
+        with _opened(path / manifest.shared.file) as file:
+            shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    return _read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
 
 
 @dataclass
 class _Manifest:
     shards: list[Shard]
+    shared: Shard | None
     state: dict[str, Any]
 
 
@@ -265,7 +280,9 @@ def _read_manifest(path: Path) -> _Manifest:
     # Format 1 had no digest of the manifest.
     if content["format"] != 1 and content.pop("sha256") != _digest(content):
         raise ValueError(f"{MANIFEST} does not match its own SHA-256")
-    return _Manifest([Shard(**shard) for shard in content["shards"]], content["state"])
+    shared = content.get("shared")
+    shards = [Shard(**shard) for shard in content["shards"]]
+    return _Manifest(shards, None if shared is None else Shard(**shared), content["state"])
 
 
 def _digest(content: Mapping[str, Any]) -> str:
@@ -283,7 +300,12 @@ def _verify(path: Path, shard: Shard) -> None:
 
 
 def _finish(
-    directory: Path, name: str, shards: list[Shard], state: Mapping[str, Any], world_size: int
+    directory: Path,
+    name: str,
+    shards: list[Shard],
+    shared: Shard | None,
+    state: Mapping[str, Any],
+    world_size: int,
 ) -> None:
     """Write the manifest beside the shards and give the folder its final name, each step synced."""
     unfinished = directory / (_UNFINISHED + name)
@@ -294,6 +316,7 @@ def _finish(
         "format": FORMAT,
         "world_size": world_size,
         "shards": [asdict(shard) for shard in shards],
+        "shared": None if shared is None else asdict(shared),
         "state": dict(state),
     }
     content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest

@@ -7,6 +7,7 @@ import dataclasses
 import platform
 import resource
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,7 @@ def save(
     config: Config,
     ranks: Ranks,
     run_id: str = "",
+    shared: Mapping[str, torch.Tensor] | None = None,
 ) -> Path:
     """Write a checkpoint of a run; rows that are behind stay behind, so that saving changes nothing.
 
@@ -111,7 +113,8 @@ def save(
         "config": to_dict(config),
         "run": run_id,
     }
-    return checkpoint.save(folder / CHECKPOINTS, table.columns, state, ranks, config.log.keep_checkpoints)
+    keep = config.log.keep_checkpoints
+    return checkpoint.save(folder / CHECKPOINTS, table.columns, state, ranks, keep, shared)
 
 
 @dataclass
@@ -125,6 +128,7 @@ class Restored:
         config: of the run.
         run_id: names the run in its log.
         source: which checkpoint it is and why that one, in words.
+        shared: what all ranks have alike: `TileOwners.columns`.
     """
 
     table: GaussianTable
@@ -133,6 +137,7 @@ class Restored:
     config: Config
     run_id: str
     source: str
+    shared: dict[str, torch.Tensor]
 
 
 def restore(folder: Path, ranks: Ranks) -> Restored | None:
@@ -154,6 +159,7 @@ def restore(folder: Path, ranks: Ranks) -> Restored | None:
         from_dict(state["config"]),
         state.get("run", ""),
         f"{loaded.name} ({why}{skipped})",
+        loaded.shared,
     )
 
 

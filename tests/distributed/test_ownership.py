@@ -118,3 +118,31 @@ def test_all_that_the_loss_reads_is_composited(tile_size, bounds):
         # No view is entered in which nothing is owned.
         views_owned = owned.flatten(1).any(1)
         assert not there.flatten(1).any(1)[~views_owned].any()
+
+
+def test_what_is_saved_draws_the_same_borders():
+    ranks = Ranks(world_size=3)
+    owners, again = TileOwners(ranks), TileOwners(ranks)
+    costs = torch.rand(2, 24) * 100
+    owners.restore(
+        {
+            "views": torch.tensor([5, 2]),
+            "tiles": torch.tensor([24, 24]),
+            "costs": costs.flatten(),
+            "steps": torch.tensor([7]),
+            "bounds": torch.tensor([[0, 1, 2, 48]]),
+        }
+    )
+    assert owners.plan(7, [2, 5], 96, 64, 0).bounds == (0, 1, 2, 48)  # as planned before the save
+    ahead = owners.plan(8, [2, 5], 96, 64, 0)
+    again.restore(owners.columns())
+    for step, keys in ((7, [2, 5]), (8, [2, 5]), (9, [5, 1])):
+        assert again.plan(step, keys, 96, 64, 0) == owners.plan(step, keys, 96, 64, 0)
+    assert ahead.bounds != TileOwners(ranks).plan(8, [2, 5], 96, 64, 0).bounds
+    owners.forget_before(8)
+    assert owners.plan(7, [2, 5], 96, 64, 0).bounds != (0, 1, 2, 48)
+    # Plans for another number of ranks mean nothing; costs do.
+    four = TileOwners(Ranks(world_size=4))
+    four.restore(again.columns())
+    assert len(four.plan(7, [2, 5], 96, 64, 0).bounds) == 5
+    assert torch.equal(four.columns()["costs"], costs.flatten())

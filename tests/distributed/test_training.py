@@ -126,6 +126,20 @@ def test_a_mismatch_is_named(tmp_path):
         assert "): 0.1; rank 1 (" in message
 
 
+def _resume_on_one_rank(ranks, folder):
+    torch.set_num_threads(1)
+    capture, images = tiny_scene()
+    Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks, resume=ranks.rank == 1)
+
+
+def test_a_resume_on_one_rank_alone_is_named(tmp_path):
+    with pytest.raises(RankError) as failure:
+        run_ranks(_resume_on_one_rank, 2, tmp_path)
+    for message in failure.value.messages.values():
+        assert "the ranks disagree on flag --resume: rank 0 (" in message
+        assert "): False; rank 1 (" in message
+
+
 def _train_and_stop(rank, arguments, signalled_at):
     """`blitzgs train`; rank 1 alone is asked to stop after a step."""
     torch.set_num_threads(1)
@@ -198,6 +212,21 @@ def test_sigterm_on_one_rank_saves_and_a_resume_finishes(capture, trained, tmp_p
     # Another number of ranks may continue.
     assert run_ranks(_command, 3, flags, join=False) == [0, 0, 0]
     assert_same_result(tmp_path, trained)
+
+
+def test_a_resume_on_as_many_ranks_repeats_every_bit(capture, trained, tmp_path):
+    """The tiles' costs are saved, so the ranks draw the borders that they would have drawn."""
+    flags = train_flags(capture, tmp_path)
+    assert run_ranks(_train_and_stop, 2, flags, 12, join=False) == [0, 0]
+    assert (tmp_path / "checkpoints" / "checkpoint_000000" / "shared.safetensors").exists()
+    assert run_ranks(_command, 2, flags, join=False) == [0, 0]
+    got, want = sorted_table(tmp_path), sorted_table(trained)
+    for name in want:
+        assert torch.equal(got[name], want[name]), name
+    got, want = (run.restore(folder, Ranks()).shared for folder in (tmp_path, trained))
+    assert len(want["views"]) == 7 and sorted(got) == sorted(want)
+    for name in want:
+        assert torch.equal(got[name], want[name]), name
 
 
 def test_torchrun_restarts_after_a_rank_is_killed(capture, trained, tmp_path):

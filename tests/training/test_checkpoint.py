@@ -247,3 +247,15 @@ def test_dealing_keeps_the_order_and_opens_only_what_it_needs(tmp_path, monkeypa
     assert equal(share, {name: column[1::2] for name, column in whole.items()})
     assert opened == ["1", "3"]
     assert equal(checkpoint._read_share(tmp_path, shards, ALONE, torch.device("cpu")), whole)
+
+
+def test_what_all_ranks_have_alike_is_kept_and_checked(tmp_path):
+    shared = {"costs": torch.rand(7), "views": torch.arange(3), "none": torch.empty(0, 4)}
+    path = checkpoint.save(tmp_path, table(5), {}, ALONE, shared=shared)
+    assert equal(checkpoint.load_latest(tmp_path, ALONE, "cpu").shared, shared)
+    _flip_bit(path / checkpoint.SHARED, -1)
+    with pytest.raises(checkpoint.CheckpointError, match="shared.safetensors does not match its SHA-256"):
+        checkpoint.load(path, ALONE, "cpu")
+    (path / checkpoint.SHARED).unlink()
+    with pytest.raises(checkpoint.CheckpointError, match="shared.safetensors is missing"):
+        checkpoint.load(path, ALONE, "cpu")

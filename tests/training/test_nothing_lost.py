@@ -16,6 +16,7 @@ import torch
 
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
+from blitzgs.population.lineage import read_lineage
 from blitzgs.training import checkpoint, run, run_log
 from blitzgs.training.agreement import Agreement, SaveClock, StopRequest
 from blitzgs.training.batches import PhotographError
@@ -238,6 +239,25 @@ def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
     with pytest.raises(checkpoint.CheckpointError, match="the disk is full"):
         trainer(tmp_path).train()
+
+
+def test_a_lineage_that_cannot_be_written_waits_as_well(tmp_path, monkeypatch):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    left, real = [2], parquet.write_table
+
+    def write_table(*args, **options):
+        if left[0]:
+            left[0] -= 1
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(*args, **options)
+
+    monkeypatch.setattr(parquet, "write_table", write_table)
+    monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
+    flags = ("population.lineage=true", "schedule.iterations=50")
+    running = trainer(tmp_path, *flags)
+    assert running.train() is not None and left == [0]
+    births = read_lineage(tmp_path / "lineage")["births"]["id"]
+    assert len(set(births.tolist())) == len(births) == running.state.lineage.ledger.births
 
 
 def test_a_log_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch):

@@ -73,10 +73,22 @@ def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[
 def _write(state: TrainingState) -> None:
     """Write a checkpoint, after the lineage has been written and found to add up."""
     if state.lineage is not None:
-        ledger = ledger_state(state.lineage.settle(state.table["id"], state.progress.step))
-        state.progress = replace(state.progress, ledger=ledger)
+        try:
+            ledger = state.lineage.settle(state.table["id"], state.progress.step)
+        except OSError as error:
+            raise CheckpointError(f"no checkpoint was written, because {error}.") from error
+        state.progress = replace(state.progress, ledger=ledger_state(ledger))
+    # Who composites which tiles decides the order of sums, and with it their last bits.
+    shared = state.owners.columns() if state.ranks.world_size > 1 else None
     run_folder.save(
-        state.folder, state.table, state.progress, state.space, state.config, state.ranks, state.run_id
+        state.folder,
+        state.table,
+        state.progress,
+        state.space,
+        state.config,
+        state.ranks,
+        state.run_id,
+        shared,
     )
     state.save_clock.restart()
 
