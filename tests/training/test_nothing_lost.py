@@ -31,6 +31,19 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
+def signals_as_in_a_terminal():
+    # What started the tests may have ignored signals, as nohup and a shell's background jobs do.
+    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
+    before = [
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+        for number in numbers
+    ]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+@pytest.fixture(autouse=True)
 def one_thread():
     before = torch.get_num_threads()
     torch.set_num_threads(1)
