@@ -7,7 +7,7 @@ PYTHON ?= $(VENV)/bin/python
 TORCH ?= torch==2.13.0
 # Folders of the environment's tools first, so that cmake and ninja from PyPI are used.
 RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
-CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu')
+CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
 
 .PHONY: venv venv-test build io demo test test-python test-cxx test-slow sanitize fuzz lint format clean
@@ -108,13 +108,13 @@ lint:
 	$(RUN) mypy
 	$(RUN) lint-imports --no-logo
 	$(RUN) clang-format --dry-run -Werror $(CXX_FILES)
-	$(RUN) gersemi --check CMakeLists.txt cmake
+	$(RUN) gersemi --check CMakeLists.txt cmake examples
 
 format:
 	$(RUN) ruff check --fix .
 	$(RUN) ruff format .
 	$(RUN) clang-format -i $(CXX_FILES)
-	$(RUN) gersemi -i CMakeLists.txt cmake
+	$(RUN) gersemi -i CMakeLists.txt cmake examples
 
 clean:
 	rm -rf build build-tests build-fuzz blitzgs/_lib runs

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from blitzgs.ops.projection import ProjectionOptions
 from blitzgs.rendering.arguments import (
     Gaussians,
     background_rows,
@@ -16,7 +17,6 @@ from blitzgs.rendering.arguments import (
     gaussians_of,
     with_covariances,
 )
-from blitzgs.rendering.groups import ProjectOptions
 from blitzgs.rendering.images import ImageOptions, render
 from blitzgs.rendering.ranks import gather_views
 
@@ -134,8 +134,18 @@ def rasterization(
         raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
     if covars is not None:
         gaussians = with_covariances(gaussians, covars)
-    project = ProjectOptions(
-        width, height, tile_size, near_plane, far_plane, eps2d, radius_clip, rasterize_mode == "antialiased"
+    antialiased = rasterize_mode == "antialiased"
+    project = ProjectionOptions(
+        width,
+        height,
+        tile_size,
+        sh_degree or 0,
+        near_plane,
+        far_plane,
+        eps2d,
+        radius_clip,
+        antialiased,
+        False,
     )
     background = background_rows(backgrounds, gaussians, render_mode)
     image = ImageOptions(render_mode, background, packed, sparse_grad, absgrad)

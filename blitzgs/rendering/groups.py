@@ -18,20 +18,6 @@ MOST_VIEWS = 32  # of one launch: a bit mask holds them
 
 
 @dataclass(frozen=True)
-class ProjectOptions:
-    """How rows are made; see `blitzgs.ops.project.project`."""
-
-    width: int
-    height: int
-    tile_size: int
-    near_plane: float
-    far_plane: float
-    eps2d: float
-    radius_clip: float
-    antialiased: bool
-
-
-@dataclass(frozen=True)
 class Group:
     """Views of one scene that are projected together.
 
@@ -46,15 +32,11 @@ class Group:
     covariances: Decomposed | None
 
 
-def groups_of(gaussians: Gaussians, options: ProjectOptions) -> list[Group]:
+def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
     """Return what is projected together: one group for one scene of up to 32 views with common colours."""
     groups = []
     sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
     most = 1 if sh_per_view else MOST_VIEWS
-    projection = ProjectionOptions(
-        options.width, options.height, options.tile_size, gaussians.sh_degree or 0, options.near_plane,
-        options.far_plane, options.eps2d, options.radius_clip, options.antialiased, gaussians.raw,
-    )  # fmt: skip
     for s, scene in enumerate(gaussians.scenes):
         # A split of nothing to be split would still cost the host a node of the graph.
         views = [(scene.viewmats, scene.Ks)]
@@ -64,7 +46,7 @@ def groups_of(gaussians: Gaussians, options: ProjectOptions) -> list[Group]:
         for part, (viewmats, Ks) in enumerate(views):
             means, quats, scales, opacities = scene[:4]
             inputs = ProjectionInputs(
-                gaussians_of(means, quats, scales, opacities, sh[part]), (viewmats, Ks), projection
+                gaussians_of(means, quats, scales, opacities, sh[part]), (viewmats, Ks), options
             )
             groups.append(Group(inputs, s * gaussians.views + part * most, scene.covariances))
     return groups

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import Rows
+from blitzgs.ops.projection import ProjectionOptions, Rows
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.render import Rendered, render_queued
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.finite import warn_of_non_finite
-from blitzgs.rendering.groups import Group, ProjectOptions, groups_of, project_groups
+from blitzgs.rendering.groups import Group, groups_of, project_groups
 from blitzgs.rendering.layout import Layout
 from blitzgs.rendering.meta import Lists, make_meta
 from blitzgs.rendering.ranks import Job, send_rows
@@ -47,7 +47,7 @@ class ImageOptions:
 def render(
     function: str,
     gaussians: Gaussians,
-    project: ProjectOptions,
+    project: ProjectionOptions,
     image: ImageOptions,
     sizes: Sizes | None = None,
     job: Job | None = None,
@@ -100,7 +100,7 @@ def render(
 def _queued(
     group: Group,
     gaussians: Gaussians,
-    project: ProjectOptions,
+    project: ProjectionOptions,
     image: ImageOptions,
     sizes: Sizes | None,
 ) -> Rendered | None:
@@ -125,19 +125,18 @@ def _queued(
 
 
 def _laid(
-    layout: Layout, gaussians: Gaussians, project: ProjectOptions, image: ImageOptions
+    layout: Layout, gaussians: Gaussians, project: ProjectionOptions, image: ImageOptions
 ) -> dict[str, Tensor]:
     """Return what is rendered as it lies in meta."""
     rows = layout.rows
     means2d, conics, opacities, depths = layout.lay(rows.means2d, rows.conics, rows.opacities, rows.depths)
     if not (image.packed or project.antialiased or image.sparse_grad):
-        given = gaussians.opacities.sigmoid() if gaussians.raw else gaussians.opacities
-        opacities = layout.lay_opacities(given)
+        opacities = layout.lay_opacities(gaussians.opacities)
     return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
 
 
 def _lists(
-    rows: Rows, images: int, project: ProjectOptions, ready: Rendered | None, count: int
+    rows: Rows, images: int, project: ProjectionOptions, ready: Rendered | None, count: int
 ) -> tuple[Lists, Lists]:
     """Return the tiles' lists for meta, and those that are composited; count: entries, -1: not known."""
     width, height, tile_size = project.width, project.height, project.tile_size
@@ -166,8 +165,8 @@ def _without_non_finite(gaussians: Gaussians) -> Gaussians:
         finite = scene.colors.detach().isfinite().all(dim=-1)
         if finite.dim() == 2:
             finite = finite.all(dim=0)
-        nothing = torch.full_like(scene.opacities, -torch.inf if gaussians.raw else 0.0)
-        scenes.append(scene._replace(opacities=torch.where(finite, scene.opacities, nothing)))
+        opacities = torch.where(finite, scene.opacities, torch.zeros_like(scene.opacities))
+        scenes.append(scene._replace(opacities=opacities))
     return replace(gaussians, scenes=tuple(scenes))
 
 

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from blitzgs.lazy_dict import Later
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import ProjectionInputs, project_rows
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_rows
 from blitzgs.ops.sparse_rows import sparse_rows
 from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
-from blitzgs.rendering.groups import ProjectOptions, groups_of
+from blitzgs.rendering.groups import groups_of
 from blitzgs.rendering.images import ImageOptions, render
 
 
@@ -99,8 +99,9 @@ def raw_rasterization(
     _check_harmonics(harmonics, len(means))
     if sh_degree is None:
         sh_degree = math.isqrt(sum(part.shape[1] for part in harmonics)) - 1
-    project = ProjectOptions(
-        width, height, tile_size, near_plane, far_plane, eps2d, radius_clip, rasterize_mode == "antialiased"
+    antialiased = rasterize_mode == "antialiased"
+    project = ProjectionOptions(
+        width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
     )
     geometry = (means, quats, scales, opacities)
     whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, False, raw=True)
