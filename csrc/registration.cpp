@@ -31,9 +31,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor? last_step, Tensor? moment_step, Tensor? table) -> ()");
   m.def(
       "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
-      "Tensor? moment_step, Tensor? table, Tensor viewmats, Tensor Ks, int width, int height, "
-      "float near_plane, float far_plane, float eps2d) -> (Tensor active_ids, Tensor active_views, "
-      "Tensor count)");
+      "Tensor? moment_step, Tensor? table, Tensor[] cameras, int[] size, float[] limits) "
+      "-> (Tensor active_ids, Tensor active_views, Tensor count)");
 
   // Projection: parameters to screen-space rows, ordered by (Gaussian, view). Groups of arguments, as
   // blitzgs/ops/project.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras (viewmats,

@@ -132,13 +132,9 @@ def cull_blocks(
             means,
             scales,
             *_pending_arguments(pending),
-            viewmats,
-            Ks,
-            width,
-            height,
-            near_plane,
-            far_plane,
-            eps2d,
+            [viewmats, Ks],
+            [width, height],
+            [near_plane, far_plane, eps2d],
         )
     )
 

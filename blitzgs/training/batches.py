@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -226,14 +227,31 @@ class BatchLoader:
     def _load(
         self, indices: list[int], ranges: TileRanges | None, rows: list[tuple[int, int]]
     ) -> tuple[Batch, _Slot]:
-        count, (width, height) = len(indices), self._views.size(indices)
+        # Images that cannot be read must not keep a slot.
         masks = [self._images.mask(index) for index in indices]
-        samples = [self._samples(index, mask) for index, mask in zip(indices, masks, strict=True)]
         strips = [
             self._images.get(index).numpy()[y0:y1] if y0 < y1 else None
             for index, (y0, y1) in zip(indices, rows, strict=True)
         ]
-        slot = self._free.popleft()  # not before: images that cannot be read must not keep it
+        slot = self._free.popleft()
+        try:
+            return self._fill(slot, indices, ranges, rows, strips, masks), slot
+        except BaseException:  # one that is not given back would be missing from then on
+            self._free.append(slot)
+            raise
+
+    def _fill(
+        self,
+        slot: _Slot,
+        indices: list[int],
+        ranges: TileRanges | None,
+        rows: list[tuple[int, int]],
+        strips: list[np.ndarray | None],
+        masks: list[Tensor | None],
+    ) -> Batch:
+        """Put a batch together in a slot and start to upload it."""
+        count, (width, height) = len(indices), self._views.size(indices)
+        samples = [self._samples(index, mask) for index, mask in zip(indices, masks, strict=True)]
         if self._stream is not None:
             slot.uploaded.synchronize()  # the pinned memory is free, long since
             self._stream.wait_event(slot.read)
@@ -249,7 +267,7 @@ class BatchLoader:
         memory.upload(rows)
         if self._stream is not None:
             slot.uploaded.record(self._stream)
-        return memory.batch(indices, ranges), slot
+        return memory.batch(indices, ranges)
 
     def _samples(self, index: int, mask: Tensor | None) -> float:
         if index not in self._counts:

@@ -6,16 +6,13 @@
 // pending: a row that no step touches moves along a straight line, by at most m / sqrt(v) times the tail of
 // the schedule (lazy_adam.h), so its mean lies between two corners and its log scales between two values.
 //
-// A box of means with axes up to sigma is dropped from a view iff it lies behind the near plane, beyond the
-// far plane, or beyond one image border by more than a splat can reach: half-width of alpha >= 1/255 is at
-// most sqrt(2 ln 255) sqrt(|J row|^2 sigma^2 + eps2d) pixels, with |J row| <= f / z max |row_x - u row_z|
-// over the clamped slopes u. Multiplied by z, each condition is a linear inequality n . p + d + k sigma >= 0,
-// which a box fails only if its farthest corner does. Blocks are tested first. Then the rows of the remaining
-// blocks are tested by the same inequalities, each on the line along which it may move. Blocks get twice the
-// rounding slack, so a row that passes its own test is never lost with its block, and the result does not
-// depend on how rows are grouped. Where a block's box, with sigma = 0, satisfies all inequalities with slack
-// to spare, all of its rows pass and need not be read. Only the rows of blocks across a view's border are
-// read.
+// A box of means with axes up to sigma is dropped from a view iff it fails one of the linear inequalities
+// n . p + d + k sigma >= 0 of the view's frustum (math/frustum.h), which it does only if its farthest corner
+// does. Blocks are tested first. Then the rows of the remaining blocks are tested by the same inequalities,
+// each on the line along which it may move. Blocks get twice the rounding slack, so a row that passes its own
+// test is never lost with its block, and the result does not depend on how rows are grouped. Where a block's
+// box, with sigma = 0, satisfies all inequalities with slack to spare, all of its rows pass and need not be
+// read. Only the rows of blocks across a view's border are read.
 //
 // The test is conservative: every row that projection would project is in the set
 // (tests/view/test_blocks.py). O(N / 256 + rows of the blocks across a border + active rows) per view.
@@ -28,13 +25,13 @@
 #include "common/limits.h"
 #include "common/stream.h"
 #include "lazy_adam/adam_table.h"
+#include "math/frustum.h"
 #include "math/morton.h"
 
 namespace blitzgs {
 
 constexpr int kBlockRows = 256;
 constexpr int kBlockBounds = 8;  // lowest corner, highest corner, largest sigma, whether all rows are finite
-constexpr int kPlanes = 6;
 
 BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
 
@@ -127,68 +124,15 @@ BLITZGS_HD SweptBox load_box(const float* bounds) {
   return {{bounds[0], bounds[1], bounds[2]}, {bounds[3], bounds[4], bounds[5]}, bounds[6]};
 }
 
-// A half-space: n . p + d + k sigma >= 0 holds for every Gaussian that the view can see.
-struct CullPlane {
-  float n[3], d, k;
-};
-
-struct CullView {
-  CullPlane planes[kPlanes];
-};
-
 struct CullCamera {
   const float *viewmats, *Ks;  // [B, 4, 4], [B, 3, 3]
   int width, height;
   float near_plane, far_plane, eps2d;
 };
 
-BLITZGS_HD CullPlane make_plane(const double* row, double offset, double factor, const double* row_z,
-                                double offset_z, double factor_z, double k) {
-  CullPlane plane;
-  for (int axis = 0; axis < 3; ++axis) {
-    plane.n[axis] = static_cast<float>(factor * row[axis] + factor_z * row_z[axis]);
-  }
-  plane.d = static_cast<float>(factor * offset + factor_z * offset_z);
-  plane.k = static_cast<float>(k);
-  return plane;
-}
-
-// Largest |row - u row_z| over the clamped slopes u in [low, high]. It is convex in u, so it is attained at
-// an end.
-BLITZGS_HD double largest_gradient(const double* row, const double* row_z, double low, double high) {
-  double squares[2] = {0, 0};
-  for (int axis = 0; axis < 3; ++axis) {
-    const double a = row[axis] - low * row_z[axis], b = row[axis] - high * row_z[axis];
-    squares[0] += a * a;
-    squares[1] += b * b;
-  }
-  return std::sqrt(squares[0] > squares[1] ? squares[0] : squares[1]);
-}
-
-BLITZGS_HD CullView make_cull_view(const CullCamera& camera, int view) {
-  const float* m = camera.viewmats + 16 * view;
-  const float* K = camera.Ks + 9 * view;
-  double rows[3][3], t[3];
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) rows[i][j] = m[4 * i + j];
-    t[i] = m[4 * i + 3];
-  }
-  const double kReach = 3.34;  // > sqrt(2 ln 255)
-  CullView cull;
-  const double zero[3] = {0, 0, 0};
-  cull.planes[0] = make_plane(rows[2], t[2], 1.0, zero, 1.0, -camera.near_plane, 0.0);
-  cull.planes[1] = make_plane(rows[2], t[2], -1.0, zero, 1.0, camera.far_plane, 0.0);
-  const double sizes[2] = {static_cast<double>(camera.width), static_cast<double>(camera.height)};
-  const double blur = kReach * std::sqrt(static_cast<double>(camera.eps2d)) + 1.0;  // and a pixel to spare
-  for (int axis = 0; axis < 2; ++axis) {
-    const double focal = K[4 * axis], centre = K[3 * axis + 2], size = sizes[axis];
-    const double low = (-centre - 0.15 * size) / focal, high = (size - centre + 0.15 * size) / focal;
-    const double k = kReach * std::fabs(focal) * largest_gradient(rows[axis], rows[2], low, high) * 1.00001;
-    cull.planes[2 + 2 * axis] = make_plane(rows[axis], t[axis], focal, rows[2], t[2], centre + blur, k);
-    cull.planes[3 + 2 * axis] =
-        make_plane(rows[axis], t[axis], -focal, rows[2], t[2], size - centre + blur, k);
-  }
-  return cull;
+BLITZGS_HD Frustum make_frustum(const CullCamera& of, int view) {
+  const Camera<float> camera = make_camera(of.viewmats + 16 * view, of.Ks + 9 * view, of.width, of.height);
+  return make_frustum(camera, of.width, of.height, of.near_plane, of.far_plane, of.eps2d);
 }
 
 // What a view sees of a box. some: the view may see a part of it. all: the view certainly sees all that is in
@@ -198,7 +142,7 @@ struct Sight {
 };
 
 // slack: the largest relative rounding error of each term.
-BLITZGS_HD Sight sight_of(const CullView& view, const SweptBox& box, float slack) {
+BLITZGS_HD Sight sight_of(const Frustum& view, const SweptBox& box, float slack) {
   float centre[3], half[3];
   for (int axis = 0; axis < 3; ++axis) {
     centre[axis] = 0.5f * box.low[axis] + 0.5f * box.high[axis];
@@ -207,8 +151,8 @@ BLITZGS_HD Sight sight_of(const CullView& view, const SweptBox& box, float slack
     half[axis] += slack * (std::fabs(centre[axis]) + half[axis]);
   }
   Sight sight{true, true};
-  for (int i = 0; i < kPlanes; ++i) {
-    const CullPlane& plane = view.planes[i];
+  for (int i = 0; i < kFrustumPlanes; ++i) {
+    const FrustumPlane& plane = view.planes[i];
     float value = plane.d, reach = slack * std::fabs(plane.d);
     for (int axis = 0; axis < 3; ++axis) {
       value += plane.n[axis] * centre[axis];
@@ -220,14 +164,14 @@ BLITZGS_HD Sight sight_of(const CullView& view, const SweptBox& box, float slack
   return sight;
 }
 
-constexpr float kRowSlack = 4e-6f, kBlockSlack = 8e-6f;
+constexpr float kRowSlack = kPointSlack, kBlockSlack = 2 * kPointSlack;
 
 // The views that may see a block, and those of them that see all its rows, one bit each.
 struct BlockViews {
   std::uint32_t some, all;
 };
 
-BLITZGS_HD BlockViews views_of_block(const CullView* views, int count, const float* bounds) {
+BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const float* bounds) {
   const SweptBox box = load_box(bounds);
   BlockViews result{0, 0};
   for (int view = 0; view < count; ++view) {
@@ -242,7 +186,7 @@ BLITZGS_HD BlockViews views_of_block(const CullView* views, int count, const flo
 // Whether the block's rows have to be tested one by one.
 BLITZGS_HD bool is_mixed(const BlockViews& block) { return block.some != block.all; }
 
-BLITZGS_HD std::uint32_t views_of_row(const CullView* views, int count, const BlockViews& block,
+BLITZGS_HD std::uint32_t views_of_row(const Frustum* views, int count, const BlockViews& block,
                                       const SweptBox& box) {
   std::uint32_t mask = block.all;
   for (int view = 0; view < count; ++view) {

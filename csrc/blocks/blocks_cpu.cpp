@@ -46,8 +46,8 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
 
 void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
                  const ActiveList& list, Workspace& workspace, CudaStream) {
-  CullView planes[kMaxViews];
-  for (int view = 0; view < views; ++view) planes[view] = make_cull_view(camera, view);
+  Frustum planes[kMaxViews];
+  for (int view = 0; view < views; ++view) planes[view] = make_frustum(camera, view);
   const std::int64_t blocks = blocks_of(rows.n);
   const CullPlan plan(rows.n, workspace);
   parallel_for(0, blocks, 1024, [&](std::int64_t begin, std::int64_t end) {

@@ -88,12 +88,12 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
 // counts the active rows of the others, and writes the planes of the views for test_rows.
 __global__ void test_blocks(const float* bounds, CullCamera camera, int views, const CullPlan plan,
                             std::int32_t* list, std::int32_t* length, std::int32_t* groups,
-                            CullView* planes_out) {
-  __shared__ CullView planes[kMaxViews];
+                            Frustum* planes_out) {
+  __shared__ Frustum planes[kMaxViews];
   wait_for_earlier_kernels();
   const int thread = threadIdx.x;
   if (thread < views) {
-    planes[thread] = make_cull_view(camera, thread);
+    planes[thread] = make_frustum(camera, thread);
     if (blockIdx.x == 0) planes_out[thread] = planes[thread];
   }
   __syncthreads();
@@ -111,9 +111,9 @@ __global__ void test_blocks(const float* bounds, CullCamera camera, int views, c
 
 // Each CUDA block tests blocks of the list in turn, one thread for each row.
 __global__ void __launch_bounds__(kBlockRows, kResident)
-    test_rows(const BlockRows rows, const CullView* planes, int views, const CullPlan plan,
+    test_rows(const BlockRows rows, const Frustum* planes, int views, const CullPlan plan,
               const std::int32_t* list, const std::int32_t* length, std::int32_t* groups) {
-  __shared__ CullView shared[kMaxViews];
+  __shared__ Frustum shared[kMaxViews];
   wait_for_earlier_kernels();
   const std::int32_t count = *length;
   if (static_cast<std::int32_t>(blockIdx.x) >= count) return;
@@ -220,7 +220,7 @@ void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& c
   }
   const CullPlan plan(rows.n, workspace);
   std::int32_t* list = workspace.allocate<std::int32_t>(blocks);
-  CullView* planes = workspace.allocate<CullView>(views);
+  Frustum* planes = workspace.allocate<Frustum>(views);
   const unsigned n_groups = blocks_for(blocks, kGroup);
   std::int32_t *groups = workspace.allocate<std::int32_t>(n_groups + 1), *length = groups + n_groups;
   zero("cull_blocks", groups, n_groups + 1, stream);

@@ -96,14 +96,17 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, co
                                mutable_data<float>(bounds), scope.workspace, scope.stream);
 }
 
-std::tuple<Tensor, Tensor, Tensor> cull_blocks(const Tensor& bounds, const Tensor& means,
-                                               const Tensor& scales, const std::vector<Tensor>& moments,
-                                               const std::optional<Tensor>& last_step,
-                                               const std::optional<Tensor>& moment_step,
-                                               const std::optional<Tensor>& table, const Tensor& viewmats_in,
-                                               const Tensor& Ks_in, std::int64_t width, std::int64_t height,
-                                               double near_plane, double far_plane, double eps2d) {
+std::tuple<Tensor, Tensor, Tensor> cull_blocks(
+    const Tensor& bounds, const Tensor& means, const Tensor& scales, const std::vector<Tensor>& moments,
+    const std::optional<Tensor>& last_step, const std::optional<Tensor>& moment_step,
+    const std::optional<Tensor>& table, const std::vector<Tensor>& cameras,
+    const std::vector<std::int64_t>& size, const std::vector<double>& limits) {
   const char* op = "cull_blocks";
+  STD_TORCH_CHECK(cameras.size() == 2 && size.size() == 2 && limits.size() == 3, "blitzgs::", op,
+                  ": cameras are viewmats and Ks, size is width and height, limits are near_plane, "
+                  "far_plane and eps2d; got ",
+                  cameras.size(), ", ", size.size(), " and ", limits.size(), " of them");
+  const Tensor &viewmats_in = cameras[0], &Ks_in = cameras[1];
   const HeldRows held = hold_rows(op, means, scales, moments, last_step, moment_step, table);
   check_bounds(op, bounds, held.rows.n);
   check_dtype(op, "viewmats", viewmats_in, ScalarType::Float);
@@ -114,10 +117,10 @@ std::tuple<Tensor, Tensor, Tensor> cull_blocks(const Tensor& bounds, const Tenso
   check_dtype(op, "Ks", Ks_in, ScalarType::Float);
   check_shape(op, "Ks", Ks_in, {views, 3, 3});
   const Tensor viewmats = as_contiguous(viewmats_in), Ks = as_contiguous(Ks_in);
-  const CullCamera camera{data<float>(viewmats),          data<float>(Ks),
-                          static_cast<int>(width),        static_cast<int>(height),
-                          static_cast<float>(near_plane), static_cast<float>(far_plane),
-                          static_cast<float>(eps2d)};
+  const CullCamera camera{data<float>(viewmats),         data<float>(Ks),
+                          static_cast<int>(size[0]),     static_cast<int>(size[1]),
+                          static_cast<float>(limits[0]), static_cast<float>(limits[1]),
+                          static_cast<float>(limits[2])};
   DeviceScope scope(bounds);
   Tensor active_ids = make_empty(bounds, {held.rows.n}, ScalarType::Int);
   Tensor active_views = make_empty(bounds, {held.rows.n}, ScalarType::Int);

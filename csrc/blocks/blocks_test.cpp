@@ -14,8 +14,8 @@ struct Scene {
   std::vector<float> viewmat = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
   std::vector<float> K = {100, 0, 50, 0, 100, 40, 0, 0, 1};
 
-  blitzgs::CullView view() const {
-    return blitzgs::make_cull_view({viewmat.data(), K.data(), 100, 80, 0.5f, 50.0f, 0.3f}, 0);
+  blitzgs::Frustum view() const {
+    return blitzgs::make_frustum({viewmat.data(), K.data(), 100, 80, 0.5f, 50.0f, 0.3f}, 0);
   }
 };
 

@@ -4,8 +4,8 @@
 
 #include "common/multiprocessors.h"
 #include "common/warp.cuh"
+#include "math/frustum.h"
 #include "project/prefilter.cuh"
-#include "project/project_cull.cuh"
 
 namespace blitzgs::cuda {
 
@@ -13,6 +13,14 @@ namespace {
 
 constexpr int kWarps = kPrefilterThreads / 32, kMostOfWarp = kMostAtOnce / kWarps;
 constexpr int kBlocksPerMultiprocessor = 8;
+
+// An upper bound. Stored opacities may exceed 1, logits cannot.
+__device__ float largest_scale(const Inputs& in, std::int64_t id) {
+  const float* s = in.scales + 3 * id;
+  const float widest = fmaxf(s[0], fmaxf(s[1], s[2]));
+  if (in.options.raw) return 1.001f * __expf(widest);
+  return in.opacities[id] <= 1.f ? widest : kAnyWidth;
+}
 
 // The views that may see each of kPrefilterBatch candidates first, first + 32, ..., from the mean, then the
 // scale.
@@ -66,7 +74,7 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
   load_cameras(in, cameras);
   __syncthreads();
   for (int view = threadIdx.x; view < in.n_views; view += kPrefilterThreads)
-    frusta[view] = make_frustum(cameras[view], in.options);
+    frusta[view] = frustum_of(cameras[view], in.options);
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const unsigned below = (1u << lane) - 1u;
   for (;;) {

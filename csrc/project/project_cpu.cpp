@@ -53,29 +53,31 @@ struct CountedBlock {
 // and returns their views.
 template <class T>
 std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
-                                const std::vector<Camera<T>>& cameras, std::int64_t candidate,
-                                std::vector<KeptRow<T>>* rows, std::int64_t* totals) {
+                                const std::vector<Camera<T>>& cameras, const std::vector<Frustum>& frusta,
+                                std::int64_t candidate, std::vector<KeptRow<T>>* rows, std::int64_t* totals) {
   const std::int64_t id = candidate_id(in, candidate);
   const std::uint32_t allowed =
       in.active_views ? static_cast<std::uint32_t>(in.active_views[candidate]) : ~std::uint32_t{0};
   const Vec3<T> mean = load3(in.means + 3 * id);
+  const Vec3<float> point{static_cast<float>(mean.x), static_cast<float>(mean.y), static_cast<float>(mean.z)};
+  const float norm = norm1(point);
   std::uint32_t maybe = 0;
   for (int view = 0; view < in.n_views; ++view) {
-    const bool ahead = in_depth_range(camera_depth(cameras[view], mean), in.options);
-    maybe |= static_cast<std::uint32_t>(ahead) << view;
+    maybe |= static_cast<std::uint32_t>(may_be_in_depth(frusta[view], point, norm)) << view;
   }
   maybe &= allowed;
   if (maybe == 0) return 0;
   const Vec3<T> scale = activate_scale(in.scales + 3 * id, in.options.raw);
   const T opacity = activate_opacity(in.opacities[id], in.options.raw);
-  const T sigmas = reach(opacity), widest = widest_variance(scale);
-  if (sigmas < T(0)) return 0;
+  if (reach(opacity) < T(0)) return 0;
+  const T widest = larger(larger(scale.x, scale.y), scale.z);
+  const float sigma = opacity <= T(1) ? 1.00001f * static_cast<float>(widest) : kAnyWidth;
   ActiveGaussian<T> gaussian{};
   std::uint32_t seen = 0;
   std::int64_t* by_rank = totals + kTotalViews + in.n_views;
   for (std::uint32_t rest = maybe, first = 1; rest != 0; rest &= rest - 1) {
     const int view = __builtin_ctz(rest);
-    if (!may_touch_image(cameras[view], mean, widest, sigmas, in.options)) continue;
+    if (!may_overlap(frusta[view], point, norm, sigma)) continue;
     if (first) {
       gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity);
       first = 0;
@@ -181,6 +183,8 @@ template <class T>
 void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, RowMemory<T>& memory,
              std::int64_t* totals, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
+  std::vector<Frustum> frusta;
+  for (const Camera<T>& camera : cameras) frusta.push_back(frustum_of(camera, in.options));
   const std::int64_t n_totals = project_totals(in.n_views, rank_tiles.n_ranks);
   std::vector<CountedBlock<T>> blocks(project_blocks(in.n_candidates));
   std::fill_n(totals, n_totals, 0);
@@ -188,7 +192,7 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, RowMemory<
   for_each_block(blocks, in.n_candidates, [&](CountedBlock<T>& block, std::int64_t first, std::int64_t last) {
     std::vector<std::int64_t> sums(n_totals, 0);
     for (std::int64_t c = first; c < last; ++c) {
-      block.views.push_back(project_candidate(in, rank_tiles, cameras, c, &block.rows, sums.data()));
+      block.views.push_back(project_candidate(in, rank_tiles, cameras, frusta, c, &block.rows, sums.data()));
     }
     block.visible = sums[kTotalVisible];
     const std::lock_guard<std::mutex> lock(adding);

@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "common/limits.h"
+#include "math/frustum.h"
 #include "math/projection.h"
 #include "math/rank_tiles.h"
 #include "math/sh.h"
@@ -63,34 +64,14 @@ BLITZGS_HD bool touches_image(const T* mean2d, T half_x, T half_y, const Project
 }
 
 template <class T>
-BLITZGS_HD T camera_depth(const Camera<T>& camera, const Vec3<T>& mean) {
-  return T(row_times_point(camera.row_z, mean, camera.translation.z));
-}
-
-template <class T>
 BLITZGS_HD bool in_depth_range(T depth, const ProjectOptions<T>& options) {
   return depth > options.near_plane && depth <= options.far_plane;
 }
 
-// Largest variance along an axis: all the cheap test knows of a Gaussian's shape.
 template <class T>
-BLITZGS_HD T widest_variance(const Vec3<T>& scale) {
-  return larger(larger(scale.x * scale.x, scale.y * scale.y), scale.z * scale.z);
-}
-
-// Cheap test from 7 values a Gaussian, sigmas = reach(opacity) >= 0 and z inside (near, far]: false only when
-// project_row would be false. Sigma'_xx cannot exceed |g_x|^2 max(s)^2 + eps, so the box around the splat
-// cannot exceed this one (1.001: float rounding).
-template <class T>
-BLITZGS_HD bool may_touch_image(const Camera<T>& camera, const Vec3<T>& mean, T widest, T sigmas,
-                                const ProjectOptions<T>& options) {
-  const ProjectedMean p = project_mean(camera, mean);
-  T mean2d[2];
-  pixel_position(camera, p, mean2d);
-  const PixelGradients<T> g = pixel_gradients(camera, p);
-  const T half_x = T(1.001) * sigmas * std::sqrt(dot(g.gx, g.gx) * widest + options.eps2d);
-  const T half_y = T(1.001) * sigmas * std::sqrt(dot(g.gy, g.gy) * widest + options.eps2d);
-  return touches_image(mean2d, half_x, half_y, options);
+BLITZGS_HD Frustum frustum_of(const Camera<T>& camera, const ProjectOptions<T>& options) {
+  return make_frustum(camera, options.width, options.height, options.near_plane, options.far_plane,
+                      options.eps2d);
 }
 
 template <class T>
