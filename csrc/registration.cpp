@@ -33,6 +33,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
       "Tensor? moment_step, Tensor? table, Tensor[] cameras, int[] size, float[] limits) "
       "-> (Tensor active_ids, Tensor active_views, Tensor count)");
+  // Clears the bits of pairs that a view leaves out, by level and distance or by the columns of a cull mask.
+  m.def(
+      "gate_views_(Tensor ids, Tensor(a!) views, Tensor? count, Tensor means, Tensor level, Tensor viewmats, "
+      "float[] reach, int lod_views, Tensor? cull, int[] columns) -> ()");
 
   // Projection: parameters to screen-space rows, ordered by (Gaussian, view). Groups of arguments, as
   // blitzgs/ops/project.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras (viewmats,

@@ -15,6 +15,7 @@ from blitzgs.progress import image_progress
 from blitzgs.training import run as run_folder
 from blitzgs.training.evaluation import evaluate, load_lpips
 from blitzgs.training.inputs import check_capture, open_capture
+from blitzgs.training.lod import scene_gate
 from blitzgs.training.run_cameras import input_files
 from blitzgs.training.views import ViewSet, render_options
 
@@ -62,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
                 lpips=load_lpips(args.lpips),
                 report=report,
                 inputs=input_files(capture),
+                lod=scene_gate(config, model.progress, model.table, ranks),
             )
         if ranks.rank == 0:
             print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))

@@ -20,6 +20,7 @@ from blitzgs.scene.pictures import encode_image
 from blitzgs.training import run as run_folder
 from blitzgs.training.evaluation import render_view
 from blitzgs.training.inputs import check_capture, open_capture
+from blitzgs.training.lod import scene_gate
 from blitzgs.training.run_cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.training.views import CameraLike, ViewSet, render_options
 
@@ -52,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         indices = range(len(cameras)) if args.split == "all" else getattr(stored, args.split)
         views = ViewSet(list(cameras), model.space, ranks.device)
         options = render_options(model.config, model.space, model.progress.sh_degree)
-        owners = TileOwners(ranks)
+        owners, lod = TileOwners(ranks), scene_gate(model.config, model.progress, model.table, ranks)
         output = OutputFolder(args.out, stored.inputs)
         # Of all views, so that a view's file has the same name whichever split is rendered.
         paths = output.paths([camera.name for camera in cameras], ".npy" if args.raw else ".png")
@@ -60,7 +61,8 @@ def run(args: argparse.Namespace) -> int:
         with image_progress("Rendering", ranks.rank == 0) as report:
             for position, index in enumerate(indices):
                 # The ranks take turns at writing.
-                render = render_view(model.table, views, index, options, owners, position % ranks.world_size)
+                destination = position % ranks.world_size
+                render = render_view(model.table, views, index, options, owners, destination, lod)
                 report(position + 1, len(indices))
                 if render is None:
                     continue

@@ -100,6 +100,8 @@ class ScheduleConfig:
         gate_from: density events from here on go through `population.gate`.
         t1, t2: the first and the second importance pass, where `population.importance` is set; 0: none. A
             pass follows the density event of the same image.
+        levels_until: from here on `view.lod` may keep all octree levels; it begins with those that
+            `view.first_levels` says. 0: `densify_until`.
         sh_every: the spherical-harmonics degree grows by one each time.
         position_decay: length of the exponential decay of the position learning rate.
         checkpoint_every: checkpoints at these times, besides those of `log.checkpoint_seconds`. 0: none.
@@ -117,6 +119,7 @@ class ScheduleConfig:
     gate_from: int = 11_250
     t1: int = 7_500
     t2: int = 16_000
+    levels_until: int = 0
     sh_every: int = 1_000
     position_decay: int = 30_000
     checkpoint_every: int = 0
@@ -224,6 +227,29 @@ class PopulationConfig:
 
 
 @dataclass(frozen=True)
+class ViewConfig:
+    """What a view leaves out before it is projected.
+
+    Attributes:
+        lod: from `schedule.densify_until` on, views leave out Gaussians whose octree level is too fine for
+            their distance. The trained model is evaluated and rendered so, too.
+        first_levels: the finest level that this may keep at the start of the run, relative to their number.
+        level_ratio: the others come one by one until `schedule.levels_until`, each after a wait shorter by
+            this factor than the one before.
+        most_kept: views that would keep at least this share of all Gaussians are rendered with all of them.
+        cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
+            in it at the last pass, until half of the images after the last pass are trained on. Needs
+            `population.importance`.
+    """
+
+    lod: bool = False
+    first_levels: float = 0.5
+    level_ratio: float = 1.5
+    most_kept: float = 0.8
+    cull: bool = False
+
+
+@dataclass(frozen=True)
 class RanksConfig:
     """How several processes share a run; nothing here changes its result beyond rounding.
 
@@ -283,6 +309,7 @@ class Config:
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     population: PopulationConfig = field(default_factory=PopulationConfig)
+    view: ViewConfig = field(default_factory=ViewConfig)
     ranks: RanksConfig = field(default_factory=RanksConfig)
     log: LogConfig = field(default_factory=LogConfig)
     seed: int = 0

@@ -70,6 +70,7 @@ RANGES: Mapping[str, Range] = {
     "schedule.gate_from": _TIME,
     "schedule.t1": _EVERY_OR_NEVER,
     "schedule.t2": _EVERY_OR_NEVER,
+    "schedule.levels_until": _TIME,
     "schedule.sh_every": _EVERY,
     "schedule.position_decay": _EVERY,
     "schedule.checkpoint_every": _EVERY_OR_NEVER,
@@ -102,6 +103,9 @@ RANGES: Mapping[str, Range] = {
     "population.gate_rate": Range(0, 1),
     "population.pass1_keep": _SHARE,
     "population.pass2_mass": _SHARE,
+    "view.first_levels": Range(0, 1),
+    "view.level_ratio": Range(1.001, 100),
+    "view.most_kept": Range(0, 1),
     "ranks.timeout_seconds": Range(1, 1e6),
     "ranks.max_imbalance": Range(1, 1e6),
     "log.every": _EVERY,
@@ -144,6 +148,9 @@ def problems(config: Config) -> Iterator[str]:
             f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
             f"all Gaussians are pruned; got {population.reset_opacity}"
         )
+
+    if config.view.cull and not population.importance:
+        yield "view.cull: needs population.importance=true, whose passes make the mask"
 
 
 def flat_fields(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:

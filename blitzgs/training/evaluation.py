@@ -24,6 +24,7 @@ from blitzgs.progress import Report
 from blitzgs.scene.pictures import comparison, encode_image
 from blitzgs.training.batches import Images
 from blitzgs.training.views import CameraLike, ViewSet
+from blitzgs.view.gate import SceneGate
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
 METRICS = ("psnr", "ssim", "psnr_corrected", "lpips")
@@ -97,8 +98,9 @@ def render_view(
     options: RenderOptions,
     owners: TileOwners,
     destination: int = 0,
+    lod: SceneGate | None = None,
 ) -> Tensor | None:
-    """Render camera `index` with all Gaussians of all ranks; every rank calls this.
+    """Render camera `index` with the Gaussians of all ranks; every rank calls this.
 
     Args:
         table: this rank's Gaussians, caught up.
@@ -107,15 +109,17 @@ def render_view(
         options: how to render.
         owners: divides the tiles among the ranks.
         destination: rank that gets the image.
+        lod: leaves out Gaussians too fine for their distance; None: none are left out.
 
     Returns:
         float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
     """
     picked, ranks = views.pick([index]), owners.ranks
+    active = None if lod is None else lod.active(table, picked.viewmats)
     if ranks.world_size == 1:
-        return pipeline.forward(table, picked, options).renders[0]
+        return pipeline.forward(table, picked, options, active).renders[0]
     ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
-    frame = pipeline.forward(table, picked, options, assignment=TileAssignment(ranks, ranges))
+    frame = pipeline.forward(table, picked, options, active, TileAssignment(ranks, ranges))
     owners.record([index], frame.tile_work, ranges)
     collect_images(frame.renders, ranges, ranks, destination)
     return frame.renders[0] if ranks.rank == destination else None
@@ -147,6 +151,7 @@ def evaluate(
     report: Report | None = None,
     inputs: Iterable[Path] = (),
     optional_files: bool = False,
+    lod: SceneGate | None = None,
 ) -> dict[str, Any]:
     """Render views and compare them with their photographs; the ranks take turns at comparing.
 
@@ -164,6 +169,7 @@ def evaluate(
         report: is told (views rendered, all of them) after each.
         inputs: files that must stay as they are, wherever `folder` is.
         optional_files: warn instead of failing when a file cannot be written, as while training.
+        lod: as for `render_view`.
 
     Returns:
         {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}; the
@@ -182,7 +188,7 @@ def evaluate(
         turn, destination = divmod(position, ranks.world_size)
         if destination == 0:
             images.prefetch(own[turn : turn + 4])
-        render = render_view(table, views, index, options, owners, destination)
+        render = render_view(table, views, index, options, owners, destination, lod)
         if report is not None:
             report(position + 1, len(indices))
         if render is None:

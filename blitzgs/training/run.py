@@ -59,6 +59,10 @@ class Progress:
         seconds: of training so far, without evaluations.
         milestones: how many Gaussians there were at the points of the run that are named so.
         ledger: of the lineage (`blitzgs.population.lineage.Ledger`), where there is one.
+        reference_distance: d_0 of the levels (`blitzgs.view.levels.Levels`), in the unit of the means.
+        finest_level: finest level that the LOD gate keeps; None: there is no gate at this point of the run.
+        gated_views: the training views, in their order, as "1" where the LOD gate holds and "0" where it
+            would keep almost all; empty without a gate.
     """
 
     step: int
@@ -68,6 +72,9 @@ class Progress:
     seconds: float
     milestones: dict[str, int] = dataclasses.field(default_factory=dict)
     ledger: dict[str, int] = dataclasses.field(default_factory=dict)
+    reference_distance: float = 0.0
+    finest_level: int | None = None
+    gated_views: str = ""
 
 
 @dataclass

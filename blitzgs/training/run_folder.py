@@ -8,6 +8,7 @@ image = model.render(run.cameras().cameras[0])     # float32 [H, W, 3]
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +24,11 @@ from blitzgs.rendering import rasterization
 from blitzgs.training import run
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import load_config
+from blitzgs.training.lod import scene_gate
 from blitzgs.training.run_cameras import RunCamera, RunCameras, load_cameras
 from blitzgs.training.run_log import LOG
 from blitzgs.training.views import CameraLike, Space, render_options, viewmat
+from blitzgs.view.gate import SceneGate
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,8 @@ class Model:
         scales: float32 [N, 3], logarithms.
         opacities: float32 [N], logits.
         sh: float32 [N, K, 3].
+        level: octree levels, uint8 [N].
+        lod: what views leave out by level and distance; None: nothing.
         space: how the trained world lies in the capture's.
         sh_degree: that is evaluated.
         config: of the run.
@@ -51,6 +56,8 @@ class Model:
     scales: Tensor
     opacities: Tensor
     sh: Tensor
+    level: Tensor
+    lod: SceneGate | None
     space: Space
     sh_degree: int
     config: Config
@@ -70,8 +77,17 @@ class Model:
         Returns:
             float32 [H, W, 3] on the model's device, not clamped.
         """
-        images, _ = self.splat([camera], antialiased=self.config.model.antialiased)
+        images, _ = self._kept(camera).splat([camera], antialiased=self.config.model.antialiased)
         return images[0]
+
+    def _kept(self, camera: CameraLike) -> Model:
+        """Return the Gaussians that the LOD gate leaves for a view."""
+        if self.lod is None:
+            return self
+        pose = torch.from_numpy(viewmat(camera, self.space)).float().to(self.means.device)[None]
+        rows = self.lod.rows(self.means, self.level, pose)
+        columns = {name: getattr(self, name)[rows] for name in (*PARAMETERS, "level")}
+        return dataclasses.replace(self, **columns)
 
     def splat(self, cameras: list[CameraLike], antialiased: bool) -> tuple[Tensor, Any]:
         """Call `blitzgs.rasterization` for cameras of one size; return its images and meta."""
@@ -165,9 +181,10 @@ class RunFolder:
             CheckpointError: none of the checkpoints is sound.
         """
         found = run.open_model(self.path, Ranks())
-        columns = {name: found.table[name].to(device) for name in PARAMETERS}
+        columns = {name: found.table[name].to(device) for name in (*PARAMETERS, "level")}
         return Model(
             **columns,
+            lod=scene_gate(found.config, found.progress, found.table, Ranks()),
             space=found.space,
             sh_degree=found.progress.sh_degree,
             config=found.config,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 
-EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "evaluate", "checkpoint"]
+EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "evaluate", "checkpoint"]
 # The columns of the learning-rate table.
 RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
@@ -57,6 +57,7 @@ class Schedule:
             ("reset_opacities", config.reset_every, config.densify_until, config.reset_every),
             ("pass_1", config.t1, config.t1 + 1, min(config.t1, 1)),
             ("pass_2", config.t2, config.t2 + 1, min(config.t2, 1)),
+            self._clear_cull(),
             ("evaluate", config.evaluate_every, math.inf, config.evaluate_every),
             ("checkpoint", config.checkpoint_every, math.inf, config.checkpoint_every),
         ]
@@ -67,6 +68,13 @@ class Schedule:
             for time in self._series(first, until, every, begin, end)
         ]
         return sorted(found)
+
+    def _clear_cull(self) -> tuple[EventKind, float, float, float]:
+        """Drop the cull mask halfway between the last importance pass and the end."""
+        config = self._config
+        last = config.t2 or config.t1
+        time = math.floor((last + config.iterations) / 2)
+        return "clear_cull", time, time + 1, min(last, 1)
 
     def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
         """Times floor(scale (first + k every)) below `until` that lie in [begin, end)."""
@@ -87,6 +95,32 @@ class Schedule:
     def gathers_statistics(self, begin: int) -> bool:
         """Tell whether the step at [begin, begin + B) counts for a density event still to come."""
         return begin < self._config.densify_until * self._config.scale
+
+    def has_lod_gate(self, begin: int) -> bool:
+        """Tell whether the step at [begin, begin + B) may leave out Gaussians by their octree levels.
+
+        Not as long as it gathers statistics for density control: what is left out would lose its share.
+        """
+        return not self.gathers_statistics(begin)
+
+    def finest_level(self, begin: int, count: int, first_levels: float, ratio: float) -> int:
+        """Return L_max(t), the finest octree level that the step at [begin, begin + B) may keep.
+
+        It is floor(K x `first_levels`) at the start and K - 1 from `levels_until` on. The waits for the
+        levels between shrink by `ratio` from each to the next (Octree-GS).
+
+        Args:
+            begin: t.
+            count: number of levels K.
+            first_levels: L_max(0), relative to K.
+            ratio: of neighbouring waits.
+        """
+        first = min(count - 1, math.floor(count * first_levels))
+        config, waits = self._config, count - 1 - first
+        until = (config.levels_until or config.densify_until) * config.scale
+        unlocked = (1 - ratio**-k for k in range(1, waits + 1))
+        whole = 1 - ratio**-waits
+        return first + sum(begin + 1e-6 >= until * share / whole for share in unlocked)
 
     def gates(self, time: int) -> bool:
         """Tell whether the candidates of a density event at `time` go through the spawn gate."""

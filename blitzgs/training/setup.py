@@ -175,4 +175,5 @@ def first_gaussians(
         peak_gaussians=count,
         seconds=0.0,
         milestones={"initial": count},
+        reference_distance=levels.reference_distance,
     )

@@ -7,6 +7,7 @@ import contextlib
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -86,6 +87,11 @@ class TrainingState:
     def images_seen(self) -> int:
         """The clock: images trained on so far."""
         return self.progress.step * self.schedule.batch_size
+
+    @cached_property
+    def columns(self) -> dict[int, int]:
+        """The place of each training camera among them, which is its column of the cull matrix."""
+        return {index: column for column, index in enumerate(self.capture.train)}
 
     @property
     def render_options(self) -> RenderOptions:

@@ -13,11 +13,13 @@ from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
 from blitzgs.population.exploration import PositionNoise
+from blitzgs.population.importance import CULL
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.view.blocks import BlockIndex
+from blitzgs.view.gate import ViewGate
 
 
 class Stepper:
@@ -54,7 +56,12 @@ class Stepper:
         self._blocks = BlockIndex(self._table, self._optimiser.pending_table)
 
     def forward(
-        self, step: int, options: RenderOptions, batch: Batch, mark: Mark = unmarked
+        self,
+        step: int,
+        options: RenderOptions,
+        batch: Batch,
+        mark: Mark = unmarked,
+        gate: ViewGate | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
         """Catch up what the views may see, render them and compare them with their photographs.
 
@@ -63,6 +70,7 @@ class Stepper:
             options: how to render.
             batch: B views, their photographs, and who composites which tiles.
             mark: called with its name at the end of each stage.
+            gate: what the views leave out; None: nothing.
 
         Returns:
             The frame, the loss's terms, and the sums of its `LossTerms.parts` over all ranks, which
@@ -76,6 +84,8 @@ class Stepper:
         mark("other")
         self._optimiser.catch_up(table, active.ids, step - 1, active.length)
         mark("optimiser")
+        if gate is not None:
+            gate.apply(active, table, views.viewmats, table.columns.get(CULL))
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         frame = pipeline.forward(
             table, views, options, active, assignment, self._transport, mark, backward_follows=True

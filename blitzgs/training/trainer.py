@@ -17,7 +17,7 @@ from blitzgs.output import write_file
 from blitzgs.pipeline import Frame
 from blitzgs.population.importance import PHI
 from blitzgs.scene.capture import Capture
-from blitzgs.training import run
+from blitzgs.training import run, view_level
 from blitzgs.training.agreement import Agreement, StopRequest
 from blitzgs.training.batches import BatchLoader, Images, PhotographError
 from blitzgs.training.config import Config
@@ -132,7 +132,10 @@ class Trainer:
         except (OSError, ValueError) as error:
             raise PhotographError(str(error)) from error
         degree = schedule.sh_degree(begin, config.model.sh_degree)
-        frame, terms, sums = state.stepper.forward(step, render_options(config, state.space, degree), batch)
+        view_level.follow_schedule(state, begin)
+        gate = view_level.batch_gate(state, batch.indices)
+        options = render_options(config, state.space, degree)
+        frame, terms, sums = state.stepper.forward(step, options, batch, gate=gate)
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.table, frame)
         is_logged = end // config.log.every > begin // config.log.every

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.config import Config
+from blitzgs.view.gate import centres_of
 
 
 class CameraLike(Protocol):
@@ -120,6 +121,10 @@ class ViewSet:
         count = 16 * len(indices)
         numbers[:count] = self._viewmats[indices].ravel()
         numbers[count:] = self._Ks[indices].ravel()
+
+    def centres(self, indices: list[int]) -> Tensor:
+        """Return the positions of cameras in the trained world, float64 [V, 3], on the CPU."""
+        return centres_of(torch.from_numpy(self._viewmats[indices]))
 
     def pick(self, indices: list[int]) -> Views:
         """Return the views of same-size cameras as one batch on the device.

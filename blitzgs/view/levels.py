@@ -35,12 +35,22 @@ class Levels:
         return self.voxel_size / self.fork**level
 
     def farthest(self, level: int) -> float:
-        """Return the largest distance from which `level` is resolvable.
+        """Return the largest distance from which `level` is resolvable; see `farthest`."""
+        return farthest(level, self.reference_distance, self.fork)
 
-        Eq. 1 rounds log_f(d_0 / d) to the nearest integer, which reaches l up to d = d_0 f^(1/2 - l). Level 0
-        is resolvable from any distance.
-        """
-        return math.inf if level == 0 else self.reference_distance * self.fork ** (0.5 - level)
+
+def farthest(level: int, reference_distance: float, fork: float) -> float:
+    """Return the largest distance from which a level is resolvable, in the unit of `reference_distance`.
+
+    Eq. 1 rounds log_f(d_0 / d) to the nearest integer, which reaches l up to d = d_0 f^(1/2 - l). Level 0 is
+    resolvable from any distance.
+
+    Args:
+        level: l.
+        reference_distance: d_0.
+        fork: f.
+    """
+    return math.inf if level == 0 else reference_distance * fork ** (0.5 - level)
 
 
 def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution: float) -> Levels:

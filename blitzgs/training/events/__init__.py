@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from blitzgs.training.events import densify, evaluate, importance, reset_opacities, save
+from blitzgs.training.events import clear_cull, densify, evaluate, importance, reset_opacities, save
 from blitzgs.training.schedule import Event, EventKind
 from blitzgs.training.state import TrainingState
 
@@ -18,6 +18,7 @@ HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
     "reset_opacities": reset_opacities.run,
     "pass_1": importance.run,
     "pass_2": importance.run,
+    "clear_cull": clear_cull.run,
     "evaluate": evaluate.run,
     "checkpoint": save.run,
 }

@@ -10,6 +10,7 @@ from typing import Any
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.training import run as run_folder
 from blitzgs.training.evaluation import evaluate
+from blitzgs.training.lod import scene_gate
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
 
@@ -53,4 +54,5 @@ def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -
         pictures=state.config.log.pictures,
         lpips=state.lpips,
         optional_files=True,
+        lod=scene_gate(state.config, state.progress, state.table, state.ranks),
     )

@@ -15,6 +15,7 @@ from blitzgs.population.importance import Importance, ScoreRule, ViewBatch, swee
 from blitzgs.population.lineage import Cause
 from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.population.redistribution import redistribute
+from blitzgs.training import view_level
 from blitzgs.training.guard import check_table
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
@@ -56,6 +57,7 @@ def run(state: TrainingState, event: Event) -> None:
     progress = state.progress
     milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
     state.progress = dataclasses.replace(progress, milestones=milestones)
+    view_level.choose_views(state)
     counts = {"before": before, "gaussians": after, "views": len(state.capture.train)}
     state.log.event(event.time, event.kind, counts)
 

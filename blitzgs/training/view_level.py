@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The view level in a run: when the LOD gate opens, for which views it pays, and what a batch leaves out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from blitzgs.population.importance import CULL
+from blitzgs.training.lod import lod_gate, scene_gate
+from blitzgs.training.state import TrainingState
+from blitzgs.view.gate import ViewGate, lod_bits
+
+
+def follow_schedule(state: TrainingState, begin: int) -> None:
+    """Open the LOD gate, or let it keep another level, if the step at [begin, begin + B) is the first to.
+
+    Collective: every rank calls this before every step.
+    """
+    view, schedule, progress = state.config.view, state.schedule, state.progress
+    if not (view.lod and schedule.has_lod_gate(begin)):
+        return
+    finest = schedule.finest_level(begin, progress.level_count, view.first_levels, view.level_ratio)
+    if finest != progress.finest_level:
+        state.progress = dataclasses.replace(progress, finest_level=finest)
+        choose_views(state)
+
+
+def choose_views(state: TrainingState) -> None:
+    """Find out which training views the LOD gate pays for, if it is open. Collective.
+
+    The choice holds until the gate keeps other levels or a pass has taken Gaussians out. It is saved with the
+    checkpoints, because a resumed run sees the Gaussians at another time.
+    """
+    if state.progress.finest_level is None:
+        return
+    state.catch_up()  # the prediction reads the means
+    scene = scene_gate(state.config, state.progress, state.table, state.ranks)
+    if scene is None:
+        return
+    kept = scene.kept(state.views.centres(state.capture.train))
+    gated = [share < scene.most_kept for share in kept]
+    flags = "".join("1" if has_gate else "0" for has_gate in gated)
+    state.progress = dataclasses.replace(state.progress, gated_views=flags)
+    mean = sum(share if has_gate else 1.0 for share, has_gate in zip(kept, gated, strict=True)) / len(kept)
+    values = {"finest_level": state.progress.finest_level, "gated_views": sum(gated), "kept": mean}
+    text = (
+        f"the LOD gate keeps levels up to {state.progress.finest_level} of {state.progress.level_count - 1}: "
+        f"it holds in {sum(gated)} of {len(gated)} training views, which keep {mean:.0%} of the Gaussians on "
+        "average over all"
+    )
+    state.log.event(state.images_seen, "lod_gate", values, text)
+
+
+def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
+    """Return what a batch of training views leaves out; None: nothing.
+
+    Args:
+        state: of the run.
+        indices: cameras of the capture, all of them for training.
+    """
+    columns = [state.columns[index] for index in indices]
+    gate, flags = lod_gate(state.config, state.progress), state.progress.gated_views
+    lod_views = 0 if gate is None else lod_bits([flags[column] == "1" for column in columns])
+    masked = state.config.view.cull and CULL in state.table
+    if not (lod_views or masked):
+        return None
+    return ViewGate(gate.reach() if gate is not None else [math.inf], lod_views, columns if masked else ())

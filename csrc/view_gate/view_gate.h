@@ -1,0 +1,104 @@
+// SPDX-License-Identifier: Apache-2.0
+// The view level: what a view leaves out of its active set before projection (paper, Section 3.3).
+//
+// LOD gate (Eq. 1 and 2): view v keeps row i iff level_i <= L_v(|mean_i - centre_v|). Eq. 1 rounds
+// log_f(d_0 / d) to the nearest integer, so level l is kept up to the distance reach_l = d_0 f^(1/2 - l);
+// level 0 at any distance, and a level beyond L_max(t) nowhere (reach < 0). Comparing squared distances
+// decides the same sets without a logarithm.
+//
+// Cull mask: view v leaves out row i iff bit columns[v] of the row's cull matrix is set.
+//
+// The op clears the bits of (row, view) pairs that are left out, in the lists of the active set. Each row
+// decides for itself, in float32 and from caught-up means, so the sets depend neither on the order of the
+// rows nor on how they are divided among ranks. In place, one thread a row: deterministic. O(listed rows).
+//
+// ids int32 [room] and views int32 [room], of which the first count [1] are valid; means [N, 3]; level uint8
+// [N]; viewmats [B, 4, 4], rigid; cull int32 [N, words].
+#pragma once
+#include <cstdint>
+
+#include "common/host_device.h"
+#include "common/limits.h"
+#include "common/stream.h"
+
+namespace blitzgs {
+
+constexpr int kMaxLevels = 32;
+
+// What all rows of a launch are compared with.
+struct GateTable {
+  float centres[kMaxViews][3];
+  float reach2[kMaxLevels];         // squared; negative: the level is kept nowhere
+  std::int32_t columns[kMaxViews];  // of the cull matrix; negative: the view has no mask
+};
+
+struct ViewGateArgs {
+  const std::int32_t* ids;
+  std::int32_t* views;
+  std::int64_t room;
+  const std::int32_t* count;  // CUDA: how many of the ids are valid, in device memory; null: all
+  const float* means;
+  const std::uint8_t* level;
+  const float* viewmats;
+  const std::int32_t* cull;  // may be null
+  std::int64_t words;
+  int n_views, n_levels;
+  std::uint32_t lod_views;   // bits of the views that have an LOD gate
+  std::uint32_t cull_views;  // and of those that have a mask
+  GateTable table;           // without the centres
+};
+
+// -R^T t of a rigid pose.
+BLITZGS_HD void camera_centre(const float* viewmat, float* centre) {
+  for (int axis = 0; axis < 3; ++axis) {
+    double sum = 0;
+    for (int i = 0; i < 3; ++i) {
+      sum -= static_cast<double>(viewmat[4 * i + axis]) * static_cast<double>(viewmat[4 * i + 3]);
+    }
+    centre[axis] = static_cast<float>(sum);
+  }
+}
+
+BLITZGS_HD float squared_distance(const float* a, const float* b) {
+  float sum = 0;
+  for (int axis = 0; axis < 3; ++axis) sum += (a[axis] - b[axis]) * (a[axis] - b[axis]);
+  return sum;
+}
+
+BLITZGS_HD bool has_bit(std::uint32_t bits, int index) { return (bits >> index & 1u) != 0; }
+
+// The views of `seen` that keep a row.
+BLITZGS_HD std::uint32_t views_that_keep(const ViewGateArgs& args, const GateTable& table, std::int64_t row,
+                                         std::uint32_t seen) {
+  std::uint32_t kept = seen;
+  if (seen & args.lod_views) {
+    const int level = args.level[row], last = args.n_levels - 1;
+    const float reach2 = table.reach2[level < last ? level : last];
+    for (int view = 0; view < args.n_views; ++view) {
+      if (!has_bit(seen & args.lod_views, view)) continue;
+      if (squared_distance(args.means + 3 * row, table.centres[view]) > reach2) kept &= ~(1u << view);
+    }
+  }
+  for (int view = 0; (kept & args.cull_views) && view < args.n_views; ++view) {
+    if (!has_bit(kept & args.cull_views, view)) continue;
+    const std::int32_t column = table.columns[view];
+    const auto word = static_cast<std::uint32_t>(args.cull[row * args.words + column / 32]);
+    if (has_bit(word, column % 32)) kept &= ~(1u << view);
+  }
+  return kept;
+}
+
+BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std::int64_t i) {
+  const auto seen = static_cast<std::uint32_t>(args.views[i]);
+  const std::uint32_t kept = views_that_keep(args, table, args.ids[i], seen);
+  if (kept != seen) args.views[i] = static_cast<std::int32_t>(kept);
+}
+
+namespace cpu {
+void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
+}
+namespace cuda {
+void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
+}
+
+}  // namespace blitzgs

@@ -1,0 +1,43 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
+#include "common/launch.cuh"
+#include "common/multiprocessors.h"
+#include "view_gate/view_gate.h"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kThreads = 256;
+constexpr int kResident = 6;  // CUDA blocks that fit into a multiprocessor of any supported GPU
+
+__global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const ViewGateArgs args) {
+  __shared__ GateTable table;
+  wait_for_earlier_kernels();
+  const std::int64_t count = args.count ? *args.count : args.room;
+  const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
+  if (first >= count) return;
+  const int thread = threadIdx.x;
+  if (thread < kMaxLevels) table.reach2[thread] = args.table.reach2[thread];
+  if (thread < args.n_views) {
+    table.columns[thread] = args.table.columns[thread];
+    camera_centre(args.viewmats + 16 * thread, table.centres[thread]);
+  }
+  __syncthreads();
+  for (std::int64_t i = first + thread; i < count; i += std::int64_t{kThreads} * gridDim.x) {
+    gate_entry(args, table, i);
+  }
+}
+
+}  // namespace
+
+void gate_views(const ViewGateArgs& args, Workspace&, CudaStream stream) {
+  if (args.room == 0) return;
+  // The lists have room for the whole table and few entries, so blocks take turns.
+  const std::int64_t most = kResident * multiprocessors();
+  const auto blocks = static_cast<unsigned>(std::min<std::int64_t>(blocks_for(args.room, kThreads), most));
+  launch_early("gate_views", gate_views_kernel, {blocks, kThreads, stream}, args);
+}
+
+}  // namespace blitzgs::cuda

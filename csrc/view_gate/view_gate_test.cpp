@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "view_gate/view_gate.h"
+
+#include <vector>
+
+#include "common/catch.h"
+#include "common/test_workspace.h"
+
+namespace {
+
+// Three rows at distance 3 of a camera at (1, 0, 0), with levels 0 to 2, seen by views 0 and 1 alike.
+struct Rows {
+  std::vector<float> means = {1, 3, 0, 1, 0, 3, 4, 0, 0};
+  std::vector<std::uint8_t> level = {0, 1, 2};
+  std::vector<std::int32_t> ids = {0, 1, 2}, views = {3, 3, 3}, cull = {0, 0, 0};
+  std::vector<float> viewmats = {0, 0, 1, 0,  0, 1, 0, 0, -1, 0, 0, 1, 0, 0, 0, 1,
+                                 1, 0, 0, -1, 0, 1, 0, 0, 0,  0, 1, 0, 0, 0, 0, 1};
+
+  blitzgs::ViewGateArgs args() {
+    blitzgs::ViewGateArgs args{};
+    args.ids = ids.data(), args.views = views.data(), args.room = 3;
+    args.means = means.data(), args.level = level.data(), args.viewmats = viewmats.data();
+    args.cull = cull.data(), args.words = 1;
+    args.n_views = 2, args.n_levels = 2;
+    return args;
+  }
+
+  std::vector<std::int32_t> left(const blitzgs::ViewGateArgs& args) {
+    blitzgs::TestWorkspace workspace;
+    blitzgs::cpu::gate_views(args, workspace, nullptr);
+    return views;
+  }
+};
+
+}  // namespace
+
+TEST_CASE("the centre of a camera does not depend on its rotation") {
+  const Rows rows;
+  for (int view = 0; view < 2; ++view) {
+    float centre[3];
+    blitzgs::camera_centre(rows.viewmats.data() + 16 * view, centre);
+    REQUIRE(centre[0] == 1);
+    REQUIRE(centre[1] == 0);
+    REQUIRE(centre[2] == 0);
+  }
+}
+
+TEST_CASE(
+    "levels beyond their reach leave the views that have a gate, and a level beyond the last is the last") {
+  Rows rows;
+  blitzgs::ViewGateArgs args = rows.args();
+  args.lod_views = 1;
+  args.table.reach2[0] = 1e30f, args.table.reach2[1] = 8.99f;
+  REQUIRE(rows.left(args) == std::vector<std::int32_t>{3, 2, 2});
+  args.table.reach2[1] = 9;
+  rows.views = {3, 3, 2};
+  REQUIRE(rows.left(args) == std::vector<std::int32_t>{3, 3, 2});
+}
+
+TEST_CASE("the bits of a column leave the view that has it") {
+  Rows rows;
+  blitzgs::ViewGateArgs args = rows.args();
+  args.cull_views = 2;
+  args.table.columns[0] = -1, args.table.columns[1] = 31;
+  rows.cull = {0, INT32_MIN, INT32_MAX};
+  REQUIRE(rows.left(args) == std::vector<std::int32_t>{3, 1, 3});
+}

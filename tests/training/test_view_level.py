@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The LOD gate and the cull mask in a training, and in what evaluates and renders its model."""
+
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+import blitzgs
+from blitzgs import pipeline
+from blitzgs.cli import main
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import GaussianTable
+from blitzgs.population.importance import CULL, is_culled
+from blitzgs.training import run
+from blitzgs.training.config import ScheduleConfig
+from blitzgs.training.config_io import ConfigError
+from blitzgs.training.evaluation import image_metrics
+from blitzgs.training.events import evaluate
+from blitzgs.training.lod import scene_gate
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.step import Stepper
+from blitzgs.training.trainer import Trainer
+from blitzgs.view.gate import centres_of
+from tests.training.test_trainer import assert_same_table
+from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+
+# The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
+FLAGS = (
+    "view.lod=true",
+    "view.cull=true",
+    "view.most_kept=0.95",
+    "population.importance=true",
+    "schedule.densify_until=60",
+    "schedule.t1=40",
+    "schedule.t2=70",
+    "log.pictures=0",
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def train(folder, *overrides, resume=False):
+    trainer = Trainer(tiny_config(*FLAGS, *overrides), *tiny_scene(), folder, Ranks(), resume)
+    return trainer, trainer.train()
+
+
+def logged(folder, event):
+    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    return [record for record in records if record.get("event") == event]
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    """A run, and of each of its steps what the views had left: (step, gate, views by row, table then)."""
+    torch.set_num_threads(1)
+    folder, steps = tmp_path_factory.mktemp("run"), {}
+    forward = Stepper.forward
+
+    def watched(self, step, options, batch, mark=None, gate=None):
+        frame, *rest = forward(self, step, options, batch, gate=gate)
+        table = {name: self._table[name].clone() for name in self._table}
+        steps[step] = (gate, frame.rows, batch.indices, table)
+        return frame, *rest
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Stepper, "forward", watched)
+        return folder, *train(folder), steps
+
+
+def test_each_phase_leaves_out_what_the_schedule_says(whole_run):
+    _, trainer, _, steps = whole_run
+    progress, column_of = trainer.state.progress, trainer.state.columns
+    dropped = {"lod": 0, "cull": 0}
+    for step, (gate, rows, (index,), table) in steps.items():
+        t = step - 1  # of one image each
+        has_lod, has_mask = t >= 60, 40 < t <= 85
+        if gate is None:
+            assert not has_mask and (not has_lod or "0" in progress.gated_views)
+            continue
+        assert has_lod or has_mask
+        assert bool(gate.columns) == has_mask and (has_lod or gate.lod_views == 0)
+        seen = torch.zeros(len(table["id"]), dtype=torch.bool)
+        seen[rows.visible_ids.long()] = True
+        everything = pipeline.forward(
+            GaussianTable(table), trainer.state.views.pick([index]), trainer.state.render_options
+        ).rows
+        allowed = torch.ones_like(seen)
+        if gate.lod_views:
+            centre = trainer.state.views.centres([index])
+            distances = torch.cdist(table["means"].double(), centre)[:, 0]
+            reach = torch.tensor(gate.reach, dtype=torch.float64)[table["level"].long()]
+            allowed &= distances <= reach
+        dropped["lod"] += int((~allowed).sum())
+        if has_mask:
+            culled = is_culled(table[CULL], column_of[index])
+            dropped["cull"] += int(culled.sum())
+            allowed &= ~culled
+        without = torch.zeros_like(seen)
+        without[everything.visible_ids.long()] = True
+        assert torch.equal(seen, without & allowed)
+    assert min(dropped.values()) > 100
+
+
+def test_what_the_run_says_and_saves(whole_run):
+    folder, trainer, _, _ = whole_run
+    progress = trainer.state.progress
+    opened, again = logged(folder, "lod_gate")  # at the end of the window, and after the second pass
+    assert opened["t"] == 60 and again["t"] == 71
+    assert progress.finest_level == progress.level_count - 1 >= 1
+    assert progress.reference_distance > 0
+    assert len(progress.gated_views) == 7 and "1" in progress.gated_views
+    assert again["gated_views"] == progress.gated_views.count("1") and again["kept"] < 0.95
+    assert logged(folder, "clear_cull")[0]["t"] == 85 and CULL not in trainer.state.table
+    saved = run.open_model(folder, Ranks())
+    assert saved.progress == progress
+    gate = scene_gate(saved.config, saved.progress, saved.table, Ranks())
+    assert gate.gate == scene_gate(trainer.state.config, progress, trainer.state.table, Ranks()).gate
+
+
+def stop_at(monkeypatch, last):
+    step = Trainer.step
+
+    def interrupted(self, number):
+        step(self, number)
+        if number == last:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Trainer, "step", interrupted)
+
+
+def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
+    """While the mask is in use."""
+    stop_at(monkeypatch, 80)
+    trainer, _ = train(tmp_path)
+    state = trainer.state
+    assert CULL in state.table
+    found = evaluate.measure(state, [3], None)
+    view, camera = state.views.pick([3]), state.capture.cameras[3]
+    distances = torch.cdist(state.table["means"].double(), centres_of(view.viewmats))[:, 0]
+    gate = scene_gate(state.config, state.progress, state.table, Ranks()).gate
+    reach = torch.tensor(gate.reach(), dtype=torch.float64)[state.table["level"].long()]
+    assert (distances <= reach).double().mean() < 0.95
+    small = GaussianTable(state.table.columns)
+    small.keep(distances <= reach)
+    image = pipeline.forward(small, view, state.render_options).renders[0]
+    assert found["psnr"] == image_metrics(image, tiny_scene()[1].get(3), None)["psnr"]
+    assert not torch.equal(image, pipeline.forward(state.table, view, state.render_options).renders[0])
+    shown = blitzgs.open_run(tmp_path).model().render(camera)
+    torch.testing.assert_close(shown, image, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("last", [50, 65, 80])
+def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
+    """Stopped with the mask alone, with the gate and the mask of the first pass, and of the second."""
+    _, whole, _, _ = whole_run
+    stop_at(monkeypatch, last)
+    assert train(tmp_path)[1] is None
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    second, _ = train(tmp_path, resume=True)
+    assert_same_table(second.state.table, whole.state.table)
+    assert second.state.progress.gated_views == whole.state.progress.gated_views
+
+
+def test_render_honours_the_gate(tmp_path):
+    write_tiny_capture(tmp_path / "capture")
+    out, flags = tmp_path / "run", [f"--{flag}" for flag in (*OVERRIDES, *FLAGS)]
+    data = ["--data", str(tmp_path / "capture"), "--out", str(out)]
+    assert main(["train", *data, "--schedule.scale=0.8", *flags]) == 0
+    arguments = ["--out", str(tmp_path / "images"), "--raw", "--device", "cpu"]
+    assert main(["render", str(out), *arguments]) == 0
+    (path,) = (tmp_path / "images").glob("*.npy")
+    model, cameras = blitzgs.open_run(out).model(), blitzgs.open_run(out).cameras()
+    assert model.lod is not None
+    image = model.render(cameras.cameras[cameras.test[0]])
+    np.testing.assert_allclose(np.load(path), image.numpy(), rtol=0, atol=1e-5)
+
+
+def test_levels_are_unlocked_as_octree_gs_does():
+    """Its intervals: a geometric series that ends at `levels_until`."""
+    config = ScheduleConfig(iterations=2000, densify_until=1000, scale=2.0)
+    schedule, count, ratio = Schedule(config), 8, 1.5
+    first, waits = count // 2, count - 1 - count // 2
+    wait = 2000 * (1 - 1 / ratio) / (1 - ratio**-waits)
+    times = [sum(wait / ratio**k for k in range(n + 1)) for n in range(waits)]
+    assert times[-1] == pytest.approx(2000)
+    for n, time in enumerate(times):
+        assert schedule.finest_level(round(time - 2), count, 0.5, ratio) == first + n
+        assert schedule.finest_level(round(time + 2), count, 0.5, ratio) == first + n + 1
+    assert schedule.finest_level(0, count, 0.0, ratio) == 0
+    assert [schedule.finest_level(t, 1, 0.5, ratio) for t in (0, 5000)] == [0, 0]
+    assert [schedule.finest_level(t, 2, 0.5, ratio) for t in (0, 5000)] == [1, 1]
+    assert not schedule.has_lod_gate(1999) and schedule.has_lod_gate(2000)
+    late = Schedule(ScheduleConfig(iterations=2000, densify_until=1000, levels_until=1500))
+    assert late.finest_level(1499, count, 0.5, ratio) == 6 and late.finest_level(1500, count, 0.5, ratio) == 7
+
+
+def test_the_gate_follows_levels_that_come_later(tmp_path):
+    trainer, _ = train(
+        tmp_path, "schedule.levels_until=90", "view.first_levels=0", "lod.fork=1.3", "schedule.t2=65",
+        "view.cull=false",
+    )  # fmt: skip
+    levels = [record["finest_level"] for record in logged(tmp_path, "lod_gate")]
+    count = trainer.state.progress.level_count
+    assert levels == sorted(levels) and levels[-1] == count - 1 and len(set(levels)) >= 2
+    assert CULL in trainer.state.table  # a mask that is not used stays, as other tools read it
+
+
+def test_the_mask_is_cleared_halfway_after_the_last_pass():
+    def cleared(**fields):
+        schedule = Schedule(ScheduleConfig(iterations=90_000, densify_until=0, **fields))
+        events = schedule.events(0, schedule.iterations)
+        return [event.time for event in events if event.kind == "clear_cull"]
+
+    assert cleared(t1=16_000, t2=34_000) == [62_000]
+    assert cleared(t1=16_000, t2=0) == [53_000]
+    assert cleared(t1=0, t2=0) == []
+    assert cleared(t1=16_000, t2=34_000, scale=0.5) == [31_000]
+
+
+def test_a_mask_needs_the_passes():
+    with pytest.raises(ConfigError, match="view.cull: needs population.importance=true"):
+        tiny_config("view.cull=true")

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The LOD gate and the cull mask against float64 by brute force; what they leave trains and renders alike."""
+
+import math
+
+import pytest
+import torch
+
+from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileAssignment, TileOwners
+from blitzgs.model import GaussianTable
+from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.view_gate import gate_views_
+from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.population.importance import CULL
+from blitzgs.training.batches import Batch
+from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.step import Stepper
+from blitzgs.view.blocks import BlockIndex
+from blitzgs.view.gate import SAMPLE, LodGate, SceneGate, ViewGate, centres_of
+from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.helpers import DEVICES
+from tests.training.tiny import random_gaussians, tiny_config
+from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
+
+# Distances of `make_table` are up to 60 or so: the gate cuts through the scene at every level.
+GATE = LodGate(reference_distance=45.0, fork=2.0, count=6, finest=4)
+COLUMNS = (5, -1, 63, 31)
+OPTIONS = RenderOptions(0, NEAR, FAR)
+
+
+def make_scene(n=3000, device="cpu", seed=0):
+    """Gaussians with levels and a cull matrix of 64 columns."""
+    table = make_table(n, device, seed)
+    generator = torch.Generator().manual_seed(seed + 100)
+    draw = lambda low, high, *shape: torch.randint(low, high, shape, generator=generator)  # noqa: E731
+    table["level"] = draw(0, 6, n).to(device, torch.uint8)
+    table[CULL] = draw(-(2**31), 2**31, n, 2).to(device, torch.int32)
+    return table
+
+
+def kept_by_definition(table, viewmats, gate=GATE, lod_views=range(32), columns=()):
+    """Bool [N, B]: Eq. 2 and Eq. 5 in float64; and bool [N, B]: pairs that rounding may decide."""
+    distances = torch.cdist(table["means"].double(), centres_of(viewmats))
+    resolved = (gate.reference_distance / distances).log() / math.log(gate.fork)
+    finest = resolved.round().clamp(0, gate.finest)
+    kept = table["level"][:, None] <= finest
+    close = ((resolved - resolved.floor() - 0.5).abs() < 1e-5) | distances.isnan()
+    for view in range(len(viewmats)):
+        if view not in lod_views:
+            kept[:, view], close[:, view] = True, False
+        if columns and columns[view] >= 0:
+            word, bit = divmod(columns[view], 32)
+            kept[:, view] &= (table[CULL][:, word] >> bit & 1) == 0
+    return kept, close
+
+
+def bits(views, count):
+    return (views[:, None] >> torch.arange(count, device=views.device) & 1).bool()
+
+
+def some_rows(table, views, seed=0):
+    """Lists as of an active set that has room for more, and views at random."""
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.randperm(len(table), generator=generator)[: len(table) // 2].sort().values
+    allowed = torch.randint(0, 1 << views, (len(ids),), generator=generator)
+    room = torch.full((len(table) - len(ids),), 2**31 - 1)
+    columns = (torch.cat((ids, room)), torch.cat((allowed, room)), torch.tensor([len(ids)]))
+    return ActiveRows(*(column.int().to(table.device) for column in columns))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("lod_views", [(), (0, 2, 3), (0, 1, 2, 3)])
+@pytest.mark.parametrize("columns", [(), COLUMNS])
+def test_every_set_is_that_of_the_definition(device, lod_views, columns):
+    for seed in range(3):
+        table = make_scene(device=device, seed=seed)
+        viewmats, _ = make_views(device=device, seed=seed)
+        active = some_rows(table, 4, seed)
+        before = active.views.clone()
+        ViewGate(GATE.reach(), sum(1 << v for v in lod_views), columns).apply(
+            active, table, viewmats, table[CULL]
+        )
+        ids, views = active.listed()
+        kept, close = (
+            pairs[ids.long()] for pairs in kept_by_definition(table, viewmats, GATE, lod_views, columns)
+        )
+        expected = bits(before[: len(ids)], 4) & kept
+        found = bits(views, 4)
+        assert torch.equal(found | close, expected | close) and close.double().mean() < 0.02
+        assert (views & ~before[: len(ids)] == 0).all()
+        assert torch.equal(active.views[len(ids) :], before[len(ids) :])  # behind the list
+        if lod_views or columns:
+            assert 0.05 < found.sum() / before[: len(ids)].double().count_nonzero() < 2
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_level_beyond_the_finest_is_kept_nowhere_and_level_0_everywhere(device):
+    table = make_scene(device=device)
+    viewmats, _ = make_views(device=device)
+    scene = SceneGate(LodGate(1e6, 2.0, 6, 2), 1.0, table, Ranks(device=torch.device(device)))
+    near = scene.active(table, viewmats)
+    finite = table["means"].isfinite().all(1)
+    assert torch.equal((near.views == 15)[finite], (table["level"] <= 2)[finite])
+    scene = SceneGate(LodGate(1e-6, 2.0, 6, 5), 1.0, table, Ranks(device=torch.device(device)))
+    far = scene.active(table, viewmats)
+    assert torch.equal((far.views == 15)[finite], (table["level"] == 0)[finite])
+
+
+def render(table, viewmats, Ks, active=None):
+    return pipeline.forward(table, Views(viewmats, Ks, WIDTH, HEIGHT), OPTIONS, active).renders
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_images_are_those_of_the_gaussians_that_are_kept_with_blocks_and_without(device):
+    table = make_scene(5000, device)
+    table["scales"].clamp_(max=0.0)
+    viewmats, Ks = make_views(device=device)
+    gate = ViewGate(GATE.reach(), 0b1011, COLUMNS)
+    with_blocks = BlockIndex(table).active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+    count = len(table)
+    without = ActiveRows(
+        torch.arange(count, dtype=torch.int32, device=device),
+        torch.full((count,), 15, dtype=torch.int32, device=device),
+        torch.tensor([count], dtype=torch.int32, device=device),
+    )
+    for active in (with_blocks, without):
+        gate.apply(active, table, viewmats, table[CULL])
+    images = render(table, viewmats, Ks, with_blocks)
+    assert torch.equal(images, render(table, viewmats, Ks, without))
+    kept, _ = kept_by_definition(table, viewmats, GATE, (0, 1, 3), COLUMNS)
+    everything = render(table, viewmats, Ks)
+    for view in range(4):
+        small = GaussianTable(table.columns)
+        small.keep(kept[:, view])
+        alone = render(small, viewmats[view : view + 1], Ks[view : view + 1])
+        assert torch.equal(images[view], alone[0])
+    assert (images != everything).flatten(1).any(1).sum() >= 2
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_training_behind_the_gate_is_dense_adams(device):
+    """Rows that wait behind the gate owe steps; a twin that pays every row at every step ends alike."""
+    steps, tables = 120, []
+    overrides = ("schedule.iterations=200", "optimiser.position=2e-3", "optimiser.position_final=1e-3")
+    config = tiny_config(*overrides)
+    schedule = Schedule(config.schedule)
+    generator = torch.Generator().manual_seed(8)
+    levels = torch.randint(0, 3, (300,), generator=generator).to(torch.uint8)
+    targets = torch.randint(0, 256, (2, HEIGHT // 2, WIDTH // 2, 3), generator=generator, dtype=torch.uint8)
+    samples = torch.full((2,), 3.0 * targets[0, ..., 0].numel(), device=device)
+    K = torch.tensor([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]], device=device).repeat(2, 1, 1)
+    crossings = 0
+    for pays_at_once in (False, True):
+        small = random_gaussians(300)
+        table = GaussianTable({name: small[name].to(device) for name in small})
+        table["level"] = levels.to(device)
+        optimiser = LazyAdam(config.optimiser, schedule, 1.0, device)
+        stepper = Stepper(table, optimiser, TileOwners(Ranks(device=torch.device(device))), config.loss, 10.0)
+        gate = ViewGate(LodGate(4.0, 2.0, 3, 2).reach(), 0b11)
+        last = None
+        for step in range(1, steps + 1):
+            if pays_at_once:
+                optimiser.catch_up(table, None, step - 1)
+            viewmats = torch.eye(4).repeat(2, 1, 1)
+            viewmats[:, 2, 3] = torch.tensor([2.0, 2.5]) + 0.8 * math.sin(step)
+            views = Views(viewmats.to(device), K, WIDTH // 2, HEIGHT // 2)
+            batch = Batch([0, 1], views, targets.to(device), None, samples, None)
+            frame, terms, _ = stepper.forward(step, RenderOptions(0, 0.05, 100.0), batch, gate=gate)
+            stepper.backward(step, frame, terms)
+            seen = torch.zeros(300, dtype=torch.bool, device=device)
+            seen[frame.rows.visible_ids.long()] = True
+            crossings += 0 if last is None else int((seen != last).sum())
+            last = seen
+        assert int((table["moment_step"] < steps - 3).sum()) > 10  # these owe steps
+        optimiser.catch_up(table, None, steps)
+        tables.append(table)
+    lazy, dense = tables
+    assert crossings > 1000
+    for name, before in zip(("means", "quats", "scales", "opacities", "sh"), lazy.parameters, strict=True):
+        torch.testing.assert_close(before, dense[name], rtol=2e-4, atol=2e-5)
+
+
+def test_what_a_view_keeps_is_predicted_from_a_sample():
+    viewmats, _ = make_views()
+    for n, tolerance in ((3000, 1e-12), (4 * SAMPLE, 0.015)):
+        table = make_scene(n)
+        scene = SceneGate(GATE, 0.8, table, Ranks())
+        kept, _ = kept_by_definition(table, viewmats)
+        found = torch.tensor(scene.kept(centres_of(viewmats)), dtype=torch.float64)
+        expected = (kept & table["means"].isfinite().all(1)[:, None]).double().mean(0)
+        torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
+
+
+def test_a_view_that_keeps_almost_all_has_no_gate():
+    table = make_scene()
+    viewmats, _ = make_views()
+    kept = SceneGate(GATE, 0.8, table, Ranks()).kept(centres_of(viewmats))
+    border = sum(sorted(kept)[1:3]) / 2  # between the views
+    active = SceneGate(GATE, border, table, Ranks()).active(table, viewmats)
+    for view, share in enumerate(kept):
+        assert bits(active.views, 4)[:, view].all() == (share >= border)
+    assert SceneGate(GATE, 0.0, table, Ranks()).active(table, viewmats) is None
+
+
+def _gated_image(ranks):
+    table = make_scene(4000)
+    table["scales"].clamp_(max=0.0)
+    table.keep(torch.arange(len(table)) % 5 % ranks.world_size == ranks.rank)  # 3 : 2 at two ranks
+    table = GaussianTable({name: table[name].to(ranks.device) for name in table})
+    viewmats, Ks = make_views(device=ranks.device)
+    views, owners = Views(viewmats, Ks, WIDTH, HEIGHT), TileOwners(ranks)
+    scene = SceneGate(GATE, 0.8, table, ranks)
+    shares = scene.kept(centres_of(viewmats))
+    images = []
+    masked = BlockIndex(table).active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+    ViewGate(GATE.reach(), 0b1101, COLUMNS).apply(masked, table, viewmats, table[CULL])
+    for active in (scene.active(table, viewmats), masked):
+        if ranks.world_size == 1:
+            images.append(pipeline.forward(table, views, OPTIONS, active).renders.cpu())
+            continue
+        ranges = owners.divide(range(4), WIDTH, HEIGHT, OPTIONS.tile_size)
+        frame = pipeline.forward(table, views, OPTIONS, active, TileAssignment(ranks, ranges))
+        own = ranges.pixel_mask(ranks.rank, ranks.device)
+        images.append(torch.where(own[..., None], frame.renders, 0.0).cpu())
+    return shares, images
+
+
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(2))
+def test_gated_images_are_the_same_at_every_world_size(world_size, device):
+    shares, images = _gated_image(Ranks(device=torch.device(device)))
+    answers = run_ranks(_gated_image, world_size, device=device)
+    for found, _ in answers:
+        assert found == shares
+    for k, image in enumerate(images):
+        assert image.any() and torch.equal(sum(parts[k] for _, parts in answers), image)
+
+
+def test_errors_name_the_value():
+    table = make_scene(300)
+    viewmats, _ = make_views(2)
+    active = some_rows(table, 2)
+    call = lambda *args: gate_views_(active, table["means"], table["level"], viewmats, *args)  # noqa: E731
+    with pytest.raises(RuntimeError, match="1 to 32 levels are supported, got 33"):
+        call([1.0] * 33, 1)
+    with pytest.raises(RuntimeError, match="2 views need as many columns of the cull matrix, got 3"):
+        call([1.0], 0, table[CULL], [0, 1, 2])
+    with pytest.raises(RuntimeError, match="the cull matrix has 64 columns, got column 64"):
+        call([1.0], 0, table[CULL], [0, 64])
+    with pytest.raises(RuntimeError, match="columns need a cull matrix"):
+        call([1.0], 0, None, [0, 1])
+    many, _ = make_views(33)
+    with pytest.raises(RuntimeError, match="at most 32 views at once, got 33"):
+        gate_views_(active, table["means"], table["level"], many, [1.0], 1)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_opcheck(device):
+    table = make_scene(600, device)
+    viewmats, _ = make_views(device=device)
+    active = some_rows(table, 4)
+    torch.library.opcheck(
+        torch.ops.blitzgs.gate_views_,
+        (active.ids, active.views, active.length, table["means"], table["level"], viewmats, GATE.reach(), 5,
+         table[CULL], list(COLUMNS)),
+    )  # fmt: skip
