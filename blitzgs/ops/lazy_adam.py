@@ -148,13 +148,24 @@ def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     return table
 
 
-def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
+def table_without_rates(steps: int, beta1: float, beta2: float) -> Tensor:
+    """Return `schedule_table` of a schedule whose learning rates are zero: powers and corrections alone.
+
+    Args:
+        steps: S + 1.
+        beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
+        beta2: decay of the second moment, in (0, 1).
+
+    Returns:
+        float64 [S + 1, 30] on the CPU.
+
+    Raises:
+        ValueError: decay rates outside their range.
+    """
     if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 < math.sqrt(beta2)):
         raise ValueError(
             f"Adam's decay rates must satisfy 0 <= beta1 < sqrt(beta2) < 1, got beta1={beta1}, beta2={beta2}"
         )
-    rates = lr_table.double().cpu()
-    steps = rates.shape[0]
     ratio, root = beta1 / math.sqrt(beta2), math.sqrt(beta2)
     t = torch.arange(steps, dtype=torch.float64)
     table = torch.zeros(steps, 30, dtype=torch.float64)
@@ -165,6 +176,15 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     first = 1 / (-torch.expm1(t[1:] * math.log(beta1)) if beta1 > 0 else torch.ones(steps - 1))
     second = (-torch.expm1(t[1:] * math.log(beta2))).rsqrt()
     table[1:, 28], table[1:, 29] = first, second
+    return table
+
+
+def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
+    rates = lr_table.double().cpu()
+    steps = rates.shape[0]
+    table = table_without_rates(steps, beta1, beta2)
+    ratio, root = beta1 / math.sqrt(beta2), math.sqrt(beta2)
+    first, second = table[1:, 28], table[1:, 29]
     orders = range(4)
     terms = torch.stack([(first * second ** (k - 1))[:, None] * rates[1:] for k in orders], 1).numpy()
     ratios = np.array([ratio * root**k for k in orders])[:, None]

@@ -7,13 +7,12 @@ import math
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from blitzgs.ops.lazy_adam import explicit_steps, schedule_table
+from blitzgs.ops.lazy_adam import explicit_steps, table_without_rates
 
 # csrc/lazy_adam/adam_table.h: a row has 4 orders of 6 groups, then powers and corrections. A parameter that
 # is stepped alone takes the place of SH, whose first three values have a group and the rest another.
-_ORDERS, _GROUPS, _OWN = 4, 6, slice(4, 6)
+_ORDERS, _GROUPS, _OWN = 4, 6, (4, 5)
 _FIRST_CAPACITY = 1024
 
 
@@ -52,32 +51,32 @@ class Drift:
 
     def _grow(self, capacity: int) -> None:
         device, known = self.lr_table.device, len(self.lr_table)
-        rates = torch.zeros(capacity + 1, _GROUPS, dtype=torch.float32)
-        # Without rates the tails are zero: what is left are the powers and corrections of the steps.
-        table, rates = schedule_table(rates, *self.betas).to(device), rates.to(device)
+        table = table_without_rates(capacity + 1, *self.betas)
+        first, second = table[:, 28], table[:, 29]
+        # What a step adds to the steps before it, for a learning rate of 1; there is no step 0.
+        shares = torch.stack([first * second ** (order - 1) for order in range(_ORDERS)], dim=1)
+        shares[0] = 0
+        self._shares = shares.to(device)[:, :, None]
+        table, rates = table.to(device), self.lr_table.new_zeros(capacity + 1, _GROUPS)
         table[:known, : _ORDERS * _GROUPS] = self.table[:, : _ORDERS * _GROUPS]
         rates[:known] = self.lr_table
         self.table, self.lr_table = table, rates
 
-    def terms(self, step: int, lr: float, lr_rest: float) -> list[float]:
-        """Return what a step adds to the steps before it, and its rates: 10 numbers for `add`."""
-        beta1, beta2 = self.betas
-        lr, lr_rest = float(np.float32(lr)), float(np.float32(lr_rest))  # as in lr_table
-        first = 1 / (1 - beta1**step)
-        second = 1 / math.sqrt(-math.expm1(step * math.log(beta2)))
-        shares = [first * second ** (order - 1) for order in range(_ORDERS)]
-        return [share * rate for share in shares for rate in (lr, lr_rest)] + [lr, lr_rest]
-
-    def add(self, step: int, terms: Tensor) -> None:
-        """Take note of a step.
+    def add(self, step: int, lr: float, lr_rest: float) -> None:
+        """Take note of a step; queues a few small kernels and copies nothing to the device.
 
         Args:
             step: its number, from 1.
-            terms: float64 [10], from `terms`, on the device of the parameter.
+            lr: learning rate of the first three values of a row.
+            lr_rest: of the others.
         """
         if step >= len(self.lr_table):
             self._grow(2 * step)
         begin = max(0, step - self.reach)
-        tails = self.table[begin:step, : _ORDERS * _GROUPS].view(-1, _ORDERS, _GROUPS)[:, :, _OWN]
-        tails.addcmul_(self._decays[begin - step :], terms[: 2 * _ORDERS].view(1, _ORDERS, 2))
-        self.lr_table[step, _OWN] = terms[2 * _ORDERS :].float()
+        tails = self.table[begin:step, : _ORDERS * _GROUPS].view(-1, _ORDERS, _GROUPS)
+        decays, shares = self._decays[begin - step :], self._shares[step]
+        for groups, rate in [(_OWN, lr)] if lr == lr_rest else [(_OWN[:1], lr), (_OWN[1:], lr_rest)]:
+            owned = slice(groups[0], groups[-1] + 1)
+            rate = float(np.float32(rate))  # as in lr_table
+            tails[:, :, owned].addcmul_(decays, shares, value=rate)
+            self.lr_table[step, owned].fill_(rate)

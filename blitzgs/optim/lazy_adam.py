@@ -99,22 +99,13 @@ class LazyAdam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        stepped, terms = [], []
         for place, group, param in self._placed():
             if param.grad is None:
                 continue
             state, drift = self._state_of(param), self._drift_of(place, group, param)
             state["step"] += 1
             rest = group["lr"] if group["lr_rest"] is None else group["lr_rest"]
-            terms.append(drift.terms(int(state["step"]), float(group["lr"]), float(rest)))
-            stepped.append((group, param, state, drift))
-        # One copy to a device for all its parameters.
-        on_device = {
-            device: torch.tensor(terms, dtype=torch.float64, device=device)
-            for device in {param.device for _, param, *_ in stepped}
-        }
-        for index, (group, param, state, drift) in enumerate(stepped):
-            drift.add(int(state["step"]), on_device[param.device][index])
+            drift.add(int(state["step"]), float(group["lr"]), float(rest))
             self._step_one(group, param, state, drift)
         return loss
 
@@ -133,8 +124,9 @@ class LazyAdam(torch.optim.Optimizer):
             values = param.grad
         if param.numel() == 0 or len(ids) == 0:
             return
+        gradients = [values.new_empty(len(values), 0)] * 4 + [values]
         torch.ops.blitzgs.lazy_adam_step_(
-            *_alone(param, state), [state["last_step"], state["moment_step"]], _with_nothing(values), ids,
+            *_alone(param, state), [state["last_step"], state["moment_step"]], gradients, ids,
             [drift.table, drift.lr_table], [int(state["step"]), drift.reach, 0],
             [*drift.betas, group["eps"]],
         )  # fmt: skip
@@ -314,8 +306,6 @@ class LazyAdam(torch.optim.Optimizer):
 
 def _alone(param: Tensor, state: dict[str, Any]) -> tuple[list[Tensor], ...]:
     """Return a parameter and its moments as the op takes tables: as SH, without the other columns."""
-    return tuple(_with_nothing(values) for values in (param.detach(), *(state[name] for name in _MOMENTS)))
-
-
-def _with_nothing(values: Tensor) -> list[Tensor]:
-    return [values.new_empty(len(values), 0)] * 4 + [values]
+    nothing = param.new_empty(len(param), 0)
+    tensors = (param.detach(), *(state[name] for name in _MOMENTS))
+    return tuple([nothing] * 4 + [values] for values in tensors)
