@@ -17,6 +17,7 @@ from blitzgs.training import run as run_folder
 from blitzgs.training.config_io import ConfigError, load_config
 from blitzgs.training.gate_replay import replay
 from blitzgs.training.inputs import open_capture
+from blitzgs.training.schedule import Schedule
 
 HELP = """\
 The spawn gate: a predictor, fitted on the lineage of finished runs, that withholds candidates of
@@ -69,7 +70,8 @@ def run_evaluate(args: argparse.Namespace) -> int:
     runs = [gate_fit.read_spawns(_lineage(folder)) for folder in args.runs]
     args.out.mkdir(parents=True, exist_ok=True)
     schedule = load_config(args.runs[0] / run_folder.CONFIG).schedule
-    results = gate_evaluation.evaluate(gate, runs, schedule.gate_from * schedule.scale, args.out)
+    gate_from = Schedule(schedule).pace.image(schedule.gate_from)
+    results = gate_evaluation.evaluate(gate, runs, gate_from, args.out)
     (args.out / "evaluation.json").write_text(json.dumps(results, indent=1) + "\n")
     for result in results:
         seen = "  (the gate was fitted on this scene)" if result["seen"] else ""

@@ -27,7 +27,7 @@ Train a model of a capture: a COLMAP model (DIR/sparse/0 and DIR/images) or a tr
 Every field of the configuration is a flag, e.g.
   blitzgs train --config configs/aerial.yaml --data DIR --out RUN --data.downscale=2 --schedule.scale=0.5
 Times are counted in images; schedule.scale stretches the whole schedule. `blitzgs train --show-config` prints
-the resolved configuration and stops.
+the resolved configuration and stops. With --minutes=M the run measures its speed and chooses the scale.
 
 RUN gets config.yaml, cameras.json, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. A
 checkpoint is written every 10 minutes (log.checkpoint_seconds) and when the run is interrupted (Ctrl-C,
@@ -49,6 +49,12 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--out", type=Path, metavar="RUN", help="folder of the run")
     parser.add_argument(
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
+    )
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        metavar="M",
+        help="fit the schedule into so much wall time of training (or --schedule.minutes=M)",
     )
     parser.add_argument(
         "--show-config", action="store_true", help="print the resolved configuration and stop"
@@ -85,7 +91,10 @@ def _config(args: argparse.Namespace) -> Config:
         raise ConfigError(
             f"{source} would be overwritten by the new run's resolved configuration: choose another --out"
         )
-    config = load_config(source, args.overrides)
+    overrides = (
+        args.overrides if args.minutes is None else [*args.overrides, f"schedule.minutes={args.minutes}"]
+    )
+    config = load_config(source, overrides)
     if args.data is not None:
         # Not by way of YAML, which knows only some of the characters that a path may have.
         config = dataclasses.replace(

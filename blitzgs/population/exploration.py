@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from torch import Tensor
 
 from blitzgs.model import GaussianTable
@@ -18,23 +16,23 @@ class PositionNoise:
     no longer depends on the unit of the world.
     """
 
-    def __init__(
-        self, factor: float, position_rates: Sequence[float], extent: float, threshold: float, seed: int
-    ) -> None:
+    def __init__(self, factor: float, extent: float, threshold: float, seed: int) -> None:
         """Prepare the noise of a run.
 
         Args:
             factor: `optimiser.position_noise`.
-            position_rates: learning rate of the means at every step from 0, in the unit of the means.
-            extent: of the scene, in the same unit.
+            extent: of the scene, in the unit of the means.
             threshold: opacity at which half of the noise is left; Gaussians below it are pruned.
             seed: of the run.
         """
-        self._strengths = [factor * rate / extent**2 for rate in position_rates]
+        self._factor, self._extent = factor, extent
         self._threshold, self._seed = threshold, seed
 
-    def add(self, table: GaussianTable, visible_ids: Tensor, step: int) -> None:
-        """Move the rows `visible_ids` (int32 [U]), whose parameters stand at `step` (from 1)."""
+    def add(self, table: GaussianTable, visible_ids: Tensor, step: int, position_rate: float) -> None:
+        """Move the rows `visible_ids` (int32 [U]), whose parameters stand at `step` (from 1).
+
+        `position_rate` is the step's learning rate of the means, in their unit.
+        """
         position_noise_(
             table["means"],
             table["quats"],
@@ -45,5 +43,5 @@ class PositionNoise:
             seed=self._seed,
             step=step,
             threshold=self._threshold,
-            strength=self._strengths[step],
+            strength=self._factor * position_rate / self._extent**2,
         )

@@ -92,6 +92,10 @@ class ScheduleConfig:
     Attributes:
         iterations: length of the run.
         scale: stretches or compresses the whole schedule without changing its shape.
+        minutes: fits the schedule into so much wall time of training (`blitzgs train --minutes`): the run
+            measures how fast it is and changes its pace accordingly; `scale` stays 1. 0: no such limit.
+        pace: pairs (image of the run, factor): from that image on, `scale` counts times the factor. A run
+            with `minutes` notes its changes of pace here; without `minutes` they are followed as they are.
         batch_size: views per optimiser step B; one step advances the clock by B.
         densify_from, densify_until, densify_every: density-control events at from, from + every, ... < until.
         size_prune_after: density events later than this also prune by size.
@@ -110,6 +114,8 @@ class ScheduleConfig:
 
     iterations: int = 30_000
     scale: float = 1.0
+    minutes: float = 0.0
+    pace: tuple[tuple[int, float], ...] = ()
     batch_size: int = 1
     densify_from: int = 500
     densify_until: int = 15_000

@@ -156,6 +156,8 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
             return value
         return _convert(next(option for option in options if option is not type(None)), value, path)
     if origin is tuple:
+        if options[-1] is Ellipsis and isinstance(value, (list, tuple)):
+            options = options[:1] * len(value)
         if not isinstance(value, (list, tuple)) or len(value) != len(options):
             raise ConfigError(f"{path}: must be a list of {len(options)} values, got {value!r}")
         return tuple(

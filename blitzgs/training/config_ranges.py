@@ -7,6 +7,7 @@ an opacity of 2) and what would only exhaust memory or never end; they are far f
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -14,7 +15,7 @@ from typing import Any, get_args
 
 from blitzgs.distributed.group import Transport
 from blitzgs.population.importance import ScoreRule
-from blitzgs.training.config import Config
+from blitzgs.training.config import Config, ScheduleConfig
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class Range:
 
 
 # Images of a whole run: its table of learning rates takes 48 bytes a step.
-_MOST_IMAGES = 10_000_000
+MOST_IMAGES = 10_000_000
+SCALE = Range(1e-4, 1e4)
 _TIME = Range(0, 1e9)
 _EVERY = Range(1, 1e9)
 _EVERY_OR_NEVER = Range(0, 1e9)
@@ -60,7 +62,9 @@ RANGES: Mapping[str, Range] = {
     "lod.visible_threshold": Range(0, 1),
     "lod.base_resolution": Range(1e-6, 1),
     "schedule.iterations": Range(1, 1e9),
-    "schedule.scale": Range(1e-4, 1e4),
+    "schedule.scale": SCALE,
+    "schedule.minutes": Range(0, 1e6),
+    "schedule.pace": Range(1e-4, 1e9),
     "schedule.batch_size": Range(1, 32),
     "schedule.densify_from": _TIME,
     "schedule.densify_until": _TIME,
@@ -126,8 +130,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 def problems(config: Config) -> Iterator[str]:
     """Name each field whose value makes no sense, with the value and what is allowed."""
     for name, value in flat_fields(config):
-        numbers = value if isinstance(value, tuple) else (value,)
-        if name in RANGES and not all(number in RANGES[name] for number in numbers):
+        if name in RANGES and not all(number in RANGES[name] for number in _numbers(value)):
             yield f"{name}: must be {RANGES[name]}, got {value}"
         if name in CHOICES and value not in CHOICES[name]:
             yield f"{name}: must be one of {', '.join(CHOICES[name])}, got {value}"
@@ -137,12 +140,7 @@ def problems(config: Config) -> Iterator[str]:
     if 0 < config.optimiser.position < 1e-20:
         # The rate falls by a power of the ratio of position_final to it, which must stay a number.
         yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
-    images = schedule.iterations * schedule.scale
-    if not math.isnan(images) and images > _MOST_IMAGES:
-        yield (
-            f"schedule.iterations: times schedule.scale must be at most {_MOST_IMAGES:,} images, got "
-            f"{images:,.0f}"
-        )
+    yield from _problems_of_length(schedule)
     if not population.min_opacity < population.reset_opacity:
         yield (
             f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
@@ -151,6 +149,32 @@ def problems(config: Config) -> Iterator[str]:
 
     if config.view.cull and not population.importance:
         yield "view.cull: needs population.importance=true, whose passes make the mask"
+
+
+def _numbers(value: Any) -> list[Any]:
+    """Return the values of nested tuples."""
+    return [number for part in value for number in _numbers(part)] if isinstance(value, tuple) else [value]
+
+
+def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
+    """Say what is wrong with how long a run is."""
+    images = [image for image, _ in schedule.pace]
+    if any(image >= after for image, after in itertools.pairwise([0, *images])):
+        yield f"schedule.pace: its images must be above 0 and increase, got {images}"
+    factors = [factor for _, factor in schedule.pace]
+    if wrong := [factor for factor in factors if factor not in SCALE]:
+        yield f"schedule.pace: its factors must be {SCALE}, got {wrong[0]}"
+    total = schedule.iterations * schedule.scale * max([1.0, *factors])
+    if not math.isnan(total) and total > MOST_IMAGES:
+        yield (
+            f"schedule.iterations: times schedule.scale must be at most {MOST_IMAGES:,} images, got "
+            f"{total:,.0f}"
+        )
+    if schedule.minutes > 0 and schedule.scale != 1.0:
+        yield (
+            f"schedule.scale: must be 1 with schedule.minutes (--minutes), which chooses the scale; got "
+            f"{schedule.scale}: add --schedule.scale=1 or leave out the minutes"
+        )
 
 
 def flat_fields(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:

@@ -150,12 +150,17 @@ def replay(
         the share of the candidates that it knew (`matched`).
 
     Raises:
-        ValueError: the run logged no lineage.
+        ValueError: the run logged no lineage, or was trained by the clock.
         FileNotFoundError: it has no checkpoint from before the onset.
     """
     if not config.population.lineage:
         raise ValueError(
             f"{source} was trained without --population.lineage=true: there is nothing to branch"
+        )
+    if config.schedule.minutes > 0:
+        raise ValueError(
+            f"{source} was trained with schedule.minutes ({config.schedule.minutes:g}): its arms would "
+            "differ in length, and could not be compared. Train it with schedule.scale instead"
         )
     point = branch_point(source, config)
 

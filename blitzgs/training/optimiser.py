@@ -31,11 +31,26 @@ class LazyAdam:
     def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:
         """Tabulate the run's learning rates on `device`; `extent` is in the unit of the means."""
         batch = schedule.batch_size
-        self.lr_table: Tensor = schedule.learning_rates(config, extent).to(device)  # type: ignore[call-overload]
+        self._config, self._extent, self._device = config, extent, device
         self._betas = (config.beta1**batch, config.beta2**batch)
         self._eps = config.eps / math.sqrt(batch)
         self._sparse = config.sparse
-        self.pending_table = None if config.sparse else schedule_table(self.lr_table, *self._betas)
+        self.follow(schedule)
+
+    def follow(self, schedule: Schedule) -> None:
+        """Tabulate the learning rates of a schedule.
+
+        Rows that are behind owe the steps already taken: the new schedule has the same rates for those.
+        """
+        rates = schedule.learning_rates(self._config, self._extent)
+        self._position_rates = rates[:, 0].tolist()
+        self.lr_table: Tensor = rates.to(self._device)  # type: ignore[call-overload]
+        self.pending_table = None if self._sparse else schedule_table(self.lr_table, *self._betas)
+
+    def position_rate(self, step: int) -> float:
+        """Return the learning rate of the means in step `step` (from 1), in their unit."""
+        rate: float = self._position_rates[step]
+        return rate
 
     def catch_up(
         self, table: GaussianTable, ids: Tensor | None, step: int, count: Tensor | None = None

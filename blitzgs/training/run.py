@@ -212,7 +212,8 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
 def _compare_with_file(config: Config, path: Path) -> None:
     """Say so when a run's configuration file is not what its checkpoint was trained with."""
     try:
-        fields = _changed_fields(config, load_config(path))
+        # The file has the pace of the run's end or of its beginning.
+        fields = _changed_fields(config, with_pace_of(load_config(path), config))
         what = f"differs in {', '.join(fields)}" if fields else ""
     except ConfigError as error:
         what = f"cannot be read ({error})"
@@ -227,11 +228,25 @@ def check_resumable(saved: Config, wanted: Config) -> None:
         ConfigError: names the first field that differs.
     """
     for name, old, new in _differences(to_dict(saved), to_dict(wanted), ""):
-        if not _is_free(name):
+        # A run may get more time, or less: what is left of it is fitted into what is left of the time.
+        is_budget = name == "schedule.minutes" and old > 0 and new > 0
+        if not (_is_free(name) or is_budget):
             raise ConfigError(
                 f"{name}: the checkpoint was trained with {old!r}, now {new!r}; "
                 "resume with the run's own configuration or start another run"
             )
+
+
+def with_pace_of(config: Config, saved: Config | None) -> Config:
+    """Return a configuration for going on from a checkpoint, or from the start where `saved` is None.
+
+    With `schedule.minutes` the run has measured its pace so far, or is about to measure it; without, the
+    configuration says what the pace is.
+    """
+    if config.schedule.minutes == 0:
+        return config
+    pace = () if saved is None else saved.schedule.pace
+    return dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, pace=pace))
 
 
 def _is_free(name: str) -> bool:

@@ -40,7 +40,11 @@ def _count(value: float) -> str:
 
 
 class RunLog:
-    """Writes records of a run. Silent without a folder (the ranks other than 0)."""
+    """Writes records of a run. Silent without a folder (the ranks other than 0).
+
+    Attributes:
+        total: images of the whole run, which the time that is left is reckoned by.
+    """
 
     def __init__(
         self, folder: Path | None, total: int, done: int, tensorboard: bool, run_id: str = ""
@@ -59,7 +63,8 @@ class RunLog:
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._run_id = run_id
-        self._total, self._first, self._started = total, done, time.monotonic()
+        self._first, self._started = done, time.monotonic()
+        self.total = total
         self.console = Console(quiet=folder is None, highlight=False)
         if folder is None:
             return
@@ -87,11 +92,11 @@ class RunLog:
             self._board.add(t, values)
         text = "  ".join(_SHOWN[name](value) for name, value in values.items() if name in _SHOWN)
         if self._progress is not None:
-            self._progress.update(self._task, completed=t, description=text)
+            self._progress.update(self._task, completed=t, total=self.total, description=text)
         elif self._file is not None:
             rate = (time.monotonic() - self._started) / max(1, t - self._first)
-            left = timedelta(seconds=round(rate * (self._total - t)))
-            self._print(f"{t:>7,}/{self._total:,} images  {text}  ETA {left}")
+            left = timedelta(seconds=round(rate * (self.total - t)))
+            self._print(f"{t:>7,}/{self.total:,} images  {text}  ETA {left}")
 
     def event(self, t: int, kind: str, values: Mapping[str, Any], text: str | None = None) -> None:
         """Record something that happened at time `t`; print `text` if given."""

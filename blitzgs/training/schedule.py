@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
+from blitzgs.training.pace import Pace
 
 EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "evaluate", "checkpoint"]
 # The columns of the learning-rate table.
@@ -29,10 +30,11 @@ class Event:
 class Schedule:
     """Answers what happens when. Time t counts images; a step covers [t, t + B) and has the number t / B + 1.
 
-    Every time of the configuration is multiplied by `scale` and rounded down, so the same shape runs at any
-    length.
+    Every time of the configuration goes through `pace` (without changes of pace: it is multiplied by `scale`)
+    and is rounded down, so the same shape runs at any length.
 
     Attributes:
+        pace: between times of the configuration and images of the run.
         batch_size: views per step, B.
         steps: optimiser steps of the whole run.
         iterations: images of the whole run, steps x B.
@@ -40,13 +42,14 @@ class Schedule:
 
     def __init__(self, config: ScheduleConfig) -> None:
         self._config = config
+        self.pace = Pace(config.scale, config.pace)
         self.batch_size = config.batch_size
         self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
         self.iterations = self.steps * self.batch_size
 
     def _scaled(self, time: float) -> int:
         # The small excess keeps 0.1 * 30 from falling to 2.
-        return math.floor(time * self._config.scale + 1e-6)
+        return math.floor(self.pace.image(time) + 1e-6)
 
     def events(self, begin: int, end: int) -> list[Event]:
         """Return the events with begin <= time < end, in the order in which they happen."""
@@ -77,8 +80,8 @@ class Schedule:
         return "clear_cull", time, time + 1, min(last, 1)
 
     def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
-        """Times floor(scale (first + k every)) below `until` that lie in [begin, end)."""
-        k = max(0, math.floor((begin / self._config.scale - first) / every) - 1)
+        """Images of the times first + k every < until that lie in [begin, end)."""
+        k = max(0, math.floor((self.pace.time(begin) - first) / every) - 1)
         times: list[int] = []
         while (unscaled := first + k * every) < until and (time := self._scaled(unscaled)) < end:
             # A compressed schedule may put two of a kind on one image: they are one event.
@@ -89,12 +92,12 @@ class Schedule:
 
     def sh_degree(self, begin: int, limit: int) -> int:
         """Degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
-        every = self._config.sh_every * self._config.scale
-        return min(limit, math.ceil((begin + self.batch_size) / every - 1e-9) - 1)
+        time = self.pace.time(begin + self.batch_size)
+        return min(limit, math.ceil(time / self._config.sh_every - 1e-9) - 1)
 
     def gathers_statistics(self, begin: int) -> bool:
         """Tell whether the step at [begin, begin + B) counts for a density event still to come."""
-        return begin < self._config.densify_until * self._config.scale
+        return self.pace.time(begin) < self._config.densify_until
 
     def has_lod_gate(self, begin: int) -> bool:
         """Tell whether the step at [begin, begin + B) may leave out Gaussians by their octree levels.
@@ -144,12 +147,13 @@ class Schedule:
             float32 [S + 1, 6]: row s holds the rates of step s = 1..S for `RATES`; row 0 is zero.
         """
         begin = torch.arange(self.steps, dtype=torch.float64) * self.batch_size
-        progress = (begin / (self._config.position_decay * self._config.scale)).clamp(max=1.0)
+        times = self.pace.times(begin)
+        progress = (times / self._config.position_decay).clamp(max=1.0)
         fall = config.position_final / config.position if config.position > 0 else 0.0
         position = config.position * fall**progress * extent
         constants = (config.rotation, config.scale, config.opacity, config.sh_dc, config.sh_rest)
         table = torch.zeros(self.steps + 1, len(RATES), dtype=torch.float64)
         table[1:, 0] = position
-        share = config.final_share ** (begin / self.iterations)
+        share = config.final_share ** (times / self._config.iterations)
         table[1:, 1:] = torch.tensor(constants, dtype=torch.float64) * share[:, None]
         return (table * math.sqrt(self.batch_size)).float()

@@ -57,7 +57,6 @@ def set_up(
     """
     check_alike(config, capture, ranks, resume)
     check_writable(folder, ranks)
-    schedule = Schedule(config.schedule)
     space = Space.of(capture.offset, capture.extent)
     lpips = load_lpips(config.log.lpips_weights)
     if not resume and any((folder / run.CHECKPOINTS).glob("*")):
@@ -65,6 +64,8 @@ def set_up(
             f"{folder} already holds a run: add --resume to continue it, or choose another --out"
         )
     restored = run.restore(folder, ranks) if resume else None
+    config = run.with_pace_of(config, None if restored is None else restored.config)
+    schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks)
     else:
@@ -101,7 +102,7 @@ def set_up(
             config.loss,
             length_unit,
             config.ranks.half_exchange,
-            _position_noise(config, schedule, space.extent),
+            _position_noise(config, space.extent),
         ),
         owners=owners,
         lpips=lpips,
@@ -114,13 +115,12 @@ def set_up(
     )
 
 
-def _position_noise(config: Config, schedule: Schedule, extent: float) -> PositionNoise | None:
+def _position_noise(config: Config, extent: float) -> PositionNoise | None:
     """Return the noise that a configuration asks for."""
     factor = config.optimiser.position_noise
     if factor == 0:
         return None
-    rates = schedule.learning_rates(config.optimiser, extent)[:, 0].tolist()
-    return PositionNoise(factor, rates, extent, config.population.min_opacity, config.seed)
+    return PositionNoise(factor, extent, config.population.min_opacity, config.seed)
 
 
 def _start_lineage(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -58,6 +58,7 @@ class TrainingState:
         lineage: logs births and deaths, or None.
         growth_was_limited: whether the log has said already that a limit holds growth back.
         log: where the run reports; silent until the loop opens the run's own.
+        clock: monotonic seconds, that training time is counted by.
     """
 
     config: Config
@@ -81,6 +82,7 @@ class TrainingState:
     lineage: Lineage | None
     log: RunLog
     growth_was_limited: bool = False
+    clock: Callable[[], float] = time.monotonic
     _started: float = field(default_factory=time.monotonic)
 
     @property
@@ -100,21 +102,31 @@ class TrainingState:
 
     def start_clock(self) -> None:
         """Count training time from now on, on top of what a resumed run has already taken."""
-        self._started = time.monotonic() - self.progress.seconds
+        self._started = self.clock() - self.progress.seconds
 
     def stepped(self, step: int, sh_degree: int) -> None:
         """Note that optimiser step `step` (from 1) was taken at a spherical-harmonics degree."""
-        seconds = time.monotonic() - self._started
+        seconds = self.clock() - self._started
         self.progress = replace(self.progress, step=step, sh_degree=sh_degree, seconds=seconds)
 
     @contextlib.contextmanager
     def paused_clock(self) -> Iterator[None]:
         """Leave what happens inside out of the training time."""
-        paused = time.monotonic()
+        paused = self.clock()
         try:
             yield
         finally:
-            self._started += time.monotonic() - paused
+            self._started += self.clock() - paused
+
+    def change_pace(self, factor: float) -> None:
+        """From now on, let `schedule.scale` count times `factor`; every rank calls this."""
+        schedule = self.config.schedule
+        pace = (*schedule.pace, (self.images_seen, factor))
+        self.config = replace(self.config, schedule=replace(schedule, pace=pace))
+        self.schedule = Schedule(self.config.schedule)
+        self.optimiser.follow(self.schedule)
+        self.stepper.reindex()
+        self.log.total = self.schedule.iterations
 
     def catch_up(self) -> None:
         """Apply every pending optimiser step, so that all rows of the table can be read."""

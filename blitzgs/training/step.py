@@ -52,7 +52,7 @@ class Stepper:
         self.reindex()
 
     def reindex(self) -> None:
-        """Take note that rows of the table were added, removed or reordered."""
+        """Take note that rows of the table were added, removed or reordered, or that the schedule changed."""
         self._blocks = BlockIndex(self._table, self._optimiser.pending_table)
 
     def forward(
@@ -122,7 +122,7 @@ class Stepper:
             v_means2d = sums = torch.empty_like(frame.rows.means2d)
         self._optimiser.step(table, frame, gradients, terms.scale_reg, step, sums)
         if self._noise is not None:
-            self._noise.add(table, frame.rows.visible_ids, step)
+            self._noise.add(table, frame.rows.visible_ids, step, self._optimiser.position_rate(step))
         mark("optimiser")
         self._blocks.update(table, frame.rows.visible_ids)
         mark("other")

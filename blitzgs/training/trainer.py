@@ -20,8 +20,9 @@ from blitzgs.scene.capture import Capture
 from blitzgs.training import run, view_level
 from blitzgs.training.agreement import Agreement, StopRequest
 from blitzgs.training.batches import BatchLoader, Images, PhotographError
+from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config
-from blitzgs.training.config_io import config_hash
+from blitzgs.training.config_io import config_hash, save_config
 from blitzgs.training.events import evaluate, handle, save
 from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
@@ -78,21 +79,23 @@ class Trainer:
             ModelLostError: no Gaussian is left.
             CheckpointError: the model could not be saved, although the run waited for room.
         """
-        state, schedule, done = self.state, self.state.schedule, self.state.progress.step
-        size = schedule.batch_size
+        state, done, size = self.state, self.state.progress.step, self.state.schedule.batch_size
         folder = state.folder if state.ranks.rank == 0 else None
         board = state.config.log.tensorboard
-        state.log = RunLog(folder, schedule.iterations, done * size, board, state.run_id)
+        state.log = RunLog(folder, state.schedule.iterations, done * size, board, state.run_id)
         state.start_clock()
         try:
             with StopRequest() as stop:
                 agreement = Agreement(state.ranks, stop, state.save_clock)
                 self._announce()
-                for step in range(done + 1, schedule.steps + 1):
+                budget = Budget(state)
+                # The budget changes how many steps there are.
+                while (step := state.progress.step + 1) <= state.schedule.steps:
                     self.step(step)
-                    for event in schedule.events((step - 1) * size, step * size):
+                    for event in state.schedule.events((step - 1) * size, step * size):
                         handle(state, event)
-                    if step == schedule.steps:
+                    budget.after(step)
+                    if step == state.schedule.steps:
                         break
                     decision = agreement.after(step)
                     if decision.signal is not None:
@@ -177,6 +180,8 @@ class Trainer:
         )
         if ranks.world_size > 1:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"
+        if state.config.schedule.minutes > 0:
+            text += f"; {state.config.schedule.minutes:g} minutes of training"
         values = views | run.versions(ranks.device) | {"transport": ranks.transport}
         state.log.event(
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
@@ -205,9 +210,16 @@ class Trainer:
             "run": state.run_id,
             "versions": run.versions(state.ranks.device),
         }
+        if state.config.schedule.minutes > 0:
+            summary |= {
+                "budget_seconds": 60 * state.config.schedule.minutes,
+                "scale": state.images_seen / state.config.schedule.iterations,
+            }
         if state.ranks.rank == 0:
             write_picture(state, population)
             try:
+                # The pace has been measured since the run wrote its configuration.
+                save_config(state.config, state.folder / run.CONFIG)
                 write_file(state.folder / run.SUMMARY, json.dumps(summary, indent=1))
             except OSError as error:
                 warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs that are fitted into a wall time, by clocks that the tests turn."""
+
+import json
+import math
+import os
+import random
+import signal
+import warnings
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from blitzgs.cli import main
+from blitzgs.distributed.group import Ranks
+from blitzgs.training import run
+from blitzgs.training.budget import Budget
+from blitzgs.training.config import Config, ScheduleConfig
+from blitzgs.training.config_io import ConfigError, load_config
+from blitzgs.training.config_ranges import problems
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import run_ranks
+from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+
+SECONDS = 2.4
+BUDGET = ("schedule.minutes=0.04", "schedule.densify_until=50")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+class Simulation:
+    """Stands for a run whose images take as long as a function of the time in the configuration says."""
+
+    def __init__(self, minutes, cost, **schedule):
+        self.config = Config(schedule=ScheduleConfig(minutes=minutes, **schedule))
+        self.schedule = Schedule(self.config.schedule)
+        self.progress = SimpleNamespace(step=0, seconds=0.0)
+        self.ranks = Ranks()
+        self.cost = cost
+        self.texts = []
+        self.log = SimpleNamespace(event=lambda t, kind, values, text: self.texts.append(text))
+
+    @property
+    def images_seen(self):
+        return self.progress.step * self.schedule.batch_size
+
+    def change_pace(self, factor):
+        pace = (*self.config.schedule.pace, (self.images_seen, factor))
+        self.config = replace(self.config, schedule=replace(self.config.schedule, pace=pace))
+        self.schedule = Schedule(self.config.schedule)
+
+    def train(self):
+        """Return the seconds of the whole run, and those until density control ended."""
+        budget, first = Budget(self), None
+        while self.progress.step < self.schedule.steps:
+            time = self.schedule.pace.time(self.images_seen)
+            self.progress.seconds += self.schedule.batch_size * self.cost(time, self.progress.step)
+            self.progress.step += 1
+            if first is None and time >= self.config.schedule.densify_until:
+                first = self.progress.seconds
+            budget.after(self.progress.step)
+        return self.progress.seconds, first
+
+
+def growing(start, factor):
+    """Seconds per image: `factor` times as many once density control has ended."""
+    return lambda time, step: start * (1 + (factor - 1) * min(time / 15_000, 1))
+
+
+@pytest.mark.parametrize("batch_size", [1, 4])
+@pytest.mark.parametrize("minutes", [0.5, 5.0, 60.0])
+@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0, 10.0])
+def test_a_run_that_slows_down_ends_on_time(minutes, batch_size, factor):
+    simulation = Simulation(minutes, growing(0.02, factor), batch_size=batch_size)
+    seconds, first = simulation.train()
+    assert seconds == pytest.approx(60 * minutes, rel=0.01)
+    assert 0.3 < first / seconds < 0.6
+    assert len(simulation.config.schedule.pace) < 60
+
+
+def test_the_shape_of_the_schedule_stays():
+    """Where images take three times as long in the end, both halves get about as many of them."""
+    simulation = Simulation(5.0, growing(0.004, 3.0))
+    simulation.train()
+    half = simulation.schedule.pace.image(15_000) / simulation.schedule.iterations
+    assert half == pytest.approx(0.5, abs=0.03)
+
+
+def test_noise_and_single_slow_steps_do_no_harm():
+    chance = random.Random(0)
+
+    def cost(time, step):
+        slow = 40.0 if step in (5, 40, 700) else 1.0
+        warm_up = 300.0 if step == 0 else 1.0
+        return growing(0.02, 3.0)(time, step) * math.exp(chance.gauss(0.0, 0.5)) * slow * warm_up
+
+    seconds, _ = Simulation(1.0, cost).train()
+    assert seconds == pytest.approx(60.0, rel=0.05)
+
+
+def test_a_budget_of_a_few_steps_is_used_up_and_not_more_than_it_must():
+    simulation = Simulation(1.0, lambda time, step: 3.0)
+    seconds, _ = simulation.train()
+    assert seconds == pytest.approx(60.0, abs=6.0)
+    # Less than it takes to see how fast the run is: the schedule is over soon after.
+    assert Simulation(0.01, lambda time, step: 3.0).train()[0] < 60.0
+
+
+def test_a_run_has_no_more_images_than_a_run_may_have():
+    simulation = Simulation(1e6, lambda time, step: 1.0, iterations=30_000)
+    budget, planned = Budget(simulation), 0
+    for _ in range(40):
+        simulation.progress.step, simulation.progress.seconds = budget._next, budget._next * 1e-4
+        budget.after(simulation.progress.step)
+        planned = max(planned, simulation.schedule.iterations)
+    assert 9_000_000 < planned <= 10_000_000
+    assert list(problems(simulation.config)) == []
+
+
+def start(folder, *overrides, resume=False, ranks=None, haste=1.0):
+    """A trainer whose images take 10 ms, and longer the more Gaussians there are."""
+    trainer = Trainer(tiny_config(*BUDGET, *overrides), *tiny_scene(), folder, ranks or Ranks(), resume)
+    state, now = trainer.state, [0.0]
+    state.clock = lambda: now[0]
+    step = trainer.step
+
+    def timed(number):
+        now[0] += haste * 0.01 * state.schedule.batch_size * state.population() / 400
+        step(number)
+
+    trainer.step = timed
+    return trainer
+
+
+def stop_after(trainer, count):
+    step = trainer.step
+
+    def stopping(number):
+        step(number)
+        if number == count:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    trainer.step = stopping
+    assert trainer.train() is None
+
+
+@pytest.fixture(scope="module")
+def timed_run(tmp_path_factory):
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("timed")
+    trainer = start(folder)
+    return folder, trainer, trainer.train()
+
+
+def test_training_ends_on_time_and_says_what_it_chose(timed_run):
+    folder, trainer, summary = timed_run
+    assert summary["gaussians"] > 450  # it has slowed down
+    assert summary["seconds"] == pytest.approx(SECONDS, rel=0.05)
+    assert summary["budget_seconds"] == pytest.approx(SECONDS)
+    assert summary["scale"] == summary["images"] / 100
+    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    plans = [record for record in records if record.get("event") == "pace"]
+    assert len(plans) == len(trainer.state.config.schedule.pace) >= 3
+    assert plans[-1]["images"] == summary["images"]
+    assert plans[-1]["seconds"] == pytest.approx(SECONDS, rel=0.05)
+    assert load_config(folder / "config.yaml") == trainer.state.config
+
+
+def test_the_saved_configuration_repeats_the_run_without_the_clock(timed_run, tmp_path):
+    folder, trainer, summary = timed_run
+    config = load_config(folder / "config.yaml", ["schedule.minutes=0"])
+    again = Trainer(config, *tiny_scene(), tmp_path, Ranks())
+    repeated = again.train()
+    assert repeated["psnr"] == summary["psnr"] and "budget_seconds" not in repeated
+    for name in again.state.table:
+        assert torch.equal(again.state.table[name], trainer.state.table[name]), name
+
+
+@pytest.mark.parametrize("stop", [2, 6, 70])
+def test_a_run_resumes_before_and_after_it_has_chosen_its_pace(tmp_path, stop):
+    first = start(tmp_path)
+    stop_after(first, stop)
+    before = first.state.config.schedule.pace
+    assert bool(before) == (stop > 8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert run.open_model(tmp_path, Ranks()).config.schedule.pace == before
+    second = start(tmp_path, resume=True)
+    # What the checkpoint was trained with counts, whatever the command says.
+    assert second.state.config.schedule.pace == before
+    taken = second.state.optimiser.lr_table[: stop + 1]
+    assert torch.equal(taken, first.state.optimiser.lr_table[: stop + 1])
+    summary = second.train()
+    assert second.state.config.schedule.pace[: len(before)] == before
+    assert torch.equal(second.state.optimiser.lr_table[: stop + 1], taken)
+    assert summary["seconds"] == pytest.approx(SECONDS, rel=0.05)
+
+
+def test_a_resumed_run_may_have_more_time_but_not_lose_its_budget(tmp_path):
+    stop_after(start(tmp_path), 70)
+    with pytest.raises(ConfigError, match=r"schedule.minutes: the checkpoint was trained with 0.04, now 0"):
+        start(tmp_path, "schedule.minutes=0", resume=True)
+    summary = start(tmp_path, "schedule.minutes=0.06", resume=True).train()
+    assert summary["seconds"] == pytest.approx(3.6, rel=0.05)
+
+
+def _train_on_ranks(ranks, folder):
+    torch.set_num_threads(1)
+    trainer = start(folder, ranks=ranks, haste=1.0 + 4.0 * ranks.rank)
+    summary = trainer.train()
+    return summary, trainer.state.config.schedule.pace, trainer.state.progress.step
+
+
+def test_ranks_whose_clocks_differ_take_the_same_steps(tmp_path):
+    (first, pace, step), (_, other_pace, other_step) = run_ranks(_train_on_ranks, 2, tmp_path)
+    assert pace == other_pace and len(pace) >= 3 and step == other_step
+    assert first["seconds"] == pytest.approx(SECONDS, rel=0.05)
+
+
+def test_the_command_takes_minutes(tmp_path, capsys):
+    write_tiny_capture(tmp_path / "data")
+    flags = [f"--{text}" for text in (*OVERRIDES, "log.pictures=0")]
+    command = ["train", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), *flags]
+    assert main([*command, "--minutes=0.02"]) == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["budget_seconds"] == pytest.approx(1.2) and summary["scale"] > 0
+    capsys.readouterr()
+    assert main([*command, "--minutes=0.02", "--schedule.scale=0.5"]) != 0
+    assert "schedule.scale: must be 1 with schedule.minutes" in capsys.readouterr().err
