@@ -15,7 +15,8 @@ from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_ranges import MOST_IMAGES, SCALE
 from blitzgs.training.state import TrainingState
 
-# The first steps of a process are slow (memory, kernels, photographs): they are not measured.
+# The first steps of a process are slow (memory, kernels, photographs): they are not measured. Fewer than these
+# are too few to measure.
 WARM_UP_STEPS = 4
 # The pace is looked at after this share of what is left, and before that after twice as many steps each time.
 SHARE = 1 / 8
@@ -92,7 +93,7 @@ class Budget:
         if new == wanted:
             self._interval *= 2
         steps_left = rest * new / config.batch_size
-        self._interval = max(1, min(self._interval, int(steps_left * SHARE)))
+        self._interval = max(WARM_UP_STEPS, min(self._interval, int(steps_left * SHARE)))
         following = step + self._interval if rest > LAST_SHARE * config.iterations else MOST_IMAGES
         return Plan(following, None if new == old else new, 1 / cost, seconds + at_one * new)
 
