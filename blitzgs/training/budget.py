@@ -15,8 +15,8 @@ from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_ranges import MOST_IMAGES, SCALE
 from blitzgs.training.state import TrainingState
 
-# The first steps of a process are slow (memory, kernels, photographs): they are not measured. Fewer than these
-# are too few to measure.
+# The first steps of a process are slow (memory, kernels, photographs): they are not measured. Nor is an
+# interval shorter than these, which one slow step would spoil.
 WARM_UP_STEPS = 4
 # The pace is looked at after this share of what is left, and before that after twice as many steps each time.
 SHARE = 1 / 8

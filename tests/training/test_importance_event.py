@@ -24,12 +24,7 @@ from tests.training.tiny import tiny_config, tiny_scene
 PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80", "log.pictures=0")
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def train(folder, *overrides, ranks=None, resume=False):
