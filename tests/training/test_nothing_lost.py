@@ -5,7 +5,6 @@ import errno
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 import warnings
@@ -14,18 +13,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.lineage import read_lineage
 from blitzgs.training import checkpoint, run, run_log
 from blitzgs.training.agreement import Agreement, SaveClock, StopRequest
 from blitzgs.training.batches import PhotographError
 from blitzgs.training.events import save
-from blitzgs.training.folder_checks import FolderError, check_room, check_writable, locked
-from blitzgs.training.guard import ModelLostError, NonFiniteError
+from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer
-from tests.distributed.rank_harness import RankError, run_ranks
-from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.distributed.rank_harness import run_ranks
+from tests.training.tiny import tiny_config, tiny_scene
 
 ROOT = Path(__file__).parents[2]
 
@@ -325,66 +322,6 @@ def test_a_terminal_that_is_gone_ends_nothing(tmp_path, monkeypatch):
         assert running.train() is not None
 
 
-# The folder is looked at before the work begins.
-
-
-def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(FolderError, match=r"file/run cannot be written: rank 0 \(.*Not a directory"):
-        check_writable(tmp_path / "file" / "run", Ranks())
-    usage = type("Usage", (), {"free": 1000})
-    monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
-    with pytest.raises(FolderError, match=r"a checkpoint takes .* GB and 0.00 GB are free"):
-        trainer(tmp_path / "run")
-    monkeypatch.undo()
-    table = trainer(tmp_path / "run").state.table
-    with pytest.warns(UserWarning, match="two checkpoints of 9,000,000,000,000 Gaussians take"):
-        check_room(tmp_path, table, Ranks(), 9_000_000_000_000)
-    assert not list(tmp_path.rglob(".probe*"))
-
-
-def _check(ranks, folders):
-    check_writable(Path(folders[ranks.rank]), ranks)
-
-
-def test_every_rank_is_asked(tmp_path):
-    with pytest.raises(RankError) as failure:
-        run_ranks(_check, 2, [str(tmp_path / "a"), "/proc/nothing"])
-    for message in failure.value.messages.values():
-        assert "cannot be written: rank 1 (" in message
-    with pytest.raises(RankError) as failure:
-        run_ranks(_check, 2, [str(tmp_path / "a"), str(tmp_path / "b")])
-    for message in failure.value.messages.values():
-        assert "ranks 1 do not see what rank 0 writes" in message
-
-
-def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
-    from blitzgs.training import folder_checks
-
-    monkeypatch.setattr(folder_checks, "_LOCK_SECONDS", 0.1)
-    write_tiny_capture(tmp_path / "data")
-    out = tmp_path / "run"
-    program = (
-        "import sys, time; from pathlib import Path; from blitzgs.distributed.group import Ranks;"
-        "from blitzgs.training.folder_checks import locked\n"
-        f"with locked(Path({str(out)!r}), Ranks()):\n  print('in', flush=True); time.sleep(60)"
-    )
-    holder = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=ROOT)
-    try:
-        assert holder.stdout.readline() == "in\n"
-        flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.iterations=2"]
-        command = ["train", "--data", str(tmp_path / "data"), "--out", str(out), *flags]
-        assert main(command) == 1
-        assert f"in use by another run (process {holder.pid} on " in capsys.readouterr().err
-        assert not (out / "log.jsonl").exists() and not (out / "config.yaml").exists()
-    finally:
-        holder.kill()
-        holder.wait()
-    assert main(command) == 0  # a lock does not outlive its process
-    with locked(out, Ranks()):
-        pass
-
-
 # Resuming says what it does, and the log holds every record once.
 
 
@@ -416,43 +353,3 @@ def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypat
 def test_a_resume_of_nothing_says_so(tmp_path, capsys):
     trainer(tmp_path, "schedule.iterations=2", resume=True).train()
     assert f"nothing to resume in {tmp_path}: starting anew" in capsys.readouterr().out.replace("\n", "")
-
-
-# Figures mean what they say.
-
-
-def test_a_view_that_is_masked_all_over_counts_for_nothing(tmp_path):
-    capture, images = tiny_scene()
-    capture.train, capture.test = [1, 2, 4, 5, 6, 7], [0, 3]
-    images.masks = [None] * 8
-    config = tiny_config("schedule.iterations=20")
-    plain = Trainer(config, capture, images, tmp_path / "plain", Ranks()).train()
-    images.masks[3] = torch.zeros(32, 48, dtype=torch.uint8)
-    with pytest.warns(UserWarning, match="1 views are masked all over and count for nothing: 03.png"):
-        summary = Trainer(config, capture, images, tmp_path / "masked", Ranks()).train()
-    views = [
-        json.loads((tmp_path / name / "evaluation" / "000020" / "metrics.json").read_text())["views"]
-        for name in ("plain", "masked")
-    ]
-    assert list(views[0]) == ["00.png", "03.png"] and list(views[1]) == ["00.png"]
-    assert summary["psnr"] == views[0]["00.png"]["psnr"] != plain["psnr"]
-
-
-def test_figures_of_training_views_are_called_so(tmp_path, capsys):
-    capture, images = tiny_scene()
-    capture.train, capture.test = list(range(8)), []
-    summary = Trainer(tiny_config("schedule.iterations=2"), capture, images, tmp_path, Ranks()).train()
-    assert summary["split"] == "train"
-    assert "evaluation of TRAINING views (none is held out)" in capsys.readouterr().out
-
-
-def test_a_model_without_gaussians_is_no_result(tmp_path):
-    running = trainer(tmp_path, "population.min_opacity=0.98", "population.reset_opacity=0.99")
-    with pytest.raises(ModelLostError, match="the density event after 20 images pruned the last Gaussian"):
-        running.train()
-    running = trainer(tmp_path / "b", "schedule.iterations=2")
-    running.state.table.keep(torch.zeros(len(running.state.table), dtype=torch.bool))
-    running.state.stepper.reindex()
-    with pytest.raises(ModelLostError, match="no Gaussian is left"):
-        running.train()
-    assert not checkpoints(tmp_path) and not checkpoints(tmp_path / "b")
