@@ -55,6 +55,7 @@ COMMANDS = {
     "step_4": "python benchmarks/bm_step.py --views 4",
     "exchange": f"{EXCHANGE} --ranks 1 2 4",
     "training": "python benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000",
+    "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
     "photometric": "python benchmarks/bm_photometric.py",
     "accuracy": "python benchmarks/bm_accuracy.py",
     "quality": (
@@ -245,6 +246,7 @@ SECTIONS = {
     "step": Section(("step_1", "step_4"), step_lines),
     "exchange": Section(("exchange",), exchange_lines),
     "training": Section(("training",), row_lines),
+    "drop_in": Section(("drop_in",), row_lines),
     "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),

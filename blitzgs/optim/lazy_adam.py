@@ -296,7 +296,7 @@ class LazyAdam(torch.optim.Optimizer):
             if state[name].dtype != torch.int32:
                 state[name] = state[name].int()
         for name in (*_MOMENTS, *_STEPS):
-            if len(state[name]) != len(param):
+            if state[name].shape[0] != param.shape[0]:
                 raise ValueError(
                     f"LazyAdam: a parameter has {len(param)} rows and its {name} {len(state[name])}; change "
                     "both together (append, keep, permute)"
