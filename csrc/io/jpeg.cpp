@@ -19,12 +19,34 @@ constexpr unsigned kHoleBytes = 64 + 8;
 
 constexpr std::uint64_t kMostBlocks = 1 << 24;
 
-// The code that the highest of 16 bits begin with: its length and its symbol. Length 0: no code begins so.
 struct Code {
-  std::uint8_t length = 0;
+  std::uint8_t length = 0;  // 0: none
   std::uint8_t symbol = 0;
 };
-using CodeTable = std::vector<Code>;
+
+// Huffman codes of 1 to 16 bits. Short ones are looked up by the bits that they begin, longer ones, which are
+// rare, found length by length: codes of one length follow each other, and those of a greater length come
+// after them.
+struct CodeTable {
+  static constexpr unsigned kShort = 9;
+
+  std::array<Code, 1 << kShort> short_codes{};
+  std::array<std::uint32_t, 17> ends{};  // of each length, the first 16 bits that are beyond its codes
+  std::array<int, 17> bases{};           // of each length, its first symbol less its first code
+  std::vector<std::uint8_t> symbols;     // empty: there is no table
+
+  Code find(std::uint32_t bits16) const {
+    const Code found = short_codes[bits16 >> (16 - kShort)];
+    if (found.length > 0) return found;
+    for (unsigned length = kShort + 1; length <= 16; ++length) {
+      if (bits16 < ends[length]) {
+        const int code = static_cast<int>(bits16 >> (16 - length));
+        return {static_cast<std::uint8_t>(length), symbols[static_cast<std::size_t>(bases[length] + code)]};
+      }
+    }
+    return {};
+  }
+};
 
 struct Component {
   std::uint8_t id;
@@ -87,19 +109,25 @@ class Checker {
       const unsigned kind = payload[0] >> 4, id = payload[0] & 15;
       if (kind > 1 || id > 3) fail("damaged JPEG: a Huffman table has an impossible number");
       CodeTable& table = tables_[kind][id];
-      table.assign(1 << 16, Code{});
-      std::size_t symbol = 17, begin = 0;
+      table = CodeTable{};
+      std::uint32_t begin = 0;
       for (unsigned length = 1; length <= 16; ++length) {
-        for (unsigned k = 0; k < payload[length]; ++k, ++symbol) {
-          const std::size_t end = begin + (std::size_t{1} << (16 - length));
-          if (symbol >= payload.size() || end > table.size())
-            fail("damaged JPEG: a Huffman table is impossible");
-          const Code code{static_cast<std::uint8_t>(length), payload[symbol]};
-          std::fill(table.begin() + begin, table.begin() + end, code);
-          begin = end;
+        const std::uint32_t count = payload[length], step = 1u << (16 - length);
+        const std::size_t first = table.symbols.size();
+        if (payload.size() - 17 < first + count || begin + count * step > (1u << 16))
+          fail("damaged JPEG: a Huffman table is impossible");
+        table.bases[length] = static_cast<int>(first) - static_cast<int>(begin / step);
+        const auto symbols = payload.subspan(17 + first, count);
+        table.symbols.insert(table.symbols.end(), symbols.begin(), symbols.end());
+        for (std::uint32_t k = 0; length <= CodeTable::kShort && k < count; ++k) {
+          const unsigned shift = 16 - CodeTable::kShort;
+          const auto at = table.short_codes.begin() + ((begin + k * step) >> shift);
+          std::fill_n(at, step >> shift, Code{static_cast<std::uint8_t>(length), symbols[k]});
         }
+        begin += count * step;
+        table.ends[length] = begin;
       }
-      payload = payload.subspan(symbol);
+      payload = payload.subspan(17 + table.symbols.size());
     }
   }
 
@@ -144,7 +172,7 @@ class Checker {
       }
       const Block block{&tables_[0][tables >> 4], &tables_[1][tables & 15], &*found};
       const bool needs_dc = band.first == 0 && !band.refines, needs_ac = band.last > 0;
-      if ((needs_dc && block.dc->empty()) || (needs_ac && block.ac->empty())) {
+      if ((needs_dc && block.dc->symbols.empty()) || (needs_ac && block.ac->symbols.empty())) {
         fail("damaged JPEG: a Huffman table is missing");
       }
       const bool alone = payload[0] == 1;
@@ -305,7 +333,7 @@ class Checker {
 
   std::uint8_t next_symbol(const CodeTable& table) {
     if (held_ < 16) refill();
-    const Code code = table[bits_ >> 48];
+    const Code code = table.find(static_cast<std::uint32_t>(bits_ >> 48));
     if (code.length == 0) fail("damaged JPEG: no such Huffman code");
     take(code.length);
     return code.symbol;
