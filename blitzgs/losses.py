@@ -33,7 +33,7 @@ def l1_ssim(
         A scalar, dtype of `renders`.
 
     Raises:
-        ValueError: shapes that do not fit, or a weight outside [0, 1].
+        ValueError: shapes or devices that do not fit, or a weight outside [0, 1].
         RuntimeError: wrong dtypes.
     """
     if renders.dim() < 3 or renders.shape[-1] != 3 or targets.shape != renders.shape:
@@ -42,6 +42,9 @@ def l1_ssim(
         )
     if masks is not None and masks.shape != renders.shape[:-1]:
         raise ValueError(f"masks must be {list(renders.shape[:-1])}, got {list(masks.shape)}")
+    for name, tensor in (("targets", targets), ("masks", masks)):
+        if tensor is not None and tensor.device != renders.device:
+            raise ValueError(f"{name} is on {tensor.device} and renders on {renders.device}; move one")
     if not 0 <= ssim_weight <= 1:
         raise ValueError(f"ssim_weight must be in [0, 1], got {ssim_weight}")
     x, y = renders.reshape(-1, *renders.shape[-3:]), targets.reshape(-1, *targets.shape[-3:])

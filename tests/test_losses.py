@@ -79,5 +79,7 @@ def test_wrong_use_is_refused():
         blitzgs.l1_ssim(x, x[:, :, :7])
     with pytest.raises(ValueError, match=r"masks must be \[1, 8, 8\], got \[8, 8\]"):
         blitzgs.l1_ssim(x, x, torch.ones(8, 8))
+    with pytest.raises(ValueError, match="targets is on meta and renders on cpu; move one"):
+        blitzgs.l1_ssim(x, x.to("meta"))
     with pytest.raises(ValueError, match=r"ssim_weight must be in \[0, 1\], got 2"):
         blitzgs.l1_ssim(x, x, ssim_weight=2)

@@ -166,6 +166,8 @@ def test_wrong_shapes_are_refused_by_name():
         raw({**p, "shN": p["shN"][:19]}, scene)
     with pytest.raises(ValueError, match=r"means must be \[N, 3\], got \[1, 20, 3\]"):
         raw({**p, "means": p["means"][None]}, scene)
+    with pytest.raises(ValueError, match="shN is on meta and means on cpu; move one"):
+        raw({**p, "shN": p["shN"].to("meta")}, scene)
     with pytest.raises(TypeError, match=r"quats must be a torch\.Tensor, got ndarray"):
         raw({**p, "quats": p["quats"].detach().numpy()}, scene)
     with pytest.raises(ValueError, match="sh_degree 3 needs 16 SH coefficients, got 4"):

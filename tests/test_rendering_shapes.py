@@ -245,6 +245,8 @@ def test_an_argument_that_gsplat_has_not_is_refused(value):
         ({"Ks": torch.zeros(3, 3)}, r"Ks must be \[..., C, 3, 3\]"),
         ({"opacities": torch.zeros(1)}, r"opacities must be \[..., N\] = \[4\], got \[1\]"),
         ({"opacities": torch.zeros(4, 1)}, r"opacities must be \[..., N\]"),
+        ({"Ks": torch.zeros(1, 3, 3, device="meta")}, "Ks is on meta and means on cpu; move one"),
+        ({"colors": torch.zeros(4, 16, 3, device="meta")}, "colors is on meta and means on cpu; move one"),
         ({"backgrounds": torch.zeros(2, 3)}, r"backgrounds must be \[..., C, D\]"),
     ],
 )

@@ -137,15 +137,27 @@ def check_options(render_mode: str, rasterize_mode: str, camera_model: str, tile
         raise ValueError(f"tile_size must be 1 to 64 px, got {tile_size}")
 
 
-def check_tensors(tensors: dict[str, Any]) -> None:
-    """Check that tensors are such, by name.
+def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
+    """Check that arguments are tensors and on one device.
+
+    Args:
+        required: by name.
+        optional: by name; some may be None.
 
     Raises:
         TypeError: one is an array of another library.
+        ValueError: one is on another device: a kernel would read memory that it cannot reach.
     """
-    for name, value in tensors.items():
+    device, first = None, ""
+    for name, value in (*required.items(), *optional.items()):
+        if value is None and name in optional:
+            continue
         if not isinstance(value, Tensor):
             raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+        if device is None:
+            device, first = value.device, name
+        if value.device != device:
+            raise ValueError(f"{name} is on {value.device} and {first} on {device}; move one")
 
 
 def gaussians_of(

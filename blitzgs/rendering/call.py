@@ -120,12 +120,13 @@ def rasterization(
     check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(render_mode, rasterize_mode, camera_model, tile_size)
-    check_tensors({"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks})
+    required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
+    if covars is None:
+        required |= {"quats": quats, "scales": scales}
+    check_tensors(required, {"colors": colors, "backgrounds": backgrounds, "covars": covars})
     if covars is not None:
-        check_tensors({"covars": covars})
         # Their places are taken by what the covariances are decomposed into.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
-    check_tensors({"quats": quats, "scales": scales} | ({} if colors is None else {"colors": colors}))
     assert quats is not None and scales is not None
     gaussians = gaussians_of(
         means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, "RGB" in render_mode

@@ -92,7 +92,7 @@ def raw_rasterization(
     """
     check_options(render_mode, rasterize_mode, "pinhole", tile_size)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
-    check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks} | ({} if shN is None else {"shN": shN}))
+    check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]
