@@ -120,10 +120,10 @@ class Schedule:
         """
         first = min(count - 1, math.floor(count * first_levels))
         config, waits = self._config, count - 1 - first
-        until = (config.levels_until or config.densify_until) * config.scale
+        until = config.levels_until or config.densify_until
         unlocked = (1 - ratio**-k for k in range(1, waits + 1))
         whole = 1 - ratio**-waits
-        return first + sum(begin + 1e-6 >= until * share / whole for share in unlocked)
+        return first + sum(begin + 1e-6 >= self.pace.image(until * share / whole) for share in unlocked)
 
     def gates(self, time: int) -> bool:
         """Tell whether the candidates of a density event at `time` go through the spawn gate."""

@@ -20,6 +20,7 @@ from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config, ScheduleConfig
 from blitzgs.training.config_io import ConfigError, load_config
 from blitzgs.training.config_ranges import problems
+from blitzgs.training.gate_replay import replay
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
@@ -208,6 +209,20 @@ def test_a_resumed_run_may_have_more_time_but_not_lose_its_budget(tmp_path):
         start(tmp_path, "schedule.minutes=0", resume=True)
     summary = start(tmp_path, "schedule.minutes=0.06", resume=True).train()
     assert summary["seconds"] == pytest.approx(3.6, rel=0.05)
+
+
+def test_a_new_run_measures_anew_whatever_its_configuration_has_noted(tmp_path):
+    noted = "schedule.pace=[[16, 0.5]]"
+    assert start(tmp_path / "new", noted).state.config.schedule.pace == ()
+    assert start(tmp_path / "nothing", noted, resume=True).state.config.schedule.pace == ()
+    assert start(tmp_path / "fixed", noted, "schedule.minutes=0").state.config.schedule.pace == ((16, 0.5),)
+
+
+def test_a_gate_is_not_replayed_on_a_run_by_the_clock(tmp_path):
+    config = tiny_config("schedule.minutes=2", "population.lineage=true")
+    arms = replay(config, *tiny_scene(), tmp_path / "run", tmp_path / "out", None, 0.5, Ranks())
+    with pytest.raises(ValueError, match=r"was trained with schedule.minutes \(2\): its arms would differ"):
+        next(arms)
 
 
 def _train_on_ranks(ranks, folder):

@@ -4,6 +4,7 @@
 import itertools
 import math
 import random
+from dataclasses import replace
 
 import pytest
 import torch
@@ -32,6 +33,18 @@ def test_times_and_images_are_those_of_a_walk_image_by_image(scale):
     assert pace.image(math.inf) == math.inf and pace.scale == scale * 3.0
 
 
+def phases_of(schedule, begin):
+    """All that a schedule says of the step that begins with an image, besides events and rates."""
+    return (
+        schedule.sh_degree(begin, 3),
+        schedule.finest_level(begin, 9, 0.2, 1.5),
+        schedule.gathers_statistics(begin),
+        schedule.has_lod_gate(begin),
+        schedule.gates(begin),
+        schedule.prunes_by_size(begin),
+    )
+
+
 def test_what_has_happened_stays_when_the_pace_changes():
     """A run that changes its pace at random has the events and the rates of the schedule it ends with."""
     chance = random.Random(3)
@@ -46,15 +59,18 @@ def test_what_has_happened_stays_when_the_pace_changes():
             t1=700,
             t2=1_600,
             sh_every=100,
+            gate_from=900,
+            size_prune_after=400,
+            levels_until=2_000,
             position_decay=2_500,
             evaluate_every=333,
         )
         optimiser = OptimiserConfig(final_share=0.1)
-        schedule, happened, degrees, step = Schedule(config), [], [], 0
+        schedule, happened, phases, step = Schedule(config), [], [], 0
         rates = schedule.learning_rates(optimiser, 2.0)
         while step < schedule.steps:
             begin, step = step * batch_size, step + 1
-            degrees.append(schedule.sh_degree(begin, 3))
+            phases.append(phases_of(schedule, begin))
             happened += schedule.events(begin, begin + batch_size)
             if step < schedule.steps and chance.random() < 0.05:
                 pace = (*config.pace, (step * batch_size, math.exp(chance.uniform(-1.5, 1.0))))
@@ -65,7 +81,8 @@ def test_what_has_happened_stays_when_the_pace_changes():
                 assert schedule.pace.image(schedule.pace.time(step * batch_size)) == step * batch_size
         assert len(config.pace) > 10
         assert happened == schedule.events(0, schedule.iterations)
-        assert degrees == [schedule.sh_degree(i * batch_size, 3) for i in range(schedule.steps)]
+        assert phases == [phases_of(schedule, i * batch_size) for i in range(schedule.steps)]
+        assert len(set(phases)) > 10
         kinds = [event.kind for event in happened]
         assert kinds.count("pass_1") == kinds.count("pass_2") == 1
         # Two events on one image are one; all others are there.
@@ -117,6 +134,23 @@ def test_rows_that_are_behind_owe_the_same_after_a_change_of_pace(factor):
     optimiser.catch_up(table, None, end)
     torch.testing.assert_close(table["means"].double(), means, rtol=1e-6, atol=1e-7)
     assert optimiser.position_rate(end) == pytest.approx(rates[end, 0].item())
+
+
+@pytest.mark.parametrize("pace", [(), ((300, 0.1), (700, 4.0))])
+def test_every_phase_begins_at_its_own_time(pace):
+    config = ScheduleConfig(
+        sh_every=100, densify_until=600, gate_from=500, size_prune_after=450, levels_until=1_000, pace=pace
+    )
+    schedule = Schedule(config)
+    plain = Schedule(replace(config, pace=()))
+    for time in range(10, 4_000, 10):
+        image = schedule.pace.image(time)
+        # Clear of the rounding at the very image.
+        for shift in (-2, 2):
+            assert (
+                phases_of(schedule, round(image) + shift)[1:]
+                == phases_of(plain, schedule.pace.time(round(image) + shift))[1:]
+            )
 
 
 def test_pace_is_read_and_written(tmp_path):
