@@ -75,7 +75,8 @@ def run_evaluate(args: argparse.Namespace) -> int:
     (args.out / "evaluation.json").write_text(json.dumps(results, indent=1) + "\n")
     for result in results:
         seen = "  (the gate was fitted on this scene)" if result["seen"] else ""
-        regions = f"  regions r {result['regions']['r']:.2f}" if "regions" in result else ""
+        r = result.get("regions", {}).get("r")
+        regions = "" if r is None else f"; regions r {r:.2f}"
         print(_judgement(result) + regions + seen)
     print(f"{args.out}: evaluation.json, survival.svg and maps of regions")
     return 0

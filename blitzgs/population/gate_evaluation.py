@@ -99,8 +99,8 @@ def region_rates(
     return where, actual / empty, expected / empty
 
 
-def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Return Pearson's r; NaN where one of the two does not vary."""
+def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float | None:
+    """Return Pearson's r; None where one of the two does not vary."""
     if len(a) < 2 or a.std() == 0 or b.std() == 0:
-        return math.nan
+        return None
     return float(np.corrcoef(a, b)[0, 1])

@@ -122,5 +122,5 @@ def test_regions_and_cohorts_of_a_known_picture():
     assert where.all() and 30 <= actual.shape[1] <= 32
     assert (actual[:, :10] == 0).all() and (actual[:, -10:] == 1).all()
     assert correlation(actual[where], predicted[where]) > 0.99
-    assert np.isnan(correlation(np.ones(3), np.arange(3.0)))
+    assert correlation(np.ones(3), np.arange(3.0)) is None
     assert sum(c["born"] for c in survival_by_cohort(run)) == 60_000
