@@ -72,15 +72,7 @@ class LazyAdam(torch.optim.Optimizer):
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add parameters with options of their own, see `__init__`."""
         super().add_param_group(param_group)
-        group = self.param_groups[-1]
-        beta1, beta2 = group["betas"]
-        if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 * beta1 < beta2):
-            raise ValueError(
-                f"LazyAdam: betas must satisfy 0 <= beta1 < sqrt(beta2) < 1, got {group['betas']}"
-            )
-        for name in ("lr", "lr_rest", "eps"):
-            if group[name] is not None and not group[name] >= 0:
-                raise ValueError(f"LazyAdam: {name} must be 0 or more, got {group[name]}")
+        _check_group(self.param_groups[-1])
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -180,7 +172,13 @@ class LazyAdam(torch.optim.Optimizer):
         return packed
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over a state of this class or of `torch.optim.Adam`; parameters as they were then."""
+        """Take over a state of this class or of `torch.optim.Adam`; parameters as they were then.
+
+        Raises:
+            ValueError: the state does not fit, or is of an Adam with weight decay, AMSGrad or maximize.
+        """
+        for group in state_dict["param_groups"]:
+            _check_group({"lr_rest": None, **group})
         super().load_state_dict(state_dict)
         self._drifts.clear()
         for _, group, param in self._placed():
@@ -302,6 +300,23 @@ class LazyAdam(torch.optim.Optimizer):
                     "both together (append, keep, permute)"
                 )
         return state
+
+
+def _check_group(group: dict[str, Any]) -> None:
+    """Check the options of a group.
+
+    Raises:
+        ValueError: one outside its range, or an option of `torch.optim.Adam` that there is not here.
+    """
+    beta1, beta2 = group["betas"]
+    if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 * beta1 < beta2):
+        raise ValueError(f"LazyAdam: betas must satisfy 0 <= beta1 < sqrt(beta2) < 1, got {group['betas']}")
+    for name in ("lr", "lr_rest", "eps"):
+        if group[name] is not None and not group[name] >= 0:
+            raise ValueError(f"LazyAdam: {name} must be 0 or more, got {group[name]}")
+    for name in ("weight_decay", "amsgrad", "maximize"):
+        if group.get(name):
+            raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
 
 
 def _alone(param: Tensor, state: dict[str, Any]) -> tuple[list[Tensor], ...]:

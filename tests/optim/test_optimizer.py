@@ -224,6 +224,10 @@ def test_wrong_use_is_refused():
         LazyAdam([param], betas=(0.99, 0.9))
     with pytest.raises(ValueError, match="lr must be 0 or more, got -1"):
         LazyAdam([param], lr=-1)
+    with pytest.raises(ValueError, match="weight_decay=0.1 is not supported"):
+        LazyAdam([{"params": [param], "weight_decay": 0.1}])
+    with pytest.raises(ValueError, match="amsgrad=True is not supported"):
+        LazyAdam([param]).load_state_dict(torch.optim.Adam([param], amsgrad=True).state_dict())
     optimizer = LazyAdam([{"params": [param], "name": "means"}])
     with pytest.raises(ValueError, match=r"rows for \['means'\] are needed, got \['x'\]"):
         optimizer.append({"x": torch.ones(1, 3)})
