@@ -203,3 +203,26 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
         grown = events[t]["cloned"] + events[t]["split"]
         assert grown > 10 and grown <= events[t]["vetoed"] <= grown + 2
         assert events[t]["held_back"] == 0
+
+
+def _train_with_lineage(ranks, folder):
+    torch.set_num_threads(1)
+    trainer, summary = train(folder, "population.lineage=true", "schedule.batch_size=2", ranks=ranks)
+    progress = trainer.state.progress
+    return trainer.state.table["id"].cpu(), progress.ledger, progress.milestones, summary["population"]
+
+
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(2))
+def test_two_ranks_pass_and_keep_the_books(tmp_path, world_size, device):
+    pytest.importorskip("pyarrow")
+    answers = run_ranks(_train_with_lineage, world_size, tmp_path, device=device)
+    _, ledger, milestones, population = answers[0]
+    assert answers[1][1:3] == (ledger, milestones)
+    assert milestones["after_pass_1"] == int(0.7 * milestones["before_pass_1"])
+    assert len(population["peak_memory_bytes"]) == 2
+    ids = torch.cat([answer[0] for answer in answers])
+    tables = read_lineage(tmp_path / run.LINEAGE)
+    births, deaths = tables["births"]["id"], tables["deaths"]["id"]
+    assert sorted(set(births) - set(deaths)) == sorted(ids.tolist())
+    assert (ledger["births"], ledger["deaths"]) == (len(births), len(deaths))
+    assert population["final"] == len(ids)
