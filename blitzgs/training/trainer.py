@@ -23,7 +23,7 @@ from blitzgs.training.batches import BatchLoader, Images, PhotographError
 from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
-from blitzgs.training.events import evaluate, handle, save
+from blitzgs.training.events import evaluate, handle_all, save
 from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
@@ -92,8 +92,7 @@ class Trainer:
                 # The budget changes how many steps there are.
                 while (step := state.progress.step + 1) <= state.schedule.steps:
                     self.step(step)
-                    for event in state.schedule.events((step - 1) * size, step * size):
-                        handle(state, event)
+                    handle_all(state, state.schedule.events((step - 1) * size, step * size))
                     budget.after(step)
                     if step == state.schedule.steps:
                         break

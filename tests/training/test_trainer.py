@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import os
+import shutil
 import signal
 
 import numpy as np
@@ -93,6 +94,20 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     assert summary is not None
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.peak_gaussians == whole.state.progress.peak_gaussians
+
+
+def test_a_checkpoint_has_all_events_of_its_step(tmp_path):
+    """In a batch, a checkpoint may be due an image before a density event of the same step."""
+    times = ("schedule.densify_from=22", "schedule.checkpoint_every=20")
+    options = ("schedule.batch_size=4", "schedule.iterations=60", "log.keep_checkpoints=10", *times)
+    whole, _ = train(tmp_path, *options)
+    checkpoints = sorted((tmp_path / run.CHECKPOINTS).iterdir())
+    for later in checkpoints[1:]:
+        shutil.rmtree(later)
+    resumed, _ = train(tmp_path, *options, resume=True)
+    assert "after 6 steps" in resumed.state.origin
+    assert (whole.state.table["birth"] == 22).any()
+    assert_same_table(resumed.state.table, whole.state.table)
 
 
 @pytest.mark.parametrize("power", [-7, 10])

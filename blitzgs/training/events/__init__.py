@@ -7,7 +7,7 @@ function in `HANDLERS`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from blitzgs.training.events import clear_cull, densify, evaluate, importance, reset_opacities, save
 from blitzgs.training.schedule import Event, EventKind
@@ -24,6 +24,11 @@ HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
 }
 
 
-def handle(state: TrainingState, event: Event) -> None:
-    """Run one event of the schedule; every rank calls this with the same event."""
-    HANDLERS[event.kind](state, event)
+def handle_all(state: TrainingState, events: Sequence[Event]) -> None:
+    """Run the schedule's events of one step; every rank calls this with the same events.
+
+    A step has several images. What changes the model goes first, even where an evaluation or a checkpoint is
+    due some images earlier: a resumed run begins with the next step, and would never make up for it.
+    """
+    for event in sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint")):
+        HANDLERS[event.kind](state, event)
