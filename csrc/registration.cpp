@@ -31,7 +31,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor? last_step, Tensor? moment_step, Tensor? table) -> ()");
   m.def(
       "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
-      "Tensor? moment_step, Tensor? table, Tensor[] cameras, int[] size, float[] limits) "
+      "Tensor? moment_step, Tensor? table, Tensor[] cameras, int[] size, float[] limits, "
+      "Tensor? level_ranges=None, Tensor? level=None, float[] reach=[], int lod_views=0, Tensor? cull=None, "
+      "int[] columns=[]) "
       "-> (Tensor active_ids, Tensor active_views, Tensor count)");
   // Clears the bits of pairs that a view leaves out, by level and distance or by the columns of a cull mask.
   m.def(

@@ -35,6 +35,28 @@ class PendingSteps(NamedTuple):
     table: Tensor
 
 
+class GateRules(NamedTuple):
+    """What B views leave out of a table before projection (paper Eq. 1 and 2, then 5).
+
+    A view with an LOD gate leaves out the rows of each level l farther than `reach[l]` from its centre; a
+    view with a column of the cull matrix those whose bit is set.
+
+    Attributes:
+        level: uint8 [N]; a level beyond the last of `reach` counts as the last.
+        reach: for each of 1 to 32 levels the distance up to which it is kept, in the unit of the means, the
+            same or less for finer levels; negative: nowhere.
+        lod_views: bit v is set when view v has an LOD gate.
+        cull: int32 [N, words], `blitzgs.population.importance.Importance.cull`; None: there is none.
+        columns: of `cull`, one for each view; negative: the view has no mask. Empty: no view has one.
+    """
+
+    level: Tensor
+    reach: list[float]
+    lod_views: int
+    cull: Tensor | None = None
+    columns: list[int] = []  # noqa: RUF012  (never changed)
+
+
 class ActiveRows(NamedTuple):
     """The rows that some view may see: the first `length` entries of lists with room for all N.
 
@@ -103,6 +125,8 @@ def cull_blocks(
     far_plane: float,
     eps2d: float = 0.3,
     pending: PendingSteps | None = None,
+    level_ranges: Tensor | None = None,
+    rules: GateRules | None = None,
 ) -> ActiveRows:
     """Return the rows that at least one of B views may see, without reading the rows of blocks outside.
 
@@ -122,9 +146,12 @@ def cull_blocks(
         far_plane: rows at z > far_plane are not seen.
         eps2d: screen-space blur, pixels squared.
         pending: as given to `update_block_bounds_`.
+        level_ranges: uint8 [ceil(N / 256), 2], coarsest and finest level of each block; needed for `rules`.
+        rules: rows that the views certainly leave out, wherever their pending steps take them, are dropped
+            too; `blitzgs.ops.view_gate.gate_views_` decides about the rest. None: none are.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, or more than 32 views.
+        RuntimeError: wrong shapes or dtypes, more than 32 views, or as `gate_views_` says.
     """
     return ActiveRows._make(
         torch.ops.blitzgs.cull_blocks(
@@ -135,6 +162,7 @@ def cull_blocks(
             [viewmats, Ks],
             [width, height],
             [near_plane, far_plane, eps2d],
+            *(() if rules is None else (level_ranges, *rules)),
         )
     )
 

@@ -11,6 +11,7 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
+from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
 from blitzgs.population.exploration import PositionNoise
 from blitzgs.population.importance import CULL
@@ -77,15 +78,16 @@ class Stepper:
             begin with [2 B].
         """
         table, ranks, views = self._table, self._owners.ranks, batch.views
+        rules = None if gate is None else gate.rules(table, table.columns.get(CULL))
         active = self._blocks.active(
             table, views.viewmats, views.Ks, views.width, views.height, options.near_plane, options.far_plane,
-            options.eps2d,
+            options.eps2d, rules,
         )  # fmt: skip
         mark("other")
         self._optimiser.catch_up(table, active.ids, step - 1, active.length)
         mark("optimiser")
-        if gate is not None:
-            gate.apply(active, table, views.viewmats, table.columns.get(CULL))
+        if rules is not None:
+            gate_views_(active, table["means"], views.viewmats, rules)
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         frame = pipeline.forward(
             table, views, options, active, assignment, self._transport, mark, backward_follows=True

@@ -10,6 +10,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import (
     BLOCK_ROWS,
     ActiveRows,
+    GateRules,
     PendingSteps,
     cull_blocks,
     morton_keys,
@@ -46,6 +47,7 @@ class BlockIndex:
         self._schedule = schedule
         count = -(-len(table) // BLOCK_ROWS)
         self._bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
+        self._level_ranges = _level_ranges(table["level"], count)
         self.update(table, None)
 
     def active(
@@ -58,6 +60,7 @@ class BlockIndex:
         near_plane: float,
         far_plane: float,
         eps2d: float = 0.3,
+        rules: GateRules | None = None,
     ) -> ActiveRows:
         """Return the rows that the views may see, and the views of each.
 
@@ -66,7 +69,7 @@ class BlockIndex:
         """
         return cull_blocks(
             self._bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
-            eps2d, self._pending(table),
+            eps2d, self._pending(table), self._level_ranges, rules,
         )  # fmt: skip
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:
@@ -88,3 +91,10 @@ class BlockIndex:
             table["moment_step"],
             self._schedule,
         )
+
+
+def _level_ranges(level: Tensor, blocks: int) -> Tensor:
+    """Return the coarsest and the finest level of each block, uint8 [blocks, 2]."""
+    rest = level[-1:].expand(blocks * BLOCK_ROWS - len(level)) if blocks else level
+    of_block = torch.cat((level, rest)).view(-1, BLOCK_ROWS)
+    return torch.stack((of_block.amin(dim=1), of_block.amax(dim=1)), dim=1)

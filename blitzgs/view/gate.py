@@ -15,7 +15,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
-from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.view.levels import farthest
@@ -64,20 +64,14 @@ class ViewGate:
     lod_views: int
     columns: Sequence[int] = ()
 
-    def apply(
-        self, active: ActiveRows, table: GaussianTable, viewmats: Tensor, cull: Tensor | None = None
-    ) -> None:
-        """Clear the bits of what the views leave out, in place.
+    def rules(self, table: GaussianTable, cull: Tensor | None = None) -> GateRules:
+        """Return what the views leave out of a table, as the ops take it.
 
         Args:
-            active: rows of the table that are caught up; every one of them stays listed.
             table: the Gaussians.
-            viewmats: of the batch, float32 [B, 4, 4].
             cull: the table's cull matrix, where there are `columns`.
         """
-        gate_views_(
-            active, table["means"], table["level"], viewmats, self.reach, self.lod_views, cull, self.columns
-        )
+        return GateRules(table["level"], list(self.reach), self.lod_views, cull, list(self.columns))
 
 
 class SceneGate:
@@ -143,7 +137,7 @@ class SceneGate:
         if lod_views == 0:
             return None
         active = _all_rows(len(means), len(viewmats), means.device)
-        gate_views_(active, means, level, viewmats, self.gate.reach(), lod_views)
+        gate_views_(active, means, viewmats, GateRules(level, self.gate.reach(), lod_views))
         return active
 
 

@@ -14,6 +14,10 @@
 // box, with sigma = 0, satisfies all inequalities with slack to spare, all of its rows pass and need not be
 // read. Only the rows of blocks across a view's border are read.
 //
+// A gate on the views (view_gate.h) drops rows by the same principle: the distances of a box decide for its
+// blocks, then for its rows; what is undecided stays, and the exact test follows when the rows have caught
+// up.
+//
 // The test is conservative: every row that projection would project is in the set
 // (tests/view/test_blocks.py). O(N / 256 + rows of the blocks across a border + active rows) per view.
 #pragma once
@@ -27,6 +31,7 @@
 #include "lazy_adam/adam_table.h"
 #include "math/frustum.h"
 #include "math/morton.h"
+#include "view_gate/view_gate.h"
 
 namespace blitzgs {
 
@@ -166,32 +171,106 @@ BLITZGS_HD Sight sight_of(const Frustum& view, const SweptBox& box, float slack)
 
 constexpr float kRowSlack = kPointSlack, kBlockSlack = 2 * kPointSlack;
 
-// The views that may see a block, and those of them that see all its rows, one bit each.
-struct BlockViews {
-  std::uint32_t some, all;
+// What is left out of the views (view_gate.h), told from where rows may be before they have caught up: a row
+// is only dropped where its exact test would drop it. Without rules nothing is left out.
+struct BlockGate {
+  GateRules rules;
+  const std::uint8_t* level_ranges;  // [blocks_of(n), 2], coarsest and finest level of each block
 };
 
-BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const float* bounds) {
-  const SweptBox box = load_box(bounds);
-  BlockViews result{0, 0};
+// Bounds of the squared distance of all points of a box from a camera.
+struct DistanceRange {
+  float near2, far2;
+};
+
+BLITZGS_HD DistanceRange distances_of(const SweptBox& box, const float* centre, float slack) {
+  DistanceRange range{0.0f, 0.0f};
+  for (int axis = 0; axis < 3; ++axis) {
+    const float middle = 0.5f * box.low[axis] + 0.5f * box.high[axis];
+    float half = 0.5f * box.high[axis] - 0.5f * box.low[axis];
+    half += slack * (std::fabs(middle) + half + std::fabs(centre[axis]));
+    const float offset = std::fabs(centre[axis] - middle);
+    const float gap = offset > half ? offset - half : 0.0f;
+    range.near2 += gap * gap;
+    range.far2 += (offset + half) * (offset + half);
+  }
+  return {range.near2 * (1.0f - 4.0f * slack), range.far2 * (1.0f + 4.0f * slack)};
+}
+
+// One bit for each view: some: it may see a part of the block; inside: its frustum holds all rows; all: it
+// certainly sees all rows.
+struct BlockViews {
+  std::uint32_t some, inside, all;
+};
+
+BLITZGS_HD void gate_block(const BlockGate& gate, const GateTable& table, std::int64_t block,
+                           const SweptBox& box, BlockViews& seen) {
+  const GateRules& rules = gate.rules;
+  const int last = rules.n_levels - 1;
+  const int coarsest = gate.level_ranges[2 * block], finest = gate.level_ranges[2 * block + 1];
+  for (int view = 0; view < rules.n_views; ++view) {
+    if (!has_bit(seen.some & rules.lod_views, view)) continue;
+    const DistanceRange range = distances_of(box, table.centres[view], kBlockSlack);
+    const std::uint32_t others = ~(1u << view);
+    if (range.near2 > table.reach2[coarsest < last ? coarsest : last]) seen.some &= others;
+    if (!(range.far2 <= table.reach2[finest < last ? finest : last])) seen.all &= others;
+  }
+  seen.inside &= seen.some;
+  seen.all &= seen.some & ~rules.cull_views;
+}
+
+template <bool kGated>
+BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const float* bounds, std::int64_t block,
+                                     const BlockGate& gate, const GateTable& table) {
+  const SweptBox box = load_box(bounds + block * kBlockBounds);
+  BlockViews result{0, 0, 0};
   for (int view = 0; view < count; ++view) {
     const Sight sight = sight_of(views[view], box, kBlockSlack);
     if (sight.some) result.some |= 1u << view;
-    if (sight.some && sight.all) result.all |= 1u << view;
+    if (sight.some && sight.all) result.inside |= 1u << view;
   }
-  if (bounds[7] == 0.0f) result.all = 0;
+  if (bounds[block * kBlockBounds + 7] == 0.0f) result.inside = 0;
+  result.all = result.inside;
+  if (kGated) gate_block(gate, table, block, box, result);
   return result;
 }
 
 // Whether the block's rows have to be tested one by one.
 BLITZGS_HD bool is_mixed(const BlockViews& block) { return block.some != block.all; }
 
-BLITZGS_HD std::uint32_t views_of_row(const Frustum* views, int count, const BlockViews& block,
-                                      const SweptBox& box) {
-  std::uint32_t mask = block.all;
+// The views that may see a row of a mixed block. A row's state is read where its block's bounds do not
+// decide.
+template <bool kGated>
+BLITZGS_HD std::uint32_t views_of_row(const BlockRows& rows, const Frustum* views, int count,
+                                      const float* bounds, const BlockViews& seen, std::int64_t row,
+                                      const BlockGate& gate, const GateTable& table) {
+  std::uint32_t mask = seen.some, by_level = 0;
+  float reach2 = 0.0f;
+  if (kGated) {
+    mask &= ~views_that_cull(gate.rules, table, row, mask);
+    if (mask & gate.rules.lod_views) {
+      const SweptBox block = load_box(bounds + row / kBlockRows * kBlockBounds);
+      reach2 = reach2_of(gate.rules, table, row);
+      for (int view = 0; view < count; ++view) {
+        if (!has_bit(mask & gate.rules.lod_views, view)) continue;
+        const DistanceRange range = distances_of(block, table.centres[view], kBlockSlack);
+        if (range.near2 > reach2) {
+          mask &= ~(1u << view);
+        } else if (!(range.far2 <= reach2)) {
+          by_level |= 1u << view;
+        }
+      }
+    }
+  }
+  const std::uint32_t by_frustum = mask & ~seen.inside;
+  if (!(by_frustum | by_level)) return mask;
+  const SweptBox box = sweep_row(rows, row);
   for (int view = 0; view < count; ++view) {
-    const bool asked = ((block.some & ~block.all) >> view & 1u) != 0;
-    if (asked && sight_of(views[view], box, kRowSlack).some) mask |= 1u << view;
+    bool dropped = has_bit(by_frustum, view) && !sight_of(views[view], box, kRowSlack).some;
+    if (kGated && !dropped && has_bit(by_level, view)) {
+      dropped = distances_of(box, table.centres[view], kRowSlack).near2 > reach2;
+    }
+    if (dropped) mask &= ~(1u << view);
   }
   return mask;
 }
@@ -222,14 +301,14 @@ void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Worksp
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);
 void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                 const ActiveList&, Workspace&, CudaStream);
+                 const BlockGate&, const ActiveList&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);
 void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                 const ActiveList&, Workspace&, CudaStream);
+                 const BlockGate&, const ActiveList&, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

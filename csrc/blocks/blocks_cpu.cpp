@@ -20,6 +20,42 @@ void bound_block(const BlockRows& rows, std::int64_t block, float* bounds) {
   store_bounds(box, all_finite, bounds + block * kBlockBounds);
 }
 
+// Finds the views of each block, the views of the rows of mixed blocks, and the number of active rows of each
+// block.
+template <bool kGated>
+void fill_plan(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
+               const BlockGate& gate, const CullPlan& plan, Workspace& workspace) {
+  Frustum planes[kMaxViews];
+  GateTable table = gate.rules.table;
+  for (int view = 0; view < views; ++view) {
+    planes[view] = make_frustum(camera, view);
+    camera_centre(camera.viewmats + 16 * view, table.centres[view]);
+  }
+  const std::int64_t blocks = blocks_of(rows.n);
+  parallel_for(0, blocks, 1024, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t block = begin; block < end; ++block) {
+      plan.blocks[block] = views_of_block<kGated>(planes, views, bounds, block, gate, table);
+      plan.active[block] = plan.blocks[block].all ? rows_in_block(rows.n, block) : 0;
+    }
+  });
+  std::int32_t* mixed = workspace.allocate<std::int32_t>(blocks);
+  std::int64_t count = 0;
+  for (std::int64_t block = 0; block < blocks; ++block) {
+    if (is_mixed(plan.blocks[block])) mixed[count++] = static_cast<std::int32_t>(block);
+  }
+  parallel_for(0, count, 16, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      const std::int64_t block = mixed[i], first = block * kBlockRows;
+      plan.active[block] = 0;
+      for (std::int64_t row = first; row < first + rows_in_block(rows.n, block); ++row) {
+        plan.masks[row] =
+            views_of_row<kGated>(rows, planes, views, bounds, plan.blocks[block], row, gate, table);
+        plan.active[block] += plan.masks[row] != 0;
+      }
+    }
+  });
+}
+
 }  // namespace
 
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream) {
@@ -45,32 +81,11 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
 }
 
 void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                 const ActiveList& list, Workspace& workspace, CudaStream) {
-  Frustum planes[kMaxViews];
-  for (int view = 0; view < views; ++view) planes[view] = make_frustum(camera, view);
+                 const BlockGate& gate, const ActiveList& list, Workspace& workspace, CudaStream) {
   const std::int64_t blocks = blocks_of(rows.n);
   const CullPlan plan(rows.n, workspace);
-  parallel_for(0, blocks, 1024, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t block = begin; block < end; ++block) {
-      plan.blocks[block] = views_of_block(planes, views, bounds + block * kBlockBounds);
-      plan.active[block] = plan.blocks[block].all ? rows_in_block(rows.n, block) : 0;
-    }
-  });
-  std::int32_t* mixed = workspace.allocate<std::int32_t>(blocks);
-  std::int64_t count = 0;
-  for (std::int64_t block = 0; block < blocks; ++block) {
-    if (is_mixed(plan.blocks[block])) mixed[count++] = static_cast<std::int32_t>(block);
-  }
-  parallel_for(0, count, 16, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      const std::int64_t block = mixed[i], first = block * kBlockRows;
-      plan.active[block] = 0;
-      for (std::int64_t row = first; row < first + rows_in_block(rows.n, block); ++row) {
-        plan.masks[row] = views_of_row(planes, views, plan.blocks[block], sweep_row(rows, row));
-        plan.active[block] += plan.masks[row] != 0;
-      }
-    }
-  });
+  const auto fill = leaves_out_any(gate.rules) ? fill_plan<true> : fill_plan<false>;
+  fill(rows, bounds, camera, views, gate, plan, workspace);
   std::int32_t before = 0;
   for (std::int64_t block = 0; block < blocks; ++block) {
     const std::int32_t own = plan.active[block];

@@ -7,6 +7,7 @@
 #include "common/warp.cuh"
 #include "common/zeros.cuh"
 #include "math/morton_cuda.cuh"
+#include "view_gate/gate_table.cuh"
 
 namespace blitzgs::cuda {
 
@@ -86,11 +87,14 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
 
 // One thread for each block, one CUDA block for each group of blocks. Lists the mixed blocks, in any order,
 // counts the active rows of the others, and writes the planes of the views for test_rows.
-__global__ void test_blocks(const float* bounds, CullCamera camera, int views, const CullPlan plan,
-                            std::int32_t* list, std::int32_t* length, std::int32_t* groups,
-                            Frustum* planes_out) {
+template <bool kGated>
+__global__ void test_blocks(const float* bounds, CullCamera camera, int views, const BlockGate gate,
+                            const CullPlan plan, std::int32_t* list, std::int32_t* length,
+                            std::int32_t* groups, Frustum* planes_out) {
   __shared__ Frustum planes[kMaxViews];
+  __shared__ GateTable table;
   wait_for_earlier_kernels();
+  if (kGated) fill_gate_table(gate.rules, camera.viewmats, table);
   const int thread = threadIdx.x;
   if (thread < views) {
     planes[thread] = make_frustum(camera, thread);
@@ -98,10 +102,10 @@ __global__ void test_blocks(const float* bounds, CullCamera camera, int views, c
   }
   __syncthreads();
   const std::int64_t blocks = blocks_of(plan.n), block = blockIdx.x * std::int64_t{blockDim.x} + thread;
-  BlockViews seen{0, 0};
+  BlockViews seen{0, 0, 0};
   int active = 0;
   if (block < blocks) {
-    plan.blocks[block] = seen = views_of_block(planes, views, bounds + block * kBlockBounds);
+    plan.blocks[block] = seen = views_of_block<kGated>(planes, views, bounds, block, gate, table);
     if (!is_mixed(seen)) plan.active[block] = active = seen.all ? rows_in_block(plan.n, block) : 0;
   }
   active = __reduce_add_sync(kFullWarp, active);
@@ -110,20 +114,24 @@ __global__ void test_blocks(const float* bounds, CullCamera camera, int views, c
 }
 
 // Each CUDA block tests blocks of the list in turn, one thread for each row.
+template <bool kGated>
 __global__ void __launch_bounds__(kBlockRows, kResident)
-    test_rows(const BlockRows rows, const Frustum* planes, int views, const CullPlan plan,
-              const std::int32_t* list, const std::int32_t* length, std::int32_t* groups) {
+    test_rows(const BlockRows rows, const float* bounds, const Frustum* planes, const float* viewmats,
+              int views, const BlockGate gate, const CullPlan plan, const std::int32_t* list,
+              const std::int32_t* length, std::int32_t* groups) {
   __shared__ Frustum shared[kMaxViews];
+  __shared__ GateTable table;
   wait_for_earlier_kernels();
   const std::int32_t count = *length;
   if (static_cast<std::int32_t>(blockIdx.x) >= count) return;
   if (threadIdx.x < views) shared[threadIdx.x] = planes[threadIdx.x];
+  if (kGated) fill_gate_table(gate.rules, viewmats, table);
   __syncthreads();
   for (std::int32_t i = blockIdx.x; i < count; i += gridDim.x) {
     const std::int64_t block = list[i], row = block * kBlockRows + threadIdx.x;
     std::uint32_t mask = 0;
     if (row < rows.n) {
-      mask = views_of_row(shared, views, plan.blocks[block], sweep_row(rows, row));
+      mask = views_of_row<kGated>(rows, shared, views, bounds, plan.blocks[block], row, gate, table);
       plan.masks[row] = mask;
     }
     const int total = __syncthreads_count(mask != 0);
@@ -212,7 +220,7 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
 }
 
 void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                 const ActiveList& out, Workspace& workspace, CudaStream stream) {
+                 const BlockGate& gate, const ActiveList& out, Workspace& workspace, CudaStream stream) {
   const std::int64_t blocks = blocks_of(rows.n);
   if (blocks == 0) {
     check(cudaMemsetAsync(out.count, 0, sizeof(*out.count), stream), "cull_blocks");
@@ -224,10 +232,12 @@ void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& c
   const unsigned n_groups = blocks_for(blocks, kGroup);
   std::int32_t *groups = workspace.allocate<std::int32_t>(n_groups + 1), *length = groups + n_groups;
   zero("cull_blocks", groups, n_groups + 1, stream);
-  launch_early("cull_blocks", test_blocks, {n_groups, kGroup, stream}, bounds, camera, views, plan, list,
-               length, groups, planes);
-  launch_early("cull_blocks", test_rows, {persistent_blocks(blocks), kBlockRows, stream}, rows, planes, views,
-               plan, list, length, groups);
+  const bool gated = leaves_out_any(gate.rules);
+  launch_early("cull_blocks", gated ? test_blocks<true> : test_blocks<false>, {n_groups, kGroup, stream},
+               bounds, camera, views, gate, plan, list, length, groups, planes);
+  launch_early("cull_blocks", gated ? test_rows<true> : test_rows<false>,
+               {persistent_blocks(blocks), kBlockRows, stream}, rows, bounds, planes, camera.viewmats, views,
+               gate, plan, list, length, groups);
   launch_early("cull_blocks", emit_rows, {blocks_for(blocks, kWarps), kBlockRows, stream}, plan, groups, out);
 }
 

@@ -4,6 +4,7 @@
 #include <tuple>
 
 #include "common/op.h"
+#include "view_gate/view_gate_op.h"
 
 namespace blitzgs {
 namespace {
@@ -100,7 +101,10 @@ std::tuple<Tensor, Tensor, Tensor> cull_blocks(
     const Tensor& bounds, const Tensor& means, const Tensor& scales, const std::vector<Tensor>& moments,
     const std::optional<Tensor>& last_step, const std::optional<Tensor>& moment_step,
     const std::optional<Tensor>& table, const std::vector<Tensor>& cameras,
-    const std::vector<std::int64_t>& size, const std::vector<double>& limits) {
+    const std::vector<std::int64_t>& size, const std::vector<double>& limits,
+    const std::optional<Tensor>& level_ranges_in, const std::optional<Tensor>& level,
+    const std::vector<double>& reach, std::int64_t lod_views, const std::optional<Tensor>& cull,
+    const std::vector<std::int64_t>& columns) {
   const char* op = "cull_blocks";
   STD_TORCH_CHECK(cameras.size() == 2 && size.size() == 2 && limits.size() == 3, "blitzgs::", op,
                   ": cameras are viewmats and Ks, size is width and height, limits are near_plane, "
@@ -121,14 +125,26 @@ std::tuple<Tensor, Tensor, Tensor> cull_blocks(
                           static_cast<int>(size[0]),     static_cast<int>(size[1]),
                           static_cast<float>(limits[0]), static_cast<float>(limits[1]),
                           static_cast<float>(limits[2])};
+  STD_TORCH_CHECK(level_ranges_in.has_value() == level.has_value(), "blitzgs::", op,
+                  ": a gate needs level_ranges and level");
+  BlockGate gate{};
+  std::optional<HeldRules> rules;
+  std::optional<Tensor> level_ranges;
+  if (level) {
+    check_dtype(op, "level_ranges", *level_ranges_in, ScalarType::Byte);
+    check_shape(op, "level_ranges", *level_ranges_in, {blocks_of(held.rows.n), 2});
+    level_ranges = as_contiguous(*level_ranges_in);
+    rules = hold_rules(op, held.rows.n, static_cast<int>(views), *level, reach, lod_views, cull, columns);
+    gate = {rules->rules, data<std::uint8_t>(*level_ranges)};
+  }
   DeviceScope scope(bounds);
   Tensor active_ids = make_empty(bounds, {held.rows.n}, ScalarType::Int);
   Tensor active_views = make_empty(bounds, {held.rows.n}, ScalarType::Int);
   Tensor count = make_empty(bounds, {1}, ScalarType::Int);
   const ActiveList list{mutable_data<std::int32_t>(active_ids), mutable_data<std::int32_t>(active_views),
                         mutable_data<std::int32_t>(count)};
-  backend::cull_blocks(held.rows, data<float>(bounds), camera, static_cast<int>(views), list, scope.workspace,
-                       scope.stream);
+  backend::cull_blocks(held.rows, data<float>(bounds), camera, static_cast<int>(views), gate, list,
+                       scope.workspace, scope.stream);
   return {active_ids, active_views, count};
 }
 

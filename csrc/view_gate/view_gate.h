@@ -32,20 +32,27 @@ struct GateTable {
   std::int32_t columns[kMaxViews];  // of the cull matrix; negative: the view has no mask
 };
 
+// What is left out of B views of a table.
+struct GateRules {
+  const std::uint8_t* level;  // [N]
+  const std::int32_t* cull;   // [N, words]; may be null
+  std::int64_t words;
+  int n_views, n_levels;
+  std::uint32_t lod_views;   // bits of the views that have an LOD gate
+  std::uint32_t cull_views;  // and of those that have a mask
+  GateTable table;           // without the centres, which the kernels work out
+};
+
+BLITZGS_HD bool leaves_out_any(const GateRules& rules) { return (rules.lod_views | rules.cull_views) != 0; }
+
 struct ViewGateArgs {
   const std::int32_t* ids;
   std::int32_t* views;
   std::int64_t room;
   const std::int32_t* count;  // CUDA: how many of the ids are valid, in device memory; null: all
   const float* means;
-  const std::uint8_t* level;
   const float* viewmats;
-  const std::int32_t* cull;  // may be null
-  std::int64_t words;
-  int n_views, n_levels;
-  std::uint32_t lod_views;   // bits of the views that have an LOD gate
-  std::uint32_t cull_views;  // and of those that have a mask
-  GateTable table;           // without the centres
+  GateRules rules;
 };
 
 // -R^T t of a rigid pose.
@@ -67,30 +74,37 @@ BLITZGS_HD float squared_distance(const float* a, const float* b) {
 
 BLITZGS_HD bool has_bit(std::uint32_t bits, int index) { return (bits >> index & 1u) != 0; }
 
-// The views of `seen` that keep a row.
-BLITZGS_HD std::uint32_t views_that_keep(const ViewGateArgs& args, const GateTable& table, std::int64_t row,
+BLITZGS_HD float reach2_of(const GateRules& rules, const GateTable& table, std::int64_t row) {
+  const int level = rules.level[row], last = rules.n_levels - 1;
+  return table.reach2[level < last ? level : last];
+}
+
+// The views of `seen` whose masks leave a row out.
+BLITZGS_HD std::uint32_t views_that_cull(const GateRules& rules, const GateTable& table, std::int64_t row,
                                          std::uint32_t seen) {
-  std::uint32_t kept = seen;
-  if (seen & args.lod_views) {
-    const int level = args.level[row], last = args.n_levels - 1;
-    const float reach2 = table.reach2[level < last ? level : last];
-    for (int view = 0; view < args.n_views; ++view) {
-      if (!has_bit(seen & args.lod_views, view)) continue;
-      if (squared_distance(args.means + 3 * row, table.centres[view]) > reach2) kept &= ~(1u << view);
-    }
-  }
-  for (int view = 0; (kept & args.cull_views) && view < args.n_views; ++view) {
-    if (!has_bit(kept & args.cull_views, view)) continue;
+  std::uint32_t culled = 0;
+  if (!(seen & rules.cull_views)) return culled;
+  for (int view = 0; view < rules.n_views; ++view) {
+    if (!has_bit(seen & rules.cull_views, view)) continue;
     const std::int32_t column = table.columns[view];
-    const auto word = static_cast<std::uint32_t>(args.cull[row * args.words + column / 32]);
-    if (has_bit(word, column % 32)) kept &= ~(1u << view);
+    const auto word = static_cast<std::uint32_t>(rules.cull[row * rules.words + column / 32]);
+    if (has_bit(word, column % 32)) culled |= 1u << view;
   }
-  return kept;
+  return culled;
 }
 
 BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std::int64_t i) {
+  const GateRules& rules = args.rules;
+  const std::int64_t row = args.ids[i];
   const auto seen = static_cast<std::uint32_t>(args.views[i]);
-  const std::uint32_t kept = views_that_keep(args, table, args.ids[i], seen);
+  std::uint32_t kept = seen & ~views_that_cull(rules, table, row, seen);
+  if (kept & rules.lod_views) {
+    const float reach2 = reach2_of(rules, table, row);
+    for (int view = 0; view < rules.n_views; ++view) {
+      if (!has_bit(kept & rules.lod_views, view)) continue;
+      if (squared_distance(args.means + 3 * row, table.centres[view]) > reach2) kept &= ~(1u << view);
+    }
+  }
   if (kept != seen) args.views[i] = static_cast<std::int32_t>(kept);
 }
 

@@ -3,7 +3,7 @@
 
 #include "common/launch.cuh"
 #include "common/multiprocessors.h"
-#include "view_gate/view_gate.h"
+#include "view_gate/gate_table.cuh"
 
 namespace blitzgs::cuda {
 
@@ -18,14 +18,9 @@ __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const V
   const std::int64_t count = args.count ? *args.count : args.room;
   const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
   if (first >= count) return;
-  const int thread = threadIdx.x;
-  if (thread < kMaxLevels) table.reach2[thread] = args.table.reach2[thread];
-  if (thread < args.n_views) {
-    table.columns[thread] = args.table.columns[thread];
-    camera_centre(args.viewmats + 16 * thread, table.centres[thread]);
-  }
+  fill_gate_table(args.rules, args.viewmats, table);
   __syncthreads();
-  for (std::int64_t i = first + thread; i < count; i += std::int64_t{kThreads} * gridDim.x) {
+  for (std::int64_t i = first + threadIdx.x; i < count; i += std::int64_t{kThreads} * gridDim.x) {
     gate_entry(args, table, i);
   }
 }

@@ -19,9 +19,9 @@ struct Rows {
   blitzgs::ViewGateArgs args() {
     blitzgs::ViewGateArgs args{};
     args.ids = ids.data(), args.views = views.data(), args.room = 3;
-    args.means = means.data(), args.level = level.data(), args.viewmats = viewmats.data();
-    args.cull = cull.data(), args.words = 1;
-    args.n_views = 2, args.n_levels = 2;
+    args.means = means.data(), args.viewmats = viewmats.data();
+    args.rules.level = level.data(), args.rules.cull = cull.data(), args.rules.words = 1;
+    args.rules.n_views = 2, args.rules.n_levels = 2;
     return args;
   }
 
@@ -49,10 +49,10 @@ TEST_CASE(
     "levels beyond their reach leave the views that have a gate, and a level beyond the last is the last") {
   Rows rows;
   blitzgs::ViewGateArgs args = rows.args();
-  args.lod_views = 1;
-  args.table.reach2[0] = 1e30f, args.table.reach2[1] = 8.99f;
+  args.rules.lod_views = 1;
+  args.rules.table.reach2[0] = 1e30f, args.rules.table.reach2[1] = 8.99f;
   REQUIRE(rows.left(args) == std::vector<std::int32_t>{3, 2, 2});
-  args.table.reach2[1] = 9;
+  args.rules.table.reach2[1] = 9;
   rows.views = {3, 3, 2};
   REQUIRE(rows.left(args) == std::vector<std::int32_t>{3, 3, 2});
 }
@@ -60,8 +60,8 @@ TEST_CASE(
 TEST_CASE("the bits of a column leave the view that has it") {
   Rows rows;
   blitzgs::ViewGateArgs args = rows.args();
-  args.cull_views = 2;
-  args.table.columns[0] = -1, args.table.columns[1] = 31;
+  args.rules.cull_views = 2;
+  args.rules.table.columns[0] = -1, args.rules.table.columns[1] = 31;
   rows.cull = {0, INT32_MIN, INT32_MAX};
   REQUIRE(rows.left(args) == std::vector<std::int32_t>{3, 1, 3});
 }

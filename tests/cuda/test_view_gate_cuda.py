@@ -6,6 +6,7 @@ import torch
 
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.view_gate import gate_views_
 from blitzgs.view.gate import ViewGate
 from tests.view.test_blocks import make_views
 from tests.view.test_gate import GATE, bits, kept_by_definition, make_scene
@@ -19,7 +20,7 @@ def gated(table, viewmats, gate, count):
         torch.full((room,), -1, dtype=torch.int32, device=device),
         torch.tensor([count], dtype=torch.int32, device=device),
     )
-    gate.apply(active, table, viewmats, table["cull"])
+    gate_views_(active, table["means"], viewmats, gate.rules(table, table["cull"]))
     assert (active.views[count:] == -1).all()
     return active.views[:count]
 

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+// The arguments of ops that leave rows out of views: level [N], reach, lod_views, cull, columns.
+#pragma once
+#include <optional>
+#include <vector>
+
+#include "common/op.h"
+#include "view_gate/view_gate.h"
+
+namespace blitzgs {
+
+// Rules, checked; their columns are kept alive during the call.
+struct HeldRules {
+  Tensor level;
+  std::optional<Tensor> cull;
+  GateRules rules{};
+};
+
+inline void set_reach(const char* op, const std::vector<double>& reach, GateRules& rules) {
+  STD_TORCH_CHECK(!reach.empty() && reach.size() <= kMaxLevels, "blitzgs::", op, ": 1 to ", kMaxLevels,
+                  " levels are supported, got ", reach.size());
+  rules.n_levels = static_cast<int>(reach.size());
+  for (int level = 0; level < rules.n_levels; ++level) {
+    STD_TORCH_CHECK(level == 0 || reach[level] <= reach[level - 1], "blitzgs::", op,
+                    ": finer levels reach no farther, got ", reach[level - 1], " and ", reach[level],
+                    " for the levels ", level - 1, " and ", level);
+    rules.table.reach2[level] = reach[level] < 0 ? -1.0f : static_cast<float>(reach[level] * reach[level]);
+  }
+}
+
+inline void set_columns(const char* op, const std::vector<std::int64_t>& columns, bool has_cull,
+                        GateRules& rules) {
+  if (columns.empty()) return;
+  STD_TORCH_CHECK(static_cast<int>(columns.size()) == rules.n_views, "blitzgs::", op, ": ", rules.n_views,
+                  " views need as many columns of the cull matrix, got ", columns.size());
+  STD_TORCH_CHECK(has_cull, "blitzgs::", op, ": columns need a cull matrix");
+  for (int view = 0; view < rules.n_views; ++view) {
+    STD_TORCH_CHECK(columns[view] < 32 * rules.words, "blitzgs::", op, ": the cull matrix has ",
+                    32 * rules.words, " columns, got column ", columns[view]);
+    rules.table.columns[view] = static_cast<std::int32_t>(columns[view]);
+    if (columns[view] >= 0) rules.cull_views |= 1u << view;
+  }
+}
+
+inline HeldRules hold_rules(const char* op, std::int64_t rows, int views, const Tensor& level,
+                            const std::vector<double>& reach, std::int64_t lod_views,
+                            const std::optional<Tensor>& cull, const std::vector<std::int64_t>& columns) {
+  check_dtype(op, "level", level, ScalarType::Byte);
+  check_shape(op, "level", level, {rows});
+  HeldRules held{as_contiguous(level), std::nullopt};
+  if (cull) {
+    check_dtype(op, "cull", *cull, ScalarType::Int);
+    check_shape(op, "cull", *cull, {rows, -1});
+    held.cull = as_contiguous(*cull);
+    held.rules.words = held.cull->size(1);
+  }
+  held.rules.level = data<std::uint8_t>(held.level);
+  held.rules.cull = data_or_null<std::int32_t>(held.cull);
+  held.rules.n_views = views;
+  held.rules.lod_views = static_cast<std::uint32_t>(lod_views);
+  set_reach(op, reach, held.rules);
+  set_columns(op, columns, cull.has_value(), held.rules);
+  return held;
+}
+
+}  // namespace blitzgs
