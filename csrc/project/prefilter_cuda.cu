@@ -14,6 +14,12 @@ namespace {
 constexpr int kWarps = kPrefilterThreads / 32, kMostOfWarp = kMostAtOnce / kWarps;
 constexpr int kBlocksPerMultiprocessor = 8;
 
+// Not inlined: the doubles of this would have the loop of the kernel spill registers.
+__device__ __noinline__ void store_frustum(const Camera<float>* camera, int width, int height,
+                                           float near_plane, float far_plane, float eps2d, Frustum* frustum) {
+  *frustum = make_frustum(*camera, width, height, near_plane, far_plane, eps2d);
+}
+
 // An upper bound. Stored opacities may exceed 1, logits cannot.
 __device__ float largest_scale(const Inputs& in, std::int64_t id) {
   const float* s = in.scales + 3 * id;
@@ -74,7 +80,8 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
   load_cameras(in, cameras);
   __syncthreads();
   for (int view = threadIdx.x; view < in.n_views; view += kPrefilterThreads)
-    frusta[view] = frustum_of(cameras[view], in.options);
+    store_frustum(cameras + view, in.options.width, in.options.height, in.options.near_plane,
+                  in.options.far_plane, in.options.eps2d, frusta + view);
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const unsigned below = (1u << lane) - 1u;
   for (;;) {
