@@ -89,7 +89,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "device_barrier_(Tensor(a!)[] control, int rank, int number, Tensor? values, int first, "
       "float timeout_seconds, Tensor(b!)? host=None) -> ()");
   // Writes a small tensor into pinned memory of the host, behind what is queued (CUDA).
-  m.def("tell_host_(Tensor(a!) known, Tensor values) -> ()");
+  m.def("copy_to_host_(Tensor(a!) host, Tensor values) -> ()");
 
   // Alpha compositing. composited: (transmittances, last_ids, packed_splats, tile_order) of the forward pass.
   m.def(

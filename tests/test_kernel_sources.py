@@ -99,8 +99,9 @@ def kernels_launched_early():
             assigned = re.findall(rf"\bauto {given}\s*=\s*([^;]+);", text[: match.start()])
             if given == "kernel":
                 assert assigned, f"{file}: what does launch_early launch as {given}?"
-                for name in re.findall(r"\b([a-z]\w*)\s*<", assigned[-1]):
-                    names[name] = file
+                found = re.findall(r"\b[a-z]\w*_kernel\b", assigned[-1])
+                assert found, f"{file}: no kernel in {assigned[-1]}"
+                names.update(dict.fromkeys(found, file))
             else:
                 names[given] = file
     return names
@@ -123,7 +124,13 @@ def body_of(name, file):
 
 def test_kernels_that_are_launched_early_wait_for_the_one_in_front():
     kernels = kernels_launched_early()
-    assert {"forward_kernel", "backward_kernel", "sweep_kernel", "tell_kernel"} <= set(kernels)
+    assert {
+        "forward_kernel",
+        "backward_kernel",
+        "sweep_kernel",
+        "copy_kernel",
+        "contributions_kernel",
+    } <= set(kernels)
     for name, file in kernels.items():
         before, wait, _ = body_of(name, file).partition("wait_for_earlier_kernels();")
         assert wait, f"{file}: {name} is launched early and does not wait"

@@ -23,7 +23,7 @@ class HostCopy:
         self._written: torch.cuda.Event | None = None
         if values.is_cuda:
             self._host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
-            torch.ops.blitzgs.tell_host_(self._host, values)
+            torch.ops.blitzgs.copy_to_host_(self._host, values)
             self._written = torch.cuda.Event()
             self._written.record(torch.cuda.current_stream(values.device))
 
@@ -40,7 +40,7 @@ class HostCopy:
         self.read()
 
 
-@torch.library.register_fake("blitzgs::tell_host_")
+@torch.library.register_fake("blitzgs::copy_to_host_")
 def _(*_args: object) -> None:
     return None
 

@@ -46,10 +46,9 @@ struct TileSum {
   }
 };
 
-template <int TILE>
 struct ContributionShared {
-  EntryBatch<TILE, kForwardBatch<TILE>> batch;
-  __align__(16) std::uint32_t groups[Tile<TILE>::kSubtiles][kGroupWords];
+  EntryBatch<kForwardBatch> batch;
+  __align__(16) std::uint32_t groups[Tile::kSubtiles][kGroupWords];
 };
 
 struct ContributionArguments {
@@ -76,16 +75,15 @@ __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& en
   if (pixels > 0) TileSum::add(entry, weight, pixels);
 }
 
-template <int TILE>
-__global__ void __launch_bounds__(TILE* TILE, 4) contributions_kernel(const ContributionArguments args) {
-  constexpr int kBatch = kForwardBatch<TILE>;
+__global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const ContributionArguments args) {
+  constexpr int kBatch = kForwardBatch;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
-  auto& shared = *reinterpret_cast<ContributionShared<TILE>*>(shared_bytes);
+  auto& shared = *reinterpret_cast<ContributionShared*>(shared_bytes);
   auto& batch = shared.batch;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   wait_for_earlier_kernels();
-  const TilePlace tile = locate_tile<TILE>(args.grid, args.order.tile(static_cast<int>(blockIdx.x)));
-  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
+  const TilePlace tile = locate_tile(args.grid, args.order.tile(static_cast<int>(blockIdx.x)));
+  const Pixel pixel = locate_pixel(args.grid, tile, thread);
   const std::int64_t start = args.tile_offsets[tile.tile];
   const int count = static_cast<int>(args.tile_offsets[tile.tile + 1] - start);
   batch.init(thread);
@@ -140,13 +138,12 @@ __global__ void __launch_bounds__(TILE* TILE, 4) contributions_kernel(const Cont
   send_sums();
 }
 
-template <int TILE>
 void launch_contributions(const ContributionArguments& args, CudaStream stream) {
-  const auto kernel = contributions_kernel<TILE>;
-  constexpr int kBytes = sizeof(ContributionShared<TILE>);
+  const auto kernel = contributions_kernel;
+  constexpr int kBytes = sizeof(ContributionShared);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "contributions");
   launch_early("contributions", kernel,
-               {static_cast<unsigned>(args.order.n_tiles), TILE * TILE, stream, kBytes}, args);
+               {static_cast<unsigned>(args.order.n_tiles), Tile::kThreads, stream, kBytes}, args);
 }
 
 }  // namespace
@@ -166,7 +163,7 @@ void contributions<float>(const ContributionInput<float>& in, const Contribution
   const TileOrder order(in.grid, owned, workspace.allocate<std::int32_t>(TileOrder::words(in.grid, owned)));
   prepare("contributions", rows, packed, nullptr, order, stream);
   const ContributionArguments args{packed, in.isect_rows, in.tile_offsets, in.grid, order, sums};
-  launch_contributions<kTileSize>(args, stream);
+  launch_contributions(args, stream);
 }
 
 }  // namespace blitzgs::cuda

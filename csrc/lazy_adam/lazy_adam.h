@@ -77,7 +77,7 @@ struct alignas(4 * sizeof(T)) AdamRule {
 
 // The drift from step `from` to step `to`, which parameters that stand at `from` still have to take.
 template <class T>
-struct AdamDebt {
+struct PendingSteps {
   AdamRule<T> rules[kAdamGroups];
   std::int32_t from, to;
   T explicit_up_to;  // elements with sqrt(v) up to this go step by step; negative: none
@@ -120,25 +120,26 @@ BLITZGS_HD T adam_explicit_up_to(const AdamArgs<T>& args, std::int32_t from, std
 }
 
 template <class T>
-BLITZGS_HD AdamDebt<T> adam_debt(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
-  AdamDebt<T> debt;
-  debt.from = from;
-  debt.to = to;
+BLITZGS_HD PendingSteps<T> pending_steps(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
+  PendingSteps<T> steps;
+  steps.from = from;
+  steps.to = to;
   double error = 0;
-  for (int g = 0; g < kAdamGroups; ++g) debt.rules[g] = adam_rule(args, from, to, g, error);
-  debt.explicit_up_to = adam_explicit_up_to(args, from, to, error);
-  return debt;
+  for (int g = 0; g < kAdamGroups; ++g) steps.rules[g] = adam_rule(args, from, to, g, error);
+  steps.explicit_up_to = adam_explicit_up_to(args, from, to, error);
+  return steps;
 }
 
-// The zero-gradient steps of one element, one by one; m and root = sqrt(v) at step debt.from.
+// The zero-gradient steps of one element, one by one; m and root = sqrt(v) at step steps.from.
 template <class T>
-BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T root) {
+BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const PendingSteps<T>& steps, int group, T m,
+                                 T root) {
   const T beta1 = static_cast<T>(args.beta1), root_beta2 = static_cast<T>(std::sqrt(args.beta2));
   const T eps = static_cast<T>(args.eps);
   const std::int32_t last =
-      debt.to - debt.from < args.explicit_steps ? debt.to : debt.from + args.explicit_steps;
+      steps.to - steps.from < args.explicit_steps ? steps.to : steps.from + args.explicit_steps;
   T drift = 0;
-  for (std::int32_t t = debt.from + 1; t <= last; ++t) {
+  for (std::int32_t t = steps.from + 1; t <= last; ++t) {
     const double* row = args.table_row(t);
     m *= beta1;
     root *= root_beta2;
@@ -180,13 +181,13 @@ BLITZGS_HD T adam_ruled_drift(const AdamRule<T>& rule, T m, T root, T eps) {
   return m == 0 ? T(0) : drift;
 }
 
-// The amount to subtract from a parameter when it catches up; m and v are the moments at step debt.from.
+// The amount to subtract from a parameter when it catches up; m and v are the moments at step steps.from.
 template <class T>
-BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T v) {
+BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const PendingSteps<T>& steps, int group, T m, T v) {
   const T root = adam_root(v);
   if (m == 0) return 0;
-  if (!(root > debt.explicit_up_to)) return adam_explicit_drift(args, debt, group, m, root);
-  return adam_ruled_drift(debt.rules[group], m, root, static_cast<T>(args.eps));
+  if (!(root > steps.explicit_up_to)) return adam_explicit_drift(args, steps, group, m, root);
+  return adam_ruled_drift(steps.rules[group], m, root, static_cast<T>(args.eps));
 }
 
 // Whether a row drifts noticeably on its way to the target. explicit_steps after the moments' step, the rest

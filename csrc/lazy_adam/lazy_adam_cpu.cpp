@@ -35,23 +35,23 @@ void prefetch_row(const AdamArgs<T>& args, std::int64_t row) {
   }
 }
 
-// Few different steps occur among the rows that are behind, so each thread computes a debt once for many
+// Few different steps occur among the rows that are behind, so each thread computes them once for many
 // rows.
 template <class T>
-class DebtCache {
+class PendingStepsCache {
  public:
-  const AdamDebt<T>& get(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
-    AdamDebt<T>& debt = debts_[from % kSlots];
-    if (!used_[from % kSlots] || debt.from != from) {
-      debt = adam_debt(args, from, to);
+  const PendingSteps<T>& get(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
+    PendingSteps<T>& steps = cached_[from % kSlots];
+    if (!used_[from % kSlots] || steps.from != from) {
+      steps = pending_steps(args, from, to);
       used_[from % kSlots] = true;
     }
-    return debt;
+    return steps;
   }
 
  private:
   static constexpr int kSlots = 64;
-  AdamDebt<T> debts_[kSlots];
+  PendingSteps<T> cached_[kSlots];
   bool used_[kSlots] = {};
 };
 
@@ -64,14 +64,14 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
   const AdamRowUpdate<T> update = row_update<T>();
   const std::int32_t target = args.target();
   parallel_for(0, args.n, 512, [&](std::int64_t begin, std::int64_t end) {
-    DebtCache<T> debts;
+    PendingStepsCache<T> pending;
     for (std::int64_t i = begin; i < end; ++i) {
       const std::int64_t row = args.ids ? args.ids[i] : i;
       if (args.ids) prefetch_row(args, args.ids[std::min(i + kPrefetchDistance, end - 1)]);
       const AdamRow<T> state = adam_row(args, row);
       if (!with_gradient && state.from >= target) continue;
-      const AdamDebt<T>* debt = state.moves ? &debts.get(args, state.from, target) : nullptr;
-      if (with_gradient || debt) update({args, step, state, debt, adam_explicit_drift<T>, row, i});
+      const PendingSteps<T>* steps = state.moves ? &pending.get(args, state.from, target) : nullptr;
+      if (with_gradient || steps) update({args, step, state, steps, adam_explicit_drift<T>, row, i});
       args.last_step[row] = args.step;
       if (with_gradient) args.moment_step[row] = args.step;
     }

@@ -23,9 +23,9 @@ constexpr int kAlone = kAdamColumns - 1;  // the column of a parameter that is s
 // What rows need to catch up. All rows of a launch go to the same step, so it is computed once for each step
 // at which a row may stand, and not for each row.
 struct Prepared {
-  AdamDebt<float>* debts;  // [target], for parameters that stand at step 0, 1, ...
-  Decay* decays;           // [target + 1], over each number of steps
-  bool* owing;             // whether any row is behind
+  PendingSteps<float>* pending;  // [target], for parameters that stand at step 0, 1, ...
+  Decay* decays;                 // [target + 1], over each number of steps
+  bool* any_pending;             // whether any row is behind
 };
 
 // kPrepareLanes lanes work on a step, one for each rule, because the kernel's time is that of a chain of
@@ -36,37 +36,37 @@ __global__ void __launch_bounds__(kPrepareThreads)
   const auto thread = static_cast<std::int32_t>(blockIdx.x * kPrepareThreads + threadIdx.x);
   const std::int32_t t = thread / kPrepareLanes, target = args.target();
   const int group = thread % kPrepareLanes;
-  if (thread == 0) *prepared.owing = false;
+  if (thread == 0) *prepared.any_pending = false;
   if (t <= target && group == kPrepareLanes - 1) prepared.decays[t] = make_decay(args, t);
   double error = 0;
   if (t < target && group < kAdamGroups)
-    prepared.debts[t].rules[group] = adam_rule(args, t, target, group, error);
+    prepared.pending[t].rules[group] = adam_rule(args, t, target, group, error);
 #pragma unroll
   for (int step = 1; step < kPrepareLanes; step *= 2) {
     error = fmax(error, __shfl_xor_sync(kFullWarp, error, step));
   }
   if (t >= target || group != 0) return;
-  AdamDebt<float>& debt = prepared.debts[t];
-  debt.from = t;
-  debt.to = target;
-  debt.explicit_up_to = adam_explicit_up_to(args, t, target, error);
+  PendingSteps<float>& steps = prepared.pending[t];
+  steps.from = t;
+  steps.to = target;
+  steps.explicit_up_to = adam_explicit_up_to(args, t, target, error);
 }
 
 // A row that catches up by the rules of the step that it stands at.
-struct alignas(16) Debtor {
-  std::int32_t row;   // -1: nothing to do
+struct alignas(16) PendingRow {
+  std::int32_t id;    // -1: nothing to do
   std::int32_t from;  // the step at which its parameters stand
   Decay here;         // of its moments, up to that step
 };
 
 // Lets a row catch up where the rules are not exact enough; a whole warp works on it.
 template <int Column>
-__device__ void pay_elements(const AdamArgs<float>& args, const AdamDebt<float>& debt, const Decay& here,
-                             std::int64_t row) {
+__device__ void catch_up_elements(const AdamArgs<float>& args, const PendingSteps<float>& steps,
+                                  const Decay& here, std::int64_t row) {
   const AdamColumn<float>& column = args.columns[Column];
   for (int j = threadIdx.x % 32; j < column.width; j += 32) {
     const std::int64_t at = row * column.width + j;
-    column.param[at] -= adam_drift(args, debt, adam_group(Column, j), column.exp_avg[at] * here.first,
+    column.param[at] -= adam_drift(args, steps, adam_group(Column, j), column.exp_avg[at] * here.first,
                                    column.exp_avg_sq[at] * here.second);
   }
 }
@@ -77,38 +77,39 @@ __device__ std::int64_t listed(const AdamArgs<float>& args) { return args.count 
 // the rules are not exact enough, which happens only early in a schedule, catch up here, each by a whole
 // warp.
 __global__ void __launch_bounds__(kListThreads)
-    list_debtors(const __grid_constant__ AdamArgs<float> args, const Prepared prepared, Debtor* debtors) {
+    list_pending_rows(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
+                      PendingRow* pending_rows) {
   wait_for_earlier_kernels();
   const std::int64_t n = listed(args);
   for (std::int64_t first = blockIdx.x * std::int64_t{kListThreads}; first < n;
        first += gridDim.x * std::int64_t{kListThreads}) {
     const std::int64_t i = first + threadIdx.x;
-    Debtor mine{-1, 0, {}};
+    PendingRow mine{-1, 0, {}};
     bool explicitly = false;
     if (i < n) {
       const std::int32_t row = args.ids ? args.ids[i] : static_cast<std::int32_t>(i);
       const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
       if (adam_moves(args, from, stand)) {
         mine = {row, from, prepared.decays[from - stand]};
-        explicitly = prepared.debts[from].explicit_up_to >= 0;
+        explicitly = prepared.pending[from].explicit_up_to >= 0;
       }
       if (from < args.step) args.last_step[row] = args.step;
     }
     for (unsigned left = __ballot_sync(kFullWarp, explicitly); left; left &= left - 1) {
       const int lane = __ffs(left) - 1;
-      const std::int64_t row = __shfl_sync(kFullWarp, mine.row, lane);
-      const AdamDebt<float>& debt = prepared.debts[__shfl_sync(kFullWarp, mine.from, lane)];
+      const std::int64_t row = __shfl_sync(kFullWarp, mine.id, lane);
+      const PendingSteps<float>& steps = prepared.pending[__shfl_sync(kFullWarp, mine.from, lane)];
       const Decay here{__shfl_sync(kFullWarp, mine.here.first, lane),
                        __shfl_sync(kFullWarp, mine.here.second, lane)};
-      pay_elements<0>(args, debt, here, row);
-      pay_elements<1>(args, debt, here, row);
-      pay_elements<2>(args, debt, here, row);
-      pay_elements<3>(args, debt, here, row);
-      pay_elements<4>(args, debt, here, row);
+      catch_up_elements<0>(args, steps, here, row);
+      catch_up_elements<1>(args, steps, here, row);
+      catch_up_elements<2>(args, steps, here, row);
+      catch_up_elements<3>(args, steps, here, row);
+      catch_up_elements<4>(args, steps, here, row);
     }
-    if (explicitly) mine.row = -1;
-    if (i < n) debtors[i] = mine;
-    if (__any_sync(kFullWarp, mine.row >= 0) && threadIdx.x % 32 == 0) *prepared.owing = true;
+    if (explicitly) mine.id = -1;
+    if (i < n) pending_rows[i] = mine;
+    if (__any_sync(kFullWarp, mine.id >= 0) && threadIdx.x % 32 == 0) *prepared.any_pending = true;
   }
 }
 
@@ -136,21 +137,21 @@ __device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
 }
 
 template <int Column, int Width>
-__device__ __forceinline__ void pay_pack(const AdamArgs<float>& args, const AdamDebt<float>* debts,
-                                         const Debtor& debtor, int pack) {
+__device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const PendingSteps<float>* pending,
+                                              const PendingRow& row, int pack) {
   using P = Pack<Width>;
   const AdamColumn<float>& column = args.columns[Column];
-  const std::int64_t at = debtor.row * column.width + pack * Width;
+  const std::int64_t at = row.id * column.width + pack * Width;
   P p = *reinterpret_cast<const P*>(column.param + at);
   const P m = *reinterpret_cast<const P*>(column.exp_avg + at);
   const P v = *reinterpret_cast<const P*>(column.exp_avg_sq + at);
-  const AdamDebt<float>& debt = debts[debtor.from];
-  const AdamRule<float> first = debt.rules[pack_group<Column, Width>(pack, 0)],
-                        last = debt.rules[pack_group<Column, Width>(pack, Width - 1)];
+  const PendingSteps<float>& steps = pending[row.from];
+  const AdamRule<float> first = steps.rules[pack_group<Column, Width>(pack, 0)],
+                        last = steps.rules[pack_group<Column, Width>(pack, Width - 1)];
 #pragma unroll
   for (int j = 0; j < Width; ++j) {
-    p.x[j] -= adam_ruled_drift(j < Width - 1 ? first : last, m.x[j] * debtor.here.first,
-                               adam_root(v.x[j] * debtor.here.second), static_cast<float>(args.eps));
+    p.x[j] -= adam_ruled_drift(j < Width - 1 ? first : last, m.x[j] * row.here.first,
+                               adam_root(v.x[j] * row.here.second), static_cast<float>(args.eps));
   }
   *reinterpret_cast<P*>(column.param + at) = p;
 }
@@ -160,23 +161,23 @@ __device__ __forceinline__ void pay_pack(const AdamArgs<float>& args, const Adam
 template <int ShWidth, int ShPacks>
 __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
     catch_up_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
-                    const Debtor* debtors) {
+                    const PendingRow* pending_rows) {
   wait_for_earlier_kernels();
-  if (!*prepared.owing) return;
+  if (!*prepared.any_pending) return;
   const std::int64_t n = listed(args);
-  const auto pay = [&]<int Column, int Width>(int local, int pack) {
+  const auto catch_up_one = [&]<int Column, int Width>(int local, int pack) {
     const std::int64_t stride = gridDim.x * std::int64_t{kRows};
     std::int64_t i = blockIdx.x * std::int64_t{kRows} + local;
-    Debtor next{-1, 0, {}};
-    if (i < n) next = debtors[i];
+    PendingRow next{-1, 0, {}};
+    if (i < n) next = pending_rows[i];
     while (i < n) {
-      const Debtor debtor = next;
+      const PendingRow row = next;
       i += stride;
-      if (i < n) next = debtors[i];
-      if (debtor.row >= 0) pay_pack<Column, Width>(args, prepared.debts, debtor, pack);
+      if (i < n) next = pending_rows[i];
+      if (row.id >= 0) catch_up_pack<Column, Width>(args, prepared.pending, row, pack);
     }
   };
-  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, pay);
+  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, catch_up_one);
 }
 
 template <int Column, int Width>
@@ -219,19 +220,19 @@ __device__ std::int64_t element_stride() { return gridDim.x * std::int64_t{kList
 
 __global__ void __launch_bounds__(kListThreads)
     catch_up_alone_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
-                          const Debtor* debtors) {
+                          const PendingRow* pending_rows) {
   wait_for_earlier_kernels();
-  if (!*prepared.owing) return;
+  if (!*prepared.any_pending) return;
   const AdamColumn<float>& column = args.columns[kAlone];
   const std::int64_t elements = listed(args) * column.width;
   for (std::int64_t e = first_element(); e < elements; e += element_stride()) {
-    const Debtor debtor = debtors[e / column.width];
-    if (debtor.row < 0) continue;
-    const std::int64_t j = e % column.width, at = debtor.row * column.width + j;
-    const AdamRule<float>& rule = prepared.debts[debtor.from].rules[adam_group(kAlone, j)];
+    const PendingRow row = pending_rows[e / column.width];
+    if (row.id < 0) continue;
+    const std::int64_t j = e % column.width, at = row.id * column.width + j;
+    const AdamRule<float>& rule = prepared.pending[row.from].rules[adam_group(kAlone, j)];
     column.param[at] -=
-        adam_ruled_drift(rule, column.exp_avg[at] * debtor.here.first,
-                         adam_root(column.exp_avg_sq[at] * debtor.here.second), static_cast<float>(args.eps));
+        adam_ruled_drift(rule, column.exp_avg[at] * row.here.first,
+                         adam_root(column.exp_avg_sq[at] * row.here.second), static_cast<float>(args.eps));
   }
 }
 
@@ -281,24 +282,24 @@ LaunchShape alone_size(const AdamArgs<float>& args, CudaStream stream) {
 
 void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
   if (args.step == 0) return;
-  const Prepared prepared{workspace.allocate<AdamDebt<float>>(args.step),
+  const Prepared prepared{workspace.allocate<PendingSteps<float>>(args.step),
                           workspace.allocate<Decay>(args.step + 1), workspace.allocate<bool>(1)};
-  auto* debtors = workspace.allocate<Debtor>(args.n);
+  auto* pending_rows = workspace.allocate<PendingRow>(args.n);
   launch_early("lazy_adam catch-up", prepare,
                {blocks_for(args.step + 1, kPrepareThreads / kPrepareLanes), kPrepareThreads, stream}, args,
                prepared);
   // n may be far more than the number of valid ids.
-  launch_early("lazy_adam catch-up", list_debtors,
+  launch_early("lazy_adam catch-up", list_pending_rows,
                {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
-               debtors);
+               pending_rows);
   if (is_alone(args)) {
     launch_early("lazy_adam catch-up", catch_up_alone_kernel, alone_size(args, stream), args, prepared,
-                 debtors);
+                 pending_rows);
     return;
   }
   const auto kernel = args.columns[4].width == 48 ? catch_up_kernel<4, 12> : catch_up_kernel<1, 0>;
   launch_early("lazy_adam catch-up", kernel, {filled_blocks(args.n, kRows, kCatchUpBlocks), kThreads, stream},
-               args, prepared, debtors);
+               args, prepared, pending_rows);
 }
 
 // Quaternions, and SH of degree 3, are moved 16 bytes at a time.

@@ -11,14 +11,14 @@ namespace blitzgs::cpu {
 
 // The elements that catch up step by step are rare, so plain code handles them.
 template <class T>
-using ExplicitDrift = T (*)(const AdamArgs<T>& args, const AdamDebt<T>& debt, int group, T m, T root);
+using ExplicitDrift = T (*)(const AdamArgs<T>& args, const PendingSteps<T>& steps, int group, T m, T root);
 
 template <class T>
 struct AdamRowJob {
   const AdamArgs<T>& args;
   const AdamStep<T>& step;
   const AdamRow<T>& state;
-  const AdamDebt<T>* debt;  // null unless the row moves
+  const PendingSteps<T>* steps;  // null unless the row moves
   ExplicitDrift<T> explicit_drift;
   std::int64_t row, list_row;
 };
@@ -43,14 +43,14 @@ Lanes by_group(const int* groups, const F& value) {
 // Returns the drift of eight elements; m and v are the moments at the step of the parameters.
 template <class Lanes, class T>
 Lanes drift_of(const AdamRowJob<T>& job, const int* groups, Lanes m, Lanes v) {
-  const AdamDebt<T>& debt = *job.debt;
+  const PendingSteps<T>& steps = *job.steps;
   const Lanes root = Lanes::sqrt(v), eps = Lanes::broadcast(static_cast<T>(job.args.eps));
   const auto moving = Lanes::greater(Lanes::abs(m), Lanes::zero());
-  const auto ruled = moving & Lanes::greater(root, Lanes::broadcast(debt.explicit_up_to));
+  const auto ruled = moving & Lanes::greater(root, Lanes::broadcast(steps.explicit_up_to));
   Lanes parts[2];
   for (int i = 0; i < 2; ++i) {
-    const Lanes place = by_group<Lanes>(groups, [&](int g) { return debt.rules[g].place[i]; });
-    const Lanes weight = by_group<Lanes>(groups, [&](int g) { return debt.rules[g].weight[i]; });
+    const Lanes place = by_group<Lanes>(groups, [&](int g) { return steps.rules[g].place[i]; });
+    const Lanes weight = by_group<Lanes>(groups, [&](int g) { return steps.rules[g].weight[i]; });
     parts[i] = Lanes::broadcast(T(1)) / (place * root + eps) * weight;
   }
   Lanes drift = Lanes::keep(ruled, m * (parts[0] + parts[1]));
@@ -60,7 +60,7 @@ Lanes drift_of(const AdamRowJob<T>& job, const int* groups, Lanes m, Lanes v) {
     root.store(roots);
     drift.store(each);
     for (int i = 0; i < kLanes; ++i) {
-      if (bits >> i & 1) each[i] = job.explicit_drift(job.args, debt, groups[i], ms[i], roots[i]);
+      if (bits >> i & 1) each[i] = job.explicit_drift(job.args, steps, groups[i], ms[i], roots[i]);
     }
     drift = Lanes::load(each);
   }
@@ -80,7 +80,7 @@ template <class Lanes, class T>
 void update_elements(const AdamRowJob<T>& job, const int* groups, T* p, T* m, T* v, const T* g) {
   Lanes param = Lanes::load(p), first = Lanes::load(m), second = Lanes::load(v);
   const AdamRow<T>& state = job.state;
-  if (job.debt) {
+  if (job.steps) {
     param = param - drift_of<Lanes>(job, groups, first * Lanes::broadcast(state.here1),
                                     second * Lanes::broadcast(state.here2));
   }

@@ -66,8 +66,8 @@ double drift_one_by_one(double m, double v, int from, int to, double eps) {
 
 template <class T>
 T drift(const blitzgs::AdamArgs<T>& args, int from, int to, int group, T m, T v) {
-  const blitzgs::AdamDebt<T> debt = blitzgs::adam_debt(args, from, to);
-  return blitzgs::adam_drift(args, debt, group, m, v);
+  const blitzgs::PendingSteps<T> steps = blitzgs::pending_steps(args, from, to);
+  return blitzgs::adam_drift(args, steps, group, m, v);
 }
 
 }  // namespace
@@ -90,9 +90,9 @@ TEST_CASE("catching up equals the steps one by one, whatever eps weighs") {
 TEST_CASE("late in a schedule no element needs its steps one by one, early those that eps concerns") {
   const Schedule schedule;
   const auto args = schedule.args<float>(1e-15);
-  REQUIRE(blitzgs::adam_debt(args, 300, 400).explicit_up_to < 0);
-  REQUIRE(blitzgs::adam_debt(args, 20, 21).explicit_up_to < 0);  // a single step is exact anywhere
-  REQUIRE(blitzgs::adam_debt(args, 20, 120).explicit_up_to > 1e-8f);
+  REQUIRE(blitzgs::pending_steps(args, 300, 400).explicit_up_to < 0);
+  REQUIRE(blitzgs::pending_steps(args, 20, 21).explicit_up_to < 0);  // a single step is exact anywhere
+  REQUIRE(blitzgs::pending_steps(args, 20, 120).explicit_up_to > 1e-8f);
 }
 
 TEST_CASE("a row's moments decay to where its parameters stand and on to the target") {

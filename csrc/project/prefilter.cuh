@@ -52,10 +52,11 @@ __device__ inline std::int64_t candidate_id(const Inputs& in, std::int64_t candi
 }
 
 // What is to be read of rows that write_rows had room for: nothing where they did not fit.
-__device__ inline ProjectSizes fitting(const ProjectRoom& room) {
-  if (!room.totals) return room.sizes;
-  const ProjectSizes sizes{room.totals[kTotalVisible], room.totals[kTotalRows]};
-  return sizes.visible <= room.sizes.visible && sizes.rows <= room.sizes.rows ? sizes : ProjectSizes{0, 0};
+__device__ inline ProjectSizes fitting(const ProjectCapacity& capacity) {
+  if (!capacity.totals) return capacity.sizes;
+  const ProjectSizes sizes{capacity.totals[kTotalVisible], capacity.totals[kTotalRows]};
+  return sizes.visible <= capacity.sizes.visible && sizes.rows <= capacity.sizes.rows ? sizes
+                                                                                      : ProjectSizes{0, 0};
 }
 
 // The Gaussians that some views may see, in the order of the candidates, and these views as bits:
@@ -75,9 +76,9 @@ struct Prefiltered {
 
 void prefilter(const Inputs&, const Prefiltered&, Workspace&, CudaStream);
 // totals: null, where they are known. With no room rows are counted only.
-void write_rows(const Inputs&, const RankTiles&, const Prefiltered&, const ProjectSizes& room,
+void write_rows(const Inputs&, const RankTiles&, const Prefiltered&, const ProjectSizes& capacity,
                 const ProjectColumns<float>&, std::int64_t* totals, Workspace&, CudaStream);
 // Of the rows that write_rows wrote; none without sh.
-void write_colors(const Inputs&, const ProjectRoom&, const ProjectColumns<float>&, CudaStream);
+void write_colors(const Inputs&, const ProjectCapacity&, const ProjectColumns<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -67,7 +67,7 @@ struct ProjectSizes {
 
 // How many there is room for, and what there is, as project_totals where the inputs are; null: exactly so
 // many.
-struct ProjectRoom {
+struct ProjectCapacity {
   ProjectSizes sizes;
   const std::int64_t* totals;
 };

@@ -92,7 +92,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   GaussianGradient<float> gradient{};
   float axis_weight = 0.f;
   PoseGradient<float>* no_pose = nullptr;
-  reader.settle(begin, end);
+  reader.finish_pull(begin, end);
   reader.for_each(begin, end, [&](std::int64_t r, const auto& v) {
     if constexpr (Reader::kPulls) v_row = v.geometry(r);
     project_row_vjp(cameras[view], gaussian, in.options, v_row, &gradient, no_pose);

@@ -15,7 +15,7 @@ class SplatGradientReader {
 
   __device__ SplatGradientReader(const Source& source, void*, int) : source_(source) {}
   __device__ __forceinline__ void pull(std::int32_t, std::int32_t) const {}
-  __device__ __forceinline__ void settle(std::int32_t, std::int32_t) const {}
+  __device__ __forceinline__ void finish_pull(std::int32_t, std::int32_t) const {}
   // Calls f(row, what to ask for its gradients) for the lane's rows [begin, end), as the whole warp does.
   template <class F>
   __device__ __forceinline__ void for_each(std::int32_t begin, std::int32_t end, const F& f) const {
@@ -114,7 +114,7 @@ class SplatGradientReader<RankSplatGradients> {
   }
   // Waits for the rows that were pulled, and finds them in the stage: those at several ranks added up, in the
   // order of these.
-  __device__ __forceinline__ void settle(std::int32_t begin, std::int32_t end) const {
+  __device__ __forceinline__ void finish_pull(std::int32_t begin, std::int32_t end) const {
     asm volatile("cp.async.wait_all;" ::: "memory");
     __syncwarp();
     const std::int32_t first = first_of(begin), last = last_of(end);

@@ -35,14 +35,14 @@ __device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>
 
 template <int DEGREE, bool QUADS>
 __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
-    color_kernel(const Inputs in, const ProjectIds ids, const ProjectRoom room,
+    color_kernel(const Inputs in, const ProjectIds ids, const ProjectCapacity capacity,
                  const ProjectOutputs<float> out) {
   __shared__ ShStage<DEGREE> stages[QUADS ? kColorThreads / 32 : 1];
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ TripleStage triples[kColorThreads / 32];
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
-  const std::int64_t n_rows = fitting(room).rows, step = gridDim.x * std::int64_t{kRowsOfBlock};
+  const std::int64_t n_rows = fitting(capacity).rows, step = gridDim.x * std::int64_t{kRowsOfBlock};
   const std::int64_t of_block = blockIdx.x * std::int64_t{kRowsOfBlock};
   if (of_block >= n_rows) return;
   load_cameras(in, cameras);
@@ -64,13 +64,13 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
 
 }  // namespace
 
-void write_colors(const Inputs& in, const ProjectRoom& room, const ProjectColumns<float>& columns,
+void write_colors(const Inputs& in, const ProjectCapacity& capacity, const ProjectColumns<float>& columns,
                   CudaStream stream) {
-  if (room.sizes.rows == 0 || !in.sh) return;
-  const std::int64_t blocks = (room.sizes.rows + kRowsOfBlock - 1) / kRowsOfBlock;
+  if (capacity.sizes.rows == 0 || !in.sh) return;
+  const std::int64_t blocks = (capacity.sizes.rows + kRowsOfBlock - 1) / kRowsOfBlock;
   dispatch_sh(in, [&](auto degree, auto quads) {
-    color_kernel<degree.value, quads.value>
-        <<<static_cast<unsigned>(blocks), kColorThreads, 0, stream>>>(in, columns.ids, room, columns.values);
+    color_kernel<degree.value, quads.value><<<static_cast<unsigned>(blocks), kColorThreads, 0, stream>>>(
+        in, columns.ids, capacity, columns.values);
   });
   check_launch("project");
 }

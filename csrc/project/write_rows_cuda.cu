@@ -102,22 +102,23 @@ __device__ __forceinline__ int sum_of_threads_before(int value, Group& group, in
 }
 
 // Closes the rows of the last visible Gaussian; all: visible << 31 | rows.
-__device__ __forceinline__ void end_rows(std::int64_t all, const ProjectSizes& room, const ProjectIds& ids) {
+__device__ __forceinline__ void end_rows(std::int64_t all, const ProjectSizes& capacity,
+                                         const ProjectIds& ids) {
   const std::int64_t visible = all >> 31;
-  if (room.rows > 0 && visible <= room.visible) {
+  if (capacity.rows > 0 && visible <= capacity.visible) {
     ids.row_offsets[visible] = static_cast<std::int32_t>(all & 0x7fffffff);
   }
 }
 
-// Writes a group's rows, as far as there is room. before: visible << 31 | rows of the turns before.
+// Writes a group's rows, as far as there is capacity. before: visible << 31 | rows of the turns before.
 __device__ __forceinline__ void write_rows(const Group& group, std::int64_t before, const Pending& pending,
-                                           int n_pairs, const ProjectSizes& room, const ProjectIds& ids,
+                                           int n_pairs, const ProjectSizes& capacity, const ProjectIds& ids,
                                            const ProjectOutputs<float>& out) {
   const int thread = threadIdx.x;
   const std::int64_t visible_before = before >> 31, rows_before = before & 0x7fffffff;
   const std::int32_t in_group = group.before[thread];
   const std::int64_t u = visible_before + (in_group >> 16);
-  if (group.seen[thread] && u < room.visible) {
+  if (group.seen[thread] && u < capacity.visible) {
     ids.visible_ids[u] = group.ids[thread];
     ids.row_offsets[u] = static_cast<std::int32_t>(rows_before + (in_group & 0xffff));
   }
@@ -127,7 +128,7 @@ __device__ __forceinline__ void write_rows(const Group& group, std::int64_t befo
     const std::uint32_t of_slot = group.seen[slot];
     const std::int64_t i =
         rows_before + (group.before[slot] & 0xffff) + __popc(of_slot & ((1u << view) - 1u));
-    if (i >= room.rows) continue;
+    if (i >= capacity.rows) continue;
     ids.gaussian_ids[i] = group.ids[slot];
     ids.camera_ids[i] = view;
     reinterpret_cast<float2*>(out.means2d)[i] = pending.means2d[p];
@@ -147,7 +148,7 @@ __device__ __forceinline__ void write_rows(const Group& group, std::int64_t befo
 // so nobody waits for the slowest.
 __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
     rows_kernel(const Inputs in, const __grid_constant__ RankTiles rank_tiles, const Prefiltered kept,
-                const ProjectSizes room, const ProjectIds ids, const ProjectOutputs<float> out,
+                const ProjectSizes capacity, const ProjectIds ids, const ProjectOutputs<float> out,
                 unsigned long long* totals, const TurnSums turns) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ TripleStage triples[kWarps];
@@ -158,9 +159,9 @@ __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
   const std::int64_t n_gaussians = *kept.count;
   const int at_once = projected_at_once(in.n_views);
   const int n_turns = static_cast<int>((n_gaussians + at_once - 1) / at_once);
-  if (blockIdx.x == 0 && thread == 0 && n_turns == 0) end_rows(0, room, ids);
+  if (blockIdx.x == 0 && thread == 0 && n_turns == 0) end_rows(0, capacity, ids);
   if (static_cast<int>(blockIdx.x) > n_turns) return;
-  const bool writes = room.rows > 0;
+  const bool writes = capacity.rows > 0;
   for (int i = thread; i < static_cast<int>(sizeof(Sums) / 4); i += kRowThreads) {
     reinterpret_cast<unsigned*>(&sums)[i] = 0;
   }
@@ -235,8 +236,8 @@ __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
     __syncthreads();
     if (writes) {
       const std::int64_t before = group.of_turns_before;
-      write_rows(group, before, pending, n_pairs, room, ids, out);
-      if (turn == n_turns - 1 && thread == 0) end_rows(before + own, room, ids);
+      write_rows(group, before, pending, n_pairs, capacity, ids, out);
+      if (turn == n_turns - 1 && thread == 0) end_rows(before + own, capacity, ids);
     }
     if (thread == 0) group.next_turn = next;
     __syncthreads();
@@ -252,14 +253,14 @@ __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
 }  // namespace
 
 void write_rows(const Inputs& in, const RankTiles& rank_tiles, const Prefiltered& kept,
-                const ProjectSizes& room, const ProjectColumns<float>& columns, std::int64_t* totals,
+                const ProjectSizes& capacity, const ProjectColumns<float>& columns, std::int64_t* totals,
                 Workspace& workspace, CudaStream stream) {
   const ProjectIds& ids = columns.ids;
   if (totals) {
     const std::size_t bytes = project_totals(in.n_views, rank_tiles.n_ranks) * sizeof(std::int64_t);
     check(cudaMemsetAsync(totals, 0, bytes, stream), "project");
   }
-  if (room.rows == 0 && ids.row_offsets) {
+  if (capacity.rows == 0 && ids.row_offsets) {
     check(cudaMemsetAsync(ids.row_offsets, 0, sizeof(*ids.row_offsets), stream), "project");
     if (!totals) return;
   }
@@ -267,7 +268,7 @@ void write_rows(const Inputs& in, const RankTiles& rank_tiles, const Prefiltered
   const std::int64_t turns = std::max<std::int64_t>(1, (in.n_candidates + at_once - 1) / at_once);
   const std::int64_t blocks = std::min<std::int64_t>(1 + turns, kBlocksPerMultiprocessor * multiprocessors());
   rows_kernel<<<static_cast<unsigned>(blocks), kRowThreads, 0, stream>>>(
-      in, rank_tiles, kept, room, ids, columns.values, reinterpret_cast<unsigned long long*>(totals),
+      in, rank_tiles, kept, capacity, ids, columns.values, reinterpret_cast<unsigned long long*>(totals),
       TurnSums(turn_zeros(turns, workspace, stream)));
   check_launch("project");
 }

@@ -9,7 +9,6 @@
 namespace blitzgs::cuda {
 
 // List entries that a block copies at once.
-template <int TILE>
 inline constexpr int kForwardBatch = 256;
 
 // Alpha T of four entries of a batch at a pixel: zero where an entry is not composited.

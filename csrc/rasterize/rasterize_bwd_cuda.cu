@@ -32,11 +32,11 @@ struct BackwardArguments {
   PackedGradient* entry_gradients;  // [I], written once each (deterministic)
 };
 
-template <int TILE, int CHANNELS, bool DETERMINISTIC>
+template <int CHANNELS, bool DETERMINISTIC>
 struct BackwardShared {
   static constexpr int kBatch = DETERMINISTIC ? 64 : 256;
-  static constexpr int kWarps = Tile<TILE>::kWarps, kSubtiles = Tile<TILE>::kSubtiles;
-  EntryBatch<TILE, kBatch> batch;
+  static constexpr int kWarps = Tile::kWarps, kSubtiles = Tile::kSubtiles;
+  EntryBatch<kBatch> batch;
   SubtileGradient<CHANNELS> v_render[kSubtiles];
   float2 group[kSubtiles][kGroup * kGroupStride];  // weight, g
   PackedGradient partial[DETERMINISTIC ? kWarps : 1][DETERMINISTIC ? kBatch : 1];
@@ -50,8 +50,8 @@ __device__ __forceinline__ float4 add_halves(float4 a) {
 }
 
 // Sums the group's entries, list[0 .. filled) of the half-warp's list, and hands the results on.
-template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
-__device__ __forceinline__ void flush_group(BackwardShared<TILE, CHANNELS, DETERMINISTIC>& shared,
+template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
+__device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINISTIC>& shared,
                                             const BackwardArguments& args, const TilePlace& tile,
                                             const Pixel& pixel, int buffer, int filled,
                                             const std::uint16_t* list) {
@@ -60,7 +60,7 @@ __device__ __forceinline__ void flush_group(BackwardShared<TILE, CHANNELS, DETER
   const std::uint32_t offset = slot < filled ? list[slot] : shared.batch.kNothing;
   const Entry& shape = entry_at(reinterpret_cast<const char*>(shared.batch.entries[buffer]), offset);
   const int my_entry = static_cast<int>(offset / sizeof(Entry));
-  constexpr int kColumns = Tile<TILE>::kColumns, kMiddle = kSubtile / 2;
+  constexpr int kColumns = Tile::kColumns, kMiddle = kSubtile / 2;
   const float x = static_cast<float>(tile.left + pixel.subtile % kColumns * kSubtile + kMiddle) - shape.x;
   const float y = static_cast<float>(tile.top + pixel.subtile / kColumns * kSubtile + kMiddle) - shape.y;
   const EntrySums<CHANNELS> sums = sum_pixels<CHANNELS, ABSOLUTE>(
@@ -96,7 +96,7 @@ __device__ __forceinline__ void flush_group(BackwardShared<TILE, CHANNELS, DETER
   __syncwarp();
 }
 
-template <int TILE, int CHANNELS, bool WIDE, class Shared>
+template <int CHANNELS, bool WIDE, class Shared>
 __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, const BackwardArguments& args,
                                                                const Pixel& pixel, int camera) {
   BackwardPixel<CHANNELS> state;
@@ -131,10 +131,10 @@ __device__ __noinline__ float wide_dot(const BackwardArguments& args, const Pixe
 }
 
 // WIDE: g is of all channels, not of the chunk's alone, which absolute sums need.
-template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
-__global__ void __launch_bounds__(TILE* TILE, 768 / (TILE * TILE))
+template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
+__global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
     backward_kernel(const BackwardArguments args) {
-  using Shared = BackwardShared<TILE, CHANNELS, DETERMINISTIC>;
+  using Shared = BackwardShared<CHANNELS, DETERMINISTIC>;
   constexpr int kBatch = Shared::kBatch;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
   Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);
@@ -142,15 +142,15 @@ __global__ void __launch_bounds__(TILE* TILE, 768 / (TILE * TILE))
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   const std::int64_t index = args.order.tile(static_cast<int>(blockIdx.x));
   if (index < args.grid.tile_begin || index >= args.grid.tile_end) return;  // composited, but not owned
-  const TilePlace tile = locate_tile<TILE>(args.grid, index);
+  const TilePlace tile = locate_tile(args.grid, index);
   const std::int64_t start = args.tile_offsets[tile.tile];
   if (args.tile_offsets[tile.tile + 1] == start) return;
-  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
+  const Pixel pixel = locate_pixel(args.grid, tile, thread);
 
   if (thread == 0) shared.last = 0;
   if (thread < 2) shared.row[thread][kBatch] = -1;
   shared.batch.init(thread);
-  auto state = start_pixel<TILE, CHANNELS, WIDE>(shared, args, pixel, tile.camera);
+  auto state = start_pixel<CHANNELS, WIDE>(shared, args, pixel, tile.camera);
   const int pixel_last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
   int list_last = pixel_last;  // of the pixels that share a list
   for (int step = DETERMINISTIC ? kHalfWarp : kHalfWarp / 2; step > 0; step /= 2) {
@@ -205,12 +205,12 @@ __global__ void __launch_bounds__(TILE* TILE, 768 / (TILE * TILE))
       for (const int stop = i + filled; i < stop; ++i, slots += 4 * kGroupStride) {
         state.add(entries, QuadOffsets(list[i]), last, pixel, dot, slots);
       }
-      flush_group<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, tile, pixel, buffer, 4 * filled,
-                                                           reinterpret_cast<const std::uint16_t*>(group));
+      flush_group<CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, tile, pixel, buffer, 4 * filled,
+                                                     reinterpret_cast<const std::uint16_t*>(group));
     }
     if constexpr (DETERMINISTIC) {
       __syncthreads();
-      for (int i = thread; i < 3 * kBatch && base + i / 3 < count; i += TILE * TILE) {
+      for (int i = thread; i < 3 * kBatch && base + i / 3 < count; i += Tile::kThreads) {
         float4 sum = shared.partial[0][0].quads[i];
         for (int other = 1; other < Shared::kWarps; ++other) {
           const float4 part = shared.partial[other][0].quads[i];
@@ -223,29 +223,28 @@ __global__ void __launch_bounds__(TILE* TILE, 768 / (TILE * TILE))
   }
 }
 
-template <int TILE, int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
+template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
 void launch_backward(const BackwardArguments& args, CudaStream stream) {
-  const auto kernel = backward_kernel<TILE, CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>;
-  constexpr int kBytes = sizeof(BackwardShared<TILE, CHANNELS, DETERMINISTIC>);
+  const auto kernel = backward_kernel<CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>;
+  constexpr int kBytes = sizeof(BackwardShared<CHANNELS, DETERMINISTIC>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_bwd");
   launch_early("rasterize_bwd", kernel,
-               {static_cast<unsigned>(args.order.n_tiles), TILE * TILE, stream, kBytes}, args);
+               {static_cast<unsigned>(args.order.n_tiles), Tile::kThreads, stream, kBytes}, args);
 }
 
-template <int TILE>
 void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream stream) {
   const bool wide = absolute && args.chunk.n_channels > 4 && args.chunk.first == 0;
   if (args.entry_gradients) {
-    wide ? launch_backward<TILE, 4, true, true, true>(args, stream)
-         : launch_backward<TILE, 4, true, true, false>(args, stream);
+    wide ? launch_backward<4, true, true, true>(args, stream)
+         : launch_backward<4, true, true, false>(args, stream);
   } else if (wide) {
-    launch_backward<TILE, 4, true, false, true>(args, stream);
+    launch_backward<4, true, false, true>(args, stream);
   } else if (absolute && args.chunk.first == 0) {
-    launch_backward<TILE, 4, true, false, false>(args, stream);
+    launch_backward<4, true, false, false>(args, stream);
   } else if (args.chunk.count == 4) {
-    launch_backward<TILE, 4, false, false, false>(args, stream);
+    launch_backward<4, false, false, false>(args, stream);
   } else {
-    launch_backward<TILE, 3, false, false, false>(args, stream);
+    launch_backward<3, false, false, false>(args, stream);
   }
 }
 
@@ -287,7 +286,7 @@ class PackedRows {
                                  saved_,
                                  packed,
                                  entries_};
-    dispatch_backward<kTileSize>(args, absolute, stream_);
+    dispatch_backward(args, absolute, stream_);
     if (!entries_) return;
     sum_entries_kernel<<<blocks_for(3 * n_isects_, 256), 256, 0, stream_>>>(
         sorted_.rows, sorted_.entries, n_isects_, in_.tile_offsets + in_.grid.count(), entries_, packed);

@@ -73,11 +73,11 @@ __device__ __forceinline__ void zero_share(const ForwardArguments& args, std::in
 }
 
 // The first blocks are the owned tiles; the rest, if wanted, write zeros.
-template <int TILE, int CHANNELS>
-__global__ void __launch_bounds__(TILE* TILE, 4) forward_kernel(const ForwardArguments args) {
-  constexpr int kBatch = kForwardBatch<TILE>;
+template <int CHANNELS>
+__global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const ForwardArguments args) {
+  constexpr int kBatch = kForwardBatch;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
-  auto& batch = *reinterpret_cast<EntryBatch<TILE, kBatch>*>(shared_bytes);
+  auto& batch = *reinterpret_cast<EntryBatch<kBatch>*>(shared_bytes);
   __shared__ int tile_work;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   wait_for_earlier_kernels();
@@ -86,10 +86,10 @@ __global__ void __launch_bounds__(TILE* TILE, 4) forward_kernel(const ForwardArg
   const std::int64_t index = block < owned                          ? args.order.tile(block)
                              : block - owned < args.grid.tile_begin ? block - owned
                                                                     : block;
-  const TilePlace tile = locate_tile<TILE>(args.grid, index);
-  const Pixel pixel = locate_pixel<TILE>(args.grid, tile, thread);
+  const TilePlace tile = locate_tile(args.grid, index);
+  const Pixel pixel = locate_pixel(args.grid, tile, thread);
   if (block >= owned) {
-    zero_share(args, zero_rows, TILE * TILE);
+    zero_share(args, zero_rows, Tile::kThreads);
     constexpr float kBlack[CHANNELS] = {};
     if (pixel.inside) write_pixel<CHANNELS>(args, pixel, tile.camera, kBlack, 0.f, 0);
     if (thread == 0 && args.chunk.first == 0) args.out.tile_work[tile.tile] = 0;
@@ -108,7 +108,7 @@ __global__ void __launch_bounds__(TILE* TILE, 4) forward_kernel(const ForwardArg
     return thread < kBatch && at < count ? args.isect_rows[start + at] : -1;
   };
   std::int32_t row = row_at(thread), next_row = row_at(thread + kBatch);
-  zero_share(args, zero_rows, TILE * TILE);  // while the list is on its way
+  zero_share(args, zero_rows, Tile::kThreads);  // while the list is on its way
   batch.fetch(0, args.rows, args.chunk, row, thread);
   for (int base = 0, buffer = 0; base < count; base += kBatch, buffer ^= 1) {
     if (thread < kBatch) batch.place(buffer, row >= 0, tile, thread);
@@ -150,19 +150,18 @@ void zero_gradients(const RasterizeOutput<float>& out, std::int64_t n_rows, Cuda
         "rasterize_fwd");
 }
 
-template <int TILE>
 void launch_forward(ForwardArguments args, CudaStream stream) {
   const auto tiles = static_cast<unsigned>(args.out.clear_rest ? args.grid.count() : args.order.n_tiles);
-  if (kQuads * args.zero_rows > tiles * std::int64_t{kMostZeros * TILE * TILE}) {
+  if (kQuads * args.zero_rows > tiles * std::int64_t{kMostZeros * Tile::kThreads}) {
     zero_gradients(args.out, args.zero_rows, stream);
     args.zero_rows = 0;
   }
   if (tiles == 0) return;
   args.rows_per_block = (args.zero_rows + tiles - 1) / tiles;
-  const auto kernel = args.chunk.count == 4 ? forward_kernel<TILE, 4> : forward_kernel<TILE, 3>;
-  constexpr int kBytes = sizeof(EntryBatch<TILE, kForwardBatch<TILE>>);
+  const auto kernel = args.chunk.count == 4 ? forward_kernel<4> : forward_kernel<3>;
+  constexpr int kBytes = sizeof(EntryBatch<kForwardBatch>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_fwd");
-  launch_early("rasterize_fwd", kernel, {tiles, TILE * TILE, stream, kBytes}, args);
+  launch_early("rasterize_fwd", kernel, {tiles, Tile::kThreads, stream, kBytes}, args);
 }
 
 }  // namespace
@@ -199,7 +198,7 @@ void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput
         zero_rows,
         0,
         in.known_rows};
-    launch_forward<kTileSize>(args, stream);
+    launch_forward(args, stream);
   }
 }
 

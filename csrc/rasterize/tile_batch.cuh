@@ -125,11 +125,10 @@ __device__ __forceinline__ float sqrt_approx(float x) {
   return y;
 }
 
-template <int TILE>
 struct Tile {
-  static constexpr int kThreads = TILE * TILE;
+  static constexpr int kThreads = kTileSize * kTileSize;
   static constexpr int kWarps = kThreads / 32;
-  static constexpr int kColumns = TILE / kSubtile;
+  static constexpr int kColumns = kTileSize / kSubtile;
   static constexpr int kSubtiles = kColumns * kColumns;
   static constexpr int kMaskWords = (kSubtiles + 31) / 32;
 };
@@ -148,7 +147,6 @@ struct TilePlace {
   int camera, left, top;
 };
 
-template <int TILE>
 __device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid, std::int64_t tile) {
   TilePlace place;
   place.tile = tile;
@@ -157,15 +155,14 @@ __device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid, std::int6
   const auto per_image = static_cast<std::uint32_t>(grid.per_image());
   const std::uint32_t in_image = number % per_image;
   place.camera = static_cast<int>(number / per_image);
-  place.top = static_cast<int>(in_image / columns * TILE);
-  place.left = static_cast<int>(in_image % columns * TILE);
+  place.top = static_cast<int>(in_image / columns * kTileSize);
+  place.left = static_cast<int>(in_image % columns * kTileSize);
   return place;
 }
 
 // A warp is two subtiles side by side.
-template <int TILE>
 __device__ __forceinline__ Pixel locate_pixel(const TileGrid& grid, const TilePlace& place, int thread) {
-  constexpr int kColumns = Tile<TILE>::kColumns;
+  constexpr int kColumns = Tile::kColumns;
   const int lane = thread % kHalfWarp;
   Pixel pixel;
   pixel.subtile = thread / kHalfWarp;
@@ -175,8 +172,8 @@ __device__ __forceinline__ Pixel locate_pixel(const TileGrid& grid, const TilePl
   pixel.y = place.top + y;
   pixel.inside = pixel.x < grid.width && pixel.y < grid.height;
   pixel.index = (static_cast<std::int64_t>(place.camera) * grid.height + pixel.y) * grid.width + pixel.x;
-  pixel.dx = static_cast<float>(x) + (0.5f - TILE / 2);
-  pixel.dy = static_cast<float>(y) + (0.5f - TILE / 2);
+  pixel.dx = static_cast<float>(x) + (0.5f - kTileSize / 2);
+  pixel.dy = static_cast<float>(y) + (0.5f - kTileSize / 2);
   return pixel;
 }
 
@@ -191,23 +188,22 @@ __device__ __forceinline__ std::uint32_t ceil_bits(float scale, float value, flo
 
 // One bit per subtile, row by row: can alpha reach 1/255 at one of its pixel centres? Over each row of
 // subtiles, the ellipse of those points spans an interval of x with ends in closed form (as in math/tiles.h).
-template <int TILE>
 __device__ __forceinline__ void subtile_mask(const PackedRow& row, const TilePlace& place,
                                              std::uint32_t* masks) {
-  constexpr int kColumns = Tile<TILE>::kColumns;
+  constexpr int kColumns = Tile::kColumns;
   constexpr std::uint32_t kRow = (1u << kColumns) - 1u;
   // From the centre of the tile's first pixel to the mean.
   const float x = row.x - (static_cast<float>(place.left) + 0.5f);
   const float y = row.y - (static_cast<float>(place.top) + 0.5f);
   // The slack covers the rounding of this test and of log2_alpha().
-  const float terms = fabsf(row.l11) * (fabsf(x) + TILE) + fabsf(row.l21) * (fabsf(y) + TILE);
+  const float terms = fabsf(row.l11) * (fabsf(x) + kTileSize) + fabsf(row.l21) * (fabsf(y) + kTileSize);
   const float cut = (row.log2_opacity - kLog2Cut) * 1.00003f + 3e-5f + 2e-6f * terms;
-  const float slack = 2e-6f * (fabsf(x) + fabsf(row.dx_per_dy) * (fabsf(y) + TILE)) + 1e-5f;
+  const float slack = 2e-6f * (fabsf(x) + fabsf(row.dx_per_dy) * (fabsf(y) + kTileSize)) + 1e-5f;
   const float inverse = 1.000003f * reciprocal_approx(row.l11);
   const float turn = row.turn * sqrt_approx(cut);
   const float left = x - slack - (kSubtile - 1), right = x + slack;
 #pragma unroll
-  for (int word = 0; word < Tile<TILE>::kMaskWords; ++word) masks[word] = 0;
+  for (int word = 0; word < Tile::kMaskWords; ++word) masks[word] = 0;
 #pragma unroll
   for (int i = 0; i < kColumns; ++i) {
     const float y0 = static_cast<float>(i * kSubtile) - y, y1 = y0 + (kSubtile - 1);
@@ -220,9 +216,9 @@ __device__ __forceinline__ void subtile_mask(const PackedRow& row, const TilePla
     const float end_right = row.dx_per_dy * dy_right + reach_right + right;
     // Subtile c holds the pixels 4 c to 4 c + 3. A NaN bound does not bound.
     const std::uint32_t skip_left =
-        ceil_bits(0.25f, fminf(fmaxf(end_left, 1.f - kSubtile), static_cast<float>(TILE)), 0.f);
+        ceil_bits(0.25f, fminf(fmaxf(end_left, 1.f - kSubtile), static_cast<float>(kTileSize)), 0.f);
     const std::uint32_t skip_right =
-        ceil_bits(-0.25f, fmaxf(fminf(end_right, static_cast<float>(TILE - 1)), -4.f), kColumns - 1.f);
+        ceil_bits(-0.25f, fmaxf(fminf(end_right, static_cast<float>(kTileSize - 1)), -4.f), kColumns - 1.f);
     const std::uint32_t bits = __funnelshift_l(0u, kRow, skip_left) & __funnelshift_r(kRow, 0u, skip_right);
     if (rest_right >= 0.f) masks[i * kColumns / 32] |= bits << (i * kColumns % 32);
   }
@@ -266,14 +262,14 @@ __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pix
 // walks, with an entry that touches nothing. Thread i < BATCH sees to entry i of each batch: fetch(first),
 // then for each batch place(it), barrier, fetch(next), list(it). One barrier is enough: fetch() overwrites
 // what was last read before it, and place() what was last read before the previous one.
-template <int TILE, int BATCH>
+template <int BATCH>
 struct EntryBatch {
   static constexpr int kWords = BATCH / 32;
   static constexpr int kLaneBits = BATCH / kHalfWarp;  // entries that each lane lists
   static constexpr std::uint32_t kNothing = BATCH * sizeof(Entry);
   Entry entries[2][BATCH + 1];
-  std::uint32_t hits[2][Tile<TILE>::kSubtiles][kWords];
-  std::uint16_t lists[Tile<TILE>::kSubtiles][BATCH + 4];
+  std::uint32_t hits[2][Tile::kSubtiles][kWords];
+  std::uint16_t lists[Tile::kSubtiles][BATCH + 4];
 
   // Once per block, before the first barrier.
   __device__ __forceinline__ void init(int thread) {
@@ -299,20 +295,20 @@ struct EntryBatch {
   __device__ __forceinline__ void place(int buffer, bool present, const TilePlace& tile, int at) {
     const int lane = at & 31;
     copies_done();
-    std::uint32_t masks[Tile<TILE>::kMaskWords] = {};
+    std::uint32_t masks[Tile::kMaskWords] = {};
     if (present) {
       auto* target = reinterpret_cast<float4*>(&entries[buffer][at]);
       const float4 a = target[0], b = target[1];
-      const float x = a.x - static_cast<float>(tile.left + TILE / 2);
-      const float y = a.y - static_cast<float>(tile.top + TILE / 2);
+      const float x = a.x - static_cast<float>(tile.left + kTileSize / 2);
+      const float y = a.y - static_cast<float>(tile.top + kTileSize / 2);
       target[0] = {a.z, a.w, -__fmaf_rn(a.z, x, __fmul_rn(a.w, y)), b.x};
       target[1] = {-__fmul_rn(b.x, y), b.y, a.x, a.y};
-      subtile_mask<TILE>({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile, masks);
+      subtile_mask({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile, masks);
     }
 #pragma unroll
-    for (int i = 0; i < Tile<TILE>::kMaskWords; ++i) {
+    for (int i = 0; i < Tile::kMaskWords; ++i) {
       const std::uint32_t mine = transpose_bits(masks[i], lane);
-      if (32 * i + lane < Tile<TILE>::kSubtiles) hits[buffer][32 * i + lane][at >> 5] = mine;
+      if (32 * i + lane < Tile::kSubtiles) hits[buffer][32 * i + lane][at >> 5] = mine;
     }
   }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/cuda_check.h"
-#include "tell_host/tell_host.h"
+#include "copy_to_host/copy_to_host.h"
 #include "transport/transport.h"
 
 namespace blitzgs::cuda {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #ifdef BLITZGS_BACKEND_CUDA
-#include "tell_host/tell_host_op.h"
+#include "copy_to_host/copy_to_host_op.h"
 #include "transport/peers_op.h"
 
 namespace blitzgs {

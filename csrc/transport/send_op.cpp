@@ -25,9 +25,10 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
   for (int c = 0; c < kSentColumns.count; ++c) {
     const Tensor& column = columns[c];
     const std::int64_t words = kSentColumns.begin[c + 1] - kSentColumns.begin[c];
-    STD_TORCH_CHECK(column.is_contiguous() && column.size(0) == columns[0].size(0) &&
-                        column.numel() * column.element_size() == 4 * words * column.size(0),
-                    "blitzgs::", kOp, ": column ", c, " must be contiguous, of ", words, " words a row");
+    STD_TORCH_CHECK(
+        column.is_contiguous() && column.size(0) == columns[0].size(0) &&
+            column.numel() * static_cast<std::int64_t>(column.element_size()) == 4 * words * column.size(0),
+        "blitzgs::", kOp, ": column ", c, " must be contiguous, of ", words, " words a row");
     arguments.rows.columns.data[c] = static_cast<const std::int32_t*>(column.const_data_ptr());
   }
   check_shape(kOp, "rank_masks", rank_masks, {columns[0].size(0)});

@@ -158,7 +158,7 @@ def test_numbers_for_the_host_go_to_pinned_memory():
             torch.cuda._sleep(20_000_000)
             assert torch.equal(copy.read(), values.cpu())
     with pytest.raises(RuntimeError, match="must be pinned memory"):
-        ops.tell_host_(torch.zeros(300, dtype=torch.int64), values)
+        ops.copy_to_host_(torch.zeros(300, dtype=torch.int64), values)
     torch.cuda._sleep(20_000_000)
     with pytest.raises(ValueError), HostCopy(values):
         raise ValueError

@@ -12,6 +12,6 @@ namespace blitzgs::cuda {
 // Where kernels of the current device find pinned memory of the host. Throws where it is not pinned.
 std::int64_t* device_address(std::int64_t* pinned);
 
-void tell_host(const std::int64_t* values, std::int64_t n, std::int64_t* known, CudaStream);
+void copy_to_host(const std::int64_t* values, std::int64_t n, std::int64_t* host, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/launch.cuh"
-#include "tell_host/tell_host.h"
+#include "copy_to_host/copy_to_host.h"
 
 namespace blitzgs::cuda {
 
@@ -8,10 +8,10 @@ namespace {
 
 constexpr int kThreads = 128;
 
-__global__ void tell_kernel(const std::int64_t* values, std::int64_t n, std::int64_t* known) {
+__global__ void copy_kernel(const std::int64_t* values, std::int64_t n, std::int64_t* host) {
   wait_for_earlier_kernels();
   const std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
-  if (i < n) known[i] = values[i];
+  if (i < n) host[i] = values[i];
 }
 
 }  // namespace
@@ -25,10 +25,10 @@ std::int64_t* device_address(std::int64_t* pinned) {
   return static_cast<std::int64_t*>(found.devicePointer);
 }
 
-void tell_host(const std::int64_t* values, std::int64_t n, std::int64_t* known, CudaStream stream) {
+void copy_to_host(const std::int64_t* values, std::int64_t n, std::int64_t* host, CudaStream stream) {
   if (n == 0) return;
-  launch_early("tell_host", tell_kernel, {blocks_for(n, kThreads), kThreads, stream}, values, n,
-               device_address(known));
+  launch_early("copy_to_host", copy_kernel, {blocks_for(n, kThreads), kThreads, stream}, values, n,
+               device_address(host));
 }
 
 }  // namespace blitzgs::cuda
