@@ -19,6 +19,11 @@ Write the model of a run as a PLY file in INRIA's layout, which most viewers rea
 Georeferenced models are written around their own origin, because the file's float32 numbers cannot hold large
 coordinates; the offset is in the header (`comment offset X Y Z`) and in FILE.offset.json.
 
+A model trained with view.lod has all its Gaussians in the file, and most viewers show them all. Their octree
+levels are the property `level`, behind the others. The line
+`comment lod reference_distance D fork F levels K finest L` tells a viewer what a view keeps: level l up to
+the distance D * F^(1/2 - l), none beyond L, level 0 everywhere.
+
 A model trained with model.antialiased is marked `comment SplatRenderMode: mip`. For a viewer that does not
 know the mark, --classic bakes the compensation into the opacities as far as that is possible.
 """

@@ -3,7 +3,8 @@
 
 The INRIA layout is binary little endian, every property a float32 in this order: x y z nx ny nz f_dc_0..2
 f_rest_0.. opacity scale_0..2 rot_0..3. f_rest is channel-major: all coefficients of red, then green, then
-blue. Values are pre-activation (log scales, logit opacities, unnormalised quaternions w x y z). A file in
+blue. Values are pre-activation (log scales, logit opacities, unnormalised quaternions w x y z). A model whose
+views leave out Gaussians by their octree levels has one property more, `level`, behind the others. A file in
 this layout that is read and written again is the same, byte for byte.
 """
 
@@ -21,6 +22,7 @@ from torch import Tensor
 from blitzgs.formats.native import native_io
 from blitzgs.output import new_file
 
+LEVEL = "level"
 _REST_TO_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 
 
@@ -42,6 +44,8 @@ class GaussianPly:
     """[N, 3]; not used by anything, kept for the round trip."""
     comments: list[str]
     """Header lines "comment ..." and "obj_info ..."."""
+    levels: Tensor | None = None
+    """[N] octree levels, where the file has them."""
 
 
 def _property_names(coefficients: int) -> list[str]:
@@ -91,6 +95,7 @@ def read_ply(path: Path | str) -> GaussianPly:
         sh=sh,
         normals=columns("nx", "ny", "nz"),
         comments=comments,
+        levels=columns(LEVEL)[:, 0] if LEVEL in names else None,
     )
 
 
@@ -105,6 +110,7 @@ def write_ply(
     normals: Tensor | None = None,
     offset: npt.NDArray[np.float64] | None = None,
     comments: list[str] | None = None,
+    levels: Tensor | None = None,
 ) -> None:
     """Write Gaussians in the INRIA layout; the file appears under its name only when it is complete.
 
@@ -118,6 +124,7 @@ def write_ply(
         normals: [N, 3]; zero when left out.
         offset: float64 [3] added to the means in float64; `Capture.offset` restores the capture's own world.
         comments: header lines, each "comment ..." or "obj_info ...".
+        levels: [N] octree levels; None: the file has none.
 
     Raises:
         ValueError: shapes disagree.
@@ -126,12 +133,17 @@ def write_ply(
     n, k = len(means), sh.shape[1] if sh.ndim == 3 else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    if levels is not None:
+        shapes["levels"], given["levels"] = (n,), levels
     if k not in _REST_TO_COEFFICIENTS.values():
         raise ValueError(f"sh has the shape {list(sh.shape)}, expected [N, K, 3] with K = 1, 4, 9 or 16")
     for name, shape in shapes.items():
         if tuple(given[name].shape) != shape:
             raise ValueError(f"{name} has the shape {list(given[name].shape)}, expected {list(shape)}")
     names = _property_names(k)
+    end = len(names)
+    if levels is not None:
+        names.append(LEVEL)
     rows = np.zeros((n, len(names)), dtype="<f4")
     rows[:, 0:3] = _moved(means, offset)
     if normals is not None:
@@ -139,9 +151,11 @@ def write_ply(
     coefficients = _array(sh)
     rows[:, 6:9] = coefficients[:, 0]
     rows[:, 9 : 9 + 3 * (k - 1)] = coefficients[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (k - 1))
-    rows[:, -8] = _array(opacities)
-    rows[:, -7:-4] = _array(scales)
-    rows[:, -4:] = _array(quats)
+    rows[:, end - 8] = _array(opacities)
+    rows[:, end - 7 : end - 4] = _array(scales)
+    rows[:, end - 4 : end] = _array(quats)
+    if levels is not None:
+        rows[:, end] = _array(levels)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     properties = [(name, "f4") for name in names]

@@ -67,6 +67,12 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
     if model.config.model.antialiased:
         # The name that viewers look for (Brush, PlayCanvas and others).
         comments.append("comment SplatRenderMode: mip")
+    if model.lod is not None:
+        gate = model.lod.gate
+        comments.append(
+            f"comment lod reference_distance {gate.reference_distance * space.unit!r} fork {gate.fork!r} "
+            f"levels {gate.count} finest {gate.finest}"
+        )
     if centred:
         x, y, z = space.offset
         comments.append(f"comment offset {x!r} {y!r} {z!r}")
@@ -80,6 +86,7 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
         sh=model.sh,
         offset=None if centred else offset,
         comments=comments,
+        levels=None if model.lod is None else model.level,
     )
     if not centred:
         return Exported(None, None, rounding)

@@ -13,6 +13,7 @@ import blitzgs
 from blitzgs import pipeline
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.ply import read_ply, write_ply
 from blitzgs.model import GaussianTable
 from blitzgs.population.importance import CULL, is_culled
 from blitzgs.training import run
@@ -184,6 +185,23 @@ def test_render_honours_the_gate(tmp_path):
     assert model.lod is not None
     image = model.render(cameras.cameras[cameras.test[0]])
     np.testing.assert_allclose(np.load(path), image.numpy(), rtol=0, atol=1e-5)
+
+
+def test_the_export_carries_the_levels(whole_run, tmp_path):
+    folder, trainer, _, _ = whole_run
+    path = tmp_path / "model.ply"
+    assert main(["export", str(folder), "--ply", str(path)]) == 0
+    found, table, state = read_ply(path), trainer.state.table, trainer.state
+    assert torch.equal(found.levels, table["level"].float())
+    assert torch.equal(found.quats, table["quats"]) and torch.equal(found.opacities, table["opacities"])
+    (line,) = [text for text in found.comments if text.startswith("comment lod ")]
+    words = line.split()
+    distance = state.progress.reference_distance * state.space.unit
+    assert float(words[words.index("reference_distance") + 1]) == distance
+    assert words[-4:] == ["levels", str(state.progress.level_count), "finest", "1"]
+    with pytest.raises(ValueError, match="levels has the shape"):
+        write_ply(path, means=found.means, quats=found.quats, scales=found.scales,
+                  opacities=found.opacities, sh=found.sh, levels=found.levels[1:])  # fmt: skip
 
 
 def test_levels_are_unlocked_as_octree_gs_does():
