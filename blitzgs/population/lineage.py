@@ -30,6 +30,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import hash_keys
+from blitzgs.output import new_file, write_file
 from blitzgs.population.candidates import FEATURES
 
 # What was trained: the capture's name and fingerprint, and the schedule under which its Gaussians lived.
@@ -112,7 +113,7 @@ class Lineage:
                 name = _PART.fullmatch(path.name)
                 if path.name.startswith(".") or (name and (step == 0 or int(name[2]) > step)):
                     path.unlink()
-            (folder / ABOUT).write_text(json.dumps(about or {}, indent=1) + "\n")
+            write_file(folder / ABOUT, json.dumps(about or {}, indent=1) + "\n")
         ranks.barrier()
         self._sums = torch.zeros(3, dtype=torch.int64, device=ranks.device)
         self._pending: dict[str, list[dict[str, Tensor]]] = {"births": [], "deaths": []}
@@ -214,11 +215,11 @@ class Lineage:
 
     def _write(self, name: str, pieces: list[dict[str, Tensor]]) -> None:
         columns = {key: torch.cat([piece[key] for piece in pieces]).numpy() for key in pieces[0]}
-        unfinished = self._folder / f".{name}"
         arrow, parquet = self._parquet
         try:
-            parquet.write_table(arrow.table(columns), unfinished, compression="zstd")
-            unfinished.rename(self._folder / name)
+            # On the disk when `settle` returns: the checkpoint that follows counts on it.
+            with new_file(self._folder / name) as partial:
+                parquet.write_table(arrow.table(columns), partial, compression="zstd")
         except OSError as error:
             self._unwritten.append((name, pieces, error))
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lineage: what is logged, that it always adds up, and that it says so when it does not."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -170,6 +172,19 @@ def test_ranks_log_the_same_lives(tmp_path):
         order, other = np.argsort(one["id"]), np.argsort(two["id"])
         for column in one:
             np.testing.assert_array_equal(one[column][order], two[column][other], column)
+
+
+def test_what_is_settled_is_on_the_disk(tmp_path, monkeypatch):
+    synced, fsync = set(), os.fsync
+    monkeypatch.setattr(os, "fsync", lambda file: (synced.add(os.fstat(file).st_ino), fsync(file)))
+    lineage = Lineage(tmp_path, Ranks(), 0, Ledger())
+    lineage.born(some([1, 2]), 1)
+    lineage.died(torch.tensor([1]), torch.tensor([Cause.SPLIT]), 4, 1)
+    lineage.settle(torch.tensor([2]), 1)
+    lineage.close()
+    parts = list(tmp_path.glob("*.parquet"))
+    assert len(parts) == 2
+    assert {path.stat().st_ino for path in (*parts, tmp_path)} <= synced
 
 
 def test_features_of_no_candidate(tmp_path):
