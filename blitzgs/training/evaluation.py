@@ -22,7 +22,7 @@ from blitzgs.output import OutputFolder
 from blitzgs.pipeline import RenderOptions
 from blitzgs.progress import Report
 from blitzgs.scene.pictures import comparison, encode_image
-from blitzgs.training.batches import Images
+from blitzgs.training.batches import Images, PhotographError
 from blitzgs.training.views import CameraLike, ViewSet
 from blitzgs.view.gate import SceneGate
 
@@ -178,6 +178,7 @@ def evaluate(
 
     Raises:
         OSError: a file cannot be written, and `optional_files` is not set.
+        PhotographError: a photograph cannot be read.
     """
     ranks = owners.ranks
     files = None if folder is None else _Files(folder, inputs, optional_files)
@@ -194,7 +195,8 @@ def evaluate(
         if render is None:
             continue
         with ranks.working(f"comparing view {cameras[index].name}"):
-            target, mask = images.get(index).to(table.device), images.mask(index)
+            target, mask = _photograph(images, index)
+            target = target.to(table.device)
             if mask is not None and not bool(mask.any()):
                 continue  # nothing to compare
             per_view[cameras[index].name] = _compare(render, target, mask, lpips)
@@ -217,6 +219,14 @@ def evaluate(
     if files is not None and ranks.rank == 0:
         files.write(files.output.root / "metrics.json", json.dumps(result, indent=1).encode())
     return result
+
+
+def _photograph(images: Images, index: int) -> tuple[Tensor, Tensor | None]:
+    """Return a photograph and its mask, with an error that a run knows to save before."""
+    try:
+        return images.get(index), images.mask(index)
+    except (OSError, ValueError) as error:
+        raise PhotographError(str(error)) from error
 
 
 class _Files:

@@ -68,7 +68,7 @@ def describe(report: dict[str, Any]) -> str:
 def write_picture(state: TrainingState, report: dict[str, Any]) -> None:
     """Draw the population over time into the run's folder, from its log; on rank 0."""
     points: list[tuple[float, float]] = [(0, report["initial"])] if "initial" in report else []
-    points += _logged(state.folder / LOG)
+    points += _logged(state.folder / LOG, state.run_id)
     points.append((state.images_seen, report["final"]))
     try:
         write_file(state.folder / PICTURE, line_chart({"": points}, "images", "Gaussians"))
@@ -76,13 +76,19 @@ def write_picture(state: TrainingState, report: dict[str, Any]) -> None:
         warnings.warn(f"the population's picture was not written: {error}", stacklevel=2)
 
 
-def _logged(path: Path) -> list[tuple[int, int]]:
-    """Return (images, Gaussians) of the events that changed the population."""
+def _logged(path: Path, run_id: str) -> list[tuple[int, int]]:
+    """Return (images, Gaussians) of the events of run `run_id` that changed the population."""
     points: list[tuple[int, int]] = []
     if not path.exists():
         return points
-    for line in path.read_text().splitlines():
-        record = json.loads(line)
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            record = json.loads(line)
+            is_own = record.get("run") == run_id  # or of a run that ended before its first checkpoint
+        except (ValueError, AttributeError):
+            continue  # torn when the disk was full or the process was killed
+        if not is_own:
+            continue
         if record.get("event") in ("pass_1", "pass_2"):
             points.append((record["t"], record["before"]))
         if record.get("event") in ("densify", "pass_1", "pass_2"):

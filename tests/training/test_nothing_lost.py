@@ -210,6 +210,24 @@ def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
         assert torch.equal(resumed.state.table[name], whole.state.table[name]), name
 
 
+def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
+    capture, images = tiny_scene()
+    get = images.get
+
+    def held_out_is_gone(index):
+        if index in capture.test:
+            raise ValueError(f"/photos/{index:02}.png is no JPEG or PNG file")
+        return get(index)
+
+    images.get = held_out_is_gone
+    running = trainer(tmp_path, "schedule.evaluate_every=30", images=images)
+    with pytest.raises(PhotographError, match=r"/photos/03.png.*put the photograph back.*--resume"):
+        running.train()
+    assert run.restore(tmp_path, Ranks()).progress.step == 31
+    images.get = get
+    assert trainer(tmp_path, "schedule.evaluate_every=30", resume=True).train() is not None
+
+
 def fail_saves(monkeypatch, count, also=lambda: None):
     """Let the next `count` checkpoints meet a full disk."""
     left = [count]
@@ -303,6 +321,26 @@ def test_an_evaluation_that_cannot_be_written_ends_nothing(tmp_path):
     tmp_path.joinpath("evaluation").write_text("not a folder")
     with pytest.warns(UserWarning, match="the evaluation could not write a file and goes on"):
         assert trainer(tmp_path, "schedule.iterations=20").train()["psnr"] > 5
+
+
+def test_a_log_of_another_run_or_with_a_torn_line_ends_nothing(tmp_path):
+    """A run that was killed before its first checkpoint leaves its log to the next one in the folder."""
+    trainer(tmp_path / "clean").train()
+    other = {"t": 20, "run": "another", "event": "densify", "gaussians": 123_456_789}
+    torn = '{"t": 20, "run": "another", "ev'
+
+    running = trainer(tmp_path / "second")
+    announce = running._announce
+
+    def announce_behind_other_records():
+        with open(tmp_path / "second" / "log.jsonl", "a") as file:
+            file.write(json.dumps(other) + "\n" + torn + "\n")
+        announce()
+
+    running._announce = announce_behind_other_records
+    assert running.train() is not None
+    pictures = [(tmp_path / name / "trajectory.svg").read_text() for name in ("clean", "second")]
+    assert pictures[0] == pictures[1]
 
 
 def test_a_terminal_that_is_gone_ends_nothing(tmp_path, monkeypatch):
