@@ -12,6 +12,7 @@ from torch import Tensor
 from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.transport import LocalTransport, Transport, open_transport
 from blitzgs.model import GaussianTable
+from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection import Rows
 from blitzgs.pipeline import RenderOptions, Views, inputs_of, list_splats, tile_grid
@@ -37,6 +38,7 @@ def survey(
     options: RenderOptions,
     assignment: TileAssignment | None = None,
     transport: Transport | None = None,
+    active: ActiveRows | None = None,
 ) -> Survey:
     """Find what each Gaussian contributes to views of a table whose rows are up to date; no colour is shaded.
 
@@ -47,6 +49,7 @@ def survey(
         assignment: who composites which tiles; every rank of the job calls this with its table. None: this
             rank alone.
         transport: as for `forward`; not in half precision, because the image is surveyed.
+        active: as for `forward`.
 
     Returns:
         The rows of this rank's Gaussians with the sums over all tiles, wherever they were composited: the
@@ -55,7 +58,7 @@ def survey(
     if transport is None:
         transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
     options = replace(options, sh_degree=0)
-    inputs, grid = inputs_of(table, views, options), tile_grid(views, options, assignment)
+    inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
 
     def attempt(capacity: Sizes | None) -> tuple[Survey | None, Sizes]:
         with transport.start(inputs, assignment, capacity) as exchange:

@@ -33,6 +33,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.importance import UNITS
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.survey import Survey, survey
+from blitzgs.view.gate import SceneGate
 
 SCORE_EPS = 1e-6
 PHI_EPS = 0.1
@@ -89,6 +90,7 @@ def sweep(
     ranks: Ranks,
     owners: TileOwners | None = None,
     rule: ScoreRule = "density",
+    lod: SceneGate | None = None,
 ) -> Importance:
     """Score the Gaussians by what they contribute to V views. Collective: every rank calls it.
 
@@ -100,13 +102,16 @@ def sweep(
         ranks: the job.
         owners: knows what tiles cost, to divide them well; the result does not depend on it.
         rule: of the score.
+        lod: leaves Gaussians out of views as rendering does: they contribute nothing there and hide nothing;
+            None: none are left out.
     """
     sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
     transport = open_transport(ranks)
     for batch in batches:
         assignment = _assign(batch, options, owners)
-        surveyed = survey(table, batch.views, options, assignment, transport)
+        active = None if lod is None else lod.active(table, batch.views.viewmats)
+        surveyed = survey(table, batch.views, options, assignment, transport, active)
         sums.add(surveyed, batch.columns, table["id"], ranks)
     return sums.result()
 

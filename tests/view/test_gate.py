@@ -15,7 +15,7 @@ from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.population.importance import CULL
+from blitzgs.population.importance import CULL, ViewBatch, is_culled, sweep
 from blitzgs.training.batches import Batch
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
@@ -304,6 +304,33 @@ def test_gated_images_are_the_same_at_every_world_size(world_size, device):
         assert found == shares
     for k, image in enumerate(images):
         assert image.any() and torch.equal(sum(parts[k] for _, parts in answers), image)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_sweep_scores_what_the_gate_lets_views_show(device):
+    table = make_scene(4000, device)
+    table["scales"].clamp_(max=0.0)
+    viewmats, Ks = make_views(device=device)
+    views, ranks = Views(viewmats, Ks, WIDTH, HEIGHT), Ranks(device=torch.device(device))
+    shares = SceneGate(GATE, 1.0, table, ranks).kept(centres_of(viewmats))
+    scene = SceneGate(GATE, max(shares), table, ranks)  # one view has no gate
+    found = sweep(table, [ViewBatch(range(4), views)], 4, OPTIONS, ranks, lod=scene)
+    gated = [view for view in range(4) if shares[view] < max(shares)]
+    assert len(gated) == 3
+    kept, _ = kept_by_definition(table, viewmats, GATE, gated)
+    score = torch.zeros(len(table), dtype=torch.float64, device=device)
+    for view in range(4):
+        small = GaussianTable(table.columns)
+        small.keep(kept[:, view])
+        one = Views(viewmats[view : view + 1], Ks[view : view + 1], WIDTH, HEIGHT)
+        alone = sweep(small, [ViewBatch([0], one)], 1, OPTIONS, ranks)
+        score[kept[:, view]] += alone.score
+        culled = is_culled(found.cull, view)
+        assert culled[~kept[:, view]].all()
+        assert torch.equal(culled[kept[:, view]], is_culled(alone.cull, 0))
+    torch.testing.assert_close(found.score.double(), score, rtol=1e-6, atol=1e-9)
+    plain = sweep(table, [ViewBatch(range(4), views)], 4, OPTIONS, ranks)
+    assert not torch.equal(plain.cull, found.cull)
 
 
 def test_errors_name_the_value():

@@ -17,6 +17,7 @@ from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.population.redistribution import redistribute
 from blitzgs.training import view_level
 from blitzgs.training.guard import check_table
+from blitzgs.training.lod import scene_gate
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
 
@@ -42,6 +43,7 @@ def run(state: TrainingState, event: Event) -> None:
         state.ranks,
         state.owners,
         cast(ScoreRule, state.config.population.score),
+        scene_gate(state.config, state.progress, state.table, state.ranks),
     )
     found.store(state.table)
     before = state.population()
