@@ -105,6 +105,12 @@ def capture_fingerprint(capture: Capture) -> str:
     return digest.hexdigest()[:12]
 
 
+def train_views_fingerprint(capture: Capture) -> str:
+    """Digest of the names of the training views, in their order."""
+    names = [capture.cameras[index].name for index in capture.train]
+    return hashlib.sha256(repr(names).encode()).hexdigest()[:12]
+
+
 def _flatten(fields: dict[str, Any], where: str = "") -> list[tuple[str, object]]:
     flat: list[tuple[str, object]] = []
     for name, value in fields.items():

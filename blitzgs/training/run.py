@@ -63,6 +63,7 @@ class Progress:
         finest_level: finest level that the LOD gate keeps; None: there is no gate at this point of the run.
         gated_views: the training views, in their order, as "1" where the LOD gate holds and "0" where it
             would keep almost all; empty without a gate.
+        train_views: digest of the names of the training views, in their order; empty in old checkpoints.
     """
 
     step: int
@@ -75,6 +76,7 @@ class Progress:
     reference_distance: float = 0.0
     finest_level: int | None = None
     gated_views: str = ""
+    train_views: str = ""
 
 
 @dataclass

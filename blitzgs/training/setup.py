@@ -31,6 +31,7 @@ from blitzgs.training.run_log import RunLog
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
+from blitzgs.training.view_level import keep_to_views
 from blitzgs.training.views import Space, ViewSet, camera_centres
 from blitzgs.view.blocks import morton_order
 from blitzgs.view.levels import measure_levels
@@ -72,6 +73,7 @@ def set_up(
         table, progress = restored.table, restored.progress
         run.check_resumable(restored.config, config)
         check_capture(restored.space, capture, folder)
+    progress = keep_to_views(table, progress, capture, ranks)
     check_room(folder, table, ranks, config.population.max_gaussians)
     if ranks.rank == 0:
         save_config(config, folder / run.CONFIG)

@@ -5,9 +5,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import GaussianTable
 from blitzgs.population.importance import CULL
+from blitzgs.scene.capture import Capture
+from blitzgs.training.inputs import train_views_fingerprint
 from blitzgs.training.lod import lod_gate, scene_gate
+from blitzgs.training.run import Progress
 from blitzgs.training.state import TrainingState
 from blitzgs.view.gate import ViewGate, lod_bits
 
@@ -21,7 +27,7 @@ def follow_schedule(state: TrainingState, begin: int) -> None:
     if not (view.lod and schedule.has_lod_gate(begin)):
         return
     finest = schedule.finest_level(begin, progress.level_count, view.first_levels, view.level_ratio)
-    if finest != progress.finest_level:
+    if finest != progress.finest_level or not progress.gated_views:
         state.progress = dataclasses.replace(progress, finest_level=finest)
         choose_views(state)
 
@@ -50,6 +56,27 @@ def choose_views(state: TrainingState) -> None:
         "average over all"
     )
     state.log.event(state.images_seen, "lod_gate", values, text)
+
+
+def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ranks: Ranks) -> Progress:
+    """Return where a run stands that goes on with the training views of a capture.
+
+    Photographs may be lost, or come back, between a checkpoint and the run that goes on from it
+    (`data.allow_missing`). What is known of the views by their places would then be that of others: it is
+    dropped, here and from the table. The gated views are chosen anew before the next step.
+    """
+    views = train_views_fingerprint(capture)
+    if progress.train_views not in ("", views):
+        progress = dataclasses.replace(progress, gated_views="")
+        if CULL in table:
+            del table.columns[CULL]
+            if ranks.rank == 0:
+                warnings.warn(
+                    f"the checkpoint was trained on other views than the {len(capture.train)} of today: the "
+                    "cull mask is dropped, and comes back with the next importance pass, if there is one",
+                    stacklevel=2,
+                )
+    return dataclasses.replace(progress, train_views=views)
 
 
 def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:

@@ -204,6 +204,29 @@ def test_the_export_carries_the_levels(whole_run, tmp_path):
                   opacities=found.opacities, sh=found.sh, levels=found.levels[1:])  # fmt: skip
 
 
+def test_a_photograph_that_is_lost_moves_no_mask_to_another_view(tmp_path, monkeypatch):
+    """The columns of the cull matrix and the gated views are those of the checkpoint's training views."""
+    stop_at(monkeypatch, 75)
+    before, _ = train(tmp_path)
+    assert CULL in before.state.table and len(before.state.progress.gated_views) == 7
+    capture, images = tiny_scene()
+    del capture.cameras[1], images.images[1]
+    capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
+    stop_at(monkeypatch, 78)
+    config = tiny_config(*FLAGS, "data.allow_missing=true")
+    with pytest.warns(
+        UserWarning, match="trained on other views than the 6 of today: the cull mask is dropped"
+    ):
+        fewer = Trainer(config, capture, images, tmp_path, Ranks(), resume=True)
+    assert CULL not in fewer.state.table
+    assert fewer.train() is None
+    assert len(fewer.state.progress.gated_views) == 6
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    again, summary = train(tmp_path, resume=True)
+    assert summary is not None and len(again.state.progress.gated_views) == 7
+
+
 def test_levels_are_unlocked_as_octree_gs_does():
     """Its intervals: a geometric series that ends at `levels_until`."""
     config = ScheduleConfig(iterations=2000, densify_until=1000, scale=2.0)
