@@ -9,6 +9,7 @@ import torch
 import torch.utils.checkpoint
 
 from blitzgs.ops.photometric import photometric_loss
+from blitzgs.reference.gaussians import covariance_factors
 from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, relative_error
 
 
@@ -177,6 +178,36 @@ def test_one_graph_is_compiled_of_a_call(device, options):
     pairs = zip(gradients(leaves, *compiled[:2]), gradients(leaves, *eager[:2]), strict=True)
     for name, (actual, expected) in zip(PARAMETERS, pairs, strict=True):
         assert relative_error(actual, expected) < 1e-5, name
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_graph_takes_other_numbers_of_gaussians(packed):
+    torch._dynamo.reset()
+    image_of = torch.compile(
+        lambda scene: rasterize_scene(scene, packed=packed)[0], fullgraph=True, backend="aot_eager"
+    )
+    for n in (20, 33, 45):
+        leaves = random_scene(n=n).leaves()
+        image, expected = image_of(leaves), rasterize_scene(leaves, packed=packed)[0]
+        assert torch.equal(image, expected)
+        inputs = [getattr(leaves, name) for name in PARAMETERS]
+        found = torch.autograd.grad(image.square().sum(), inputs)
+        for actual, wanted in zip(found, torch.autograd.grad(expected.square().sum(), inputs), strict=True):
+            assert relative_error(actual, wanted) < 1e-5
+
+
+def test_a_graph_of_many_views_and_one_of_covariances():
+    torch._dynamo.reset()
+    views = random_scene(n=20, cameras=34, width=8, height=8).leaves()
+    shapes = random_scene(n=20, cameras=1).leaves()
+    factors = covariance_factors(shapes.quats.detach(), shapes.scales.detach())
+    for scene, options in ((views, {}), (shapes, {"covars": factors @ factors.mT})):
+        call = partial(rasterize_scene, **options)
+        image = torch.compile(lambda s, call=call: call(s)[0], fullgraph=True, backend="aot_eager")(scene)
+        expected = call(scene)[0]
+        assert torch.equal(image, expected)
+        found, wanted = (torch.autograd.grad(x.square().sum(), scene.means)[0] for x in (image, expected))
+        assert relative_error(found, wanted) < 1e-5
 
 
 def test_a_second_derivative_of_a_compiled_call_is_refused():

@@ -260,7 +260,7 @@ def _splat_gradients(saved: _Saved, v: Rows) -> list[Tensor]:
         return [table]
     if all(column is not None for column in columns):
         return columns
-    zeros = saved.gaussians[0].new_zeros(len(saved.rows[0]), 3)
+    zeros = saved.gaussians[0].new_zeros(saved.rows[0].shape[0], 3)
     parts = (zeros[:, :2], zeros, zeros[:, 0], zeros)
     return [part if column is None else column for column, part in zip(columns, parts, strict=False)]
 

@@ -68,6 +68,8 @@ class Layout:
         """Return rows' values [P, ...] as [*shape, ...]; zero where a view does not see a Gaussian."""
         if self.places is None:
             return values
+        if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
+            return tuple(_laid(self.places, self.shape, v) for v in values)
         laid: tuple[Tensor, ...] = _Lay.apply(self.places, self.shape, *values)  # type: ignore[no-untyped-call]
         return laid
 
@@ -75,6 +77,8 @@ class Layout:
         """Return what rows have of [*shape, ...]: [P, ...] each."""
         if self.places is None:
             return laid
+        if torch.compiler.is_compiling():
+            return tuple(_taken(self.places, self.shape, t) for t in laid)
         taken: tuple[Tensor, ...] = _Take.apply(self.places, self.shape, *laid)  # type: ignore[no-untyped-call]
         return taken
 
@@ -83,6 +87,9 @@ class Layout:
 
         As in gsplat, whose dense opacities are those of all Gaussians.
         """
+        assert self.places is not None  # they are given where all Gaussians are laid out
+        if torch.compiler.is_compiling():
+            return _laid_over(self.places, self.shape, self.rows.opacities, opacities)
         laid: Tensor = _LayOver.apply(self.places, self.shape, self.rows.opacities, opacities)  # type: ignore[no-untyped-call]
         return laid
 
@@ -90,6 +97,12 @@ class Layout:
 def _laid(places: Tensor, shape: tuple[int, ...], values: Tensor) -> Tensor:
     laid = values.new_zeros(*shape, *values.shape[1:])
     laid.view(-1, *values.shape[1:]).index_copy_(0, places, values)
+    return laid
+
+
+def _laid_over(places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
+    laid = under[..., None, :].expand(shape).clone(memory_format=torch.contiguous_format)
+    laid.view(-1).index_copy_(0, places, values)
     return laid
 
 
@@ -120,9 +133,7 @@ class _LayOver(torch.autograd.Function):
     def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
         ctx.save_for_backward(places)
         ctx.shape = shape
-        laid = under[..., None, :].expand(shape).clone(memory_format=torch.contiguous_format)
-        laid.view(-1).index_copy_(0, places, values)
-        return laid
+        return _laid_over(places, shape, values, under)
 
     @staticmethod
     def backward(ctx: Any, v_laid: Tensor) -> Any:
