@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
+    from blitzgs import optim
     from blitzgs.losses import l1_ssim
     from blitzgs.ops.importance import contributions
     from blitzgs.rendering import rasterization, raw_rasterization
@@ -25,6 +26,7 @@ __all__ = [
     "l1_ssim",
     "morton_order",
     "open_run",
+    "optim",
     "rasterization",
     "raw_rasterization",
 ]
@@ -41,6 +43,8 @@ _MODULES = {
 
 def __getattr__(name: str) -> Any:
     # Loaded on first use: `blitzgs --help` and the synthetic city need no kernels.
+    if name == "optim":
+        return import_module("blitzgs.optim")
     if name in _MODULES:
         return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module 'blitzgs' has no attribute {name!r}")
