@@ -206,13 +206,23 @@ def quality_lines(quality: Json) -> list[str]:
     return table(["capture", *QUALITY_COLUMNS], rows)
 
 
-def summary_lines(render: Json, step_1: Json, step_4: Json, exchange: Json) -> list[str]:
-    """The README's table: one line for each kind of work."""
+SUMMARY_HEAD = ["work", "BlitzGS", "compared with", "ratio", "command"]
+
+
+def summary_row(
+    work: str, ours: float, theirs: float | None, unit: str, other: str, command: str
+) -> list[str]:
+    """One line of the README's tables: a figure, what it is compared with, and how often better it is."""
+    their_cells = [f"{other} {theirs:.2f} {unit}", f"{theirs / ours:.1f}"] if theirs else ["–", "–"]
+    return [work, f"{ours:.2f} {unit}", *their_cells, f"`{command}`"]
+
+
+def summary_lines(render: Json, step_1: Json, step_4: Json) -> list[str]:
+    """The README's table for one GPU: one line for each kind of work."""
     rows = []
 
-    def add(work: str, ours: float, theirs: float | None, unit: str, other: str, command: str) -> None:
-        their_cells = [f"{other} {theirs:.2f} {unit}", f"{theirs / ours:.1f}"] if theirs else ["–", "–"]
-        rows.append([work, f"{ours:.2f} {unit}", *their_cells, f"`{command}`"])
+    def add(*cells: Any) -> None:
+        rows.append(summary_row(*cells))
 
     for result in render["results"]:
         ours, theirs = result["blitzgs"], fastest_gsplat(result)
@@ -231,12 +241,24 @@ def summary_lines(render: Json, step_1: Json, step_4: Json, exchange: Json) -> l
             add(f"whole training step, {result['scene']}, {result['views']} view(s)",
                 result["blitzgs"]["ms"]["total"], their["ms"]["total"] if their else None, "ms",
                 "gsplat + fused Adam", COMMANDS[name])  # fmt: skip
+    return table(SUMMARY_HEAD, rows)
+
+
+def summary_ranks_lines(exchange: Json) -> list[str]:
+    """The README's table for several GPUs: their step against one GPU's."""
     one = exchange["results"][0]
-    for report in exchange["results"][1:]:
-        add(f"step of 4 views, {report['gaussians'] / 1e6:.0f} M Gaussians, on {report['ranks']} GPUs",
-            report["ms"]["step"], one["ms"]["step"], "ms", f"{one['ranks']} GPU",
-            COMMANDS["exchange"])  # fmt: skip
-    return table(["work", "BlitzGS", "compared with", "ratio", "command"], rows)
+    rows = [
+        summary_row(
+            f"step of 4 views, {report['gaussians'] / 1e6:.0f} M Gaussians, on {report['ranks']} GPUs",
+            report["ms"]["step"],
+            one["ms"]["step"],
+            "ms",
+            f"{one['ranks']} GPU",
+            COMMANDS["exchange"],
+        )  # fmt: skip
+        for report in exchange["results"][1:]
+    ]
+    return table(SUMMARY_HEAD, rows)
 
 
 SECTIONS = {
@@ -250,7 +272,8 @@ SECTIONS = {
     "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),
-    "summary": Section(("render", "step_1", "step_4", "exchange"), summary_lines),
+    "summary": Section(("render", "step_1", "step_4"), summary_lines),
+    "summary_ranks": Section(("exchange",), summary_ranks_lines),
 }
 
 
@@ -315,7 +338,7 @@ def section_lines(name: str, results: Results) -> list[str]:
                 *(f"    {command}" for command in commands)]  # fmt: skip
     files = [results[file] for file in section.files]
     lines = section.lines(*files)
-    if name == "summary":  # each of its lines has its command
+    if name.startswith("summary"):  # each of its lines has its command
         return [*lines, "", f"{machine_line(files[0]).split('`, ', 1)[1]}"]
     return [*lines, "", *("- " + machine_line(file) for file in files)]
 

@@ -122,7 +122,7 @@ def test_the_pages_match_the_results_in_the_repository(capsys):
         ("step", "| aerial 1M | 4 | other 0.10 | **2.00** | render 9.00 | **13.00** | **6.50** |"),
         ("exchange", "| speed-up of steps in a row | 1.00 | 3.20 |"),
         ("exchange", "| MB between ranks | 0 | 12 |"),
-        ("summary", "| step of 4 views, 16 M Gaussians, on 4 GPUs | 2.50 ms | 1 GPU 8.00 ms | 3.2 | "),
+        ("summary_ranks", "| step of 4 views, 16 M Gaussians, on 4 GPUs | 2.50 ms | 1 GPU 8.00 ms | 3.2 | "),
         ("summary", "| memory above the parameters, aerial 1M | 0.50 GB | gsplat 1.00 GB | 2.0 | "),
     ],
 )  # fmt: skip
