@@ -140,6 +140,33 @@ def test_a_resume_on_one_rank_alone_is_named(tmp_path):
         assert "): False; rank 1 (" in message
 
 
+def _lose_a_photograph(ranks, folder):
+    torch.set_num_threads(1)
+    capture, images = tiny_scene()
+    trainer = Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks)
+    step = trainer.step
+
+    def gone(index):
+        raise FileNotFoundError(2, "No such file or directory", f"/photos/{index:02}.png")
+
+    def losing(number):
+        step(number)
+        if number == 15 and ranks.rank == 1:
+            images.get = gone
+
+    trainer.step = losing
+    trainer.train()
+
+
+def test_a_photograph_lost_on_one_rank_is_named_by_all_and_costs_a_checkpoint_interval(tmp_path):
+    with pytest.raises(RankError) as failure:
+        run_ranks(_lose_a_photograph, 2, tmp_path)
+    for message in failure.value.messages.values():
+        assert "PhotographError" in message and "/photos/0" in message
+    # The other rank is in the middle of the step: what counts is the last checkpoint, after 19 images.
+    assert run.restore(tmp_path, Ranks()).progress.step == 10
+
+
 def _train_and_stop(rank, arguments, signalled_at):
     """`blitzgs train`; rank 1 alone is asked to stop after a step."""
     torch.set_num_threads(1)
