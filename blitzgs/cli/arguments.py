@@ -28,6 +28,13 @@ def add_command(
     return parser
 
 
+def named_path(text: str) -> Path:
+    """Read a path that must not be empty: `--out "$UNSET"` would otherwise mean the folder one is in."""
+    if not text:
+        raise argparse.ArgumentTypeError("the path is empty")
+    return Path(text)
+
+
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Add the folder of a run."""
     parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a run")

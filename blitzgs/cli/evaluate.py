@@ -6,9 +6,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from pathlib import Path
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_run
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_run, named_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.progress import image_progress
@@ -27,7 +26,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     add_capture(parser)
     add_device(parser, shares_gpus=True)
     parser.add_argument("--split", choices=("test", "train"), default="test", help="views (%(default)s)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="default: RUN/evaluation/SPLIT")
+    parser.add_argument("--out", type=named_path, metavar="DIR", help="default: RUN/evaluation/SPLIT")
     parser.add_argument(
         "--pictures", type=int, default=8, metavar="N", help="side-by-side pictures (%(default)s)"
     )

@@ -6,9 +6,8 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from pathlib import Path
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, add_run
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_run, named_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.training.export import COORDINATES, Exported, export_ply, without_antialiasing
 from blitzgs.training.run_folder import open_run
@@ -35,7 +34,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = add_command(commands, "export", run, summary, HELP)
     add_run(parser)
     add_device(parser)
-    parser.add_argument("--ply", type=Path, required=True, metavar="FILE", help="file to write")
+    parser.add_argument("--ply", type=named_path, required=True, metavar="FILE", help="file to write")
     parser.add_argument(
         "--coordinates",
         choices=COORDINATES,

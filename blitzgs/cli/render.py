@@ -6,12 +6,11 @@ from __future__ import annotations
 import argparse
 import io
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from torch import Tensor
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, add_run
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_run, named_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.output import OutputFolder
@@ -36,7 +35,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--split", choices=("test", "train", "all"), default="test", help="views (%(default)s)"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the images")
+    parser.add_argument("--out", type=named_path, required=True, metavar="DIR", help="folder for the images")
     parser.add_argument(
         "--raw",
         action="store_true",

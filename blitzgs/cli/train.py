@@ -6,13 +6,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import cast
 
 from rich.console import Console
 from rich.table import Table
 
-from blitzgs.cli.arguments import Commands, add_command, add_device
+from blitzgs.cli.arguments import Commands, add_command, add_device, named_path
 from blitzgs.distributed.group import Ranks, Transport
 from blitzgs.training import run as run_folder
 from blitzgs.training.config import Config
@@ -46,7 +47,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "--config", type=Path, metavar="YAML", help="configuration file (default: the defaults)"
     )
     parser.add_argument("--data", metavar="DIR", help="the capture (or --data.path=DIR)")
-    parser.add_argument("--out", type=Path, metavar="RUN", help="folder of the run")
+    parser.add_argument("--out", type=named_path, metavar="RUN", help="folder of the run")
     parser.add_argument(
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
     )
@@ -98,7 +99,7 @@ def _config(args: argparse.Namespace) -> Config:
     if args.data is not None:
         # Not by way of YAML, which knows only some of the characters that a path may have.
         config = dataclasses.replace(
-            config, data=dataclasses.replace(config.data, path=str(Path(args.data).resolve()))
+            config, data=dataclasses.replace(config.data, path=os.path.realpath(args.data))
         )
     return config
 

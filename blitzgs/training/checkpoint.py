@@ -282,6 +282,8 @@ def _read_manifest(path: Path) -> _Manifest:
         raise ValueError(f"{MANIFEST} does not match its own SHA-256")
     shared = content.get("shared")
     shards = [Shard(**shard) for shard in content["shards"]]
+    if not shards:
+        raise ValueError(f"{MANIFEST} names no files")
     return _Manifest(shards, None if shared is None else Shard(**shared), content["state"])
 
 

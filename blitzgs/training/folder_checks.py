@@ -100,7 +100,10 @@ def check_writable(folder: Path, ranks: Ranks) -> None:
         if written != _PROBE_BYTES:
             problem = f"rank {ranks.rank} ({socket.gethostname()}): the disk is full"
     except OSError as error:
-        problem = f"rank {ranks.rank} ({socket.gethostname()}): {error.strerror or error}"
+        reason = (
+            "a file is where a folder is needed" if isinstance(error, FileExistsError) else error.strerror
+        )
+        problem = f"rank {ranks.rank} ({socket.gethostname()}): {reason or error}"
     try:
         problems = [text for text in ranks.all_gather_object(problem) if text]
         seen = (folder / f"{token}_0").exists()

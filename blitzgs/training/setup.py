@@ -57,10 +57,10 @@ def set_up(
         FolderError: a rank cannot write to the folder, or there is no room.
     """
     check_alike(config, capture, ranks, resume)
-    check_writable(folder, ranks)
+    check_writable(folder / run.CHECKPOINTS, ranks)
     space = Space.of(capture.offset, capture.extent)
     lpips = load_lpips(config.log.lpips_weights)
-    if not resume and any((folder / run.CHECKPOINTS).glob("*")):
+    if not resume and any((folder / run.CHECKPOINTS).glob("checkpoint_*")):
         raise FileExistsError(
             f"{folder} already holds a run: add --resume to continue it, or choose another --out"
         )

@@ -88,6 +88,8 @@ def _flip_bit(path, offset):
         (lambda p: (p / "manifest.json").unlink(), "manifest.json is missing"),
         (lambda p: os.truncate(p / "manifest.json", 40), "not valid JSON"),
         (lambda p: (p / "manifest.json").write_text(json.dumps({"format": 9})), "format 9"),
+        (lambda p: (p / "manifest.json").write_text('{"format": 1, "shards": [], "state": {}}'), "no files"),
+        (lambda p: (p / "manifest.json").write_text("[" * 5000), "recursion"),
     ],
 )
 def test_a_damaged_one_is_refused_by_name(tmp_path, damage, reason):

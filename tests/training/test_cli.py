@@ -93,12 +93,15 @@ def test_torchrun_entry(trained, tmp_path):
         (["export", "/nowhere", "--ply", "x.ply"], 1, "/nowhere is not a run"),
         (["train", "--data", "d", "--out", "x", "--device", "tpu"], 1, "cuda or cuda:N, got 'tpu'"),
         (["train", "--data", "d", "--out", "x", "--device", "cuda:x"], 1, "cuda or cuda:N, got 'cuda:x'"),
+        (["train", "--data", "d", "--out", ""], 2, "argument --out: the path is empty"),
+        (["train", "--data", "loop", "--out", "x"], 1, "loop is not a folder"),
         (["eval", "/nowhere", "--fast"], 2, "unrecognized arguments: --fast"),
     ],
 )
 def test_mistakes_get_a_message(arguments, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "300")
+    Path("loop").symlink_to("loop")
     try:
         result = main(arguments)
     except SystemExit as exit_:

@@ -32,6 +32,12 @@ def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path, monkeypatc
     assert not list(tmp_path.rglob(".probe*"))
 
 
+def test_a_file_in_the_place_of_the_checkpoints_is_found_at_once(tmp_path):
+    (tmp_path / "checkpoints").write_text("")
+    with pytest.raises(FolderError, match="checkpoints cannot be written: rank 0 .*a file is where a folder"):
+        Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+
+
 def _check(ranks, folders):
     check_writable(Path(folders[ranks.rank]), ranks)
 
