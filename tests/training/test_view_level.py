@@ -26,6 +26,7 @@ from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of
+from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training.test_trainer import assert_same_table
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
 
@@ -171,6 +172,22 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
     second, _ = train(tmp_path, resume=True)
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.gated_views == whole.state.progress.gated_views
+
+
+def _train_on(ranks, folder):
+    torch.set_num_threads(1)
+    trainer = Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, ranks)
+    summary = trainer.train()
+    return summary["psnr"], trainer.state.progress.gated_views, CULL in trainer.state.table
+
+
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(2))
+def test_a_run_on_two_ranks_opens_the_gate_and_clears_the_mask(whole_run, tmp_path, world_size, device):
+    _, whole, summary, _ = whole_run
+    answers = run_ranks(_train_on, world_size, tmp_path, device=device)
+    for psnr, gated_views, has_mask in answers:
+        assert gated_views == whole.state.progress.gated_views and not has_mask
+        assert psnr == pytest.approx(summary["psnr"], abs=0.5)
 
 
 def test_render_honours_the_gate(tmp_path):
