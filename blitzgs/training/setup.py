@@ -82,7 +82,9 @@ def set_up(
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     optimiser = LazyAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = TileOwners(ranks)
-    if restored is not None and restored.shared and ranks.world_size > 1:
+    # Costs and plans go by the places of the views: of others, they would be for images of other sizes.
+    has_same_views = restored is None or restored.progress.train_views in ("", progress.train_views)
+    if restored is not None and restored.shared and has_same_views and ranks.world_size > 1:
         owners.restore(restored.shared)
     length_unit = space.extent * config.loss.scale_reference
     return TrainingState(

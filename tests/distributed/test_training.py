@@ -167,6 +167,33 @@ def test_a_photograph_lost_on_one_rank_is_named_by_all_and_costs_a_checkpoint_in
     assert run.restore(tmp_path, Ranks()).progress.step == 10
 
 
+def _resume_with_fewer_views(ranks, folder):
+    """Train on views of two sizes, and go on from the first checkpoint without the first of them."""
+    torch.set_num_threads(1)
+    capture, images = tiny_scene()
+    for camera in capture.cameras[::2]:
+        camera.width = 24
+    images.images[::2] = [image[:, :24].contiguous() for image in images.images[::2]]
+    Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks).train()
+    if ranks.rank == 0:
+        for later in sorted((folder / run.CHECKPOINTS).glob("checkpoint_*"))[1:]:
+            shutil.rmtree(later)
+    ranks.barrier()
+    known = run.restore(folder, ranks).shared["steps"].tolist()
+    del capture.cameras[0], images.images[0]
+    capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
+    config = tiny_config(*SETTINGS, "data.allow_missing=true")
+    resumed = Trainer(config, capture, images, folder, ranks, resume=True)
+    kept = resumed.state.owners.columns()
+    return known, kept["views"].tolist(), kept["steps"].tolist(), resumed.train() is not None
+
+
+def test_borders_of_views_that_are_lost_are_not_those_of_others(tmp_path):
+    for known, views, steps, is_done in run_ranks(_resume_with_fewer_views, 2, tmp_path):
+        assert known and is_done
+        assert views == steps == []
+
+
 def _train_and_stop(rank, arguments, signalled_at):
     """`blitzgs train`; rank 1 alone is asked to stop after a step."""
     torch.set_num_threads(1)
