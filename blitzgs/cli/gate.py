@@ -107,7 +107,18 @@ def run_replay(args: argparse.Namespace) -> int:
 
 
 def _lineage(folder: Path) -> Path:
-    return folder / run_folder.LINEAGE
+    """Return where the lineage of a finished run lies.
+
+    Raises:
+        ValueError: the run is not finished, so that what is alive has not survived yet.
+    """
+    lineage = folder / run_folder.LINEAGE
+    if lineage.is_dir() and not (folder / run_folder.SUMMARY).exists():
+        raise ValueError(
+            f"{folder} is not finished (it has no {run_folder.SUMMARY}): what is alive in the middle of a "
+            "run need not survive; finish it with blitzgs train ... --resume"
+        )
+    return lineage
 
 
 def _judgement(entry: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 """`blitzgs gate`: from the lineage of runs to a gate, its figures and its replay."""
 
 import json
+import shutil
 from xml.etree import ElementTree
 
 import numpy as np
@@ -41,6 +42,16 @@ def lineage_run(tmp_path_factory):
     flags = [f"--{text}" for text in (*OVERRIDES, *SETTINGS)]
     assert main(["train", "--data", str(folder / "capture"), "--out", str(folder / "run"), *flags]) == 0
     return folder
+
+
+def test_a_run_that_is_not_finished_is_no_example(lineage_run, tmp_path, capsys):
+    folder = shutil.copytree(lineage_run / "run", tmp_path / "run")
+    (folder / "summary.json").unlink()
+    gate, out = str(tmp_path / "g.json"), str(tmp_path / "out.json")
+    assert main(["gate", "fit", str(lineage_run / "run"), "--out", gate]) == 0
+    for arguments in (["fit", str(folder)], ["evaluate", gate, str(folder)]):
+        assert main(["gate", *arguments, "--out", out]) == 1
+        assert "is not finished (it has no summary.json)" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
