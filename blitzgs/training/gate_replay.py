@@ -152,6 +152,7 @@ def replay(
     Raises:
         ValueError: the run logged no lineage, or was trained by the clock.
         FileNotFoundError: it has no checkpoint from before the onset.
+        FileExistsError: `out` holds a replay already.
     """
     if not config.population.lineage:
         raise ValueError(
@@ -162,6 +163,9 @@ def replay(
             f"{source} was trained with schedule.minutes ({config.schedule.minutes:g}): its arms would "
             "differ in length, and could not be compared. Train it with schedule.scale instead"
         )
+    # As rank 0 finds it: others might come when it has begun to write.
+    if ranks.broadcast_object((out / REFERENCE).exists()):
+        raise FileExistsError(f"{out} already holds a replay: choose another --out, or delete it")
     point = branch_point(source, config)
 
     def train(name: str, veto: Veto | None) -> dict[str, Any]:

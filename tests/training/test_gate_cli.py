@@ -79,6 +79,8 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     assert arms["oracle"]["matched"] > 0.5
     for name in ("oracle", "oracle_rate", "gate", "random"):
         assert arms[name]["peak"] < arms["reference"]["peak"]
+    assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
+    assert "already holds a replay: choose another --out" in capsys.readouterr().err.replace("\n", " ")
     table = (tmp_path / "replay" / "replay.md").read_text()
     assert table.count("\n") == 7 and table in capsys.readouterr().out
     # The first gated event is that of the reference, so the oracle knows each candidate there.
