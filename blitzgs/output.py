@@ -24,7 +24,7 @@ _LONGEST_NAME = 200
 def new_file(path: Path, sync: bool = True) -> Iterator[Path]:
     """Give a temporary file to fill; it takes its final name when the context ends without an error.
 
-    Whoever reads `path` sees what was there before or the whole new file. Only a regular file is replaced.
+    A reader of `path` sees the old file or the whole new one. Only a regular file is replaced.
 
     Args:
         path: the final name; its folder must exist.

@@ -306,7 +306,7 @@ def _with_ties(
     chosen = keys < limit
     counts = torch.zeros_like(left).index_add_(0, segments[tied], torch.ones_like(tied))
     if not bool((ranks.all_reduce(counts) > left).any()):
-        # The usual case: nobody has to go without.
+        # The usual case: there is enough for all.
         chosen[tied] = True
         return chosen
     last, _ = _kth(ids[tied], _ID_DIGITS, left, segments[tied], ranks)

@@ -232,7 +232,7 @@ def _first_gradients(
     sparse: Sequence[bool],
     v: Rows,
 ) -> tuple[Tensor | None, ...]:
-    # Where all are to be dense, the kernel writes them so; a dense one that nobody needs would cost memory.
+    # Where all are to be dense, the kernel writes them so; one that is not needed would cost memory.
     dense = not any(sparse) and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         list(saved.gaussians), list(saved.cameras), list(saved.rows), options.ints, options.floats,

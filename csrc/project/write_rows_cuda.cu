@@ -143,9 +143,9 @@ __device__ __forceinline__ void write_rows(const Group& group, std::int64_t befo
 }
 
 // A block takes Gaussians turn by turn, a thread each, and writes their rows behind those of the turns
-// before. Which pairs are rows takes every block about the same time; the tiles that they touch, which take
-// some much longer, it finds between telling the others how many rows it has and asking how many they have:
-// so nobody waits for the slowest.
+// before. To find which pairs are rows takes every block about the same time. To find the tiles that they
+// touch takes some blocks much longer, so a block first tells the others how many rows it has, then finds the
+// tiles, and only then asks how many rows the blocks before it have. No block waits for the slowest one.
 __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
     rows_kernel(const Inputs in, const __grid_constant__ RankTiles rank_tiles, const Prefiltered kept,
                 const ProjectSizes capacity, const ProjectIds ids, const ProjectOutputs<float> out,

@@ -278,8 +278,8 @@ struct EntryBatch {
     }
   }
 
-  // Starts to copy entry `at` of a batch that nobody reads; row < 0 where there is none. `chunk` is what
-  // copy_color() takes.
+  // Starts to copy entry `at` of a batch that no thread reads at the time; row < 0 where the list has ended.
+  // `chunk` is what copy_color() takes.
   template <class Chunk>
   __device__ __forceinline__ void fetch(int buffer, const PackedRow* rows, const Chunk& chunk,
                                         std::int32_t row, int at) {
