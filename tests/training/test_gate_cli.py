@@ -79,8 +79,6 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     assert arms["oracle"]["matched"] > 0.5
     for name in ("oracle", "oracle_rate", "gate", "random"):
         assert arms[name]["peak"] < arms["reference"]["peak"]
-    assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
-    assert "already holds a replay: choose another --out" in capsys.readouterr().err.replace("\n", " ")
     table = (tmp_path / "replay" / "replay.md").read_text()
     assert table.count("\n") == 7 and table in capsys.readouterr().out
     # The first gated event is that of the reference, so the oracle knows each candidate there.
@@ -88,6 +86,8 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
         json.loads(line) for line in (tmp_path / "replay" / "oracle" / "log.jsonl").read_text().splitlines()
     ]
     assert [r["t"] for r in records if r.get("event") == "densify"] == [60, 80]
+    assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
+    assert "already holds a replay: choose another --out" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_what_is_missing_is_named(lineage_run, tmp_path, capsys):
