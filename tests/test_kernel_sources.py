@@ -93,8 +93,13 @@ def kernels_launched_early():
         if file == "common/launch.cuh":
             continue
         text = source(file)
-        for match in re.finditer(r"launch_early\(\s*[^,]+,\s*([A-Za-z_]\w*)", text):
-            given = match.group(1)
+        for match in re.finditer(r"launch_early\(\s*[^,]+,\s*([^,]+)", text):
+            if "?" in match.group(1):  # one of two kernels
+                either = re.findall(r"[?:]\s*([A-Za-z_]\w*)", match.group(1))
+                assert len(either) == 2, f"{file}: which kernels are {match.group(1)}?"
+                names.update(dict.fromkeys(either, file))
+                continue
+            given = re.match(r"[A-Za-z_]\w*", match.group(1))[0]
             # The last assignment of a local name before the launch, or the kernel itself.
             assigned = re.findall(rf"\bauto {given}\s*=\s*([^;]+);", text[: match.start()])
             if given == "kernel":
