@@ -6,6 +6,8 @@ BLITZGS_LIBRARY_DIR names another folder to load them from: that of a build with
 
 from __future__ import annotations
 
+import ctypes
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +15,8 @@ from typing import Any
 
 import torch
 
+# In a checkout: the list of ops that the libraries were built with.
+REGISTRATION = Path(__file__).resolve().parents[1] / "csrc" / "registration.cpp"
 LIBRARY_DIR = Path(os.environ.get("BLITZGS_LIBRARY_DIR") or Path(__file__).parent / "_lib")
 
 
@@ -20,7 +24,8 @@ def load_libraries() -> None:
     """Register the CPU kernels, and the CUDA kernels when this torch can use a GPU.
 
     Raises:
-        ImportError: a library that is needed here was not built; says how to build it.
+        ImportError: a library that is needed here was not built, or before the list of ops changed; says how
+            to build it.
     """
     _load(LIBRARY_DIR / "libblitzgs_cpu.so")
     if torch.cuda.is_available():
@@ -34,6 +39,20 @@ def _load(path: Path) -> None:
             "checkout); the CUDA library needs nvcc on the PATH while building."
         )
     torch.ops.load_library(str(path))
+    if REGISTRATION.exists() and schema_digest(path) != hashlib.sha256(REGISTRATION.read_bytes()).hexdigest():
+        raise ImportError(
+            f"{path} was built before the ops changed ({REGISTRATION} is another now): run `make build`"
+        )
+
+
+def schema_digest(path: Path) -> str:
+    """Return the SHA-256 of the registration.cpp that a library was built with; "" if it does not say."""
+    try:
+        digest = ctypes.CDLL(str(path)).blitzgs_schema_digest
+    except AttributeError:
+        return ""
+    digest.restype = ctypes.c_char_p
+    return str(digest().decode())
 
 
 def without_autograd(op: Callable[..., Any]) -> Callable[..., Any]:

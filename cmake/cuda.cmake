@@ -28,7 +28,7 @@ find_package(CUDAToolkit REQUIRED)
 set(CMAKE_CUDA_STANDARD 20)
 set(CMAKE_CUDA_RUNTIME_LIBRARY Static)
 
-add_library(blitzgs_cuda SHARED ${op_sources} ${cuda_kernels})
+add_library(blitzgs_cuda SHARED csrc/common/schema_digest.cpp ${op_sources} ${cuda_kernels})
 target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_BACKEND_CUDA USE_CUDA)
 target_link_libraries(blitzgs_cuda PRIVATE blitzgs_flags blitzgs_torch CUDA::cudart_static)
 target_compile_options(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
@@ -152,15 +153,16 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
 def decay_opacities(table: GaussianTable, share: float) -> None:
     """Take a share of its opacity from every row, all of which must have been caught up.
 
-    The logit l of the opacity o becomes that of (1 - share) o: l + log(1 - share) - log(1 + share e^l), an
-    identity that does not cancel where o is close to 1.
+    The logit l of the opacity o becomes that of (1 - share) o: l + log(1 - share) - log(1 + share e^l), which
+    neither cancels where o is close to 1 nor overflows.
 
     Args:
         table: changed in place.
         share: in [0, 1).
     """
     logits = table["opacities"]
-    logits.add_(math.log1p(-share) - torch.log1p(share * logits.exp()))
+    if share > 0:
+        logits.add_(math.log1p(-share) - softplus(logits + math.log(share)))
 
 
 def child_ids(parents: Tensor, time: int, slots: Tensor) -> Tensor:

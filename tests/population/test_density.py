@@ -186,6 +186,7 @@ def test_capping_opacities_touches_what_lies_above_and_every_moment():
 def test_decaying_opacities_takes_the_same_share_of_each():
     table = random_table(200)
     table["opacities"][:3] = torch.tensor([-30.0, 0.0, 15.0])
+    table["opacities"][3] = 200.0
     before = table["opacities"].double().sigmoid()
     decay_opacities(table, 0.2)
     torch.testing.assert_close(table["opacities"].double().sigmoid(), 0.8 * before, rtol=2e-6, atol=0)

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The libraries that are loaded belong to the sources."""
+
+import hashlib
+import os
+import subprocess
+import sys
+
+import pytest
+
+from blitzgs import _library
+
+
+def test_the_library_says_which_ops_it_was_built_with():
+    digest = hashlib.sha256(_library.REGISTRATION.read_bytes()).hexdigest()
+    assert _library.schema_digest(_library.LIBRARY_DIR / "libblitzgs_cpu.so") == digest
+
+
+def test_a_library_that_was_not_rebuilt_is_named(tmp_path, monkeypatch):
+    changed = tmp_path / "registration.cpp"
+    changed.write_text("// other ops")
+    monkeypatch.setattr(_library, "REGISTRATION", changed)
+    with pytest.raises(
+        ImportError, match="libblitzgs_cpu.so was built before the ops changed .*: run `make build`"
+    ):
+        _library.load_libraries()
+
+
+def test_a_library_that_is_missing_is_named(tmp_path):
+    environment = os.environ | {"BLITZGS_LIBRARY_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", "import blitzgs.ops.knn_distances"],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode != 0
+    assert f"{tmp_path}/libblitzgs_cpu.so is missing: the kernels are not built" in done.stderr
