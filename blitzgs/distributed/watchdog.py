@@ -95,6 +95,7 @@ class Watchdog:
             int, tuple[float, float]
         ] = {}  # of each rank: its last stamp, and when it was new here
         self._announced = 0.0
+        self._excused = 0.0  # when a late rank was last seen at work
         self.stopping = threading.Event()
         self.thread = threading.Thread(target=self._run, name="blitzgs-watchdog", daemon=True)
         self._publish()
@@ -233,9 +234,11 @@ class Watchdog:
                     and not self._first_failure()
                     and (work := self._waits_for_work())
                 ):
+                    self._excused = time.monotonic()
                     self._announce(work, waited)
                     continue
-                if waited > limit:
+                # A rank that has ended its work needs a while to arrive, and to say that it has.
+                if time.monotonic() - max(since, self._excused) > limit:
                     self._abort(f"waited {limit:.0f} s in {self.name}")
             except RuntimeError:
                 return  # the store's host is gone; the collectives report that themselves
