@@ -30,21 +30,30 @@ def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: i
     Returns:
         bool [N_rank], the same ids at every world size.
     """
-    total = ranks.all_reduce(torch.tensor(len(score), device=score.device))
-    count = math.floor(Fraction(repr(float(keep))) * int(total))
-    return smallest(sampling_keys(score, ids, seed, event), ids, count, ranks)
+    return smallest(sampling_keys(score, ids, seed, event), ids, _share_of_all(keep, score, ranks), ranks)
 
 
-def top_by_score(score: Tensor, ids: Tensor, mass: float, ranks: Ranks) -> Tensor:
-    """Choose the Gaussians whose scores pass 2 keeps: the smallest prefix, descending, that holds the mass.
+def top_by_score(score: Tensor, ids: Tensor, mass: float, keep: float, ranks: Ranks) -> Tensor:
+    """Choose the Gaussians whose scores pass 2 keeps: a prefix by descending score.
 
     Args:
         score: float32 [N_rank], finite, >= 0.
         ids: int64 [N_rank], persistent; they decide between equal scores.
-        mass: share of the total score of all ranks, in [0, 1].
+        mass: the prefix is the smallest that holds this share of the total score of all ranks, in [0, 1];
+        keep: or, where that is shorter, it has floor(keep N) of all ranks' N Gaussians; in [0, 1], its
+            decimal value counts.
         ranks: the job; every rank calls this.
 
     Returns:
         bool [N_rank], the same ids at every world size.
     """
-    return mass_prefix(score, ids, mass, ranks)
+    kept = mass_prefix(score, ids, mass, ranks)
+    if keep < 1:
+        kept &= smallest(-score, ids, _share_of_all(keep, score, ranks), ranks)
+    return kept
+
+
+def _share_of_all(share: float, rows: Tensor, ranks: Ranks) -> int:
+    """Return the floor of a share, by its decimal value, of the rows of all ranks."""
+    total = ranks.all_reduce(torch.tensor(len(rows), device=rows.device))
+    return math.floor(Fraction(repr(float(share))) * int(total))

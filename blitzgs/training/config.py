@@ -201,6 +201,8 @@ class PopulationConfig:
             then makes its signals alone.
         pass2_mass: share of the total score that the second pass keeps, by the fewest Gaussians, of which
             those below `min_opacity` go too; 1: all, as above.
+        pass2_keep: share of the Gaussians that the second pass keeps at most, those of the highest scores;
+            1: as many as `pass2_mass` says.
         phi: from the first pass on, weigh the gradients that density control adds up with phi, the share of
             the views seeing a Gaussian in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`); null: none.
@@ -224,6 +226,7 @@ class PopulationConfig:
     score: str = "density"
     pass1_keep: float = 0.7
     pass2_mass: float = 0.99
+    pass2_keep: float = 1.0
     phi: bool = True
     gate: str | None = None
     gate_rate: float = 0.6

@@ -107,6 +107,7 @@ RANGES: Mapping[str, Range] = {
     "population.gate_rate": Range(0, 1),
     "population.pass1_keep": _SHARE,
     "population.pass2_mass": _SHARE,
+    "population.pass2_keep": _SHARE,
     "view.first_levels": Range(0, 1),
     "view.level_ratio": Range(1.001, 100),
     "view.most_kept": Range(0, 1),

@@ -193,7 +193,8 @@ def test_the_papers_configuration_has_the_papers_values():
     assert (population.grad_threshold, population.min_opacity, population.clone_scale) == (1e-4, 0.005, 0.01)
     assert (population.prune_screen_radius, population.prune_world_scale) == (20, 0.1)
     assert population.importance and population.phi
-    assert (population.pass1_keep, population.pass2_mass, population.gate_rate) == (0.7, 0.99, 0.6)
+    assert (population.pass1_keep, population.pass2_mass, population.pass2_keep) == (0.7, 0.99, 1)
+    assert population.gate_rate == 0.6
     assert (population.max_gaussians, population.pixels_per_gaussian, population.min_observations) == (
         0,
         0,

@@ -111,6 +111,13 @@ def test_ablations_keep_the_signals(tmp_path):
     assert PHI not in off.state.table and not pass_events(tmp_path / "b")
 
 
+def test_the_second_pass_keeps_at_most_a_share(tmp_path):
+    flags = ("population.pass1_keep=1", "population.pass2_mass=1", "population.pass2_keep=0.5")
+    train(tmp_path, *flags, "population.min_opacity=1e-6")
+    second = pass_events(tmp_path)["pass_2"]
+    assert second["gaussians"] == second["before"] // 2
+
+
 def test_phi_weighs_the_gradients_from_the_first_pass_on(tmp_path):
     sums = {}
     for phi in ("true", "false"):

@@ -90,9 +90,10 @@ def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Te
         return causes
     # Where nothing contributes to any view, there is no mass to keep a share of.
     total = state.ranks.all_reduce(found.score.double().sum())
-    if population.pass2_mass < 1 and total.item() > 0:
+    if min(population.pass2_mass, population.pass2_keep) < 1 and total.item() > 0:
         least = population.min_opacity
         logit = math.log(least / (1.0 - least)) if least > 0 else -math.inf
         causes[table["opacities"] < logit] = Cause.LATE_OPACITY
-        causes[~top_by_score(found.score, ids, population.pass2_mass, state.ranks)] = Cause.PASS_2
+        kept = top_by_score(found.score, ids, population.pass2_mass, population.pass2_keep, state.ranks)
+        causes[~kept] = Cause.PASS_2
     return causes
