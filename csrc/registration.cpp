@@ -59,7 +59,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible rows. With places, v_splats are the tables of the ranks
   // that composited the splats. Groups: last_steps (last_step, moment_step); tables (schedule_table,
-  // lr_table); steps (step, explicit_steps, sparse); decays (beta1, beta2, eps).
+  // lr_table[, final_rules]); steps (step, explicit_steps, sparse); decays (beta1, beta2, eps).
   m.def(
       "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
       "Tensor(d!)[] last_steps, Tensor[] tables, int[] steps, float[] decays, Tensor[] cameras, "
@@ -146,6 +146,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "lazy_adam_catch_up_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
       "Tensor(d!)[] last_steps, Tensor? ids, Tensor[] tables, int[] steps, float[] decays, "
       "Tensor? count=None) -> ()");
+  // What a row owes in the end, by the step that it stands at; `like` is of the parameters' dtype.
+  m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,6 @@ def lazy_adam_step_(
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    table = schedule_table(lr_table, beta1, beta2)
     torch.ops.blitzgs.lazy_adam_step_(
         list(params),
         list(exp_avgs),
@@ -68,7 +67,7 @@ def lazy_adam_step_(
         [last_step, moment_step],
         list(grads),
         ids,
-        [table, lr_table],
+        schedule_tables(lr_table, beta1, beta2, eps, params[0]),
         [step, explicit_steps(beta1, beta2, params[0].dtype), int(sparse)],
         [beta1, beta2, eps],
     )
@@ -100,14 +99,13 @@ def lazy_adam_catch_up_(
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
-    table = schedule_table(lr_table, beta1, beta2)
     torch.ops.blitzgs.lazy_adam_catch_up_(
         list(params),
         list(exp_avgs),
         list(exp_avg_sqs),
         [last_step, moment_step],
         ids,
-        [table, lr_table],
+        schedule_tables(lr_table, beta1, beta2, eps, params[0]),
         [step, explicit_steps(beta1, beta2, params[0].dtype), 0],
         [beta1, beta2, eps],
         count,
@@ -121,8 +119,47 @@ def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
     return 1 if ratio == 0 else max(1, math.ceil(math.log(negligible) / math.log(ratio)))
 
 
-# The table is a function of the schedule alone: (beta1, beta2, version of lr_table) -> table.
+# Functions of the schedule alone, by lr_table: its version, and what was made of it then.
 _tables: Any = WeakTensorKeyDictionary()
+
+
+def _once(lr_table: Tensor, key: tuple[object, ...], make: Callable[[], Tensor]) -> Tensor:
+    """Return what `make` made of a schedule first, by `key`; anew once `lr_table` has changed."""
+    version, made = _tables.get(lr_table, (None, {}))
+    if version != lr_table._version:
+        made = {}
+        _tables[lr_table] = (lr_table._version, made)
+    if key not in made:
+        made[key] = make()
+    found: Tensor = made[key]
+    return found
+
+
+def schedule_tables(lr_table: Tensor, beta1: float, beta2: float, eps: float, like: Tensor) -> list[Tensor]:
+    """Return the tables of a schedule as the ops take them, made on first use.
+
+    Args:
+        lr_table: as for `schedule_table`, like the next two.
+        beta1: decay of the first moment.
+        beta2: decay of the second moment.
+        eps: added to the root of the second moment.
+        like: has the dtype of the parameters.
+
+    Returns:
+        `schedule_table`, `lr_table`, and what rows owe that have been behind for `explicit_steps` or more, by
+        the step that they stand at: uint8 [max(0, S + 1 - explicit_steps), bytes], for the ops alone.
+
+    Raises:
+        ValueError: decay rates outside their range.
+    """
+    table = schedule_table(lr_table, beta1, beta2)
+    reach = explicit_steps(beta1, beta2, like.dtype)
+    rules = _once(
+        lr_table,
+        (beta1, beta2, eps, like.dtype),
+        lambda: torch.ops.blitzgs.lazy_adam_final_rules(table, like, reach, eps),
+    )
+    return [table, lr_table, rules]
 
 
 def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
@@ -139,13 +176,7 @@ def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     Raises:
         ValueError: decay rates outside their range.
     """
-    key = (beta1, beta2, lr_table._version)
-    cached = _tables.get(lr_table)
-    if cached is None or cached[0] != key:
-        cached = (key, _make_table(lr_table, beta1, beta2))
-        _tables[lr_table] = cached
-    table: Tensor = cached[1]
-    return table
+    return _once(lr_table, (beta1, beta2), lambda: _make_table(lr_table, beta1, beta2))
 
 
 def table_without_rates(steps: int, beta1: float, beta2: float) -> Tensor:
@@ -192,6 +223,12 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     for step in range(steps - 2, -1, -1):
         tails[step] = ratios * (terms[step] + tails[step + 1])
     return table.to(lr_table.device)
+
+
+@torch.library.register_fake("blitzgs::lazy_adam_final_rules")
+def _(table: Tensor, like: Tensor, explicit_steps: int, eps: float) -> Tensor:
+    # Six rules of four numbers, two steps and a number, to a multiple of four numbers.
+    return table.new_empty(max(0, len(table) - explicit_steps), 28 * like.dtype.itemsize, dtype=torch.uint8)
 
 
 @torch.library.register_fake("blitzgs::lazy_adam_step_")

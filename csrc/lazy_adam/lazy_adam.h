@@ -15,7 +15,9 @@
 // variance: 1e-9 of the drift in mid-schedule, the rounding of float32 after some 200 single-view steps.
 // Where that is not exact enough (earlier steps, and float64), the elements for which eps matters take the
 // zero-gradient steps one by one. At most `explicit_steps` of them are needed, because q_0^j is below the
-// rounding of the sum after that.
+// rounding of the sum after that. A row that is behind by that many steps or more owes the same whatever the
+// step it goes to: its rule depends on the step it stands at alone (final_rules), so what a launch computes
+// anew does not grow with the number of steps.
 //
 // Two columns say where a row stands: its parameters are those after step `last_step`, its moments those
 // after step `moment_step` <= last_step. Catching up reads the moments but does not write them; the next step
@@ -44,6 +46,20 @@ struct AdamColumn {
   std::int64_t width;
 };
 
+// The Gauss rule of one group: drift = m times the sum of weight / (place sqrt(v) + eps).
+template <class T>
+struct alignas(4 * sizeof(T)) AdamRule {
+  T place[2], weight[2];
+};
+
+// The drift from step `from` to step `to`, which parameters that stand at `from` still have to take.
+template <class T>
+struct PendingSteps {
+  AdamRule<T> rules[kAdamGroups];
+  std::int32_t from, to;
+  T explicit_up_to;  // elements with sqrt(v) up to this go step by step; negative: none
+};
+
 template <class T>
 struct AdamArgs {
   AdamColumn<T> columns[kAdamColumns];
@@ -54,6 +70,7 @@ struct AdamArgs {
   std::int32_t *last_step, *moment_step;  // [N]
   const double* table;                    // [S+1, kAdamTable]
   const float* lr_table;                  // [S+1, 6]
+  const PendingSteps<T>* final_rules;     // [final_rules_of(S + 1, explicit_steps)]; null: not tabulated
   std::int32_t step;
   std::int32_t explicit_steps;
   double beta1, beta2, eps;
@@ -69,29 +86,24 @@ struct AdamArgs {
   }
 };
 
-// The Gauss rule of one group: drift = m times the sum of weight / (place sqrt(v) + eps).
-template <class T>
-struct alignas(4 * sizeof(T)) AdamRule {
-  T place[2], weight[2];
-};
+// How many steps, from step 0, a row of a table of so many steps may stand at and be behind by
+// explicit_steps.
+BLITZGS_HD std::int64_t final_rules_of(std::int64_t table_rows, std::int64_t explicit_steps) {
+  return table_rows > explicit_steps ? table_rows - explicit_steps : 0;
+}
 
-// The drift from step `from` to step `to`, which parameters that stand at `from` still have to take.
-template <class T>
-struct PendingSteps {
-  AdamRule<T> rules[kAdamGroups];
-  std::int32_t from, to;
-  T explicit_up_to;  // elements with sqrt(v) up to this go step by step; negative: none
-};
-
-// Returns the rule of a group; `error` becomes a bound of its relative error if that is larger.
+// Returns the rule of a group; `error` becomes a bound of its relative error if that is larger. From
+// explicit_steps on, `to` makes no difference.
 template <class T>
 BLITZGS_HD AdamRule<T> adam_rule(const AdamArgs<T>& args, std::int32_t from, std::int32_t to, int group,
                                  double& error) {
-  const double *begin = args.table_row(from) + kTails + group, *end = args.table_row(to) + kTails + group;
-  const double* power = args.table_row(to - from);
-  double moments[kAdamOrders], q = power[kRatioPower];
-  for (int k = 0; k < kAdamOrders; ++k, q *= power[kRootPower]) {
-    moments[k] = begin[k * kAdamGroups] - q * end[k * kAdamGroups];
+  const double* begin = args.table_row(from) + kTails + group;
+  double moments[kAdamOrders];
+  for (int k = 0; k < kAdamOrders; ++k) moments[k] = begin[k * kAdamGroups];
+  if (to - from < args.explicit_steps) {
+    const double *end = args.table_row(to) + kTails + group, *power = args.table_row(to - from);
+    double q = power[kRatioPower];
+    for (int k = 0; k < kAdamOrders; ++k, q *= power[kRootPower]) moments[k] -= q * end[k * kAdamGroups];
   }
   const double total = moments[0];
   if (!(total > 0)) return {{T(1), T(1)}, {T(0), T(0)}};  // rates of zero
@@ -128,6 +140,12 @@ BLITZGS_HD PendingSteps<T> pending_steps(const AdamArgs<T>& args, std::int32_t f
   for (int g = 0; g < kAdamGroups; ++g) steps.rules[g] = adam_rule(args, from, to, g, error);
   steps.explicit_up_to = adam_explicit_up_to(args, from, to, error);
   return steps;
+}
+
+// Those of a row that is behind by explicit_steps or more.
+template <class T>
+BLITZGS_HD PendingSteps<T> final_pending_steps(const AdamArgs<T>& args, std::int32_t from) {
+  return pending_steps(args, from, from + args.explicit_steps);
 }
 
 // The zero-gradient steps of one element, one by one; m and root = sqrt(v) at step steps.from.
@@ -262,10 +280,15 @@ namespace cpu {
 // are caught up and stand at `step`.
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
+// Fills rules, [n], of which args has the table, explicit_steps and eps.
+template <class T>
+void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream);
 }  // namespace cpu
 namespace cuda {
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
-}
+template <class T>
+void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream);
+}  // namespace cuda
 
 }  // namespace blitzgs

@@ -41,6 +41,7 @@ template <class T>
 class PendingStepsCache {
  public:
   const PendingSteps<T>& get(const AdamArgs<T>& args, std::int32_t from, std::int32_t to) {
+    if (args.final_rules && to - from >= args.explicit_steps) return args.final_rules[from];
     PendingSteps<T>& steps = cached_[from % kSlots];
     if (!used_[from % kSlots] || steps.from != from) {
       steps = pending_steps(args, from, to);
@@ -78,6 +79,17 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
   });
 }
 
+template <class T>
+void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream) {
+  parallel_for(0, n, 1024, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t from = begin; from < end; ++from) {
+      rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
+    }
+  });
+}
+
+template void final_rules<float>(const AdamArgs<float>&, std::int64_t, PendingSteps<float>*, CudaStream);
+template void final_rules<double>(const AdamArgs<double>&, std::int64_t, PendingSteps<double>*, CudaStream);
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
 template void lazy_adam<double>(const AdamArgs<double>&, Workspace&, CudaStream);
 

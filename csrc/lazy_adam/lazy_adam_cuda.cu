@@ -21,11 +21,18 @@ static_assert(kPrepareLanes > kAdamGroups);
 constexpr int kAlone = kAdamColumns - 1;  // the column of a parameter that is stepped alone
 
 // What rows need to catch up. All rows of a launch go to the same step, so it is computed once for each step
-// at which a row may stand, and not for each row.
+// at which a row may stand, and not for each row; and only for the last explicit_steps of them where the
+// final rules of the others are tabulated.
 struct Prepared {
-  PendingSteps<float>* pending;  // [target], for parameters that stand at step 0, 1, ...
-  Decay* decays;                 // [target + 1], over each number of steps
-  bool* any_pending;             // whether any row is behind
+  PendingSteps<float>* pending;            // [target - first], for parameters that stand at step first, ...
+  Decay* decays;                           // [n_decays], over each number of steps
+  bool* any_pending;                       // whether any row is behind
+  const PendingSteps<float>* final_rules;  // for parameters that stand at steps before `first`
+  std::int32_t first, n_decays;
+
+  __device__ const PendingSteps<float>& of(std::int32_t from) const {
+    return from < first ? final_rules[from] : pending[from - first];
+  }
 };
 
 // kPrepareLanes lanes work on a step, one for each rule, because the kernel's time is that of a chain of
@@ -34,22 +41,29 @@ __global__ void __launch_bounds__(kPrepareThreads)
     prepare(const __grid_constant__ AdamArgs<float> args, const Prepared prepared) {
   wait_for_earlier_kernels();
   const auto thread = static_cast<std::int32_t>(blockIdx.x * kPrepareThreads + threadIdx.x);
-  const std::int32_t t = thread / kPrepareLanes, target = args.target();
+  const std::int32_t i = thread / kPrepareLanes, t = prepared.first + i, target = args.target();
   const int group = thread % kPrepareLanes;
   if (thread == 0) *prepared.any_pending = false;
-  if (t <= target && group == kPrepareLanes - 1) prepared.decays[t] = make_decay(args, t);
+  if (i < prepared.n_decays && group == kPrepareLanes - 1) prepared.decays[i] = make_decay(args, i);
   double error = 0;
   if (t < target && group < kAdamGroups)
-    prepared.pending[t].rules[group] = adam_rule(args, t, target, group, error);
+    prepared.pending[i].rules[group] = adam_rule(args, t, target, group, error);
 #pragma unroll
   for (int step = 1; step < kPrepareLanes; step *= 2) {
     error = fmax(error, __shfl_xor_sync(kFullWarp, error, step));
   }
   if (t >= target || group != 0) return;
-  PendingSteps<float>& steps = prepared.pending[t];
+  PendingSteps<float>& steps = prepared.pending[i];
   steps.from = t;
   steps.to = target;
   steps.explicit_up_to = adam_explicit_up_to(args, t, target, error);
+}
+
+__global__ void __launch_bounds__(kListThreads)
+    final_rules_kernel(const __grid_constant__ AdamArgs<float> args, std::int64_t n,
+                       PendingSteps<float>* rules) {
+  const std::int64_t from = blockIdx.x * std::int64_t{kListThreads} + threadIdx.x;
+  if (from < n) rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
 }
 
 // A row that catches up by the rules of the step that it stands at.
@@ -91,14 +105,14 @@ __global__ void __launch_bounds__(kListThreads)
       const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
       if (adam_moves(args, from, stand)) {
         mine = {row, from, prepared.decays[from - stand]};
-        explicitly = prepared.pending[from].explicit_up_to >= 0;
+        explicitly = prepared.of(from).explicit_up_to >= 0;
       }
       if (from < args.step) args.last_step[row] = args.step;
     }
     for (unsigned left = __ballot_sync(kFullWarp, explicitly); left; left &= left - 1) {
       const int lane = __ffs(left) - 1;
       const std::int64_t row = __shfl_sync(kFullWarp, mine.id, lane);
-      const PendingSteps<float>& steps = prepared.pending[__shfl_sync(kFullWarp, mine.from, lane)];
+      const PendingSteps<float>& steps = prepared.of(__shfl_sync(kFullWarp, mine.from, lane));
       const Decay here{__shfl_sync(kFullWarp, mine.here.first, lane),
                        __shfl_sync(kFullWarp, mine.here.second, lane)};
       catch_up_elements<0>(args, steps, here, row);
@@ -137,7 +151,7 @@ __device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
 }
 
 template <int Column, int Width>
-__device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const PendingSteps<float>* pending,
+__device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const Prepared& prepared,
                                               const PendingRow& row, int pack) {
   using P = Pack<Width>;
   const AdamColumn<float>& column = args.columns[Column];
@@ -145,7 +159,7 @@ __device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const
   P p = *reinterpret_cast<const P*>(column.param + at);
   const P m = *reinterpret_cast<const P*>(column.exp_avg + at);
   const P v = *reinterpret_cast<const P*>(column.exp_avg_sq + at);
-  const PendingSteps<float>& steps = pending[row.from];
+  const PendingSteps<float>& steps = prepared.of(row.from);
   const AdamRule<float> first = steps.rules[pack_group<Column, Width>(pack, 0)],
                         last = steps.rules[pack_group<Column, Width>(pack, Width - 1)];
 #pragma unroll
@@ -174,7 +188,7 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
       const PendingRow row = next;
       i += stride;
       if (i < n) next = pending_rows[i];
-      if (row.id >= 0) catch_up_pack<Column, Width>(args, prepared.pending, row, pack);
+      if (row.id >= 0) catch_up_pack<Column, Width>(args, prepared, row, pack);
     }
   };
   for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, catch_up_one);
@@ -229,7 +243,7 @@ __global__ void __launch_bounds__(kListThreads)
     const PendingRow row = pending_rows[e / column.width];
     if (row.id < 0) continue;
     const std::int64_t j = e % column.width, at = row.id * column.width + j;
-    const AdamRule<float>& rule = prepared.pending[row.from].rules[adam_group(kAlone, j)];
+    const AdamRule<float>& rule = prepared.of(row.from).rules[adam_group(kAlone, j)];
     column.param[at] -=
         adam_ruled_drift(rule, column.exp_avg[at] * row.here.first,
                          adam_root(column.exp_avg_sq[at] * row.here.second), static_cast<float>(args.eps));
@@ -282,12 +296,20 @@ LaunchShape alone_size(const AdamArgs<float>& args, CudaStream stream) {
 
 void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
   if (args.step == 0) return;
-  const Prepared prepared{workspace.allocate<PendingSteps<float>>(args.step),
-                          workspace.allocate<Decay>(args.step + 1), workspace.allocate<bool>(1)};
+  // Rows whose moments are behind by more do not move, so decays over more steps are not needed.
+  const std::int32_t first = args.final_rules ? std::max(0, args.step - args.explicit_steps + 1) : 0,
+                     n_decays = std::min(args.step + 1, args.explicit_steps);
+  const Prepared prepared{workspace.allocate<PendingSteps<float>>(args.step - first),
+                          workspace.allocate<Decay>(n_decays),
+                          workspace.allocate<bool>(1),
+                          args.final_rules,
+                          first,
+                          n_decays};
   auto* pending_rows = workspace.allocate<PendingRow>(args.n);
   launch_early("lazy_adam catch-up", prepare,
-               {blocks_for(args.step + 1, kPrepareThreads / kPrepareLanes), kPrepareThreads, stream}, args,
-               prepared);
+               {blocks_for(std::max(args.step - first, n_decays), kPrepareThreads / kPrepareLanes),
+                kPrepareThreads, stream},
+               args, prepared);
   // n may be far more than the number of valid ids.
   launch_early("lazy_adam catch-up", list_pending_rows,
                {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
@@ -339,6 +361,14 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
   launch_early("lazy_adam step", kernel, {blocks_for(args.n, kRows), kThreads, stream}, args);
 }
 
+template <class T>
+void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream stream) {
+  if (n == 0) return;
+  final_rules_kernel<<<blocks_for(n, kListThreads), kListThreads, 0, stream>>>(args, n, rules);
+  check_launch("lazy_adam_final_rules");
+}
+
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
+template void final_rules<float>(const AdamArgs<float>&, std::int64_t, PendingSteps<float>*, CudaStream);
 
 }  // namespace blitzgs::cuda

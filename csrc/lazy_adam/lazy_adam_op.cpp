@@ -55,10 +55,35 @@ void lazy_adam_catch_up(std::vector<Tensor> params, std::vector<Tensor> exp_avgs
   });
 }
 
+Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64_t explicit_steps,
+                             double eps) {
+  constexpr const char* kOp = "lazy_adam_final_rules";
+  check_dtype(kOp, "table", table, ScalarType::Double);
+  check_shape(kOp, "table", table, {-1, kAdamTable});
+  check_floating(kOp, "like", like);
+  STD_TORCH_CHECK(explicit_steps >= 1, "blitzgs::", kOp, ": explicit_steps must be 1 or more, got ",
+                  explicit_steps);
+  const Tensor contiguous = as_contiguous(table);
+  const std::int64_t n = final_rules_of(table.size(0), explicit_steps);
+  std::optional<Tensor> rules;
+  DeviceScope scope(contiguous);
+  dispatch_floating(like, [&](auto zero) {
+    using T = decltype(zero);
+    AdamArgs<T> args{};
+    args.table = data<double>(contiguous);
+    args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
+    args.eps = eps;
+    rules = make_empty(contiguous, {n, static_cast<std::int64_t>(sizeof(PendingSteps<T>))}, ScalarType::Byte);
+    backend::final_rules(args, n, static_cast<PendingSteps<T>*>(rules->mutable_data_ptr()), scope.stream);
+  });
+  return *rules;
+}
+
 }  // namespace
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
   m.impl("lazy_adam_step_", TORCH_BOX(&blitzgs::lazy_adam_step));
+  m.impl("lazy_adam_final_rules", TORCH_BOX(&blitzgs::lazy_adam_final_rules));
   m.impl("lazy_adam_catch_up_", TORCH_BOX(&blitzgs::lazy_adam_catch_up));
 }

@@ -18,12 +18,13 @@ inline void check_adam_list(const char* op, const std::vector<Tensor>& tensors, 
 }
 
 // The optimiser's state of a table, and where its schedule stands. last_steps: (last_step, moment_step);
-// tables: (table of adam_table.h, lr_table); steps: (step, explicit_steps, sparse); decays: (beta1, beta2,
-// eps).
+// tables: (table of adam_table.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays:
+// (beta1, beta2, eps).
 struct AdamTensors {
   const char* op;
   std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
   Tensor last_step, moment_step, table, lr_table;
+  std::optional<Tensor> final_rules;
   std::int64_t step = 0, explicit_steps = 0;
   double beta1 = 0, beta2 = 0, eps = 0;
   bool sparse = false;
@@ -33,13 +34,16 @@ struct AdamTensors {
               const std::vector<Tensor>& last_steps, const std::vector<Tensor>& tables,
               const std::vector<std::int64_t>& steps, const std::vector<double>& decays)
       : op(op_name), params(params_in), exp_avgs(exp_avgs_in), exp_avg_sqs(exp_avg_sqs_in) {
-    STD_TORCH_CHECK(last_steps.size() == 2 && tables.size() == 2 && steps.size() == 3 && decays.size() == 3,
+    STD_TORCH_CHECK(last_steps.size() == 2 && (tables.size() == 2 || tables.size() == 3) &&
+                        steps.size() == 3 && decays.size() == 3,
                     "blitzgs::", op, ": expected last_steps (last_step, moment_step), tables (table, ",
-                    "lr_table), steps (step, explicit_steps, sparse) and decays (beta1, beta2, eps)");
+                    "lr_table[, final_rules]), steps (step, explicit_steps, sparse) and decays (beta1, ",
+                    "beta2, eps)");
     last_step = last_steps[0];
     moment_step = last_steps[1];
     table = tables[0];
     lr_table = tables[1];
+    if (tables.size() == 3) final_rules = tables[2];
     step = steps[0];
     explicit_steps = steps[1];
     sparse = steps[2] != 0;
@@ -66,6 +70,12 @@ struct AdamTensors {
     args.moment_step = mutable_data<std::int32_t>(moment_step);
     args.table = data<double>(table);
     args.lr_table = data<float>(lr_table);
+    if (final_rules) {
+      check_shape(op, "final_rules", *final_rules,
+                  {final_rules_of(table.size(0), explicit_steps),
+                   static_cast<std::int64_t>(sizeof(PendingSteps<T>))});
+      args.final_rules = static_cast<const PendingSteps<T>*>(final_rules->const_data_ptr());
+    }
     args.step = static_cast<std::int32_t>(step);
     args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
     args.beta1 = beta1;
@@ -101,6 +111,9 @@ struct AdamTensors {
     check_shape(op, "table", table, {-1, kAdamTable});
     check_dtype(op, "lr_table", lr_table, ScalarType::Float);
     check_shape(op, "lr_table", lr_table, {table.size(0), kAdamGroups});
+    if (final_rules) check_dtype(op, "final_rules", *final_rules, ScalarType::Byte);
+    STD_TORCH_CHECK(!final_rules || final_rules->is_contiguous(), "blitzgs::", op,
+                    ": final_rules must be contiguous");
     STD_TORCH_CHECK(table.is_contiguous() && lr_table.is_contiguous() && last_step.is_contiguous() &&
                         moment_step.is_contiguous(),
                     "blitzgs::", op, ": table, lr_table, last_step and moment_step must be contiguous");

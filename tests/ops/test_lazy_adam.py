@@ -4,7 +4,7 @@ import math
 import pytest
 import torch
 
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_
+from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam_step_, schedule_tables
 from tests.helpers import DEVICES, needs_cuda
 
 COEFFICIENTS = 4
@@ -260,6 +260,52 @@ def test_a_step_after_catching_up_equals_a_step_alone():
         torch.testing.assert_close(x, y, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("gap", [-1, 0, 1, 5000])
+def test_what_rows_owe_in_the_end_is_tabulated_once(gap, dtype):
+    """Around the gap from which the table holds, and far behind it."""
+    lr_table = learning_rates(9000)
+    reach = explicit_steps(BETA1, BETA2, dtype)
+    for begin in (1, 40, 900, 2000):
+        state, alone = (scattered_state(40, dtype, begin) for _ in range(2))
+        end = begin + reach + gap
+        state.catch_up(None, lr_table, end)
+        tables = schedule_tables(lr_table, BETA1, BETA2, EPS, alone.params[0])
+        torch.ops.blitzgs.lazy_adam_catch_up_(
+            alone.params, *alone.moments(), [alone.last_step, alone.moment_step], None, tables[:2],
+            [end, reach, 0], [BETA1, BETA2, EPS],
+        )  # fmt: skip
+        for with_rules, without in zip(state.params, alone.params, strict=True):
+            assert torch.equal(with_rules, without)
+
+
+@pytest.mark.parametrize("steps", [1, 60, 100_000])
+def test_tables_belong_to_the_schedule_and_not_to_the_step(steps):
+    lr_table, like = learning_rates(steps), torch.zeros(1)
+    tables = schedule_tables(lr_table, BETA1, BETA2, EPS, like)
+    reach = explicit_steps(BETA1, BETA2, like.dtype)
+    assert [len(table) for table in tables] == [steps + 1, steps + 1, max(0, steps + 1 - reach)]
+    again = schedule_tables(lr_table, BETA1, BETA2, EPS, like)
+    assert all(a is b for a, b in zip(tables, again, strict=True))
+    lr_table.mul_(0.5)
+    assert schedule_tables(lr_table, BETA1, BETA2, EPS, like)[2] is not tables[2]
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_catching_up_needs_no_more_memory_late_in_a_schedule():
+    lr_table = learning_rates(100_000).cuda()
+    peaks = []
+    for step in (300, 30_000, 100_000):
+        state = scattered_state(64, torch.float32, 200, "cuda")
+        state.catch_up(None, lr_table, 201)
+        before = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+        state.catch_up(None, lr_table, step)
+        peaks.append(torch.cuda.max_memory_allocated() - before)
+    assert peaks[0] == peaks[1] == peaks[2]
+
+
 def test_order_of_the_list_does_not_matter():
     a, lr_table = one_update(50, torch.float32)
     b, _ = one_update(50, torch.float32)
@@ -326,20 +372,23 @@ def test_errors_name_the_value():
 
 def test_opcheck():
     state, lr_table = one_update(5, torch.float32)
-    from blitzgs.ops.lazy_adam import schedule_table
-
-    table = schedule_table(lr_table, BETA1, BETA2)
+    tables = schedule_tables(lr_table, BETA1, BETA2, EPS, state.params[0])
+    reach = explicit_steps(BETA1, BETA2, torch.float32)
     grads = [torch.randn(s) for s in shapes(2)]
     ids = torch.tensor([1, 3], dtype=torch.int32)
     columns = state.params, *state.moments()
-    steps, tables, decays = [state.last_step, state.moment_step], [table, lr_table], [BETA1, BETA2, EPS]
+    steps, decays = [state.last_step, state.moment_step], [BETA1, BETA2, EPS]
     torch.library.opcheck(
         torch.ops.blitzgs.lazy_adam_step_,
-        (*columns, steps, grads, ids, tables, [2, 100, 0], decays),
+        (*columns, steps, grads, ids, tables, [2, reach, 0], decays),
     )
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_catch_up_, (*columns, steps, ids, tables, [9, 100, 0], decays)
+        torch.ops.blitzgs.lazy_adam_catch_up_, (*columns, steps, ids, tables, [9, reach, 0], decays)
     )
+    torch.library.opcheck(torch.ops.blitzgs.lazy_adam_final_rules, (tables[0], state.params[0], reach, EPS))
+    bad = [*tables[:2], tables[2][1:]]
+    with pytest.raises(RuntimeError, match=r"final_rules must have shape"):
+        torch.ops.blitzgs.lazy_adam_catch_up_(*columns, steps, ids, bad, [9, reach, 0], decays)
 
 
 @pytest.mark.cuda
