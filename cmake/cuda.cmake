@@ -30,6 +30,12 @@ set(CMAKE_CUDA_RUNTIME_LIBRARY Static)
 
 add_library(blitzgs_cuda SHARED csrc/common/schema_digest.cpp ${op_sources} ${cuda_kernels})
 target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_BACKEND_CUDA USE_CUDA)
+if(BLITZGS_SM80_BRANCHES)
+  target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_SM80_BRANCHES=1)
+endif()
+if(BLITZGS_SMALL_STATES)
+  target_compile_definitions(blitzgs_cuda PRIVATE BLITZGS_SMALL_STATES=${BLITZGS_SMALL_STATES})
+endif()
 target_link_libraries(blitzgs_cuda PRIVATE blitzgs_flags blitzgs_torch CUDA::cudart_static)
 target_compile_options(
   blitzgs_cuda

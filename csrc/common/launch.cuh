@@ -23,6 +23,7 @@
 #include <atomic>
 #include <type_traits>
 
+#include "common/branches.cuh"
 #include "common/cuda_check.h"
 #include "common/stream.h"
 
@@ -30,7 +31,7 @@ namespace blitzgs::cuda {
 
 // A kernel that is launched by launch_early calls this first.
 __device__ __forceinline__ void wait_for_earlier_kernels() {
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+#if BLITZGS_SM90
   asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
@@ -39,6 +40,7 @@ __device__ __forceinline__ void wait_for_earlier_kernels() {
 // device: code that was compiled for an older device and translated when it was loaded does not wait. All
 // kernels are compiled for the same architectures, so asking one of them is enough.
 inline bool kernels_wait(const void* kernel) {
+  if constexpr (BLITZGS_SM80_BRANCHES) return false;
   enum : signed char { kUnknown, kNo, kYes };
   static std::array<std::atomic<signed char>, 64> known{};  // by device
   int device = 0;

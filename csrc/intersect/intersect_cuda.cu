@@ -314,8 +314,7 @@ std::int64_t intersect<float>(const Input& in, std::int64_t capacity, std::int32
           "intersect");
     return capacity;
   }
-  // 32-bit states leave 30 bits for counts.
-  const bool small = in.n_rows < (1 << 30) && capacity < (1 << 30);
+  const bool small = in.n_rows < kSmallStates && capacity < kSmallStates;
   const auto list = [&](auto key, auto state) {
     list_rows<decltype(key), decltype(state)>(in, capacity, isect_rows, tile_offsets, workspace, stream);
   };

@@ -19,7 +19,8 @@ namespace blitzgs::cuda {
 inline constexpr int kSweepThreads = 512, kSweepItems = 16, kSweepTile = kSweepThreads * kSweepItems;
 inline constexpr int kSweepWindow = 4;  // predecessors that are looked at together
 
-// State: an unsigned integer. Its two high bits say what the other bits count, so n_items < 2^30 for 32 bits.
+// State: an unsigned integer. Its two high bits say what the other bits count, so n_items < kSmallStates for
+// 32 bits.
 template <class Key, class State>
 struct SweepPass {
   const Key* keys;

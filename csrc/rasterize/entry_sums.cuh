@@ -3,6 +3,7 @@
 // alpha T and g = dL/d(ln alpha), to an entry's gradients: sums of the weights against the pixels' gradients,
 // and moments of g over the pixel grid, from which the gradients of mean and conic follow.
 #pragma once
+#include "common/branches.cuh"
 #include "rasterize/tile_batch.cuh"
 
 namespace blitzgs::cuda {
@@ -12,7 +13,7 @@ inline constexpr int kGroup = 16;  // entries transposed at a time, one for each
 inline constexpr int kGroupStride = kSubtile * kSubtile + 2;
 
 __device__ __forceinline__ void add_quad(float* address, float a, float b, float c, float d) {
-#if __CUDA_ARCH__ >= 900
+#if BLITZGS_SM90
   asm volatile("red.relaxed.gpu.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(address), "f"(a), "f"(b),
                "f"(c), "f"(d)
                : "memory");

@@ -1,0 +1,28 @@
+// SPDX-License-Identifier: Apache-2.0
+// Tells tests which branches the loaded code takes (branches.cuh).
+#include <cuda_runtime.h>
+
+#include "common/branches.cuh"
+
+namespace {
+// One value for each architecture in the library: the current device reads that of the code it runs.
+__device__ const int sm90_branches = BLITZGS_SM90;
+}  // namespace
+
+extern "C" {
+
+// 1 if the code that the current device runs has the branches for sm_90, otherwise 0; -1 without a device.
+__attribute__((visibility("default"))) int blitzgs_sm90_branches() {
+  int answer = -1;
+  return cudaMemcpyFromSymbol(&answer, sm90_branches, sizeof(answer)) == cudaSuccess ? answer : -1;
+}
+
+// 1 if this build leaves out the branches for sm_90 whatever the device, otherwise 0.
+__attribute__((visibility("default"))) int blitzgs_sm80_forced() { return BLITZGS_SM80_BRANCHES; }
+
+// The number of items from which sorts take 64-bit states.
+__attribute__((visibility("default"))) std::int64_t blitzgs_small_states() {
+  return blitzgs::cuda::kSmallStates;
+}
+
+}  // extern "C"
