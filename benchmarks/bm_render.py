@@ -63,7 +63,7 @@ class OurRender:
         """List the rows of each tile."""
         r = self.rows
         count = int(r.counts[2])
-        self.lists = ops.intersect(r[4], r[5], r[7], r[6], r[1], None, self.grid, count)
+        self.lists = ops.intersect(r[4], r[5], r[7], r[6], r[1], None, self.grid, count, None, True)
 
     def rasterize(self) -> None:
         """Composite the tiles."""

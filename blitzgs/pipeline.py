@@ -263,7 +263,7 @@ def list_splats(arrived: Arrived, grid: list[int]) -> tuple[Tensor, Tensor]:
     splats = arrived.splats
     isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
-        grid, arrived.n_isects, arrived.n_splats,
+        grid, arrived.n_isects, arrived.n_splats, True,
     )  # fmt: skip
     return isect_rows, tile_offsets
 

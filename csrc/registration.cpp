@@ -70,11 +70,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("splat_gradient_layout() -> int[]");
 
   // Which rows each tile composites, front to back by (depth, id). grid: n_cameras, width, height, tile_size,
-  // tile_begin, tile_end (-1: all tiles).
+  // tile_begin, tile_end (-1: all tiles). unchecked: the caller finds out by itself whether n_isects is too
+  // small, and CUDA does not wait for the number.
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor depths, Tensor camera_ids, "
-      "Tensor? ids, int[] grid, int n_isects, Tensor? n_rows=None) -> (Tensor isect_rows, "
-      "Tensor tile_offsets)");
+      "Tensor? ids, int[] grid, int n_isects, Tensor? n_rows=None, bool unchecked=False) -> ("
+      "Tensor isect_rows, Tensor tile_offsets)");
 
   // Rows on their way between ranks, packed for a collective or written straight into peers' memory (CUDA).
   m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");

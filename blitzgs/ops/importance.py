@@ -137,7 +137,7 @@ def _of_rows(rows: Rows, n_views: int, width: int, height: int) -> tuple[Tensor,
     splats = rows.means2d, rows.conics, rows.opacities
     grid = [n_views, width, height, _TILE_SIZE, 0, -1]
     lists = torch.ops.blitzgs.intersect(
-        *splats, rows.depths, rows.camera_ids, None, grid, int(rows.counts[2])
+        *splats, rows.depths, rows.camera_ids, None, grid, int(rows.counts[2]), None, True
     )
     weights, pixels = torch.ops.blitzgs.contributions(*splats, *lists, grid)
     return weights, pixels

@@ -53,9 +53,7 @@ def intersect(
         tile_begin: first owned tile; tiles outside [tile_begin, tile_end) get empty lists.
         tile_end: end of the owned tiles, -1 for all.
         n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``),
-            -1 to have them counted. On CUDA the check that it is one waits for the device; the op
-            ``torch.ops.blitzgs.intersect``, which nothing waits for there, then lists the first so many, by
-            depth.
+            -1 to have them counted. On CUDA the check that it is one waits for the device.
         n_rows: int64 [1] on the device of the rows: only the first ``n_rows`` of the P rows are valid, the
             others are never read. With it, the host can queue the CUDA op before it knows the number. None:
             all rows; a number outside [0, P] counts as 0.
@@ -71,17 +69,8 @@ def intersect(
     """
     rows = (means2d, conics, row_opacities, depths, camera_ids, ids)
     grid = [n_cameras, width, height, tile_size, tile_begin, tile_end]
-    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(*rows, grid, n_isects, n_rows)
-    # Lists that are not full have all intersections; on CUDA full ones may have lost some.
-    checked = means2d.is_cuda and n_isects >= 0 and not torch.compiler.is_compiling()
-    if checked and int(tile_offsets[-1]) == n_isects:
-        needed = len(torch.ops.blitzgs.intersect(*rows, grid, -1, n_rows)[0])
-        if needed > n_isects:
-            raise RuntimeError(
-                f"blitzgs::intersect: n_isects is {n_isects} but there are {needed} intersections; pass the "
-                "sum of tiles_touched, or -1 to have them counted"
-            )
-    return isect_rows, tile_offsets
+    lists: tuple[Tensor, Tensor] = torch.ops.blitzgs.intersect(*rows, grid, n_isects, n_rows)
+    return lists
 
 
 @torch.library.register_fake("blitzgs::intersect")
@@ -95,6 +84,7 @@ def _(
     grid: Sequence[int],
     n_isects: int,
     n_rows: Tensor | None = None,
+    unchecked: bool = False,
 ) -> tuple[Tensor, Tensor]:
     n_cameras, width, height, tile_size, *_ = grid
     tiles_x, tiles_y = tile_counts(width, height, tile_size)

@@ -52,7 +52,7 @@ def render_queued(
             n_isects = int(copy.read()[2]) if capacity is None else capacity.isects
             splats = rows.means2d, rows.conics, rows.opacities
             isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
-                *splats, rows.depths, rows.camera_ids, None, grid, n_isects, n_rows
+                *splats, rows.depths, rows.camera_ids, None, grid, n_isects, n_rows, True
             )
             composited = torch.ops.blitzgs.rasterize_fwd(
                 *splats, channels(rows), backgrounds, isect_rows, tile_offsets, grid, None, True,

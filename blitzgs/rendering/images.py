@@ -147,7 +147,7 @@ def _lists(
     def lists_of(size: int, n_isects: int) -> Lists:
         isect_rows, offsets = torch.ops.blitzgs.intersect(
             rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, None,
-            [images, width, height, size, 0, -1], n_isects,
+            [images, width, height, size, 0, -1], n_isects, None, True,
         )  # fmt: skip
         return Lists(isect_rows, offsets, width, height, size)
 

@@ -14,8 +14,9 @@
 //
 // capacity is the length of isect_rows; entries from tile_offsets[B*T] on are left unspecified. If there are
 // more entries than that, the CPU kernel returns their number and writes no list, and the op fails with both
-// numbers. The host does not wait for the CUDA kernel, which then lists the first entries in depth order; its
-// lists and offsets are consistent.
+// numbers. On CUDA the op counts them first, which is a wait, and fails likewise. The CUDA kernel itself then
+// lists the first entries in depth order, in consistent lists and offsets: so does the op where the caller
+// asks for no check because it learns the number while the device works (`unchecked`).
 //
 // Deterministic: the lists depend on the rows alone, never on threads. Row order need not follow depth.
 // O(P) for the radix sort, O(tile rows) for the tests, O(I) to write. Counts are 64-bit; P and

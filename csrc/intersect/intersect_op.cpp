@@ -12,11 +12,23 @@
 namespace blitzgs {
 namespace {
 
+// Whether the host learns the number of intersections by a wait alone; the CPU kernel returns it.
+#ifdef BLITZGS_BACKEND_CUDA
+constexpr bool kWaitsForCounts = true;
+#else
+constexpr bool kWaitsForCounts = false;
+#endif
+
+void check_capacity(std::int64_t capacity, std::int64_t count) {
+  STD_TORCH_CHECK(count <= capacity, "blitzgs::intersect: n_isects is ", capacity, " but there are ", count,
+                  " intersections; pass the sum of tiles_touched, or -1 to have them counted");
+}
+
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
                                      const Tensor& depths, const Tensor& camera_ids,
                                      const std::optional<Tensor>& ids,
                                      const std::vector<std::int64_t>& grid_numbers, std::int64_t n_isects,
-                                     const std::optional<Tensor>& known_rows) {
+                                     const std::optional<Tensor>& known_rows, bool unchecked) {
   constexpr const char* kOp = "intersect";
   check_floating(kOp, "means2d", means2d);
   const std::int64_t n_rows = means2d.size(0);
@@ -62,8 +74,12 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
                                row_count.n_rows,
                                grid,
                                row_count.known_rows};
-    const std::int64_t capacity =
-        n_isects >= 0 ? n_isects : backend::count_intersections(in, scope.workspace, scope.stream);
+    std::int64_t capacity = n_isects;
+    if (n_isects < 0 || (kWaitsForCounts && !unchecked)) {
+      const std::int64_t needed = backend::count_intersections(in, scope.workspace, scope.stream);
+      if (n_isects < 0) capacity = needed;
+      check_capacity(capacity, needed);
+    }
     std::int64_t count = 0;
     try {
       rows = make_empty(means, {capacity}, ScalarType::Int);
@@ -76,8 +92,7 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
                       " rows failed; it takes about ", capacity * 20 / 1000000, " MB. Render fewer views at ",
                       "once, in smaller images, or with a larger radius_clip. Cause: ", error.what());
     }
-    STD_TORCH_CHECK(count <= capacity, "blitzgs::intersect: n_isects is ", capacity, " but there are ", count,
-                    " intersections; pass the sum of tiles_touched, or -1 to have them counted");
+    check_capacity(capacity, count);
   });
   return {rows, offsets};
 }

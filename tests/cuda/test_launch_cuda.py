@@ -29,7 +29,7 @@ class Calls:
     def run(self) -> list[torch.Tensor]:
         means2d, conics, opacities, _ = self.splats
         lists = ops.intersect(
-            means2d, conics, opacities, self.depths, self.cameras, None, self.grid, self.capacity
+            means2d, conics, opacities, self.depths, self.cameras, None, self.grid, self.capacity, None, True
         )
         image = ops.rasterize_fwd(*self.splats, None, *lists, self.grid, None, True, False)
         renders, rest, last, _, packed, order, _ = image

@@ -145,7 +145,9 @@ def test_lists_with_too_little_room_are_the_nearest_rows(share, tiles):
     view = [2, *VIEW[1:], *tiles]
     whole, offsets = (t.cpu() for t in ops.intersect(*rows.alone.rows(), None, view, -1))
     room = int(share * len(whole))
-    cut, cut_offsets = (t.cpu() for t in ops.intersect(*rows.roomy.rows(), None, view, room, rows.count))
+    cut, cut_offsets = (
+        t.cpu() for t in ops.intersect(*rows.roomy.rows(), None, view, room, rows.count, True)
+    )
     assert len(cut) == room == cut_offsets[-1]
     assert (cut_offsets.diff() >= 0).all() and cut_offsets[0] == 0
     for tile in range(len(offsets) - 1):
@@ -154,8 +156,9 @@ def test_lists_with_too_little_room_are_the_nearest_rows(share, tiles):
         assert len(found) <= offsets[tile + 1] - offsets[tile]
 
 
-def test_lists_with_too_little_room_are_an_error_on_the_cpu():
-    rows = Rows(100, 150, "cpu")
+@pytest.mark.parametrize("device", DEVICES)
+def test_lists_with_too_little_room_are_an_error(device):
+    rows = Rows(100, 150, device)
     count = len(ops.intersect(*rows.alone.rows(), None, [*VIEW, 0, -1], -1)[0])
     with pytest.raises(RuntimeError, match=f"n_isects is {count - 1} but there are {count}"):
         ops.intersect(*rows.roomy.rows(), None, [*VIEW, 0, -1], count - 1, rows.count)
