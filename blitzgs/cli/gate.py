@@ -11,7 +11,7 @@ from typing import Any
 
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device
 from blitzgs.distributed.group import Ranks
-from blitzgs.population import gate_evaluation, gate_fit
+from blitzgs.population import gate_evaluation, gate_fit, spawn_samples
 from blitzgs.population.spawn_gate import SpawnGate
 from blitzgs.training import run as run_folder
 from blitzgs.training.config_io import ConfigError, load_config
@@ -25,6 +25,7 @@ densification which are not going to survive.
 
   blitzgs train ... --population.lineage=true       log births and deaths (for each scene)
   blitzgs gate fit RUN RUN RUN --out gate.json      fit on them; figures of scenes left out
+  blitzgs gate sample RUN --out NAME.parquet        a run's lineage in one small file, to fit elsewhere
   blitzgs gate evaluate gate.json RUN --out DIR     judge it on a scene that it has not seen
   blitzgs gate replay gate.json RUN --out DIR       compare it with an oracle and with chance
   blitzgs train ... --population.gate=gate.json     use it
@@ -36,8 +37,16 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = add_command(commands, "gate", lambda _: 2, "fit and judge spawn gates", HELP)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
-    fit.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage")
+    fit.add_argument(
+        "runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage, or a sample"
+    )
     fit.add_argument("--out", type=Path, required=True, metavar="FILE", help="model, .json or .ubj")
+    sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
+    sample.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
+    sample.add_argument("--out", type=Path, required=True, metavar="FILE", help="sample, .parquet")
+    sample.add_argument(
+        "--rows", type=int, default=spawn_samples.MOST_ROWS, help="spawns, about (%(default)s)"
+    )
     judge = add_command(actions, "evaluate", run_evaluate, "judge a gate on the lineage of runs")
     judge.add_argument("gate", type=Path, metavar="GATE", help="model file")
     judge.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage")
@@ -55,12 +64,25 @@ def run_fit(args: argparse.Namespace) -> int:
     """Fit a gate; returns the exit status."""
     if args.out.suffix not in (".json", ".ubj"):
         raise ValueError(f"--out {args.out}: a gate's file ends in .json or .ubj")
-    runs = [gate_fit.read_spawns(_lineage(folder)) for folder in args.runs]
+    runs = [_spawns(path) for path in args.runs]
     args.out.parent.mkdir(parents=True, exist_ok=True)
     figures = gate_fit.fit(runs, args.out)
     print(f"{args.out}: fitted on {len(runs)} runs; {figures['protocol']}:")
     for entry in figures["held_out"]:
         print(f"  {_judgement(entry)}")
+    return 0
+
+
+def run_sample(args: argparse.Namespace) -> int:
+    """Write a sample of spawns; returns the exit status."""
+    if args.out.suffix != spawn_samples.SUFFIX:
+        raise ValueError(f"--out {args.out}: a sample's file ends in {spawn_samples.SUFFIX}")
+    if args.rows < 1:
+        raise ValueError(f"--rows: must be at least 1, got {args.rows}")
+    run = gate_fit.read_spawns(_lineage(args.folder))
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    rate = spawn_samples.write_sample(run, args.out, args.rows)
+    print(f"{args.out}: {rate:.2%} of {len(run.survived):,} spawns of {run.name}")
     return 0
 
 
@@ -104,6 +126,13 @@ def run_replay(args: argparse.Namespace) -> int:
         if ranks.rank == 0:
             print(_table(results))
     return 0
+
+
+def _spawns(path: Path) -> gate_fit.Spawns:
+    """Read the spawns of a run, or a sample of them."""
+    if path.suffix == spawn_samples.SUFFIX:
+        return spawn_samples.read_sample(path)
+    return gate_fit.read_spawns(_lineage(path))
 
 
 def _lineage(folder: Path) -> Path:

@@ -105,7 +105,7 @@ class Lineage:
         Raises:
             ImportError: pyarrow is not installed.
         """
-        self._parquet = _pyarrow()
+        self._parquet = import_pyarrow()
         self._folder, self._ranks, self.ledger = folder, ranks, ledger
         if ranks.rank == 0:
             folder.mkdir(parents=True, exist_ok=True)
@@ -237,7 +237,7 @@ def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
         FileNotFoundError: there is no log.
         ImportError: pyarrow is not installed.
     """
-    arrow, parquet = _pyarrow()
+    arrow, parquet = import_pyarrow()
     tables = {}
     for table in ("births", "deaths"):
         paths = sorted(path for path in folder.glob(f"{table}_*.parquet") if _PART.fullmatch(path.name))
@@ -282,7 +282,8 @@ def _same_number(ledger: Ledger, live: int) -> str:
     return " (their numbers agree, their ids do not)" if ledger.births - ledger.deaths == live else ""
 
 
-def _pyarrow() -> tuple[ModuleType, ModuleType]:
+def import_pyarrow() -> tuple[ModuleType, ModuleType]:
+    """Return pyarrow and pyarrow.parquet, or say what to install."""
     try:
         import pyarrow
         import pyarrow.parquet

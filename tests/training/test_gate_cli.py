@@ -14,6 +14,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.population.candidates import Candidates
 from blitzgs.population.gate_evaluation import correlation, region_rates, survival_by_cohort
 from blitzgs.population.gate_fit import read_spawns
+from blitzgs.population.spawn_samples import read_sample
 from blitzgs.training.gate_replay import OracleVeto, event_keys, label_events
 from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import OVERRIDES, write_tiny_capture
@@ -88,6 +89,36 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     assert [r["t"] for r in records if r.get("event") == "densify"] == [60, 80]
     assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
     assert "already holds a replay: choose another --out" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys):
+    run = read_spawns(lineage_run / "run" / "lineage")
+    sample, part = tmp_path / "all.parquet", tmp_path / "part.parquet"
+    flags = ["gate", "sample", str(lineage_run / "run"), "--out"]
+    assert main([*flags, str(sample)]) == 0
+    assert f"100.00% of {len(run.survived):,} spawns of capture" in capsys.readouterr().out
+    read = read_sample(sample)
+    for name in ("features", "survived", "parents", "positions"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(run, name))
+    assert (read.name, read.scene, read.schedule) == (run.name, run.scene, run.schedule)
+    assert read.initial_survival == run.initial_survival
+    assert main([*flags, str(part), "--rows", str(len(run.survived) // 2)]) == 0
+    drawn = set(read_sample(part).parents.tolist())
+    # Whole families, about as many as wanted.
+    assert len(read_sample(part).parents) == np.isin(run.parents, list(drawn)).sum()
+    assert 0.35 < len(read_sample(part).parents) / len(run.parents) < 0.65
+    gates = [tmp_path / name for name in ("run.json", "sample.json")]
+    for source, gate in zip((lineage_run / "run", sample), gates, strict=True):
+        assert main(["gate", "fit", str(source), "--out", str(gate)]) == 0
+    assert gates[0].read_bytes() == gates[1].read_bytes()
+    assert main(["gate", "fit", str(tmp_path / "none.parquet"), "--out", str(gates[0])]) == 1
+    assert "there is no such sample of spawns" in capsys.readouterr().err
+    (tmp_path / "text.parquet").write_text("text")
+    assert main(["gate", "fit", str(tmp_path / "text.parquet"), "--out", str(gates[0])]) == 1
+    assert "is not a Parquet file" in capsys.readouterr().err
+    births = str(next((lineage_run / "run" / "lineage").glob("births*.parquet")))
+    assert main(["gate", "fit", births, "--out", str(gates[0])]) == 1
+    assert "is not a sample of spawns" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_what_is_missing_is_named(lineage_run, tmp_path, capsys):

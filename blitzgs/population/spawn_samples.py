@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of spawns: a run's lineage reduced to one small file from which a gate can be fitted elsewhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from blitzgs.ops.counter_random import uniform
+from blitzgs.output import new_file
+from blitzgs.population.candidates import FEATURES
+from blitzgs.population.gate_fit import Spawns
+from blitzgs.population.lineage import import_pyarrow
+
+SUFFIX = ".parquet"
+# Rows of a sample; a row takes some 40 bytes.
+MOST_ROWS = 250_000
+_ABOUT = b"blitzgs.spawns"
+# Names the draw of parents; nothing else draws by parent under this seed.
+_SEED = 0x5A3B1E
+_AXES = ("x", "y", "z")
+
+
+def write_sample(run: Spawns, path: Path, most: int = MOST_ROWS) -> float:
+    """Write the spawns of some parents, drawn by the hash of their ids, so that siblings stay together.
+
+    Args:
+        run: the spawns of a run.
+        path: the file, `NAME.parquet`.
+        most: how many rows to expect; with fewer spawns than this all are written.
+
+    Returns:
+        The share of the parents that was drawn.
+
+    Raises:
+        ImportError: pyarrow is not installed.
+    """
+    arrow, parquet = import_pyarrow()
+    rate = min(1.0, most / len(run.survived))
+    some = run.only((uniform(_SEED, torch.from_numpy(run.parents)) < rate).numpy())
+    columns: dict[str, Any] = {"parent": some.parents, "survived": some.survived}
+    columns |= dict(zip(_AXES, some.positions.T, strict=True))
+    columns |= dict(zip(FEATURES, some.features.T, strict=True))
+    about = {
+        "name": run.name,
+        "scene": run.scene,
+        "schedule": run.schedule,
+        "initial_survival": run.initial_survival,
+        "spawns": len(run.survived),
+        "rate": rate,
+    }
+    table = arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
+    with new_file(path) as partial:
+        table = table.replace_schema_metadata({_ABOUT: json.dumps(about)})
+        parquet.write_table(table, partial, compression="zstd")
+    return rate
+
+
+def read_sample(path: Path) -> Spawns:
+    """Read a sample back.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not a sample, or one of other features.
+        ImportError: pyarrow is not installed.
+    """
+    arrow, parquet = import_pyarrow()
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: there is no such sample of spawns")
+    try:
+        table = parquet.read_table(path)
+    except (OSError, arrow.ArrowInvalid) as error:
+        raise ValueError(f"{path} is not a Parquet file: {error}") from error
+    content = (table.schema.metadata or {}).get(_ABOUT)
+    if content is None:
+        raise ValueError(f"{path} is not a sample of spawns: write one with blitzgs gate sample")
+    columns = {name: table[name].to_numpy() for name in table.column_names}
+    if missing := [name for name in FEATURES if name not in columns]:
+        raise ValueError(f"{path}: the sample lacks the features {missing}; write it anew")
+    about = json.loads(content)
+    return Spawns(
+        name=about["name"],
+        scene=about["scene"],
+        schedule=about["schedule"],
+        features=np.stack([columns[name].astype(np.float32) for name in FEATURES], 1),
+        survived=columns["survived"].astype(bool),
+        parents=columns["parent"],
+        positions=np.stack([columns[axis] for axis in _AXES], 1),
+        initial_survival=about["initial_survival"],
+    )
