@@ -161,7 +161,11 @@ def errors(scene: BenchmarkScene, renderer: Renderer) -> tuple[float, float, flo
         v_renders[place] += weights.to(v_renders)
     actual = renderer.backward(frame, v_renders)
     expected = torch.autograd.grad(expected_loss, exact.inputs, retain_graph=True)
-    return image_error, _gradient_error(actual, expected, frame.rows.visible_ids.cpu().long(), exact.ids), cut
+    return (
+        image_error,
+        _gradient_error(actual, expected, frame.projected.visible_ids.cpu().long(), exact.ids),
+        cut,
+    )
 
 
 def _gradient_error(

@@ -11,8 +11,8 @@ again by their measured cost.
 
 Stages: every step starts together on all ranks, behind a barrier; a stage is the time between its marks on
 the device, the slowest rank's, and the median over the batches and visits. "alone" is their sum. Where ranks
-share memory, rows travel in "project" and "sort", and gradients in "optimiser", whose kernel pulls them from
-the other ranks; "exchange" and "exchange back" are then the meetings before these are read.
+share memory, splats travel in "project" and "sort", and gradients in "optimiser", whose kernel pulls them
+from the other ranks; "exchange" and "exchange back" are then the meetings before these are read.
 Step: all batches one after the other without a barrier, as in training; the time from the first to the last,
 by the host's clock, over their number; the median over the visits.
 """
@@ -192,8 +192,8 @@ class Workload:
         self.guard.check(self.steps, [str(key) for key in batch.indices], sums, self.table, frame)
         self.stepper.backward(self.steps, frame, terms, mark)
         return {
-            "rows": len(frame.rows.gaussian_ids),
-            "visible": len(frame.rows.visible_ids),
+            "rows": len(frame.projected.gaussian_ids),
+            "visible": len(frame.projected.visible_ids),
             "sent": 0 if frame.traffic is None else _sent_elsewhere(frame.traffic),
             "work": sums,
             "ranges": batch.ranges,
@@ -304,7 +304,7 @@ def show(report: dict[str, Any]) -> None:
             f"{report['bytes per visible gaussian']:.1f} bytes per visible Gaussian"
         )
         print(
-            f"  {report['visible per step']:,.0f} visible Gaussians, {report['rows per step']:,.0f} rows, "
+            f"  {report['visible per step']:,.0f} visible Gaussians, {report['rows per step']:,.0f} splats, "
             f"{report['rows sent to other ranks']:,.0f} of them sent to another rank; "
             f"exchange {100 * exchange / report['ms']['alone']:.1f} % of the step"
         )

@@ -21,14 +21,14 @@ from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
 from blitzgs.ops.blocks import BLOCK_ROWS, cull_blocks, update_block_bounds_
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
 from blitzgs.view.blocks import morton_order
 
 COLUMNS = ("means", "quats", "scales", "opacities", "sh")
 CULL_BYTES = 4 * (3 + 3 + 1)  # mean, scales, opacity: read for every Gaussian
 VISIBLE_BYTES = 4 * (4 + 48)  # quaternion, SH: read for the visible ones
-ROW_BYTES = 4 * (1 + 1 + 2 + 3 + 1 + 1 + 3 + 2 + 1)  # written
-ROW_GRADIENT_BYTES = 4 * (2 + 3 + 1 + 3)  # read backward
+SPLAT_BYTES = 4 * (1 + 1 + 2 + 3 + 1 + 1 + 3 + 2 + 1)  # written
+SPLAT_GRADIENT_BYTES = 4 * (2 + 3 + 1 + 3)  # read backward
 GRADIENT_BYTES = 4 * 59  # parameters read and gradients written backward, each
 
 
@@ -52,11 +52,11 @@ def active_rows(scene: BenchmarkScene) -> tuple[Tensor, Tensor]:
     ).listed()
 
 
-def backward_arguments(scene: BenchmarkScene, rows: Rows) -> tuple[Any, ...]:
-    v = [torch.randn_like(getattr(rows, name)) for name in ("means2d", "conics", "opacities", "colors")]
+def backward_arguments(scene: BenchmarkScene, splats: ProjectedSplats) -> tuple[Any, ...]:
+    v = [torch.randn_like(getattr(splats, name)) for name in ("means2d", "conics", "opacities", "colors")]
     inputs = inputs_of(scene)
     return (
-        inputs.gaussians, list(inputs.cameras), [rows.camera_ids, rows.visible_ids, rows.row_offsets],
+        inputs.gaussians, list(inputs.cameras), [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
         inputs.options.ints, inputs.options.floats, v, None, None, False,
     )  # fmt: skip
 
@@ -77,36 +77,36 @@ def main() -> None:
     for views in args.views:
         scene = aerial(args.gaussians, args.device, views=views)
         forward = inputs_of(scene)
-        rows = project_rows(forward)
-        visible, n_rows, _ = rows.counts.tolist()
+        splats = project_splats(forward)
+        visible, n_splats, _ = splats.counts.tolist()
 
         def report(
-            name: str, milliseconds: float, megabytes: float, n_rows: int = n_rows, views: int = views
+            name: str, milliseconds: float, megabytes: float, n_splats: int = n_splats, views: int = views
         ) -> None:
             floor = megabytes / bandwidth
             results.append(
-                {"views": views, "work": name, "rows": n_rows, "ms": milliseconds, "floor_ms": floor}
+                {"views": views, "work": name, "rows": n_splats, "ms": milliseconds, "floor_ms": floor}
             )
-            each = 1e6 * milliseconds / max(n_rows, 1)
-            print(f"  {name:32s} {milliseconds:9.3f} ms  {each:7.1f} ns a row  byte floor {floor:.3f} ms")
+            each = 1e6 * milliseconds / max(n_splats, 1)
+            print(f"  {name:32s} {milliseconds:9.3f} ms  {each:7.1f} ns a splat  byte floor {floor:.3f} ms")
 
-        print(f"{views} view(s): {visible} visible, {n_rows} rows")
-        moved = VISIBLE_BYTES * visible + ROW_BYTES * n_rows
-        time = median_ms(project_rows, [(forward,)], args.repeats)
+        print(f"{views} view(s): {visible} visible, {n_splats} splats")
+        moved = VISIBLE_BYTES * visible + SPLAT_BYTES * n_splats
+        time = median_ms(project_splats, [(forward,)], args.repeats)
         report("forward, all candidates", time, (CULL_BYTES * args.gaussians + moved) / 1e6)
-        time = median_ms(project_rows, [(inputs_of(scene, rows.visible_ids),)], args.repeats)
+        time = median_ms(project_splats, [(inputs_of(scene, splats.visible_ids),)], args.repeats)
         report("forward, the visible given", time, (CULL_BYTES * visible + moved) / 1e6)
-        back = (2 * GRADIENT_BYTES * visible + ROW_GRADIENT_BYTES * n_rows) / 1e6
-        time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, rows)], args.repeats)
+        back = (2 * GRADIENT_BYTES * visible + SPLAT_GRADIENT_BYTES * n_splats) / 1e6
+        time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, splats)], args.repeats)
         report("backward", time, back)
-        del rows, forward
+        del splats, forward
         scene = in_morton_order(scene)
         active = active_rows(scene)
         forward = inputs_of(scene, *active)
-        rows = project_rows(forward)
-        time = median_ms(project_rows, [(forward,)], args.repeats)
+        splats = project_splats(forward)
+        time = median_ms(project_splats, [(forward,)], args.repeats)
         report(f"Morton order, {len(active[0])} active", time, (CULL_BYTES * len(active[0]) + moved) / 1e6)
-        time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, rows)], args.repeats)
+        time = median_ms(torch.ops.blitzgs.project_bwd, [backward_arguments(scene, splats)], args.repeats)
         report("Morton order, backward", time, back)
     if args.json:
         write_json(args.json, args.device, gaussians=args.gaussians, results=results)

@@ -30,13 +30,13 @@ WIDTH, HEIGHT = 395, 297
 PAIRS_PER_BATCH = 1 << 21  # (entry, pixel) pairs that one batch of tiles evaluates
 
 
-def torch_tiles(values: list[Tensor], rows: Tensor, tiles: Tensor, offsets: Tensor, tiles_x: int) -> Tensor:
+def torch_tiles(values: list[Tensor], isects: Tensor, tiles: Tensor, offsets: Tensor, tiles_x: int) -> Tensor:
     """Composite some tiles: [tiles, pixels, D + 1], colour and final transmittance."""
     means2d, conics, opacities, colors = values
     lengths = offsets[tiles + 1] - offsets[tiles]
     places = torch.arange(int(lengths.max()))
     present = places < lengths[:, None]
-    index = rows[(offsets[tiles][:, None] + places).clamp(max=len(rows) - 1)].long()  # [tiles, entries]
+    index = isects[(offsets[tiles][:, None] + places).clamp(max=len(isects) - 1)].long()  # [tiles, entries]
     pixel = torch.arange(TILE * TILE)
     centres = torch.stack([pixel % TILE, pixel // TILE], -1) + 0.5
     corner = torch.stack([tiles % tiles_x, tiles // tiles_x], -1) * TILE
@@ -54,7 +54,7 @@ def torch_tiles(values: list[Tensor], rows: Tensor, tiles: Tensor, offsets: Tens
     return torch.cat([color, before[:, -1, :, None]], -1)
 
 
-def torch_rasterize(values: list[Tensor], rows: Tensor, offsets: Tensor) -> Tensor:
+def torch_rasterize(values: list[Tensor], isects: Tensor, offsets: Tensor) -> Tensor:
     """Render one view with plain PyTorch: [H, W, D + 1]."""
     tiles_x, tiles_y = tile_counts(WIDTH, HEIGHT, TILE)
     lengths = offsets.diff()
@@ -68,19 +68,19 @@ def torch_rasterize(values: list[Tensor], rows: Tensor, offsets: Tensor) -> Tens
             empty[..., -1] = 1
             images.append(empty)
         else:
-            images.append(torch_tiles(values, rows, batch, offsets, tiles_x))
+            images.append(torch_tiles(values, isects, batch, offsets, tiles_x))
         done += len(batch)
     pixels = torch.cat(images)[torch.argsort(order)]
     image = pixels.view(tiles_y, tiles_x, TILE, TILE, -1).permute(0, 2, 1, 3, 4)
     return image.reshape(tiles_y * TILE, tiles_x * TILE, -1)[:HEIGHT, :WIDTH]
 
 
-def count_blends(values: list[Tensor], rows: Tensor, offsets: Tensor, last_ids: Tensor) -> int:
+def count_blends(values: list[Tensor], isects: Tensor, offsets: Tensor, last_ids: Tensor) -> int:
     """Count the composited (splat, pixel) pairs."""
     tiles_x, tiles_y = tile_counts(WIDTH, HEIGHT, TILE)
     total = 0
     for tile in range(tiles_x * tiles_y):
-        entries = rows[offsets[tile] : offsets[tile + 1]].long()
+        entries = isects[offsets[tile] : offsets[tile + 1]].long()
         y, x = tile // tiles_x * TILE, tile % tiles_x * TILE
         last = last_ids[0, y : y + TILE, x : x + TILE]
         height, width = last.shape
@@ -101,22 +101,22 @@ def run(scene: BenchmarkScene, repeats: int) -> list[dict[str, object]]:
         WIDTH, HEIGHT, tile_size=TILE, sh_degree=3, raw=False,
     )  # fmt: skip
     values = [t.detach() for t in (view.means2d, view.conics, view.opacities, view.colors)]
-    rows, offsets = intersect(
+    isects, offsets = intersect(
         *values[:3], view.depths, view.camera_ids, n_cameras=1, width=WIDTH, height=HEIGHT
     )
     leaves = [t.clone().requires_grad_() for t in values]
     options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     v_image = torch.randn(HEIGHT, WIDTH, 3)
-    last_ids = torch.ops.blitzgs.rasterize_fwd(*values, None, rows, offsets, [1, WIDTH, HEIGHT, TILE, 0, -1])[
-        2
-    ]
-    blends = count_blends(values, rows, offsets, last_ids)
+    last_ids = torch.ops.blitzgs.rasterize_fwd(
+        *values, None, isects, offsets, [1, WIDTH, HEIGHT, TILE, 0, -1]
+    )[2]
+    blends = count_blends(values, isects, offsets, last_ids)
 
     def ours(inputs: list[Tensor]) -> Tensor:
-        return rasterize(*inputs, rows, offsets, **options)[0][0]
+        return rasterize(*inputs, isects, offsets, **options)[0][0]
 
     def plain(inputs: list[Tensor]) -> Tensor:
-        return torch_rasterize(inputs, rows, offsets)[..., :3]
+        return torch_rasterize(inputs, isects, offsets)[..., :3]
 
     results = []
     for name, render in (("blitzgs", ours), ("plain PyTorch", plain)):

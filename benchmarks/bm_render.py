@@ -4,7 +4,7 @@
     python benchmarks/bm_render.py [--scenes aerial1 aerial4 aerial16 garden] [--repeats 30] [--json FILE]
 
 Gradients for every parameter; SH degree 3, float32. Ours: the ops of the training step in order (project,
-intersect, rasterize and their gradients, in compact rows), and the same through `blitzgs.rasterization` and
+intersect, rasterize and their gradients, in compact splats), and the same through `blitzgs.rasterization` and
 autograd: with dense gradients, with sparse ones, and with every entry of meta read. gsplat: `rasterization`
 and autograd, packed and not. Torch's autograd hands the backward pass of CUDA tensors to a thread of its own
 and waits for it; "1 thread" is without that (`torch.autograd.set_multithreading_enabled(False)`). Each figure
@@ -26,7 +26,7 @@ from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
 from blitzgs import rasterization
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_rows
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
 from blitzgs.ops.rasterize import rasterize_fwd
 
 try:
@@ -57,17 +57,17 @@ class OurRender:
 
     def project(self) -> None:
         """Run the projection."""
-        self.rows = project_rows(ProjectionInputs(self.parameters, self.cameras, self.options))
+        self.projected = project_splats(ProjectionInputs(self.parameters, self.cameras, self.options))
 
     def intersect(self) -> None:
-        """List the rows of each tile."""
-        r = self.rows
+        """List the splats of each tile."""
+        r = self.projected
         count = int(r.counts[2])
         self.lists = ops.intersect(r[4], r[5], r[7], r[6], r[1], None, self.grid, count, None, True)
 
     def rasterize(self) -> None:
         """Composite the tiles."""
-        r = self.rows
+        r = self.projected
         self.splats = (r[4], r[5], r[7], r[8], None, *self.lists)
         self.saved = rasterize_fwd(*self.splats, self.grid, None, True, True)
 
@@ -77,14 +77,14 @@ class OurRender:
         ops.rasterize_bwd_packed_(
             *self.splats, [rest, last, packed_splats, tile_order], v_renders, self.grid, False, packed
         )
-        self.v_rows = [packed]
+        self.v_splats = [packed]
 
     def project_backward(self) -> None:
-        """Differentiate the projection, to compact rows."""
-        r = self.rows
+        """Differentiate the projection, to compact splats."""
+        r = self.projected
         self.gradients = ops.project_bwd(
             self.parameters, self.cameras, [r[1], r[2], r[3]], self.options.ints, self.options.floats,
-            self.v_rows, None, None, False,
+            self.v_splats, None, None, False,
         )  # fmt: skip
 
     def forward(self) -> Tensor:
@@ -99,7 +99,7 @@ class OurRender:
         self.rasterize_backward(v_renders)
         del self.saved, self.splats, self.lists
         self.project_backward()
-        del self.rows, self.v_rows, self.gradients
+        del self.projected, self.v_splats, self.gradients
 
 
 class CallRender:
@@ -178,9 +178,9 @@ def run(name: str, repeats: int) -> dict[str, Any]:
     ours = OurRender(scene)
     result: dict[str, Any] = {"scene": scene.name, "blitzgs": measure(ours, v, repeats)}
     image = ours.forward()
-    result["visible"], result["rows"], result["intersections"] = ours.rows.counts.tolist()
+    result["visible"], result["rows"], result["intersections"] = ours.projected.counts.tolist()
     result["stages"] = stages(ours, v, repeats)
-    del ours.saved, ours.splats, ours.lists, ours.rows, ours.v_rows, ours.gradients
+    del ours.saved, ours.splats, ours.lists, ours.projected, ours.v_splats, ours.gradients
     sparse = partial(rasterization, sparse_grad=True)
     calls: dict[str, Callable[[], CallRender]] = {
         "rasterization": lambda: CallRender(scene, rasterization),
@@ -216,8 +216,8 @@ def main() -> None:
     for name in args.scenes:
         result = run(name, args.repeats)
         results.append(result)
-        rows, entries = result["rows"], result["intersections"]
-        print(f"{result['scene']}: {result['visible']} visible, {rows} rows, {entries} intersections")
+        n_splats, entries = result["rows"], result["intersections"]
+        print(f"{result['scene']}: {result['visible']} visible, {n_splats} splats, {entries} intersections")
         print("  " + "  ".join(f"{k} {v:.3f}" for k, v in result["stages"].items()))
         for label, r in result.items():
             if label not in ("scene", "visible", "rows", "intersections", "stages"):

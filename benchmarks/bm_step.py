@@ -120,7 +120,7 @@ class OurStep:
         """Take one step."""
         frame, terms, _ = self.stepper.forward(self.step, OPTIONS, self.batch, mark)
         self.stepper.backward(self.step, frame, terms, mark)
-        self.visible = len(frame.rows.visible_ids)
+        self.visible = len(frame.projected.visible_ids)
 
 
 class GsplatStep:

@@ -29,14 +29,14 @@ def parameter_gradients(
     table: GaussianTable, frame: pipeline.Frame, v_renders: Tensor, scale_reg: Tensor | None = None
 ) -> list[Tensor]:
     """Return the gradients of the U visible Gaussians' parameters, from those of a frame's images."""
-    gradients, rows = pipeline.backward_splats(frame, v_renders), frame.rows
+    gradients, projected = pipeline.backward_splats(frame, v_renders), frame.projected
     options = frame.options.projection(frame.views)
     parts = gradients.parts
     if gradients.places is not None:
-        parts = [sum_of_ranks(gradients, len(rows.means2d))]
+        parts = [sum_of_ranks(gradients, len(projected.means2d))]
     *parameters, _ = torch.ops.blitzgs.project_bwd(
         list(table.parameters), [frame.views.viewmats, frame.views.Ks],
-        [rows.camera_ids, rows.visible_ids, rows.row_offsets], options.ints, options.floats, list(parts),
-        None, scale_reg, False,
+        [projected.camera_ids, projected.visible_ids, projected.splat_offsets], options.ints, options.floats,
+        list(parts), None, scale_reg, False,
     )  # fmt: skip
     return parameters

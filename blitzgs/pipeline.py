@@ -24,7 +24,7 @@ from blitzgs.distributed.transport.local import LocalTransport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
 
 Mark = Callable[[str], None]
@@ -98,14 +98,14 @@ class Frame(NamedTuple):
     Attributes:
         views: the views.
         options: the options.
-        rows: this rank's projected Gaussians, P rows.
-        splats: what was composited: the rows, or those that the exchange brought here.
+        projected: this rank's splats, of the Gaussians that it owns; P of them.
+        splats: what was composited: these, or those that the exchange brought here.
         assignment: who composites which tiles; None: one rank does all.
         exchange: returns the gradients of the splats.
         traffic: which splats went where; None: they stayed.
         visible: int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
         backgrounds: [B, 3]; None: black.
-        isect_rows: int32 [I], splats by tile, front to back.
+        isect_splats: int32 [I], splats by tile, front to back.
         tile_offsets: int64 [B * T + 1].
         renders: [B, H, W, 3]; like the next two undefined where other ranks composite.
         transmittances: [B, H, W], share of the background that shows.
@@ -118,14 +118,14 @@ class Frame(NamedTuple):
 
     views: Views
     options: RenderOptions
-    rows: Rows
+    projected: ProjectedSplats
     splats: Splats
     assignment: TileAssignment | None
     exchange: Exchange
     traffic: Traffic | None
     visible: Tensor
     backgrounds: Tensor | None
-    isect_rows: Tensor
+    isect_splats: Tensor
     tile_offsets: Tensor
     renders: Tensor
     transmittances: Tensor
@@ -209,14 +209,14 @@ class _Render:
         frame = Frame(
             views=views,
             options=self.options,
-            rows=counts.rows,
+            projected=counts.projected,
             splats=counts.splats,
             assignment=self.assignment,
             exchange=exchange,
             traffic=counts.traffic,
             visible=counts.visible,
             backgrounds=backgrounds,
-            isect_rows=lists[0],
+            isect_splats=lists[0],
             tile_offsets=lists[1],
             renders=renders,
             transmittances=transmittances,
@@ -259,13 +259,13 @@ def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment |
 
 
 def list_splats(arrived: Arrived, grid: list[int]) -> tuple[Tensor, Tensor]:
-    """Return the lists of the tiles of `tile_grid`: isect_rows and tile_offsets, as `Frame` has them."""
+    """Return the lists of the tiles of `tile_grid`: isect_splats and tile_offsets, as `Frame` has them."""
     splats = arrived.splats
-    isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
+    isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
         grid, arrived.n_isects, arrived.n_splats, True,
     )  # fmt: skip
-    return isect_rows, tile_offsets
+    return isect_splats, tile_offsets
 
 
 @lru_cache(maxsize=16)
@@ -288,7 +288,7 @@ def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> S
     views, options, splats = frame.views, frame.options, frame.splats
     tiles = (0, -1) if frame.assignment is None else frame.assignment.tiles
     arguments = (
-        splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
+        splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_splats,
         frame.tile_offsets,
         [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order], v_renders,
     )  # fmt: skip

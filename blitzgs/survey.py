@@ -14,20 +14,20 @@ from blitzgs.distributed.transport import LocalTransport, Transport, open_transp
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import Rows
+from blitzgs.ops.projection import ProjectedSplats
 from blitzgs.pipeline import RenderOptions, Views, inputs_of, list_splats, tile_grid
 
 
 class Survey(NamedTuple):
-    """What this rank's P rows contribute to their views.
+    """What this rank's P splats contribute to their views.
 
     Attributes:
-        rows: the projected Gaussians.
+        splats: the projected Gaussians.
         weights: int64 [P], sum of alpha T over the pixels in units of 2^-32.
-        pixels: int32 [P], the pixels at which a row is composited.
+        pixels: int32 [P], the pixels at which a splat is composited.
     """
 
-    rows: Rows
+    splats: ProjectedSplats
     weights: Tensor
     pixels: Tensor
 
@@ -52,7 +52,7 @@ def survey(
         active: as for `forward`.
 
     Returns:
-        The rows of this rank's Gaussians with the sums over all tiles, wherever they were composited: the
+        The splats of this rank's Gaussians with the sums over all tiles, wherever they were composited: the
         same bits at any number of ranks.
     """
     if transport is None:
@@ -75,7 +75,7 @@ def survey(
         if assignment is not None:
             returned = exchange.return_sums(torch.stack((weights, pixels.long()), 1))
             weights, pixels = returned[:, 0], returned[:, 1].int()
-        return Survey(counts.rows, weights, pixels), exchange.needed
+        return Survey(counts.projected, weights, pixels), exchange.needed
 
     with torch._C._AutoDispatchBelowAutograd():
         return transport.capacity.run(attempt)

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Every op of BlitzGS, one readable list. N Gaussians, B views, P projected rows (a Gaussian in a view), U
-// Gaussians visible in at least one view, I row-tile intersections, D channels, K = (degree + 1)^2 SH
-// coefficients. An argument n_rows, int64 [1]: only the first of the P rows are there. Contracts:
+// Every op of BlitzGS, one readable list. N Gaussians, B views, P projected splats (a Gaussian in a view), U
+// Gaussians visible in at least one view, I splat-tile intersections, D channels, K = (degree + 1)^2 SH
+// coefficients. An argument n_splats, int64 [1]: only the first of the P splats are there. Contracts:
 // csrc/<op>/<op>.h; Python functions, fake kernels and autograd: blitzgs/ops/<op>.py.
 #include <torch/csrc/stable/library.h>
 
@@ -40,48 +40,49 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "gate_views_(Tensor ids, Tensor(a!) views, Tensor? count, Tensor means, Tensor level, Tensor viewmats, "
       "float[] reach, int lod_views, Tensor? cull, int[] columns) -> ()");
 
-  // Projection: parameters to screen-space rows, ordered by (Gaussian, view). Groups of arguments, as
+  // Projection: parameters to screen-space splats, ordered by (Gaussian, view). Groups of arguments, as
   // blitzgs/ops/project.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras (viewmats,
   // Ks); active ([ids[, views[, count]]]); rank_tiles (begin and end of each rank); capacity ([visible,
-  // rows]; none: wait for their number); rows (camera_ids, visible_ids, row_offsets); ints (width, height,
-  // tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d, radius_clip).
+  // splats]; none: wait for their number); splats (camera_ids, visible_ids, splat_offsets); ints (width,
+  // height, tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d, radius_clip).
   m.def(
       "project_fwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] active, int[] ints, float[] floats, "
       "int[] rank_tiles, int[] capacity, Tensor? ids) -> (Tensor gaussian_ids, "
-      "Tensor camera_ids, Tensor visible_ids, Tensor row_offsets, Tensor means2d, Tensor conics, "
-      "Tensor depths, Tensor row_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
-      "Tensor rank_masks, Tensor row_ids, Tensor totals)");
+      "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
+      "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
+      "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
   // v_splats: (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
-      "project_bwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] rows, int[] ints, float[] floats, "
+      "project_bwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] splats, int[] ints, float[] floats, "
       "Tensor[] v_splats, Tensor? v_depths, Tensor? scale_reg, bool need_viewmats, bool dense=False) -> ("
       "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
       "Tensor v_viewmats)");
-  // project_bwd, then lazy_adam_step_ of the visible rows. With places, v_splats are the tables of the ranks
-  // that composited the splats. Groups: last_steps (last_step, moment_step); tables (schedule_table,
+  // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the
+  // ranks that composited the splats. Groups: last_steps (last_step, moment_step); tables (schedule_table,
   // lr_table[, final_rules]); steps (step, explicit_steps, sparse); decays (beta1, beta2, eps).
   m.def(
       "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
       "Tensor(d!)[] last_steps, Tensor[] tables, int[] steps, float[] decays, Tensor[] cameras, "
-      "Tensor[] rows, int[] ints, float[] floats, Tensor[] v_splats, Tensor? places=None, "
+      "Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, Tensor? places=None, "
       "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None) -> ()");
   // Where the parts of a splat gradient begin in its floats, and last how many these are: mean2d, conic,
   // opacity, color, mean2d_abs.
   m.def("splat_gradient_layout() -> int[]");
 
-  // Which rows each tile composites, front to back by (depth, id). grid: n_cameras, width, height, tile_size,
-  // tile_begin, tile_end (-1: all tiles). unchecked: the caller finds out by itself whether n_isects is too
-  // small, and CUDA does not wait for the number.
+  // Which splats each tile composites, front to back by (depth, id). grid: n_cameras, width, height,
+  // tile_size, tile_begin, tile_end (-1: all tiles). unchecked: the caller finds out by itself whether
+  // n_isects is too small, and CUDA does not wait for the number.
   m.def(
-      "intersect(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor depths, Tensor camera_ids, "
-      "Tensor? ids, int[] grid, int n_isects, Tensor? n_rows=None, bool unchecked=False) -> ("
-      "Tensor isect_rows, Tensor tile_offsets)");
+      "intersect(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor depths, Tensor camera_ids, "
+      "Tensor? ids, int[] grid, int n_isects, Tensor? n_splats=None, bool unchecked=False) -> ("
+      "Tensor isect_splats, Tensor tile_offsets)");
 
-  // Rows on their way between ranks, packed for a collective or written straight into peers' memory (CUDA).
-  m.def("scatter_rows(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
-  m.def("gather_rows(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
+  // Splats on their way between ranks, packed for a collective or written straight into peers' memory (CUDA).
   m.def(
-      "sum_rows(Tensor values, Tensor places, int[] group_sizes, int rows, int[] widths) -> "
+      "scatter_splats(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
+  m.def("gather_splats(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
+  m.def(
+      "sum_splats(Tensor values, Tensor places, int[] group_sizes, int splats, int[] widths) -> "
       "Tensor[] columns");
   m.def(
       "send_splats_(Tensor[] columns, Tensor rank_masks, Tensor everyone, int rank, Tensor(a!)[] buffers, "
@@ -94,32 +95,32 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
 
   // Alpha compositing. composited: (transmittances, last_ids, packed_splats, tile_order) of the forward pass.
   m.def(
-      "rasterize_fwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_rows, Tensor tile_offsets, int[] grid, Tensor? means2d_abs=None, "
-      "bool clear_rest=True, bool backward_follows=False, Tensor? n_rows=None) -> (Tensor renders, "
+      "rasterize_fwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, int[] grid, Tensor? means2d_abs=None, "
+      "bool clear_rest=True, bool backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, "
       "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
       "Tensor splat_gradients)");
   // The same for a backward pass that adds up gradients in `packed`, which is zeroed; pixels of tiles that
   // are not owned are left as they are (CUDA).
   m.def(
-      "rasterize_fwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_rows, Tensor tile_offsets, int[] grid, Tensor(a!) packed, "
-      "Tensor? n_rows=None) -> (Tensor renders, Tensor transmittances, Tensor last_ids, Tensor tile_work, "
+      "rasterize_fwd_packed_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, int[] grid, Tensor(a!) packed, "
+      "Tensor? n_splats=None) -> (Tensor renders, Tensor transmittances, Tensor last_ids, Tensor tile_work, "
       "Tensor packed_splats, Tensor tile_order)");
   m.def(
-      "rasterize_bwd(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_rows, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
+      "rasterize_bwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
       "Tensor? v_alphas, int[] grid, bool absgrad, bool deterministic) -> (Tensor v_means2d, "
-      "Tensor v_conics, Tensor v_row_opacities, Tensor v_colors, Tensor v_means2d_abs)");
+      "Tensor v_conics, Tensor v_splat_opacities, Tensor v_colors, Tensor v_means2d_abs)");
   m.def(
-      "rasterize_bwd_packed_(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_rows, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
+      "rasterize_bwd_packed_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
+      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
       "int[] grid, bool deterministic, Tensor(a!) packed) -> ()");
 
-  // What each row contributes to the pixels, without colours.
+  // What each splat contributes to the pixels, without colours.
   m.def(
-      "contributions(Tensor means2d, Tensor conics, Tensor row_opacities, Tensor isect_rows, "
-      "Tensor tile_offsets, int[] grid, Tensor? n_rows=None) -> (Tensor weights, Tensor pixels)");
+      "contributions(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, "
+      "Tensor tile_offsets, int[] grid, Tensor? n_splats=None) -> (Tensor weights, Tensor pixels)");
 
   // L1 and SSIM of the owned tiles; fwd_bwd does both at once when the weights of the sums are known.
   m.def(
@@ -151,7 +152,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
-      "Tensor row_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
+      "Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
       "weight) -> ()");
 
   // Noise on the means of almost transparent Gaussians.

@@ -13,8 +13,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 CSRC = ROOT / "csrc"
 # Two kernels that compute the same of these must get the same bits.
-EXACT = ("project_row", "row_color", "row_tiles", "for_each_tile_row", "for_each_tile")
-DEFINED_IN = ("math/tiles.h", "project/project_row.h")
+EXACT = ("project_splat", "splat_color", "splat_tiles", "for_each_tile_row", "for_each_tile")
+DEFINED_IN = ("math/tiles.h", "project/project_splat.h")
 LIBRARY = ROOT / "blitzgs" / "_lib" / "libblitzgs_cuda.so"
 # In SASS: the wait for the kernel in front, and what touches global memory.
 WAIT = "ACQBULK"
@@ -61,7 +61,7 @@ def files_without_contraction():
 
 def test_kernels_whose_bits_must_agree_are_compiled_without_contraction():
     needed = files_that_must_agree()
-    assert {"project/write_rows_cuda.cu", "intersect/intersect_cuda.cu"} <= needed
+    assert {"project/write_splats_cuda.cu", "intersect/intersect_cuda.cu"} <= needed
     assert needed <= files_without_contraction()
 
 

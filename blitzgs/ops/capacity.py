@@ -23,7 +23,7 @@ class Sizes(NamedTuple):
     """How many of each there are, or may be."""
 
     visible: int  # Gaussians seen by at least one view
-    rows: int  # pairs of a Gaussian and a view that sees it
+    splats: int  # pairs of a Gaussian and a view that sees it
     isects: int  # entries of the tiles' lists
 
     def holds(self, needed: Sequence[int]) -> bool:

@@ -17,7 +17,7 @@ def density_stats_(
     grad_count: Tensor,
     max_radii: Tensor,
     visible_ids: Tensor,
-    row_offsets: Tensor,
+    splat_offsets: Tensor,
     v_means2d: Tensor,
     conics: Tensor,
     width: int,
@@ -25,18 +25,18 @@ def density_stats_(
     weight: float,
     phi: Tensor | None = None,
 ) -> None:
-    """Add one step's rows to the statistics of the visible Gaussians, in place.
+    """Add one step's splats to the statistics of the visible Gaussians, in place.
 
-    Per row: ``grad_sum += phi * weight * |v_means2d * (width / 2, height / 2)|``, ``grad_count += 1`` and
+    Per splat: ``grad_sum += phi * weight * |v_means2d * (width / 2, height / 2)|``, ``grad_count += 1`` and
     ``max_radii = max(max_radii, ceil(3 sigma))`` (Kerbl et al. 2023, section 5; its normalised units).
 
     Args:
         grad_sum: [N], float32 (CPU also float64).
         grad_count: int32 [N].
         max_radii: [N], pixels, dtype of `grad_sum`.
-        visible_ids: int32 [U], Gaussians with rows, each once.
-        row_offsets: int32 [U + 1], the rows of each.
-        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel; rows may lie apart
+        visible_ids: int32 [U], Gaussians with splats, each once.
+        splat_offsets: int32 [U + 1], the splats of each.
+        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel; splats may lie apart
             in memory.
         conics: [P, 3], inverse 2D covariances (a, b, c).
         width: image width in pixels.
@@ -53,7 +53,7 @@ def density_stats_(
         grad_count,
         max_radii,
         visible_ids,
-        row_offsets,
+        splat_offsets,
         v_means2d,
         conics,
         phi,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
 
 # Units of a weight in 1, kContributionScale of csrc/importance/importance.h.
 UNITS = 1 << 32
@@ -15,11 +15,11 @@ _VIEWS = 8
 _TILE_SIZE = 16
 
 
-def row_contributions(
+def splat_contributions(
     means2d: Tensor,
     conics: Tensor,
-    row_opacities: Tensor,
-    isect_rows: Tensor,
+    splat_opacities: Tensor,
+    isect_splats: Tensor,
     tile_offsets: Tensor,
     *,
     n_cameras: int,
@@ -28,9 +28,9 @@ def row_contributions(
     tile_size: int = 16,
     tile_begin: int = 0,
     tile_end: int = -1,
-    n_rows: Tensor | None = None,
+    n_splats: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Sum alpha T over the pixels at which each row is composited, and count these pixels.
+    """Sum alpha T over the pixels at which each splat is composited, and count these pixels.
 
     Pixels are composited as by :func:`blitzgs.ops.rasterize.rasterize`, bit for bit. Sums are of integers, so
     they do not depend on the order, and partial sums of several tile ranges add up to the whole.
@@ -38,8 +38,8 @@ def row_contributions(
     Args:
         means2d: [P, 2], pixels, float32 or (CPU) float64.
         conics: inverse 2D covariances (a, b, c) [P, 3].
-        row_opacities: [P].
-        isect_rows: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
+        splat_opacities: [P].
+        isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], likewise.
         n_cameras: number of views B.
         width: of every view, pixels.
@@ -47,7 +47,7 @@ def row_contributions(
         tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.
         tile_begin: first tile to composite.
         tile_end: end of the tiles to composite, -1 for all.
-        n_rows: int64 [1] on the device of the rows: only the first so many are there. None: all.
+        n_splats: int64 [1] on the device of the splats: only the first so many are there. None: all.
 
     Returns:
         Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest), and pixels int32 [P].
@@ -56,8 +56,8 @@ def row_contributions(
         RuntimeError: wrong shapes or dtypes, a tile range outside the images, or a tile size that CUDA lacks.
     """
     weights, pixels = torch.ops.blitzgs.contributions(
-        means2d, conics, row_opacities, isect_rows, tile_offsets,
-        [n_cameras, width, height, tile_size, tile_begin, tile_end], n_rows,
+        means2d, conics, splat_opacities, isect_splats, tile_offsets,
+        [n_cameras, width, height, tile_size, tile_begin, tile_end], n_splats,
     )  # fmt: skip
     return weights, pixels
 
@@ -123,27 +123,27 @@ def contributions(
             antialiased=rasterize_mode == "antialiased", raw=False,
         )  # fmt: skip
         gaussians, cameras = (means, quats, scales, opacities), (viewmats[views], Ks[views])
-        rows = project_rows(ProjectionInputs(gaussians, cameras, options))
-        row_weights, row_pixels = _of_rows(rows, n_views, width, height)
-        at = rows.camera_ids.long() + begin, rows.gaussian_ids.long()
-        weights[at] = row_weights.double() / UNITS
-        pixels[at] = row_pixels.long()
+        splats = project_splats(ProjectionInputs(gaussians, cameras, options))
+        splat_weights, splat_pixels = _of_splats(splats, n_views, width, height)
+        at = splats.camera_ids.long() + begin, splats.gaussian_ids.long()
+        weights[at] = splat_weights.double() / UNITS
+        pixels[at] = splat_pixels.long()
         visible[at] = True
     return weights, pixels, visible
 
 
-def _of_rows(rows: Rows, n_views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Return the weights and pixels of all rows of a projection."""
-    splats = rows.means2d, rows.conics, rows.opacities
+def _of_splats(splats: ProjectedSplats, n_views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Return the weights and pixels of all splats of a projection."""
+    geometry = splats.means2d, splats.conics, splats.opacities
     grid = [n_views, width, height, _TILE_SIZE, 0, -1]
     lists = torch.ops.blitzgs.intersect(
-        *splats, rows.depths, rows.camera_ids, None, grid, int(rows.counts[2]), None, True
+        *geometry, splats.depths, splats.camera_ids, None, grid, int(splats.counts[2]), None, True
     )
-    weights, pixels = torch.ops.blitzgs.contributions(*splats, *lists, grid)
+    weights, pixels = torch.ops.blitzgs.contributions(*geometry, *lists, grid)
     return weights, pixels
 
 
 @torch.library.register_fake("blitzgs::contributions")
 def _(means2d: Tensor, *_rest: object) -> tuple[Tensor, Tensor]:
-    n_rows = means2d.shape[0]
-    return means2d.new_empty(n_rows, dtype=torch.int64), means2d.new_empty(n_rows, dtype=torch.int32)
+    n_splats = means2d.shape[0]
+    return means2d.new_empty(n_splats, dtype=torch.int64), means2d.new_empty(n_splats, dtype=torch.int32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intersection: which projected rows each image tile composites, front to back."""
+"""Intersection: which projected splats each image tile composites, front to back."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def tile_counts(width: int, height: int, tile_size: int) -> tuple[int, int]:
 def intersect(
     means2d: Tensor,
     conics: Tensor,
-    row_opacities: Tensor,
+    splat_opacities: Tensor,
     depths: Tensor,
     camera_ids: Tensor,
     ids: Tensor | None = None,
@@ -31,21 +31,21 @@ def intersect(
     tile_begin: int = 0,
     tile_end: int = -1,
     n_isects: int = -1,
-    n_rows: Tensor | None = None,
+    n_splats: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """List, for every tile of every view, the rows that touch it, ordered by (depth, id).
+    """List, for every tile of every view, the splats that touch it, ordered by (depth, id).
 
-    A row touches a tile iff its alpha, ``opacity * exp(-q / 2)``, can reach 1/255 on the tile's pixels
+    A splat touches a tile iff its alpha, ``opacity * exp(-q / 2)``, can reach 1/255 on the tile's pixels
     (conservatively: culling never changes the image). Tiles are numbered
     ``(camera * tiles_y + ty) * tiles_x + tx``. Not differentiable.
 
     Args:
         means2d: projected means [P, 2], pixels, float32 or float64.
         conics: inverse 2D covariances (a, b, c) [P, 3], 1/pixel^2.
-        row_opacities: [P], in [0, 1].
-        depths: sort keys [P], the z of each row in its view.
-        camera_ids: int32 [P], the view of each row.
-        ids: int64 [P] that order rows of equal depth; None: the row order does.
+        splat_opacities: [P], in [0, 1].
+        depths: sort keys [P], the z of each splat in its view.
+        camera_ids: int32 [P], the view of each splat.
+        ids: int64 [P] that order splats of equal depth; None: the splat order does.
         n_cameras: number of views B.
         width: of every view, pixels.
         height: of every view, pixels.
@@ -54,22 +54,22 @@ def intersect(
         tile_end: end of the owned tiles, -1 for all.
         n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``),
             -1 to have them counted. On CUDA the check that it is one waits for the device.
-        n_rows: int64 [1] on the device of the rows: only the first ``n_rows`` of the P rows are valid, the
+        n_splats: int64 [1] on the device of the splats: only the first ``n_splats`` of the P are valid, the
             others are never read. With it, the host can queue the CUDA op before it knows the number. None:
-            all rows; a number outside [0, P] counts as 0.
+            all splats; a number outside [0, P] counts as 0.
 
     Returns:
-        ``isect_rows`` int32 [I] row indices and ``tile_offsets`` int64 [B * T + 1]: tile t composites
-        ``isect_rows[tile_offsets[t]:tile_offsets[t + 1]]``. I is ``n_isects`` when that was given; entries
+        ``isect_splats`` int32 [I] splat indices and ``tile_offsets`` int64 [B * T + 1]: tile t composites
+        ``isect_splats[tile_offsets[t]:tile_offsets[t + 1]]``. I is ``n_isects`` when that was given; entries
         past ``tile_offsets[-1]`` are undefined.
 
     Raises:
-        RuntimeError: wrong shapes, dtypes or devices, a tile range outside the image, 2^31 rows or tiles or
+        RuntimeError: wrong shapes, dtypes or devices, a tile range outside the image, 2^31 splats or tiles or
             more, or more intersections than ``n_isects``.
     """
-    rows = (means2d, conics, row_opacities, depths, camera_ids, ids)
+    splats = (means2d, conics, splat_opacities, depths, camera_ids, ids)
     grid = [n_cameras, width, height, tile_size, tile_begin, tile_end]
-    lists: tuple[Tensor, Tensor] = torch.ops.blitzgs.intersect(*rows, grid, n_isects, n_rows)
+    lists: tuple[Tensor, Tensor] = torch.ops.blitzgs.intersect(*splats, grid, n_isects, n_splats)
     return lists
 
 
@@ -77,13 +77,13 @@ def intersect(
 def _(
     means2d: Tensor,
     conics: Tensor,
-    row_opacities: Tensor,
+    splat_opacities: Tensor,
     depths: Tensor,
     camera_ids: Tensor,
     ids: Tensor | None,
     grid: Sequence[int],
     n_isects: int,
-    n_rows: Tensor | None = None,
+    n_splats: Tensor | None = None,
     unchecked: bool = False,
 ) -> tuple[Tensor, Tensor]:
     n_cameras, width, height, tile_size, *_ = grid

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projection: Gaussians and pinhole views to screen-space rows, one for each Gaussian that a view sees."""
+"""Projection: Gaussians and pinhole views to screen-space splats, one for each Gaussian that a view sees."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
 from blitzgs.ops.sparse_rows import sparse_rows
 from blitzgs.ops.splat_gradients import packed_table
 
@@ -37,11 +37,11 @@ def project(
     antialiased: bool = False,
     raw: bool = True,
     sparse_grad: bool = False,
-) -> Rows:
+) -> ProjectedSplats:
     """Project Gaussians into B views (EWA splatting; the image's definition).
 
-    A row exists where a Gaussian can reach alpha = 1/255 in the image at a depth in (near, far]. Anything
-    NaN or infinite hides its Gaussian: there is no row, or, where only the colour is not finite, one whose
+    A splat exists where a Gaussian can reach alpha = 1/255 in the image at a depth in (near, far]. Anything
+    NaN or infinite hides its Gaussian: there is no splat, or, where only the colour is not finite, one whose
     opacity, colour, radii and tiles are 0. Differentiable in means, quats, scales, opacities, sh and viewmats
     (dense gradients; the pose's as 12 free entries); the culling itself has no gradient.
 
@@ -59,10 +59,10 @@ def project(
         active_views: int32 [A] bit masks of the views to consider for each; None for all.
         tile_size: edge of a tile in px (only for `tiles_touched`).
         sh_degree: degree to evaluate, 0 to 3.
-        near_plane: rows have z > near_plane, world units.
-        far_plane: rows have z <= far_plane, world units.
+        near_plane: splats have z > near_plane, world units.
+        far_plane: splats have z <= far_plane, world units.
         eps2d: variance added to both screen axes, px^2.
-        radius_clip: drop rows that reach no further than this, px.
+        radius_clip: drop splats that reach no further than this, px.
         antialiased: scale opacities by sqrt(det before / det after) of that addition.
         raw: whether scales and opacities are before their activation.
         sparse_grad: whether gradients of Gaussians are sparse tensors of the visible ones, without a pass
@@ -70,7 +70,7 @@ def project(
             are leaves (what made others of them might not take a sparse gradient).
 
     Returns:
-        Rows, bit-identical for a Gaussian and a view whatever else is projected with them.
+        ProjectedSplats, bit-identical for a Gaussian and a view whatever else is projected with them.
 
     Raises:
         RuntimeError: a wrong shape, dtype or value, by name.
@@ -86,7 +86,7 @@ def project(
         ),
         [tensor for tensor in (active_ids, active_views) if tensor is not None],
     )
-    return differentiable_rows(inputs, sparse_grad)
+    return differentiable_splats(inputs, sparse_grad)
 
 
 def gaussians_of(
@@ -96,19 +96,21 @@ def gaussians_of(
     return [means, quats, scales, opacities, *([] if sh is None else [sh])]
 
 
-def differentiable_rows(inputs: ProjectionInputs, sparse_grad: bool, rows: Rows | None = None) -> Rows:
+def differentiable_splats(
+    inputs: ProjectionInputs, sparse_grad: bool, splats: ProjectedSplats | None = None
+) -> ProjectedSplats:
     """`project` of grouped arguments.
 
     Args:
         inputs: what is projected.
         sparse_grad: see `project`.
-        rows: what `project_rows` returned or would return, if they are there already.
+        splats: what `project_splats` returned or would return, if they are there already.
     """
     gaussians, (viewmats, Ks) = list(inputs.gaussians), inputs.cameras  # noqa: N806
     if not torch.compiler.is_compiling():
         sh = gaussians[4] if len(gaussians) > 4 else None
-        columns = _Project.apply(*gaussians[:4], sh, viewmats, inputs, sparse_grad, rows)  # type: ignore[no-untyped-call]
-        return Rows._make(columns)
+        columns = _Project.apply(*gaussians[:4], sh, viewmats, inputs, sparse_grad, splats)  # type: ignore[no-untyped-call]
+        return ProjectedSplats._make(columns)
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
     *columns, _, totals = torch.ops.blitzgs.project_fwd(
@@ -121,7 +123,7 @@ def differentiable_rows(inputs: ProjectionInputs, sparse_grad: bool, rows: Rows 
         [],
         None,
     )
-    return Rows._make((*columns, totals.cpu()[:3]))
+    return ProjectedSplats._make((*columns, totals.cpu()[:3]))
 
 
 @torch.library.register_fake("blitzgs::project_fwd")
@@ -163,7 +165,7 @@ def _(
 def _(
     gaussians: Sequence[Tensor],
     cameras: Sequence[Tensor],
-    rows: Sequence[Tensor],
+    splats: Sequence[Tensor],
     ints: Sequence[int],
     floats: Sequence[float],
     v_splats: Sequence[Tensor],
@@ -172,7 +174,7 @@ def _(
     need_viewmats: bool,
     dense: bool = False,
 ) -> tuple[Tensor, ...]:
-    means, (_, visible_ids, _) = gaussians[0], rows
+    means, (_, visible_ids, _) = gaussians[0], splats
     length = (means if dense else visible_ids).shape[0]
     return (
         means.new_empty(length, 3),
@@ -184,10 +186,10 @@ def _(
     )
 
 
-def _save(ctx: Any, inputs: ProjectionInputs, rows: Rows) -> None:
+def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats) -> None:
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(
-        *inputs.gaussians, *inputs.cameras, rows.camera_ids, rows.visible_ids, rows.row_offsets
+        *inputs.gaussians, *inputs.cameras, splats.camera_ids, splats.visible_ids, splats.splat_offsets
     )
     ctx.options, ctx.n_gaussians = inputs.options, len(inputs.gaussians)
 
@@ -197,17 +199,17 @@ class _Saved(NamedTuple):
 
     gaussians: Sequence[Tensor]
     cameras: Sequence[Tensor]
-    rows: Sequence[Tensor]
+    splats: Sequence[Tensor]
 
     @classmethod
     def of(cls, ctx: Any) -> _Saved:
         """Read it, once: checkpointing recomputes saved tensors for each reading."""
-        *tensors, viewmats, Ks, camera_ids, visible_ids, row_offsets = ctx.saved_tensors  # noqa: N806
-        return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, row_offsets))
+        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets = ctx.saved_tensors  # noqa: N806
+        return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets))
 
 
 def _gradients(
-    ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: Rows
+    ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: ProjectedSplats
 ) -> tuple[Tensor | None, ...]:
     """Return the gradients of all gaussians (None where there are no sh) and viewmats, where needed.
 
@@ -216,7 +218,7 @@ def _gradients(
         needed: which of means, quats, scales, opacities and, unless there are none, sh need a gradient.
         need_viewmats: whether viewmats do.
         sparse: which of these gradients are to be sparse.
-        v: gradients of the rows; None: zero.
+        v: gradients of the splats; None: zero.
     """
     saved = _Saved.of(ctx)
     with torch.no_grad():
@@ -230,17 +232,17 @@ def _first_gradients(
     needed: Sequence[bool],
     need_viewmats: bool,
     sparse: Sequence[bool],
-    v: Rows,
+    v: ProjectedSplats,
 ) -> tuple[Tensor | None, ...]:
     # Where all are to be dense, the kernel writes them so; one that is not needed would cost memory.
     dense = not any(sparse) and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
-        list(saved.gaussians), list(saved.cameras), list(saved.rows), options.ints, options.floats,
+        list(saved.gaussians), list(saved.cameras), list(saved.splats), options.ints, options.floats,
         _splat_gradients(saved, v), v.depths, None, need_viewmats, dense,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if not dense:
-        ids = saved.rows[1].long()
+        ids = saved.splats[1].long()
         columns = zip(saved.gaussians, gradients, sparse, needed, strict=False)
         found = [_of_all(ids, *column) if wanted else None for *column, wanted in columns]
     return (*found, *[None] * (5 - len(found)), v_viewmats if need_viewmats else None)
@@ -253,20 +255,20 @@ def _of_all(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> T
     return torch.zeros_like(parameter).index_copy_(0, ids, gradient)
 
 
-def _splat_gradients(saved: _Saved, v: Rows) -> list[Tensor]:
+def _splat_gradients(saved: _Saved, v: ProjectedSplats) -> list[Tensor]:
     """Return the gradients of means2d, conics, opacities and colors as `project_bwd` takes them."""
     columns = [v.means2d, v.conics, v.opacities] + ([v.colors] if len(saved.gaussians) > 4 else [])
     if v.depths is None and len(columns) == 4 and (table := packed_table(columns)) is not None:
         return [table]
     if all(column is not None for column in columns):
         return columns
-    zeros = saved.gaussians[0].new_zeros(saved.rows[0].shape[0], 3)
+    zeros = saved.gaussians[0].new_zeros(saved.splats[0].shape[0], 3)
     parts = (zeros[:, :2], zeros, zeros[:, 0], zeros)
     return [part if column is None else column for column, part in zip(columns, parts, strict=False)]
 
 
 class _Project(torch.autograd.Function):
-    """`project_rows` with the formula registered below, outside of `torch.compile`.
+    """`project_splats` with the formula registered below, outside of `torch.compile`.
 
     The way through torch to a registered formula takes 0.2 ms of the host's time, and each argument some:
     those without a gradient are one. Counts are no output of the op.
@@ -274,23 +276,23 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        *tensors, inputs, sparse_grad, rows = arguments
+        *tensors, inputs, sparse_grad, splats = arguments
         *gaussians, viewmats = tensors
         cameras = (viewmats, inputs.cameras[1])
         inputs = inputs._replace(gaussians=[t for t in gaussians if t is not None], cameras=cameras)
-        if rows is None:
-            rows = project_rows(inputs)
-        _save(ctx, inputs, rows)
-        ctx.mark_non_differentiable(rows.counts)
+        if splats is None:
+            splats = project_splats(inputs)
+        _save(ctx, inputs, splats)
+        ctx.mark_non_differentiable(splats.counts)
         opacities, sh = gaussians[3:5]
         leaves = [sh is not None and tensor.is_leaf for tensor in (opacities, sh)]
         ctx.sparse = (True, True, True, *leaves) if sparse_grad else (False,) * 5
-        return tuple(rows)
+        return tuple(splats)
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
         *needed, need_viewmats = ctx.needs_input_grad[:6]
-        v = Rows._make((*v_output[:-1], None))
+        v = ProjectedSplats._make((*v_output[:-1], None))
         return (*_gradients(ctx, needed[: ctx.n_gaussians], need_viewmats, ctx.sparse, v), *(None,) * 3)
 
 
@@ -300,12 +302,12 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
     # Torch wants a gradient for each argument, and for each tensor of a list.
     ctx.no_gradients = [_no_gradient(argument) for argument in inputs[2:]]
     *columns, _, _ = output
-    _save(ctx, ProjectionInputs(gaussians, cameras, options), Rows._make((*columns, None)))
+    _save(ctx, ProjectionInputs(gaussians, cameras, options), ProjectedSplats._make((*columns, None)))
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
     needed, (need_viewmats, _) = ctx.needs_input_grad[:2]
-    v = Rows._make((*v_output[:12], None))
+    v = ProjectedSplats._make((*v_output[:12], None))
     *gradients, v_viewmats = _gradients(ctx, needed, need_viewmats, (False,) * 5, v)
     return gradients[: len(needed)], [v_viewmats, None], *ctx.no_gradients
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the gradients of projected rows straight to an optimiser step of the Gaussians they are of."""
+"""From the gradients of projected splats straight to an optimiser step of the Gaussians they are of."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.lazy_adam import explicit_steps, schedule_table
-from blitzgs.ops.projection import ProjectionOptions, Rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.splat_gradients import SplatGradients
 
 
@@ -27,14 +27,14 @@ def project_bwd_step_(
     beta2: float,
     eps: float,
     sparse: bool,
-    rows: Rows,
+    splats: ProjectedSplats,
     cameras: Sequence[Tensor],
     options: ProjectionOptions,
     gradients: SplatGradients,
     scale_reg: Tensor | None = None,
     means2d_sums: Tensor | None = None,
 ) -> None:
-    """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their rows.
+    """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
     What the backward pass of `blitzgs.ops.project.project` and `blitzgs.ops.lazy_adam.lazy_adam_step_` do one
     after the other, to rounding; on CUDA the gradients of the parameters are never stored. The parameters of
@@ -53,13 +53,13 @@ def project_bwd_step_(
         beta2: decay of the second moment, in (0, 1).
         eps: added to the root of the second moment.
         sparse: plain sparse Adam.
-        rows: what `project` made of these parameters and views: P rows.
+        splats: what `project` made of these parameters and views: P splats.
         cameras: viewmats [B, 4, 4] and Ks [B, 3, 3], as for `project`.
-        options: with which the rows were projected; scales and opacities are taken before their activation.
-        gradients: of the rows.
+        options: with which the splats were projected; scales and opacities are taken before their activation.
+        gradients: of the splats.
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
-        means2d_sums: [P, 2], becomes the gradient of `rows.means2d` where `gradients` has it at ranks.
+        means2d_sums: [P, 2], becomes the gradient of `splats.means2d` where `gradients` has it at ranks.
 
     Raises:
         ValueError: decay rates outside their range.
@@ -74,7 +74,7 @@ def project_bwd_step_(
         [step, explicit_steps(beta1, beta2, params[0].dtype), int(sparse)],
         [beta1, beta2, eps],
         list(cameras),
-        [rows.camera_ids, rows.visible_ids, rows.row_offsets],
+        [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
         options.ints,
         options.floats,
         list(gradients.parts),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A projection's arguments in groups, as the ops take them, and the rows that it returns."""
+"""A projection's arguments in groups, as the ops take them, and the splats that it returns."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
 
 
-class Rows(NamedTuple):
-    """What the views see, ordered by (Gaussian, view): P rows of U different Gaussians."""
+class ProjectedSplats(NamedTuple):
+    """What the views see, ordered by (Gaussian, view): P splats of U different Gaussians."""
 
     gaussian_ids: Tensor  # int32 [P]
     camera_ids: Tensor  # int32 [P]
     visible_ids: Tensor  # int32 [U], ascending
-    row_offsets: Tensor  # int32 [U + 1]: rows row_offsets[u] to row_offsets[u + 1] are of visible_ids[u]
+    splat_offsets: (
+        Tensor  # int32 [U + 1]: splats splat_offsets[u] to splat_offsets[u + 1] are of visible_ids[u]
+    )
     means2d: Tensor  # [P, 2], px; the centre of pixel (i, j) is (i + 0.5, j + 0.5)
     conics: Tensor  # [P, 3]: a, b, c of the inverse 2D covariance, 1/px^2
     depths: Tensor  # [P]: camera-space z
@@ -29,22 +31,22 @@ class Rows(NamedTuple):
     colors: Tensor  # [P, 3]; [0, 3] without SH
     radii: Tensor  # int32 [P, 2]: half width and height of the box around alpha >= 1/255, rounded up
     tiles_touched: Tensor  # int32 [P]
-    rank_masks: Tensor  # int64 [P]: bit m set where rank m wants the row; [0] where no rank asked
+    rank_masks: Tensor  # int64 [P]: bit m set where rank m wants the splat; [0] where no rank asked
     counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
 
 
-def rows_of(columns: Sequence[Tensor], counts: Tensor) -> Rows:
-    """Return the rows that lie in columns with room behind them.
+def splats_of(columns: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
+    """Return the splats that lie in columns with room behind them.
 
     Args:
-        columns: those of `Rows` but the last, and perhaps more.
-        counts: `Rows.counts`.
+        columns: those of `ProjectedSplats` but the last, and perhaps more.
+        counts: `ProjectedSplats.counts`.
     """
-    visible, rows = counts[:2].tolist()
-    lengths = (rows, rows, visible, visible + 1, *(rows,) * 8)
+    visible, splats = counts[:2].tolist()
+    lengths = (splats, splats, visible, visible + 1, *(splats,) * 8)
     # No views to autograd: a Function may return those, but a caller could not change them in place.
     with torch._C._AutoDispatchBelowADInplaceOrView():
-        return Rows._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
+        return ProjectedSplats._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
 
 
 class ProjectionOptions(NamedTuple):
@@ -93,7 +95,7 @@ class ProjectionInputs(NamedTuple):
         options: the rest.
         active: which Gaussians to consider, `ActiveRows`: ids, the views of each, how many ids there are;
             those behind the first may be left out. Empty: all Gaussians in all views.
-        ids: int64 [N], persistent, of the Gaussians; None: the rows' are not wanted.
+        ids: int64 [N], persistent, of the Gaussians; None: the splats' are not wanted.
     """
 
     gaussians: Sequence[Tensor]
@@ -111,50 +113,50 @@ class ProjectionInputs(NamedTuple):
         """Project.
 
         Args:
-            capacity: how many visible Gaussians and rows to have room for: CUDA then does not wait for their
-                number. None: as many as there are.
+            capacity: how many visible Gaussians and splats to have room for: CUDA then does not wait for
+                their number. None: as many as there are.
             rank_tiles: the [begin, end) of the tiles that each rank composites, begins ascending.
         """
-        *columns, row_ids, totals = torch.ops.blitzgs.project_fwd(
+        *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
             list(self.gaussians),
             list(self.cameras),
             list(self.active),
             self.options.ints,
             self.options.floats,
             [tile for tiles in rank_tiles for tile in tiles],
-            [] if capacity is None else [capacity.visible, capacity.rows],
+            [] if capacity is None else [capacity.visible, capacity.splats],
             self.ids,
         )
-        return Projected(Rows._make((*columns, None)), row_ids, totals)
+        return Projected(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 
 
 class Projected(NamedTuple):
     """What `ProjectionInputs.run` returns.
 
     Attributes:
-        rows: with room behind them where a capacity was given; counts are None. Where the capacity was too
+        splats: with room behind them where a capacity was given; counts are None. Where the capacity was too
             small they mean nothing.
-        ids: int64 [P], persistent, of the rows' Gaussians; [0] where none were given.
+        ids: int64 [P], persistent, of the splats' Gaussians; [0] where none were given.
         totals: int64 [3 + B + 2 M], on the device, right in any case: U, P and the sum of tiles_touched; the
-            rows of each view; and for each rank its rows and the tiles that these touch there.
+            splats of each view; and for each rank its splats and the tiles that these touch there.
     """
 
-    rows: Rows
+    splats: ProjectedSplats
     ids: Tensor
     totals: Tensor
 
 
-def project_rows(inputs: ProjectionInputs) -> Rows:
+def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
     """`project` of grouped arguments, without gradients."""
 
-    def attempt(capacity: Sizes | None) -> tuple[Rows | None, list[int]]:
+    def attempt(capacity: Sizes | None) -> tuple[ProjectedSplats | None, list[int]]:
         projected = inputs.run(capacity)
         with HostCopy(projected.totals) as copy:
             counts = copy.read()[:3]
         needed = counts.tolist()
         if capacity is not None and not capacity.holds(needed[:2]):
             return None, needed
-        return rows_of(projected.rows[:12], counts), needed
+        return splats_of(projected.splats[:12], counts), needed
 
     with torch._C._AutoDispatchBelowAutograd():
         return capacity_for(inputs).run(attempt)

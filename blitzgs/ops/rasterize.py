@@ -20,9 +20,9 @@ rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
 def rasterize(
     means2d: Tensor,
     conics: Tensor,
-    row_opacities: Tensor,
+    splat_opacities: Tensor,
     colors: Tensor,
-    isect_rows: Tensor,
+    isect_splats: Tensor,
     tile_offsets: Tensor,
     *,
     n_cameras: int,
@@ -35,15 +35,15 @@ def rasterize(
     tell_absgrad: Callable[[Tensor], object] | None = None,
     composited: tuple[Tensor, ...] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Composite the rows of each tile's list into images.
+    """Composite the splats of each tile's list into images.
 
-    Per pixel, in list order, with d from the row's mean to the pixel centre (i + 0.5, j + 0.5)::
+    Per pixel, in list order, with d from the splat's mean to the pixel centre (i + 0.5, j + 0.5)::
 
         alpha = min(0.99, opacity * exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2)), skipped below 1/255
         the pixel ends before T (1 - alpha) would fall below 1e-4
-        color += alpha T row_color;  T *= 1 - alpha
+        color += alpha T splat_color;  T *= 1 - alpha
 
-    and the background is added with the remaining T. Differentiable in means2d, conics, row_opacities,
+    and the background is added with the remaining T. Differentiable in means2d, conics, splat_opacities,
     colors and backgrounds; no gradient flows where alpha is clipped, nor through the order and the two cuts.
     Gradients are bitwise repeatable on the CPU, and on CUDA under
     ``torch.use_deterministic_algorithms(True)``.
@@ -51,9 +51,9 @@ def rasterize(
     Args:
         means2d: [P, 2], pixels, float32 or (CPU) float64.
         conics: inverse 2D covariances (a, b, c) [P, 3].
-        row_opacities: [P].
+        splat_opacities: [P].
         colors: [P, D], any D.
-        isect_rows: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
+        isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], likewise.
         n_cameras: number of views B.
         width: of every view, pixels.
@@ -73,7 +73,7 @@ def rasterize(
         RuntimeError: wrong shapes or dtypes, or a tile range outside the images.
         ValueError: `tell_absgrad` under `torch.compile`.
     """
-    splats = (means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets)
+    splats = (means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets)
     grid = [n_cameras, width, height, tile_size, tile_begin, tile_end]
     if torch.compiler.is_compiling():
         if tell_absgrad is not None:
@@ -103,28 +103,28 @@ def _owned_pixels(images: Tensor, tile_size: int, tile_begin: int, tile_end: int
 def _(
     means2d: Tensor,
     conics: Tensor,
-    row_opacities: Tensor,
+    splat_opacities: Tensor,
     colors: Tensor,
     backgrounds: Tensor | None,
-    isect_rows: Tensor,
+    isect_splats: Tensor,
     tile_offsets: Tensor,
     grid: Sequence[int],
     means2d_abs: Tensor | None = None,
     clear_rest: bool = True,
     backward_follows: bool = False,
-    n_rows: Tensor | None = None,
+    n_splats: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
     n_cameras, width, height, *_ = grid
     pixels, context = (n_cameras, height, width), torch.library.get_ctx()
     # The layout of what is packed is the backend's own.
-    row_bytes, n_ordered = context.new_dynamic_size(), context.new_dynamic_size()
+    splat_bytes, n_ordered = context.new_dynamic_size(), context.new_dynamic_size()
     n_ready = context.new_dynamic_size() if backward_follows else 0
     return (
         means2d.new_empty(*pixels, colors.shape[1]),
         means2d.new_empty(pixels),
         means2d.new_empty(pixels, dtype=torch.int32),
         means2d.new_empty(tile_offsets.shape[0] - 1, dtype=torch.int32),
-        means2d.new_empty(means2d.shape[0], row_bytes, dtype=torch.uint8),
+        means2d.new_empty(means2d.shape[0], splat_bytes, dtype=torch.uint8),
         means2d.new_empty(n_ordered, 16, dtype=torch.int32),
         means2d.new_empty(n_ready, SPLAT_GRADIENT),
     )
@@ -134,10 +134,10 @@ def _(
 def _(
     means2d: Tensor,
     conics: Tensor,
-    row_opacities: Tensor,
+    splat_opacities: Tensor,
     colors: Tensor,
     backgrounds: Tensor | None,
-    isect_rows: Tensor,
+    isect_splats: Tensor,
     tile_offsets: Tensor,
     composited: Sequence[Tensor],
     v_renders: Tensor,
@@ -146,13 +146,13 @@ def _(
     absgrad: bool,
     deterministic: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    n_rows = means2d.shape[0]
+    n_splats = means2d.shape[0]
     return (
-        means2d.new_empty(n_rows, 2),
-        means2d.new_empty(n_rows, 3),
-        means2d.new_empty(n_rows),
-        means2d.new_empty(n_rows, colors.shape[1]),
-        means2d.new_empty(n_rows if absgrad else 0, 2),
+        means2d.new_empty(n_splats, 2),
+        means2d.new_empty(n_splats, 3),
+        means2d.new_empty(n_splats),
+        means2d.new_empty(n_splats, colors.shape[1]),
+        means2d.new_empty(n_splats if absgrad else 0, 2),
     )
 
 
@@ -184,7 +184,7 @@ def _backward(
 def _gradients(
     ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None, absgrad: bool, may_pack: bool = False
 ) -> tuple[Tensor | None, ...]:
-    """Return the gradients of means2d, conics, row_opacities, colors, backgrounds and means2d_abs.
+    """Return the gradients of means2d, conics, splat_opacities, colors, backgrounds and means2d_abs.
 
     With `may_pack`, on CUDA, they may be columns of one table, which `project_bwd` reads as it is.
     """

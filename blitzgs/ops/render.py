@@ -11,33 +11,33 @@ from torch import Tensor
 
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection import ProjectionInputs, Rows, capacity_for, rows_of
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, capacity_for, splats_of
 
 
 class Rendered(NamedTuple):
     """What the ops returned; attributes are theirs."""
 
-    rows: Rows
-    isect_rows: Tensor
+    splats: ProjectedSplats
+    isect_splats: Tensor
     tile_offsets: Tensor
     composited: tuple[Tensor, ...]
 
 
 def render_queued(
     inputs: ProjectionInputs,
-    channels: Callable[[Rows], Tensor],
+    channels: Callable[[ProjectedSplats], Tensor],
     backgrounds: Tensor | None,
     backward_follows: bool,
     sizes: Sizes | None = None,
 ) -> Rendered:
     """Render without gradients, for ops that are then given the result to differentiate it.
 
-    Where calls of this size were made before, the host learns how many rows there are when all is queued,
+    Where calls of this size were made before, the host learns how many splats there are when all is queued,
     while the GPU works.
 
     Args:
-        inputs: of `project_rows`.
-        channels: what is composited of the rows, [P, D], whatever their number P; their counts are None.
+        inputs: of `project_splats`.
+        channels: what is composited of the splats, [P, D], whatever their number P; their counts are None.
         backgrounds: [B, D] or None.
         backward_follows: see the op `rasterize_fwd`.
         sizes: what is needed, if that is known; None: as much as calls of this size needed before.
@@ -47,23 +47,23 @@ def render_queued(
 
     def attempt(capacity: Sizes | None) -> tuple[Rendered | None, list[int]]:
         projected = inputs.run(capacity)
-        rows, n_rows = projected.rows, None if capacity is None else projected.totals[1:2]
+        splats, n_splats = projected.splats, None if capacity is None else projected.totals[1:2]
         with HostCopy(projected.totals) as copy:
             n_isects = int(copy.read()[2]) if capacity is None else capacity.isects
-            splats = rows.means2d, rows.conics, rows.opacities
-            isect_rows, tile_offsets = torch.ops.blitzgs.intersect(
-                *splats, rows.depths, rows.camera_ids, None, grid, n_isects, n_rows, True
+            geometry = splats.means2d, splats.conics, splats.opacities
+            isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
+                *geometry, splats.depths, splats.camera_ids, None, grid, n_isects, n_splats, True
             )
             composited = torch.ops.blitzgs.rasterize_fwd(
-                *splats, channels(rows), backgrounds, isect_rows, tile_offsets, grid, None, True,
-                backward_follows, n_rows,
+                *geometry, channels(splats), backgrounds, isect_splats, tile_offsets, grid, None, True,
+                backward_follows, n_splats,
             )  # fmt: skip
             counts = copy.read()[:3]
         needed = counts.tolist()
         if capacity is not None and not capacity.holds(needed):
             return None, needed
-        listed = isect_rows[: needed[2]]
-        return Rendered(rows_of(rows[:12], counts), listed, tile_offsets, composited), needed
+        listed = isect_splats[: needed[2]]
+        return Rendered(splats_of(splats[:12], counts), listed, tile_offsets, composited), needed
 
     with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
         estimate = capacity_for(inputs) if sizes is None else CapacityEstimate(sizes)

@@ -55,7 +55,7 @@ class SplatGradients(NamedTuple):
             composited splats, in memory that they share. A splat's gradient is then the sum over the ranks,
             in their order.
         places: int64 [ceil(P / 32), M], where each splat is among those that a rank had of this one, as
-            `scatter_rows` returns it. Such gradients are valid until the next frame, or the next backward
+            `scatter_splats` returns it. Such gradients are valid until the next frame, or the next backward
             pass of this one.
     """
 

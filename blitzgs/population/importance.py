@@ -143,14 +143,14 @@ class _Sums:
         self._cull = _all_culled(n_views, device).repeat(count, 1)
 
     def add(self, found: Survey, columns: Sequence[int], ids: Tensor, ranks: Ranks) -> None:
-        """Add the rows of a batch of views."""
-        rows, weights = found.rows, found.weights
-        gaussians, views = rows.gaussian_ids.long(), rows.camera_ids.long()
+        """Add the splats of a batch of views."""
+        splats, weights = found.splats, found.weights
+        gaussians, views = splats.gaussian_ids.long(), splats.camera_ids.long()
         terms, pixels = weights.double() / UNITS, found.pixels.double() + SCORE_EPS
         if self._rule != "weight":
             terms = terms / (pixels if self._rule == "density" else pixels.sqrt())
         self._score.index_add_(0, gaussians, (terms / self._unit).round().long())
-        self._seen.index_add_(0, gaussians, (rows.radii > 0).any(1).int())
+        self._seen.index_add_(0, gaussians, (splats.radii > 0).any(1).int())
         counts = integer_mass_prefix(weights, ids[gaussians], VIEW_MASS, ranks, views, len(columns))
         self._counted.index_add_(0, gaussians, counts.int())
         column = torch.tensor(columns, device=views.device)[views]

@@ -90,7 +90,7 @@ def rasterization(
         channel_chunk: accepted and not needed: any channel count is rendered in one pass.
         distributed: whether Gaussians and views are divided among the ranks of the process group: each rank
             gives its own, as many views as the others, and gets the images of its views, of the Gaussians of
-            all ranks. Every rank has to call this, and to run its backward pass. As in gsplat, meta's rows
+            all ranks. Every rank has to call this, and to run its backward pass. As in gsplat, meta's splats
             are of this rank's Gaussians in the views of all ranks, and its lists of what this rank renders.
         camera_model: only "pinhole" is supported.
         segmented: accepted and not needed: it selects a sort in gsplat, never the result.
@@ -103,8 +103,8 @@ def rasterization(
         gaussian_ids (None unless packed; ordered by image, then Gaussian), radii, means2d, depths, conics,
         opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets (int64),
         width, height, tile_size, n_batches, n_cameras. The image depends on means2d, conics, opacities and,
-        where depth is rendered, depths, so they take `retain_grad()`. Rows whose alpha is below 1/255 on all
-        pixels of the image are not there, though gsplat counts some of them as visible (0.1 % more).
+        where depth is rendered, depths, so they take `retain_grad()`. Splats whose alpha is below 1/255 on
+        all pixels of the image are not there, though gsplat counts some of them as visible (0.1 % more).
         `meta["non_finite"]` has what was not rendered because it is NaN or infinite: a dict of the indices of
         Gaussians and views by argument. Meta is a `LazyDict`: what the image does not need is worked out when
         it is first read.

@@ -2,7 +2,7 @@
 """Gaussians given by covariances instead of rotations and scales.
 
 The kernels find what a view sees from rotations and scales, so each covariance is decomposed once, without
-gradients: those of an eigenvalue decomposition are infinite where two axes are alike. The shape of each row
+gradients: those of an eigenvalue decomposition are infinite where two axes are alike. The shape of each splat
 on the screen, which the image depends on, is then worked out from the covariance itself.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from blitzgs.ops.projection import ProjectionInputs, Rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,13 @@ def _quaternions(rotations: Tensor) -> Tensor:
     return torch.nn.functional.normalize(products[torch.arange(len(r), device=r.device), best], dim=1)
 
 
-def shaped_by(rows: Rows, inputs: ProjectionInputs, decomposed: Decomposed) -> Rows:
-    """Return rows whose conics, and compensated opacities, come from covariances (docs/image.md).
+def shaped_by(splats: ProjectedSplats, inputs: ProjectionInputs, decomposed: Decomposed) -> ProjectedSplats:
+    """Return splats whose conics, and compensated opacities, come from covariances (docs/image.md).
 
     In double, because the determinant of a covariance loses the digits of a thin splat.
 
     Args:
-        rows: of the decomposed covariances.
+        splats: of the decomposed covariances.
         inputs: of the projection.
         decomposed: the covariances.
     """
@@ -79,7 +79,7 @@ def shaped_by(rows: Rows, inputs: ProjectionInputs, decomposed: Decomposed) -> R
     means, opacities, viewmats, Ks = (t.double() for t in (means, opacities, *inputs.cameras))
     options = inputs.options
     width, height, eps2d, antialiased = options.width, options.height, options.eps2d, options.antialiased
-    views, ids = rows.camera_ids, rows.gaussian_ids
+    views, ids = splats.camera_ids, splats.gaussian_ids
     viewmats, Ks = viewmats.index_select(0, views), Ks.index_select(0, views)
     rotations = viewmats[:, :3, :3]
     points = torch.einsum("pij,pj->pi", rotations, means.index_select(0, ids)) + viewmats[:, :3, 3]
@@ -91,13 +91,13 @@ def shaped_by(rows: Rows, inputs: ProjectionInputs, decomposed: Decomposed) -> R
     before = xx * yy - xy * xy
     after = (xx + eps2d) * (yy + eps2d) - xy * xy
     conics = torch.stack([yy + eps2d, -xy, xx + eps2d], dim=1) / after[:, None]
-    rows = rows._replace(conics=conics.to(rows.conics.dtype))
+    splats = splats._replace(conics=conics.to(splats.conics.dtype))
     if not antialiased:
-        return rows
+        return splats
     share = (before / after).clamp(min=1e-30).sqrt()  # the root of zero has no derivative
-    compensated = (opacities.index_select(0, ids) * share).to(rows.opacities.dtype)
-    # A row without opacity is hidden: its colour is not finite.
-    return rows._replace(opacities=torch.where(rows.opacities == 0, rows.opacities, compensated))
+    compensated = (opacities.index_select(0, ids) * share).to(splats.opacities.dtype)
+    # A splat without opacity is hidden: its colour is not finite.
+    return splats._replace(opacities=torch.where(splats.opacities == 0, splats.opacities, compensated))
 
 
 def _jacobians(points: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:

@@ -58,8 +58,8 @@ def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> N
     summed = [t for name, given in gaussians.named.items() if name not in COLOURS for t in given]
     with torch.no_grad():
         sums = [t.sum() for t in summed]
-        # Rows whose colour is not finite have no opacity, and no other row is below 1/255.
-        hidden = (layout.rows.opacities == 0).any()
+        # Splats whose colour is not finite have no opacity, and no other splat is below 1/255.
+        hidden = (layout.splats.opacities == 0).any()
         looks_finite = bool(torch.stack(sums).sum().isfinite() & ~hidden)
     if looks_finite:
         return

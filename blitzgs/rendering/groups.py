@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from blitzgs.ops.project import differentiable_rows, gaussians_of
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows
+from blitzgs.ops.project import differentiable_splats, gaussians_of
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.rendering.arguments import Gaussians, Scene
 from blitzgs.rendering.covariances import Decomposed, shaped_by
 
@@ -59,8 +59,10 @@ def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Ten
     return scene.colors.unbind(0) if gaussians.per_view else (scene.colors,) * parts
 
 
-def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rows | None) -> Rows:
-    """Return the rows of all images, those of a group after those of the groups before.
+def project_groups(
+    groups: Sequence[Group], sparse_grad: bool, ready: ProjectedSplats | None
+) -> ProjectedSplats:
+    """Return the splats of all images, those of a group after those of the groups before.
 
     Args:
         groups: what is projected.
@@ -68,18 +70,18 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rows | Non
         ready: what the projection of the one group returned, if it is there already.
 
     Returns:
-        Rows whose camera_ids number all images of the call. Of several groups, visible_ids and row_offsets
-        are those of the first.
+        Splats whose camera_ids number all images of the call. Of several groups, visible_ids and
+        splat_offsets are those of the first.
     """
     parts = []
     for group in groups:
-        rows = differentiable_rows(group.inputs, sparse_grad, ready)
+        splats = differentiable_splats(group.inputs, sparse_grad, ready)
         if group.covariances is not None:
-            rows = shaped_by(rows, group.inputs, group.covariances)
-        parts.append(rows)
+            splats = shaped_by(splats, group.inputs, group.covariances)
+        parts.append(splats)
     if len(parts) == 1:
         return parts[0]
-    images = [rows.camera_ids + group.first_image for rows, group in zip(parts, groups, strict=True)]
+    images = [splats.camera_ids + group.first_image for splats, group in zip(parts, groups, strict=True)]
     joined = parts[0]._asdict()
     for name in (
         "gaussian_ids",
@@ -91,7 +93,7 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rows | Non
         "radii",
         "tiles_touched",
     ):
-        joined[name] = torch.cat([getattr(rows, name) for rows in parts])
+        joined[name] = torch.cat([getattr(splats, name) for splats in parts])
     joined["camera_ids"] = torch.cat(images)
-    joined["counts"] = torch.stack([rows.counts for rows in parts]).sum(dim=0)
-    return Rows(**joined)
+    joined["counts"] = torch.stack([splats.counts for splats in parts]).sum(dim=0)
+    return ProjectedSplats(**joined)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import ProjectionOptions, Rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.render import Rendered, render_queued
 from blitzgs.rendering.arguments import Gaussians
@@ -19,7 +19,7 @@ from blitzgs.rendering.finite import warn_of_non_finite
 from blitzgs.rendering.groups import Group, groups_of, project_groups
 from blitzgs.rendering.layout import Layout
 from blitzgs.rendering.meta import Lists, make_meta
-from blitzgs.rendering.ranks import Job, send_rows
+from blitzgs.rendering.ranks import Job, send_splats
 
 # What the CUDA kernels composite; for any other size, meta's lists are of the tiles asked for alone.
 CUDA_TILE_SIZE = 16
@@ -27,12 +27,12 @@ CUDA_TILE_SIZE = 16
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """What is composited of the rows, and what is told of them; see `blitzgs.rasterization`.
+    """What is composited of the splats, and what is told of them; see `blitzgs.rasterization`.
 
     Attributes:
         render_mode: what the channels are.
         backgrounds: [I, channels] or None.
-        packed: whether `meta` has rows, else all Gaussians.
+        packed: whether `meta` has splats, else all Gaussians.
         sparse_grad: whether gradients are sparse.
         absgrad: whether the backward pass tells absolute gradients.
     """
@@ -59,7 +59,7 @@ def render(
         gaussians: what is rendered.
         project: how it is projected.
         image: how it is composited.
-        sizes: how much room rows and lists need, if that is known.
+        sizes: how much room splats and lists need, if that is known.
         job: the ranks among which the Gaussians and their views are divided; None: all of them are here.
     """
     compiling = torch.compiler.is_compiling()
@@ -69,19 +69,19 @@ def render(
     ready = None
     if len(groups) == 1 and groups[0].covariances is None and not by_value and job is None and not compiling:
         ready = _queued(groups[0], gaussians, project, image, sizes)
-    rows = project_groups(groups, image.sparse_grad, None if ready is None else ready.rows)
-    layout = Layout(rows, gaussians.lead, gaussians.count, image.packed)
+    splats = project_groups(groups, image.sparse_grad, None if ready is None else ready.splats)
+    layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
     laid = _laid(layout, gaussians, project, image)
     means2d, conics, opacities, depths = layout.take(*laid.values())
-    rendered = rows._replace(means2d=means2d, conics=conics, opacities=opacities, depths=depths)
+    rendered = splats._replace(means2d=means2d, conics=conics, opacities=opacities, depths=depths)
     channels, lead = _channels(rendered, layout, gaussians, image.render_mode), gaussians.lead
     if job is not None:
-        (rendered, channels), lead = send_rows(rendered, channels, job), (job.views,)
-    count = -1 if compiling or job is not None else int(rows.counts[2])
+        (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
+    count = -1 if compiling or job is not None else int(splats.counts[2])
     lists, composited_lists = _lists(rendered, math.prod(lead), project, ready, count)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
-        composited_lists.rows, composited_lists.offsets, n_cameras=math.prod(lead), width=project.width,
+        composited_lists.splats, composited_lists.offsets, n_cameras=math.prod(lead), width=project.width,
         height=project.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
         tell_absgrad=_absgrad_teller(layout, laid["means2d"]) if image.absgrad else None,
         composited=None if ready is None else ready.composited,
@@ -104,9 +104,9 @@ def _queued(
     image: ImageOptions,
     sizes: Sizes | None,
 ) -> Rendered | None:
-    """Have all of it queued on CUDA before the host knows how many rows there are, if that can be done."""
+    """Have all of it queued on CUDA before the host knows how many splats there are, if that can be done."""
     means = group.inputs.gaussians[0]
-    # Hooks on saved tensors (checkpointing) want the same shapes each time, without room behind rows.
+    # Hooks on saved tensors (checkpointing) want the same shapes each time, without room behind splats.
     if (
         not means.is_cuda
         or project.tile_size != CUDA_TILE_SIZE
@@ -117,7 +117,7 @@ def _queued(
     differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     return render_queued(
         group.inputs,
-        lambda rows: _channels_of_rows(rows, gaussians, image.render_mode),
+        lambda splats: _channels_of_splats(splats, gaussians, image.render_mode),
         image.backgrounds,
         differentiable and not image.absgrad,
         sizes,
@@ -128,31 +128,33 @@ def _laid(
     layout: Layout, gaussians: Gaussians, project: ProjectionOptions, image: ImageOptions
 ) -> dict[str, Tensor]:
     """Return what is rendered as it lies in meta."""
-    rows = layout.rows
-    means2d, conics, opacities, depths = layout.lay(rows.means2d, rows.conics, rows.opacities, rows.depths)
+    splats = layout.splats
+    means2d, conics, opacities, depths = layout.lay(
+        splats.means2d, splats.conics, splats.opacities, splats.depths
+    )
     if not (image.packed or project.antialiased or image.sparse_grad):
         opacities = layout.lay_opacities(gaussians.opacities)
     return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
 
 
 def _lists(
-    rows: Rows, images: int, project: ProjectionOptions, ready: Rendered | None, count: int
+    splats: ProjectedSplats, images: int, project: ProjectionOptions, ready: Rendered | None, count: int
 ) -> tuple[Lists, Lists]:
     """Return the tiles' lists for meta, and those that are composited; count: entries, -1: not known."""
     width, height, tile_size = project.width, project.height, project.tile_size
     if ready is not None:
-        lists = Lists(ready.isect_rows, ready.tile_offsets, width, height, tile_size)
+        lists = Lists(ready.isect_splats, ready.tile_offsets, width, height, tile_size)
         return lists, lists
 
     def lists_of(size: int, n_isects: int) -> Lists:
-        isect_rows, offsets = torch.ops.blitzgs.intersect(
-            rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, None,
+        isect_splats, offsets = torch.ops.blitzgs.intersect(
+            splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, None,
             [images, width, height, size, 0, -1], n_isects, None, True,
         )  # fmt: skip
-        return Lists(isect_rows, offsets, width, height, size)
+        return Lists(isect_splats, offsets, width, height, size)
 
     lists = lists_of(tile_size, count)
-    if not rows.means2d.is_cuda or tile_size == CUDA_TILE_SIZE:
+    if not splats.means2d.is_cuda or tile_size == CUDA_TILE_SIZE:
         return lists, lists
     return lists, lists_of(CUDA_TILE_SIZE, -1)
 
@@ -170,27 +172,27 @@ def _without_non_finite(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, scenes=tuple(scenes))
 
 
-def _channels(rows: Rows, layout: Layout, gaussians: Gaussians, render_mode: str) -> Tensor:
-    """Return what is composited, per row [P, D]."""
+def _channels(splats: ProjectedSplats, layout: Layout, gaussians: Gaussians, render_mode: str) -> Tensor:
+    """Return what is composited, per splat [P, D]."""
     if gaussians.colors is None or gaussians.sh_degree is not None:
-        return _channels_of_rows(rows, gaussians, render_mode)
+        return _channels_of_splats(splats, gaussians, render_mode)
     N = gaussians.count
     scenes = layout.images if gaussians.per_view else layout.images // gaussians.views
     of_all = len(gaussians.scenes) > 1 or gaussians.per_view
     places = scenes * N + layout.gaussians if of_all else layout.gaussians
     values = gaussians.colors.reshape(-1, gaussians.colors.shape[-1]).index_select(0, places)
-    return _with_depth(values, rows, render_mode)
+    return _with_depth(values, splats, render_mode)
 
 
-def _channels_of_rows(rows: Rows, gaussians: Gaussians, render_mode: str) -> Tensor:
-    """Return what is composited of rows that have all of it: depths, or colours of SH."""
+def _channels_of_splats(splats: ProjectedSplats, gaussians: Gaussians, render_mode: str) -> Tensor:
+    """Return what is composited of splats that have all of it: depths, or colours of SH."""
     if gaussians.colors is None:
-        return rows.depths[:, None]
-    return _with_depth(rows.colors, rows, render_mode)
+        return splats.depths[:, None]
+    return _with_depth(splats.colors, splats, render_mode)
 
 
-def _with_depth(values: Tensor, rows: Rows, render_mode: str) -> Tensor:
-    return values if render_mode == "RGB" else torch.cat([values, rows.depths[:, None]], dim=1)
+def _with_depth(values: Tensor, splats: ProjectedSplats, render_mode: str) -> Tensor:
+    return values if render_mode == "RGB" else torch.cat([values, splats.depths[:, None]], dim=1)
 
 
 def _absgrad_teller(layout: Layout, means2d: Tensor) -> Any:

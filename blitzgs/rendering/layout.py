@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a call's rows stand in `meta`: one after the other, or in [..., C, N, ...] of all Gaussians.
+"""Where a call's splats stand in `meta`: one after the other, or in [..., C, N, ...] of all Gaussians.
 
-The ops have rows by Gaussian, then view; packed, `meta` has them by image, then Gaussian. What `meta` shows
-of them lies on the way from the projection to the image, as in gsplat: rows are laid out, and what is
+The ops have splats by Gaussian, then view; packed, `meta` has them by image, then Gaussian. What `meta` shows
+of them lies on the way from the projection to the image, as in gsplat: splats are laid out, and what is
 rendered is taken from there, so that the tensors in `meta` get gradients.
 """
 
@@ -14,33 +14,33 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.projection import Rows
+from blitzgs.ops.projection import ProjectedSplats
 
 
 class Layout:
-    """Where P rows stand in `meta`.
+    """Where P splats stand in `meta`.
 
     Attributes:
-        rows: the rows; their camera_ids number all images of the call, their gaussian_ids those of a scene.
-        packed: whether `meta` has rows, else all Gaussians.
-        places: int64 [P], where each row stands; None: rows stand as they are.
-        shape: dimensions before those of a row's values.
+        splats: the splats; camera_ids number all images of the call, gaussian_ids the Gaussians of a scene.
+        packed: whether `meta` has splats, else all Gaussians.
+        places: int64 [P], where each splat stands; None: splats stand as they are.
+        shape: dimensions before those of a splat's values.
     """
 
-    def __init__(self, rows: Rows, lead: tuple[int, ...], count: int, packed: bool) -> None:
-        """Lay rows out.
+    def __init__(self, splats: ProjectedSplats, lead: tuple[int, ...], count: int, packed: bool) -> None:
+        """Lay splats out.
 
         Args:
-            rows: as the attribute.
+            splats: as the attribute.
             lead: dimensions of the batch, and C.
             count: Gaussians N of a scene.
-            packed: whether `meta` has rows, else all Gaussians.
+            packed: whether `meta` has splats, else all Gaussians.
         """
-        self.rows, self.packed = rows, packed
+        self.splats, self.packed = splats, packed
         self._images: Tensor | None = None
         self._gaussians: Tensor | None = None
         self.places: Tensor | None = None
-        self.shape: tuple[int, ...] = tuple(rows.camera_ids.shape)
+        self.shape: tuple[int, ...] = tuple(splats.camera_ids.shape)
         if not packed:
             self.places = self.images * count + self.gaussians
             self.shape = (*lead, count)
@@ -52,20 +52,20 @@ class Layout:
     # Made when first asked for; functools.cached_property takes a lock, which torch.compile cannot trace.
     @property
     def images(self) -> Tensor:
-        """The image of each row, int64 [P]."""
+        """The image of each splat, int64 [P]."""
         if self._images is None:
-            self._images = self.rows.camera_ids.long()
+            self._images = self.splats.camera_ids.long()
         return self._images
 
     @property
     def gaussians(self) -> Tensor:
-        """The Gaussian of each row in its scene, int64 [P]."""
+        """The Gaussian of each splat in its scene, int64 [P]."""
         if self._gaussians is None:
-            self._gaussians = self.rows.gaussian_ids.long()
+            self._gaussians = self.splats.gaussian_ids.long()
         return self._gaussians
 
     def lay(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """Return rows' values [P, ...] as [*shape, ...]; zero where a view does not see a Gaussian."""
+        """Return splats' values [P, ...] as [*shape, ...]; zero where a view does not see a Gaussian."""
         if self.places is None:
             return values
         if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
@@ -74,7 +74,7 @@ class Layout:
         return laid
 
     def take(self, *laid: Tensor) -> tuple[Tensor, ...]:
-        """Return what rows have of [*shape, ...]: [P, ...] each."""
+        """Return what splats have of [*shape, ...]: [P, ...] each."""
         if self.places is None:
             return laid
         if torch.compiler.is_compiling():
@@ -83,14 +83,14 @@ class Layout:
         return taken
 
     def lay_opacities(self, opacities: Tensor) -> Tensor:
-        """Return the rows' opacities as [..., C, N], over those given, [..., N], of what a view does not see.
+        """Return the splats' opacities as [..., C, N], over those given, [..., N], of what no view sees.
 
         As in gsplat, whose dense opacities are those of all Gaussians.
         """
         assert self.places is not None  # they are given where all Gaussians are laid out
         if torch.compiler.is_compiling():
-            return _laid_over(self.places, self.shape, self.rows.opacities, opacities)
-        laid: Tensor = _LayOver.apply(self.places, self.shape, self.rows.opacities, opacities)  # type: ignore[no-untyped-call]
+            return _laid_over(self.places, self.shape, self.splats.opacities, opacities)
+        laid: Tensor = _LayOver.apply(self.places, self.shape, self.splats.opacities, opacities)  # type: ignore[no-untyped-call]
         return laid
 
 
@@ -111,7 +111,7 @@ def _taken(places: Tensor, shape: tuple[int, ...], laid: Tensor) -> Tensor:
 
 
 class _Lay(torch.autograd.Function):
-    """Rows to where they stand; no two at one place, so the gradient is taken from there."""
+    """Splats to where they stand; no two at one place, so the gradient is taken from there."""
 
     @staticmethod
     def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *values: Tensor) -> tuple[Tensor, ...]:

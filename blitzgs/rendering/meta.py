@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.lazy_dict import Later, LazyDict
-from blitzgs.ops.projection import Rows
+from blitzgs.ops.projection import ProjectedSplats
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.finite import non_finite
 from blitzgs.rendering.layout import Layout
@@ -19,17 +19,17 @@ from blitzgs.rendering.layout import Layout
 
 @dataclass(frozen=True)
 class Lists:
-    """Which rows the tiles of all images composite.
+    """Which splats the tiles of all images composite.
 
     Attributes:
-        rows: int32, row indices; entries past the last offset mean nothing.
+        splats: int32, splat indices; entries past the last offset mean nothing.
         offsets: int64 [I T + 1].
         width: of the images in px.
         height: likewise.
         tile_size: edge of a tile in px.
     """
 
-    rows: Tensor
+    splats: Tensor
     offsets: Tensor
     width: int
     height: int
@@ -46,10 +46,10 @@ class Lists:
         return -(-self.height // self.tile_size)
 
     def listed(self) -> Tensor:
-        """Return the rows without the entries that mean nothing: there are some where rows are hidden."""
+        """Return the splats without the entries that mean nothing: there are some where splats are hidden."""
         if torch.compiler.is_compiling():  # they were counted
-            return self.rows
-        return self.rows[: int(self.offsets[-1])]
+            return self.splats
+        return self.splats[: int(self.offsets[-1])]
 
 
 def make_meta(
@@ -58,7 +58,7 @@ def make_meta(
     laid: dict[str, Tensor],
     lists: Lists,
     lead: tuple[int, ...],
-    arrived: Rows | None,
+    arrived: ProjectedSplats | None,
 ) -> dict[str, Any]:
     """Return `meta`; what the image did not need is worked out when it is first read.
 
@@ -66,13 +66,13 @@ def make_meta(
 
     Args:
         gaussians: the call's.
-        layout: of its rows.
+        layout: of its splats.
         laid: what is rendered, as it lies in `meta`.
         lists: of the tiles.
         lead: dimensions of the batch, and the views that are rendered here.
-        arrived: the rows that the lists are of, where ranks have exchanged them; None: those laid out.
+        arrived: the splats that the lists are of, where ranks have exchanged them; None: those laid out.
     """
-    rows, packed = layout.rows, layout.packed
+    splats, packed = layout.splats, layout.packed
     views = gaussians.views
 
     def flatten_ids() -> Tensor:
@@ -84,12 +84,12 @@ def make_meta(
         "batch_ids": Later(lambda: layout.lay(layout.images // views)[0]) if packed else None,
         "camera_ids": Later(lambda: layout.lay(layout.images % views)[0]) if packed else None,
         "gaussian_ids": Later(lambda: layout.lay(layout.gaussians)[0]) if packed else None,
-        "radii": Later(lambda: layout.lay(rows.radii)[0]),
+        "radii": Later(lambda: layout.lay(splats.radii)[0]),
         **laid,
         "tile_width": lists.tiles_x,
         "tile_height": lists.tiles_y,
-        "tiles_per_gauss": Later(lambda: layout.lay(rows.tiles_touched)[0]),
-        "isect_ids": Later(lambda: _isect_ids((arrived or rows).depths, lists, math.prod(lead))),
+        "tiles_per_gauss": Later(lambda: layout.lay(splats.tiles_touched)[0]),
+        "isect_ids": Later(lambda: _isect_ids((arrived or splats).depths, lists, math.prod(lead))),
         "flatten_ids": Later(flatten_ids),
         "isect_offsets": Later(lambda: lists.offsets[:-1].reshape(*lead, lists.tiles_y, lists.tiles_x)),
         "width": lists.width,

@@ -2,7 +2,7 @@
 """`rasterization(distributed=True)`: ranks that each have some of the Gaussians and some of the views.
 
 As in gsplat (and Grendel, Zhao et al. 2024), every rank projects its Gaussians into the views of all ranks
-and sends each row to the rank whose view it is of; gradients return the same way. The collectives are those
+and sends each splat to the rank whose view it is of; gradients return the same way. The collectives are those
 of the process group that the program has started. (Training of BlitzGS divides images by tiles instead, with
 the transports of `blitzgs.distributed`.)
 """
@@ -18,7 +18,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from blitzgs.ops.projection import Rows
+from blitzgs.ops.projection import ProjectedSplats
 from blitzgs.rendering.arguments import Gaussians
 
 
@@ -80,19 +80,19 @@ def _require_same(given: tuple[Any, ...], device: torch.device) -> None:
     )
 
 
-def send_rows(rows: Rows, channels: Tensor, job: Job) -> tuple[Rows, Tensor]:
-    """Send each row to the rank whose view it is of. Collective; so is its backward pass.
+def send_splats(splats: ProjectedSplats, channels: Tensor, job: Job) -> tuple[ProjectedSplats, Tensor]:
+    """Send each splat to the rank whose view it is of. Collective; so is its backward pass.
 
     Args:
-        rows: of this rank's Gaussians in the views of all ranks.
+        splats: of this rank's Gaussians in the views of all ranks.
         channels: what is composited of them, [P, D].
         job: the ranks.
 
     Returns:
-        The rows that this rank's views see, by (rank, Gaussian, view), and their channels. Only what lists
+        The splats that this rank's views see, by (rank, Gaussian, view), and their channels. Only what lists
         and images need of them is there.
     """
-    images = rows.camera_ids.long()
+    images = splats.camera_ids.long()
     ranks = images // job.views
     order = torch.argsort(ranks, stable=True)
     sent = torch.bincount(ranks, minlength=job.size)
@@ -100,12 +100,12 @@ def send_rows(rows: Rows, channels: Tensor, job: Job) -> tuple[Rows, Tensor]:
     dist.all_to_all_single(received, sent)
     sizes = sent.tolist(), received.tolist()
     widths = (2, 3, 1, 1, channels.shape[1])
-    columns = (rows.means2d, rows.conics, rows.opacities[:, None], rows.depths[:, None], channels)
+    columns = (splats.means2d, splats.conics, splats.opacities[:, None], splats.depths[:, None], channels)
     table = torch.cat(columns, dim=1).index_select(0, order)
-    arrived: Tensor = _SendRows.apply(table, *sizes)  # type: ignore[no-untyped-call]
+    arrived: Tensor = _SendSplats.apply(table, *sizes)  # type: ignore[no-untyped-call]
     means2d, conics, opacities, depths, own_channels = arrived.split(widths, dim=1)
     own_views = _all_to_all((images % job.views).index_select(0, order), *sizes).int()
-    return rows._replace(
+    return splats._replace(
         camera_ids=own_views,
         means2d=means2d.contiguous(),
         conics=conics.contiguous(),
@@ -126,8 +126,8 @@ def _gathered(values: Tensor, job: Job) -> Tensor:
     return torch.cat(parts)
 
 
-class _SendRows(torch.autograd.Function):
-    """Rows to their ranks, gradients to where the rows came from."""
+class _SendSplats(torch.autograd.Function):
+    """Splats to their ranks, gradients to where the splats came from."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, sent: list[int], received: list[int]) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from blitzgs.lazy_dict import Later
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_rows
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
 from blitzgs.ops.sparse_rows import sparse_rows
 from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
 from blitzgs.rendering.groups import groups_of
@@ -143,17 +143,17 @@ def _check_harmonics(harmonics: list[Tensor], count: int) -> None:
 
 @torch.no_grad()
 def _visible(calls: list[ProjectionInputs]) -> tuple[Tensor, Sizes | None]:
-    """Return the Gaussians that some view sees, int32 [U], and the rows there will be of them.
+    """Return the Gaussians that some view sees, int32 [U], and the splats there will be of them.
 
     Args:
         calls: what is projected, into at most 32 views each.
 
     Returns:
-        Ascending ids; how many Gaussians, rows and intersections there are, if all are of one call.
+        Ascending ids; how many Gaussians, splats and intersections there are, if all are of one call.
     """
-    parts = [project_rows(inputs) for inputs in calls]
+    parts = [project_splats(inputs) for inputs in calls]
     if len(parts) > 1:
-        return torch.cat([rows.visible_ids for rows in parts]).unique(), None
+        return torch.cat([splats.visible_ids for splats in parts]).unique(), None
     return parts[0].visible_ids, Sizes._make(parts[0].counts.tolist())
 
 

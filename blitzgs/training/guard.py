@@ -82,12 +82,12 @@ def _first_in(table: GaussianTable, frame: Frame, names: Sequence[str]) -> str |
     """Name the column, or the op with the Gaussian and view, of the first value that is not finite."""
     if (culprit := bad_column(table)) is not None:
         return culprit
-    rows = frame.rows
+    splats = frame.projected
     for name in ("means2d", "conics", "depths", "opacities", "colors"):
-        bad = ~getattr(rows, name).isfinite().view(len(rows.depths), -1).all(1)
+        bad = ~getattr(splats, name).isfinite().view(len(splats.depths), -1).all(1)
         if bool(bad.any()):
-            row = int(bad.nonzero()[0])
-            gaussian, view = int(rows.gaussian_ids[row]), int(rows.camera_ids[row])
+            at = int(bad.nonzero()[0])
+            gaussian, view = int(splats.gaussian_ids[at]), int(splats.camera_ids[at])
             return (
                 f"it first appears in op project, output {name}: Gaussian id {int(table['id'][gaussian])} in "
                 f"view '{names[view]}', and {int(bad.sum()) - 1} more"

@@ -86,9 +86,9 @@ def photometric(sums: Tensor, samples: Tensor, config: LossConfig) -> Tensor:
 
 def scale_term(frame: Frame, table: GaussianTable, length_unit: float) -> Tensor:
     """Return L_scale of each view, float32 [B]: the mean smallest axis of the Gaussians visible in it."""
-    smallest = table["scales"][frame.rows.gaussian_ids].amin(dim=1).exp() / length_unit
+    smallest = table["scales"][frame.projected.gaussian_ids].amin(dim=1).exp() / length_unit
     views = torch.arange(len(frame.views), device=smallest.device)
-    sums = (smallest[:, None] * (frame.rows.camera_ids[:, None] == views)).sum(dim=0)
+    sums = (smallest[:, None] * (frame.projected.camera_ids[:, None] == views)).sum(dim=0)
     if frame.assignment is not None:
         frame.assignment.ranks.all_reduce(sums)
     return sums / frame.visible.clamp(min=1)

@@ -106,7 +106,7 @@ class LazyAdam:
             *self._betas,
             self._eps,
             self._sparse,
-            frame.rows,
+            frame.projected,
             (frame.views.viewmats, frame.views.Ks),
             frame.options.projection(frame.views),
             v,

@@ -105,14 +105,14 @@ class Stepper:
     def backward(
         self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
     ) -> Tensor | None:
-        """Carry the gradients of `forward`'s loss back to the rows, and move the Gaussians by them.
+        """Carry the gradients of `forward`'s loss back to the splats, and move the Gaussians by them.
 
         Args:
             step: as for `forward`.
             frame: from `forward`.
             terms: from `forward`.
             mark: called with its name at the end of each stage.
-            keep_means2d: whether the caller wants the gradient of the rows' means2d.
+            keep_means2d: whether the caller wants the gradient of the splats' means2d.
 
         Returns:
             That gradient, [P, 2] per pixel, or None.
@@ -121,11 +121,11 @@ class Stepper:
         gradients = pipeline.backward_splats(frame, terms.v_renders, mark)
         v_means2d, sums = gradients.means2d, None
         if v_means2d is None and keep_means2d:
-            v_means2d = sums = torch.empty_like(frame.rows.means2d)
+            v_means2d = sums = torch.empty_like(frame.projected.means2d)
         self._optimiser.step(table, frame, gradients, terms.scale_reg, step, sums)
         if self._noise is not None:
-            self._noise.add(table, frame.rows.visible_ids, step, self._optimiser.position_rate(step))
+            self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
         mark("optimiser")
-        self._blocks.update(table, frame.rows.visible_ids)
+        self._blocks.update(table, frame.projected.visible_ids)
         mark("other")
         return v_means2d if keep_means2d else None

@@ -22,7 +22,7 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
     scale = scale_term(frame, state.table, length_unit).mean()
     counts = [
         state.ranks.all_reduce(torch.full((), float(count), dtype=torch.float64, device=scale.device))
-        for count in (len(frame.rows.visible_ids), len(state.table))
+        for count in (len(frame.projected.visible_ids), len(state.table))
     ]
     return torch.stack([scale.double(), batch_psnr(frame, batch).double(), *counts])
 

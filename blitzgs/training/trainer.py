@@ -154,15 +154,15 @@ class Trainer:
 
     def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
         """Add a step's screen-space gradients to the statistics that density control reads."""
-        rows, views, table = frame.rows, frame.views, self.state.table
+        splats, views, table = frame.projected, frame.views, self.state.table
         density_stats_(
             table["grad_sum"],
             table["grad_count"],
             table["max_radii"],
-            rows.visible_ids,
-            rows.row_offsets,
+            splats.visible_ids,
+            splats.splat_offsets,
             v_means2d,
-            rows.conics,
+            splats.conics,
             views.width,
             views.height,
             float(len(views)),

@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 // Statistics that density control reads, added up over the views of one step (Kerbl et al. 2023, section 5).
 //
-// For every visible Gaussian g and each of its rows r (g in one view):
+// For every visible Gaussian g and each of its splats r (g in one view):
 //   grad_sum[g]   += phi[g] * weight * |(v_means2d[r].x * width / 2, v_means2d[r].y * height / 2)|
 //   grad_count[g] += 1
 //   max_radii[g]   = max(max_radii[g], ceil(3 sqrt(largest eigenvalue of the 2D covariance))) pixels, with
 //   the
 //                    eigenvalue's root term clamped at sqrt(0.1) as in the original renderer
 //
-// v_means2d [P, 2] is the gradient by the pixel position, with v_stride numbers from one row to the next;
+// v_means2d [P, 2] is the gradient by the pixel position, with v_stride numbers from one splat to the next;
 // weight is the factor from the gradient of the batch's loss to the gradient of one view's loss (B for a mean
 // over B views); phi [N] or null (1); conics [P, 3] inverse covariance (a, b, c); visible_ids int32 [U],
-// row_offsets int32 [U + 1]. The statistics are updated in place. One thread adds up the rows of a Gaussian
-// in order, so the result is deterministic. O(P).
+// splat_offsets int32 [U + 1]. The statistics are updated in place. One thread adds up the splats of a
+// Gaussian in order, so the result is deterministic. O(P).
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -28,7 +28,7 @@ struct DensityStatsArgs {
   std::int32_t* grad_count;  // [N]
   T* max_radii;              // [N]
   const std::int32_t* visible_ids;
-  const std::int32_t* row_offsets;
+  const std::int32_t* splat_offsets;
   const T* v_means2d;
   std::int64_t v_stride;
   const T* conics;
@@ -50,7 +50,7 @@ BLITZGS_HD T three_sigma_radius(const T* conic) {
 template <class T>
 BLITZGS_HD void density_stats_of(const DensityStatsArgs<T>& args, std::int64_t u) {
   const std::int32_t id = args.visible_ids[u];
-  const std::int32_t begin = args.row_offsets[u], end = args.row_offsets[u + 1];
+  const std::int32_t begin = args.splat_offsets[u], end = args.splat_offsets[u + 1];
   T sum = 0, radius = args.max_radii[id];
   for (std::int32_t r = begin; r < end; ++r) {
     const T* v = args.v_means2d + r * args.v_stride;

@@ -16,7 +16,7 @@ void check_column(const char* name, const Tensor& column, ScalarType dtype, std:
 }
 
 void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const Tensor& visible_ids_in,
-                    const Tensor& row_offsets_in, const Tensor& v_means2d_in, const Tensor& conics_in,
+                    const Tensor& splat_offsets_in, const Tensor& v_means2d_in, const Tensor& conics_in,
                     const std::optional<Tensor>& phi_in, std::int64_t width, std::int64_t height,
                     double weight) {
   check_floating(kOp, "grad_sum", grad_sum);
@@ -28,8 +28,8 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   check_dtype(kOp, "visible_ids", visible_ids_in, ScalarType::Int);
   check_shape(kOp, "visible_ids", visible_ids_in, {-1});
   const std::int64_t visible = visible_ids_in.size(0);
-  check_dtype(kOp, "row_offsets", row_offsets_in, ScalarType::Int);
-  check_shape(kOp, "row_offsets", row_offsets_in, {visible + 1});
+  check_dtype(kOp, "splat_offsets", splat_offsets_in, ScalarType::Int);
+  check_shape(kOp, "splat_offsets", splat_offsets_in, {visible + 1});
   check_dtype(kOp, "v_means2d", v_means2d_in, dtype);
   check_dtype(kOp, "conics", conics_in, dtype);
   check_shape(kOp, "conics", conics_in, {-1, 3});
@@ -41,7 +41,7 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
     phi = as_contiguous(*phi_in);
   }
   if (visible == 0) return;
-  const Tensor visible_ids = as_contiguous(visible_ids_in), row_offsets = as_contiguous(row_offsets_in);
+  const Tensor visible_ids = as_contiguous(visible_ids_in), splat_offsets = as_contiguous(splat_offsets_in);
   const Tensor conics = as_contiguous(conics_in);
   // A gradient that is part of a table's rows is read in place, without a copy.
   const Tensor v_means2d = v_means2d_in.stride(1) == 1 ? v_means2d_in : as_contiguous(v_means2d_in);
@@ -53,7 +53,7 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
                                    mutable_data<std::int32_t>(grad_count),
                                    mutable_data<T>(max_radii),
                                    data<std::int32_t>(visible_ids),
-                                   data<std::int32_t>(row_offsets),
+                                   data<std::int32_t>(splat_offsets),
                                    data<T>(v_means2d),
                                    v_means2d.stride(0),
                                    data<T>(conics),

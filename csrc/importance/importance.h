@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// What each row contributes to the image: the instrumented rasterisation. Compositing is that of
-// rasterize/rasterize.h, without colours; per row, over the pixels at which it is composited:
+// What each splat contributes to the image: the instrumented rasterisation. Compositing is that of
+// rasterize/rasterize.h, without colours; per splat, over the pixels at which it is composited:
 //   weights = sum of round(2^32 alpha T)   int64 [P], alpha T to the nearest unit of 2^-32, ties to even
 //   pixels  = number of these pixels       int32 [P]
 //
-//   means2d [P, 2], conics [P, 3], opacities [P], isect_rows and tile_offsets from intersect  ->  the sums
-//   over the tiles [tile_begin, tile_end). Rows in no list get zeros.
+//   means2d [P, 2], conics [P, 3], opacities [P], isect_splats and tile_offsets from intersect  ->  the sums
+//   over the tiles [tile_begin, tile_end). Splats in no list get zeros.
 //
 // Exact: alpha T of a pixel has the bits with which the backend renders the pixel (same tile size), and the
 // sums are integers, so tile ranges, ranks, threads, atomics and repetition change no bit. An alpha T is at
@@ -14,7 +14,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/row_count.h"
+#include "common/splat_count.h"
 #include "common/stream.h"
 #include "math/tiles.h"
 
@@ -27,11 +27,11 @@ struct ContributionInput {
   const T* means2d;
   const T* conics;
   const T* opacities;
-  const std::int32_t* isect_rows;
+  const std::int32_t* isect_splats;
   const std::int64_t* tile_offsets;
-  std::int64_t n_rows;
+  std::int64_t n_splats;
   TileGrid grid;
-  const std::int64_t* known_rows = nullptr;  // common/row_count.h; CUDA alone
+  const std::int64_t* known_splats = nullptr;  // common/splat_count.h; CUDA alone
 };
 
 struct ContributionSums {

@@ -5,7 +5,7 @@
 
 #include "common/launch.cuh"
 #include "rasterize/compositor.cuh"
-#include "rasterize/pack_rows.cuh"
+#include "rasterize/pack_splats.cuh"
 
 namespace blitzgs::cuda {
 
@@ -18,7 +18,7 @@ constexpr int kEntryStride =
 // Half-warps of a warp write to different banks.
 constexpr int kGroupWords = kGroup * kEntryStride + 16;
 
-// Colours are not copied; their place in an entry holds what the tile contributes to its row.
+// Colours are not copied; their place in an entry holds what the tile contributes to its splat.
 struct NoColors {};
 __device__ __forceinline__ void copy_color(float* shared, NoColors, std::int32_t) {
   *reinterpret_cast<uint2*>(shared) = {0u, 0u};
@@ -35,14 +35,14 @@ struct TileSum {
     atomicAdd(words + 1, static_cast<std::uint32_t>(weight >> kLowBits) | pixels << kPixelShift);
   }
 
-  __device__ __forceinline__ static void send(const Entry& entry, std::int32_t row,
+  __device__ __forceinline__ static void send(const Entry& entry, std::int32_t splat,
                                               const ContributionSums& sums) {
     const uint2 words = *reinterpret_cast<const uint2*>(entry.color);
     if (words.y == 0) return;  // an entry that is composited has at least a pixel
     const std::uint64_t high = words.y & ((1u << kPixelShift) - 1);
-    atomicAdd(reinterpret_cast<unsigned long long*>(sums.weights + row),
+    atomicAdd(reinterpret_cast<unsigned long long*>(sums.weights + splat),
               static_cast<unsigned long long>((high << kLowBits) + words.x));
-    atomicAdd(sums.pixels + row, static_cast<std::int32_t>(words.y >> kPixelShift));
+    atomicAdd(sums.pixels + splat, static_cast<std::int32_t>(words.y >> kPixelShift));
   }
 };
 
@@ -52,8 +52,8 @@ struct ContributionShared {
 };
 
 struct ContributionArguments {
-  const PackedRow* rows;
-  const std::int32_t* isect_rows;
+  const PackedSplat* splats;
+  const std::int32_t* isect_splats;
   const std::int64_t* tile_offsets;
   TileGrid grid;
   TileOrder order;
@@ -91,26 +91,26 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
   Compositor state;
   state.limit = pixel.inside ? kLog2Cut : INFINITY;
   std::uint32_t* const group = shared.groups[pixel.subtile];
-  const auto row_at = [&](int at) {
-    return thread < kBatch && at < count ? args.isect_rows[start + at] : -1;
+  const auto splat_at = [&](int at) {
+    return thread < kBatch && at < count ? args.isect_splats[start + at] : -1;
   };
-  // `summed` is the row of the thread's entry in the batch before, whose sums are complete at the barrier.
-  std::int32_t row = row_at(thread), next_row = row_at(thread + kBatch), summed = -1;
+  // `summed` is the splat of the thread's entry in the batch before, whose sums are complete at the barrier.
+  std::int32_t splat = splat_at(thread), next_splat = splat_at(thread + kBatch), summed = -1;
   int buffer = 0;
   const auto send_sums = [&] {
     if (summed >= 0) TileSum::send(batch.entries[buffer ^ 1][thread], summed, args.sums);
     summed = -1;
   };
-  batch.fetch(0, args.rows, NoColors{}, row, thread);
+  batch.fetch(0, args.splats, NoColors{}, splat, thread);
   for (int base = 0; base < count; base += kBatch, buffer ^= 1) {
-    if (thread < kBatch) batch.place(buffer, row >= 0, tile, thread);
+    if (thread < kBatch) batch.place(buffer, splat >= 0, tile, thread);
     const bool all_done = __syncthreads_and(state.done());
     send_sums();
     if (all_done) break;
-    summed = row;
-    row = next_row;
-    batch.fetch(buffer ^ 1, args.rows, NoColors{}, row, thread);
-    next_row = row_at(base + 2 * kBatch + thread);
+    summed = splat;
+    splat = next_splat;
+    batch.fetch(buffer ^ 1, args.splats, NoColors{}, splat, thread);
+    next_splat = splat_at(base + 2 * kBatch + thread);
     const unsigned done = __ballot_sync(kFullWarp, state.done()) >> (thread & kHalfWarp) & 0xffffu;
     const int quads =
         batch.template list<false, false>(buffer, pixel.subtile, lane, done == 0xffffu ? 0 : kBatch);
@@ -152,17 +152,17 @@ template <>
 void contributions<float>(const ContributionInput<float>& in, const ContributionSums& sums,
                           Workspace& workspace, CudaStream stream) {
   check_tile_size("contributions", in.grid);
-  check(cudaMemsetAsync(sums.weights, 0, in.n_rows * sizeof(*sums.weights), stream), "contributions");
-  check(cudaMemsetAsync(sums.pixels, 0, in.n_rows * sizeof(*sums.pixels), stream), "contributions");
+  check(cudaMemsetAsync(sums.weights, 0, in.n_splats * sizeof(*sums.weights), stream), "contributions");
+  check(cudaMemsetAsync(sums.pixels, 0, in.n_splats * sizeof(*sums.pixels), stream), "contributions");
   const std::int64_t owned = in.grid.tile_end - in.grid.tile_begin;
-  if (owned == 0 || in.n_rows == 0) return;
-  const RasterizeInput<float> rows{in.means2d, in.conics,     in.opacities,    nullptr,
-                                   nullptr,    in.isect_rows, in.tile_offsets, in.n_rows,
-                                   0,          in.grid,       in.known_rows};
-  auto* packed = static_cast<PackedRow*>(workspace.allocate_bytes(in.n_rows * sizeof(PackedRow)));
+  if (owned == 0 || in.n_splats == 0) return;
+  const RasterizeInput<float> input{in.means2d, in.conics,       in.opacities,    nullptr,
+                                    nullptr,    in.isect_splats, in.tile_offsets, in.n_splats,
+                                    0,          in.grid,         in.known_splats};
+  auto* packed = static_cast<PackedSplat*>(workspace.allocate_bytes(in.n_splats * sizeof(PackedSplat)));
   const TileOrder order(in.grid, owned, workspace.allocate<std::int32_t>(TileOrder::words(in.grid, owned)));
-  prepare("contributions", rows, packed, nullptr, order, stream);
-  const ContributionArguments args{packed, in.isect_rows, in.tile_offsets, in.grid, order, sums};
+  prepare("contributions", input, packed, nullptr, order, stream);
+  const ContributionArguments args{packed, in.isect_splats, in.tile_offsets, in.grid, order, sums};
   launch_contributions(args, stream);
 }
 

@@ -17,7 +17,7 @@ template <class T>
 struct Pair {
   std::vector<T> means2d{T(9.5), T(6.5), T(12), T(6)}, conics{T(0.1), T(0), T(0.1), T(0.05), T(0), T(0.05)};
   std::vector<T> opacities{T(0.999), T(0.7)};
-  std::vector<std::int32_t> rows{0, 1, 0, 1};
+  std::vector<std::int32_t> splats{0, 1, 0, 1};
   std::vector<std::int64_t> offsets{0, 2, 4}, weights{7, 7};
   std::vector<std::int32_t> pixels{7, 7};
   TestWorkspace workspace;
@@ -25,15 +25,15 @@ struct Pair {
   void survey(std::int64_t tile_begin, std::int64_t tile_end) {
     const TileGrid grid = make_tile_grid(1, 20, 12, 16, tile_begin, tile_end);
     cpu::contributions<T>(
-        {means2d.data(), conics.data(), opacities.data(), rows.data(), offsets.data(), 2, grid},
+        {means2d.data(), conics.data(), opacities.data(), splats.data(), offsets.data(), 2, grid},
         {weights.data(), pixels.data()}, workspace, nullptr);
   }
 };
 
-double alpha_at(const Pair<double>& pair, int row, double x, double y) {
-  const double dx = x - pair.means2d[2 * row], dy = y - pair.means2d[2 * row + 1];
+double alpha_at(const Pair<double>& pair, int splat, double x, double y) {
+  const double dx = x - pair.means2d[2 * splat], dy = y - pair.means2d[2 * splat + 1];
   const double alpha =
-      std::min(0.99, pair.opacities[row] * std::exp(-0.5 * pair.conics[3 * row] * (dx * dx + dy * dy)));
+      std::min(0.99, pair.opacities[splat] * std::exp(-0.5 * pair.conics[3 * splat] * (dx * dx + dy * dy)));
   return alpha >= 1.0 / 255.0 ? alpha : 0.0;
 }
 
@@ -53,10 +53,10 @@ TEST_CASE("contributions are alpha T, summed over pixels in units of 2^-32") {
       pixels[1] += far > 0;
     }
   }
-  for (int row = 0; row < 2; ++row) {
-    REQUIRE(pair.pixels[row] == pixels[row]);
+  for (int splat = 0; splat < 2; ++splat) {
+    REQUIRE(pair.pixels[splat] == pixels[splat]);
     // The exponential of one pixel or another may round to another unit.
-    REQUIRE(std::abs(pair.weights[row] - weights[row]) <= pixels[row]);
+    REQUIRE(std::abs(pair.weights[splat] - weights[splat]) <= pixels[splat]);
   }
 }
 
@@ -69,11 +69,11 @@ TEST_CASE("contributions of tile ranges add up") {
   const std::vector<std::int64_t> left_weights = pair.weights;
   const std::vector<std::int32_t> left_pixels = pair.pixels;
   pair.survey(1, 2);
-  for (int row = 0; row < 2; ++row) {
-    REQUIRE(left_weights[row] + pair.weights[row] == weights[row]);
-    REQUIRE(left_pixels[row] + pair.pixels[row] == pixels[row]);
-    REQUIRE(left_pixels[row] > 0);
-    REQUIRE(pair.pixels[row] > 0);
+  for (int splat = 0; splat < 2; ++splat) {
+    REQUIRE(left_weights[splat] + pair.weights[splat] == weights[splat]);
+    REQUIRE(left_pixels[splat] + pair.pixels[splat] == pixels[splat]);
+    REQUIRE(left_pixels[splat] > 0);
+    REQUIRE(pair.pixels[splat] > 0);
   }
   pair.survey(1, 1);
   REQUIRE(pair.weights == std::vector<std::int64_t>{0, 0});

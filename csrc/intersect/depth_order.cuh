@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sorts rows by (depth, id): a radix sort of keys of up to 27 bits in three passes. A key is the depth's
+// Sorts splats by (depth, id): a radix sort of keys of up to 27 bits in three passes. A key is the depth's
 // place among all floats, counted from the smallest depth of the call. If 27 bits are more than that needs,
-// the remaining high bits hold the view: rows of different views need no order among each other, and fewer
+// the remaining high bits hold the view: splats of different views need no order among each other, and fewer
 // keys are then equal. If 27 bits are too few (more than a factor of 65536 between the nearest and the
-// farthest depth), the low bits are left out, and rows with equal keys are compared by depth as well as by
+// farthest depth), the low bits are left out, and splats with equal keys are compared by depth as well as by
 // id.
 #pragma once
 #include <cstdint>
@@ -17,8 +17,8 @@ namespace blitzgs::cuda {
 inline constexpr int kDepthThreads = 256, kDepthBlocks = 5;  // blocks of a multiprocessor
 inline constexpr int kDepthPasses = 3, kDepthBits = 9, kDepthBins = 1 << kDepthBits;
 inline constexpr int kRangeBlocks = kDepthThreads, kRangeThreads = 512;
-inline constexpr int kTieItems = 4, kTieRows = kDepthThreads * kTieItems;
-inline constexpr int kShortRun = 16;  // rows of equal keys that one thread orders
+inline constexpr int kTieItems = 4, kTieSplats = kDepthThreads * kTieItems;
+inline constexpr int kShortRun = 16;  // splats of equal keys that one thread orders
 
 // Maps floats to unsigned integers of the same order.
 __device__ __forceinline__ std::uint32_t ordered_bits(float depth) {
@@ -68,7 +68,7 @@ struct DepthDigits {
 __global__ void __launch_bounds__(kRangeThreads)
     range_kernel(const IntersectInput<float> in, DepthRange* ranges, uint4* zeros, std::int64_t n_zeros) {
   wait_for_earlier_kernels();
-  const std::int64_t n = rows_there(in);
+  const std::int64_t n = splats_there(in);
   constexpr std::int64_t kStep = kRangeBlocks * kRangeThreads;
   const std::int64_t thread = blockIdx.x * static_cast<std::int64_t>(kRangeThreads) + threadIdx.x;
   DepthRange range{0xffffffffu, 0u};
@@ -82,24 +82,24 @@ __global__ void __launch_bounds__(kRangeThreads)
   if (threadIdx.x == 0) ranges[blockIdx.x] = range;
 }
 
-// Writes sort keys, the histograms of their digits, and which tiles the rows touch. Launched with as many
+// Writes sort keys, the histograms of their digits, and which tiles the splats touch. Launched with as many
 // blocks as run at a time.
 __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
     depth_keys_kernel(const IntersectInput<float> in, const DepthRange* ranges, std::uint32_t* keys,
                       Touched* touched, std::uint64_t* histograms, int* dropped_bits, int* width,
-                      std::int64_t* n_rows) {
+                      std::int64_t* n_splats) {
   __shared__ std::uint32_t counts[kDepthPasses][kDepthBins];
   for (int bin = threadIdx.x; bin < kDepthPasses * kDepthBins; bin += kDepthThreads) counts[0][bin] = 0;
   wait_for_earlier_kernels();
   // The number is below 2^31, and a 64-bit loop counter would need more registers than there are.
-  const auto n = static_cast<std::uint32_t>(rows_there(in));
+  const auto n = static_cast<std::uint32_t>(splats_there(in));
   const DepthRange range =
       ranges[threadIdx.x].of_block<kDepthThreads>();  // also a barrier for the zeroed counters
   const DepthDigits digits(range, in.grid.n_cameras);
   if (blockIdx.x == 0 && threadIdx.x == 0) {
     *dropped_bits = digits.dropped;
     *width = digits.width;
-    *n_rows = n;
+    *n_splats = n;
   }
 #pragma unroll 1
   for (std::uint32_t i = blockIdx.x * kDepthThreads + threadIdx.x; i < n; i += gridDim.x * kDepthThreads) {
@@ -117,9 +117,9 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
   add_counts(counts[0], kDepthPasses * kDepthBins, histograms);
 }
 
-struct RowOrder {
+struct SplatOrder {
   const float* depths;      // null: not compared
-  const std::int64_t* ids;  // null: the row index
+  const std::int64_t* ids;  // null: the splat index
 
   __device__ bool before(std::int32_t a, std::int32_t b) const {
     if (depths) {
@@ -129,9 +129,9 @@ struct RowOrder {
     return ids ? ids[a] < ids[b] : a < b;
   }
 
-  // A bitonic sort by a whole block. Every comparison orders upwards, so rows behind the last one need not
+  // A bitonic sort by a whole block. Every comparison orders upwards, so splats behind the last one need not
   // exist.
-  __device__ void sort(std::int32_t* rows, std::int64_t n) const {
+  __device__ void sort(std::int32_t* splats, std::int64_t n) const {
     for (std::int64_t size = 2; size < 2 * n; size *= 2) {
       for (std::int64_t step = size / 2; step > 0; step /= 2) {
         __syncthreads();
@@ -139,10 +139,10 @@ struct RowOrder {
           const std::int64_t at = i & (step - 1), group = 2 * (i - at), low = group + at;
           // The first step of a size mirrors its upper half.
           const std::int64_t high = 2 * step == size ? group + size - 1 - at : low + step;
-          if (high < n && before(rows[high], rows[low])) {
-            const std::int32_t row = rows[low];
-            rows[low] = rows[high];
-            rows[high] = row;
+          if (high < n && before(splats[high], splats[low])) {
+            const std::int32_t splat = splats[low];
+            splats[low] = splats[high];
+            splats[high] = splat;
           }
         }
       }
@@ -151,22 +151,22 @@ struct RowOrder {
   }
 };
 
-// Orders each run of equal keys. One thread orders a run of a few rows, which is the usual case; its block
+// Orders each run of equal keys. One thread orders a run of a few splats, which is the usual case; its block
 // orders longer runs together, one after the other.
 __global__ void __launch_bounds__(kDepthThreads)
-    order_ties_kernel(const std::uint32_t* keys, std::int32_t* rows, const std::int64_t* n_rows,
-                      RowOrder order, const int* dropped_bits) {
-  __shared__ std::int64_t long_runs[kTieRows / kShortRun + 1];
+    order_ties_kernel(const std::uint32_t* keys, std::int32_t* splats, const std::int64_t* n_splats,
+                      SplatOrder order, const int* dropped_bits) {
+  __shared__ std::int64_t long_runs[kTieSplats / kShortRun + 1];
   __shared__ int n_long;
   wait_for_earlier_kernels();
-  const std::int64_t n = *n_rows;
+  const std::int64_t n = *n_splats;
   if (*dropped_bits == 0) {
-    if (!order.ids) return;  // the passes kept equal depths in the order of rows
+    if (!order.ids) return;  // the passes kept equal depths in the order of splats
     order.depths = nullptr;
   }
   if (threadIdx.x == 0) n_long = 0;
   __syncthreads();
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kTieRows) + threadIdx.x;
+  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kTieSplats) + threadIdx.x;
   unsigned begins = 0;
 #pragma unroll
   for (int k = 0; k < kTieItems; ++k) {
@@ -175,7 +175,7 @@ __global__ void __launch_bounds__(kDepthThreads)
   }
   for (; begins; begins &= begins - 1) {
     const std::int64_t i = first + (__ffs(begins) - 1) * kDepthThreads;
-    std::int32_t* const run = rows + i;
+    std::int32_t* const run = splats + i;
     int length = 2;
     while (length <= kShortRun && i + length < n && keys[i + length] == keys[i]) ++length;
     if (length > kShortRun) {
@@ -183,10 +183,10 @@ __global__ void __launch_bounds__(kDepthThreads)
       continue;
     }
     for (int at = 1; at < length; ++at) {
-      const std::int32_t row = run[at];
+      const std::int32_t splat = run[at];
       int to = at;
-      for (; to > 0 && order.before(row, run[to - 1]); --to) run[to] = run[to - 1];
-      if (to < at) run[to] = row;
+      for (; to > 0 && order.before(splat, run[to - 1]); --to) run[to] = run[to - 1];
+      if (to < at) run[to] = splat;
     }
   }
   __syncthreads();
@@ -197,7 +197,7 @@ __global__ void __launch_bounds__(kDepthThreads)
       const std::int64_t i = begin + length + threadIdx.x;
       same = __syncthreads_count(i < n && keys[i] == keys[begin]);
     }
-    order.sort(rows + begin, length);
+    order.sort(splats + begin, length);
   }
 }
 

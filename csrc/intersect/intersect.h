@@ -1,30 +1,30 @@
 // SPDX-License-Identifier: Apache-2.0
-// Intersection: which rows each tile composites, front to back.
+// Intersection: which splats each tile composites, front to back.
 //
-// Row p (a splat in camera camera_ids[p]) is listed in tile t of that camera iff for_each_tile() of
-// math/tiles.h visits it. Within a tile the rows are ordered by (depth, id); without ids by (depth, row). -0
-// and 0 are different depths; lists are undefined if a depth is NaN.
+// Splat p (a splat in camera camera_ids[p]) is listed in tile t of that camera iff for_each_tile() of
+// math/tiles.h visits it. Within a tile the splats are ordered by (depth, id); without ids by (depth, splat).
+// -0 and 0 are different depths; lists are undefined if a depth is NaN.
 //
 //   means2d [P, 2] pixels, conics [P, 3], opacities [P], depths [P], camera_ids int32 [P], ids int64 [P] or
-//   null  ->  isect_rows int32 [I] row indices, tile_offsets int64 [B*T + 1] with T = tiles_y * tiles_x:
-//   tile t's list is isect_rows[tile_offsets[t] .. tile_offsets[t + 1]). Tiles that grid does not own have
+//   null  ->  isect_splats int32 [I] splat indices, tile_offsets int64 [B*T + 1] with T = tiles_y * tiles_x:
+//   tile t's list is isect_splats[tile_offsets[t] .. tile_offsets[t + 1]). Tiles that grid does not own have
 //   empty lists.
 //
-// known_rows: null, or the number of rows in device memory (common/row_count.h; CUDA alone).
+// known_splats: null, or the number of splats in device memory (common/splat_count.h; CUDA alone).
 //
-// capacity is the length of isect_rows; entries from tile_offsets[B*T] on are left unspecified. If there are
-// more entries than that, the CPU kernel returns their number and writes no list, and the op fails with both
-// numbers. On CUDA the op counts them first, which is a wait, and fails likewise. The CUDA kernel itself then
-// lists the first entries in depth order, in consistent lists and offsets: so does the op where the caller
-// asks for no check because it learns the number while the device works (`unchecked`).
+// capacity is the length of isect_splats; entries from tile_offsets[B*T] on are left unspecified. If there
+// are more entries than that, the CPU kernel returns their number and writes no list, and the op fails with
+// both numbers. On CUDA the op counts them first, which is a wait, and fails likewise. The CUDA kernel itself
+// then lists the first entries in depth order, in consistent lists and offsets: so does the op where the
+// caller asks for no check because it learns the number while the device works (`unchecked`).
 //
-// Deterministic: the lists depend on the rows alone, never on threads. Row order need not follow depth.
+// Deterministic: the lists depend on the splats alone, never on threads. Splat order need not follow depth.
 // O(P) for the radix sort, O(tile rows) for the tests, O(I) to write. Counts are 64-bit; P and
 // B*T < 2^31.
 #pragma once
 #include <cstdint>
 
-#include "common/row_count.h"
+#include "common/splat_count.h"
 #include "common/stream.h"
 #include "math/tiles.h"
 
@@ -38,16 +38,16 @@ struct IntersectInput {
   const T* depths;
   const std::int32_t* camera_ids;
   const std::int64_t* ids;
-  std::int64_t n_rows;
+  std::int64_t n_splats;
   TileGrid grid;
-  const std::int64_t* known_rows = nullptr;
+  const std::int64_t* known_splats = nullptr;
 };
 
 namespace cpu {
 template <class T>
 std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
 template <class T>
-std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_rows,
+std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_splats,
                        std::int64_t* tile_offsets, Workspace&, CudaStream);
 }  // namespace cpu
 
@@ -57,7 +57,7 @@ template <class T>
 std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
 // Returns a count that is exact or at most the capacity, without waiting for the device.
 template <class T>
-std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_rows,
+std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_splats,
                        std::int64_t* tile_offsets, Workspace&, CudaStream);
 }  // namespace cuda
 

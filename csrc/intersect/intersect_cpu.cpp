@@ -12,9 +12,9 @@
 namespace blitzgs::cpu {
 namespace {
 
-// The tiles of one tile row that a row touches: [first, first + count), counted from grid.tile_begin.
+// The tiles of one tile row that a splat touches: [first, first + count), counted from grid.tile_begin.
 struct Span {
-  std::int32_t row;
+  std::int32_t splat;
   std::int32_t count;
   std::int64_t first;
 };
@@ -25,7 +25,7 @@ using KeyOf = std::conditional_t<sizeof(T) == 4, std::uint32_t, std::uint64_t>;
 template <class Key>
 struct Keyed {
   Key key;
-  std::int32_t row;
+  std::int32_t splat;
 };
 
 // Maps floats to unsigned integers of the same order.
@@ -38,11 +38,11 @@ KeyOf<T> depth_key(T depth) {
 }
 
 template <class T, class F>
-void for_each_span(const IntersectInput<T>& in, std::int32_t row, const F& f) {
+void for_each_span(const IntersectInput<T>& in, std::int32_t splat, const F& f) {
   const TileGrid& grid = in.grid;
-  const std::int64_t image = in.camera_ids[row] * grid.per_image();
-  for_each_tile_row(in.means2d + 2 * static_cast<std::int64_t>(row),
-                    in.conics + 3 * static_cast<std::int64_t>(row), in.opacities[row], grid.width,
+  const std::int64_t image = in.camera_ids[splat] * grid.per_image();
+  for_each_tile_row(in.means2d + 2 * static_cast<std::int64_t>(splat),
+                    in.conics + 3 * static_cast<std::int64_t>(splat), in.opacities[splat], grid.width,
                     grid.height, grid.tile_size, [&](int ty, int begin, int end) {
                       const std::int64_t tile_row = image + static_cast<std::int64_t>(ty) * grid.tiles_x;
                       const std::int64_t first = std::max(tile_row + begin, grid.tile_begin);
@@ -93,36 +93,37 @@ bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, std::int64_t n, int shif
   return true;
 }
 
-// The sort has kept rows of equal depth in row order; this puts each run of equal depths in the order of ids.
+// The sort has kept splats of equal depth in splat order; this puts each run of equal depths in the order of
+// ids.
 template <class Key>
-void order_ties(Keyed<Key>* rows, std::int64_t n, const std::int64_t* ids) {
+void order_ties(Keyed<Key>* splats, std::int64_t n, const std::int64_t* ids) {
   for (std::int64_t begin = 0; begin < n;) {
     std::int64_t end = begin + 1;
-    while (end < n && rows[end].key == rows[begin].key) ++end;
+    while (end < n && splats[end].key == splats[begin].key) ++end;
     if (end - begin > 1) {
-      std::sort(rows + begin, rows + end, [ids](const Keyed<Key>& a, const Keyed<Key>& b) {
-        return ids[a.row] != ids[b.row] ? ids[a.row] < ids[b.row] : a.row < b.row;
+      std::sort(splats + begin, splats + end, [ids](const Keyed<Key>& a, const Keyed<Key>& b) {
+        return ids[a.splat] != ids[b.splat] ? ids[a.splat] < ids[b.splat] : a.splat < b.splat;
       });
     }
     begin = end;
   }
 }
 
-// Rows of all cameras by (depth, id): within one camera's tile that is the order of compositing.
+// Splats of all cameras by (depth, id): within one camera's tile that is the order of compositing.
 template <class T>
-const Keyed<KeyOf<T>>* sort_rows(const IntersectInput<T>& in, Workspace& workspace) {
+const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& workspace) {
   using Key = KeyOf<T>;
-  auto* rows = workspace.allocate<Keyed<Key>>(in.n_rows);
-  auto* spare = workspace.allocate<Keyed<Key>>(in.n_rows);
-  parallel_for(0, in.n_rows, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
+  auto* splats = workspace.allocate<Keyed<Key>>(in.n_splats);
+  auto* spare = workspace.allocate<Keyed<Key>>(in.n_splats);
+  parallel_for(0, in.n_splats, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i)
-      rows[i] = {depth_key(in.depths[i]), static_cast<std::int32_t>(i)};
+      splats[i] = {depth_key(in.depths[i]), static_cast<std::int32_t>(i)};
   });
   for (int shift = 0; shift < static_cast<int>(8 * sizeof(Key)); shift += 11) {
-    if (radix_pass(rows, spare, in.n_rows, shift)) std::swap(rows, spare);
+    if (radix_pass(splats, spare, in.n_splats, shift)) std::swap(splats, spare);
   }
-  if (in.ids) order_ties(rows, in.n_rows, in.ids);
-  return rows;
+  if (in.ids) order_ties(splats, in.n_splats, in.ids);
+  return splats;
 }
 
 // As many pieces as threads, or fewer where a counter for each tile and piece would take too much memory.
@@ -140,9 +141,9 @@ std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaSt
   std::vector<std::int64_t> counts(pieces, 0);
   parallel_pieces(pieces, [&](int piece) {
     std::int64_t count = 0;
-    const std::int64_t end = piece_start(in.n_rows, pieces, piece + 1);
-    for (std::int64_t row = piece_start(in.n_rows, pieces, piece); row < end; ++row) {
-      for_each_span(in, static_cast<std::int32_t>(row), [&](std::int64_t, std::int32_t n) { count += n; });
+    const std::int64_t end = piece_start(in.n_splats, pieces, piece + 1);
+    for (std::int64_t splat = piece_start(in.n_splats, pieces, piece); splat < end; ++splat) {
+      for_each_span(in, static_cast<std::int32_t>(splat), [&](std::int64_t, std::int32_t n) { count += n; });
     }
     counts[piece] = count;
   });
@@ -152,11 +153,11 @@ std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaSt
 }
 
 template <class T>
-std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_rows,
+std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_splats,
                        std::int64_t* tile_offsets, Workspace& workspace, CudaStream) {
   const TileGrid& grid = in.grid;
   const std::int64_t n_tiles = grid.tile_end - grid.tile_begin;
-  const auto* rows = sort_rows(in, workspace);
+  const auto* splats = sort_splats(in, workspace);
 
   // First, each piece of the depth order notes its spans and counts them per tile.
   const int pieces = choose_pieces(n_tiles);
@@ -165,18 +166,18 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
   parallel_pieces(pieces, [&](int piece) {
     std::int64_t* counts = places + n_tiles * piece;
     std::fill_n(counts, n_tiles, 0);
-    const std::int64_t begin = piece_start(in.n_rows, pieces, piece);
-    const std::int64_t end = piece_start(in.n_rows, pieces, piece + 1);
+    const std::int64_t begin = piece_start(in.n_splats, pieces, piece);
+    const std::int64_t end = piece_start(in.n_splats, pieces, piece + 1);
     spans[piece].reserve(2 * (end - begin));
     for (std::int64_t i = begin; i < end; ++i) {
-      // Rows in depth order are scattered in memory, so a few rows are prefetched.
-      const std::int64_t ahead = rows[std::min(i + 8, end - 1)].row;
+      // Splats in depth order are scattered in memory, so a few splats are prefetched.
+      const std::int64_t ahead = splats[std::min(i + 8, end - 1)].splat;
       __builtin_prefetch(in.means2d + 2 * ahead);
       __builtin_prefetch(in.conics + 3 * ahead);
       __builtin_prefetch(in.opacities + ahead);
       __builtin_prefetch(in.camera_ids + ahead);
-      for_each_span(in, rows[i].row, [&](std::int64_t first, std::int32_t count) {
-        spans[piece].push_back({rows[i].row, count, first});
+      for_each_span(in, splats[i].splat, [&](std::int64_t first, std::int32_t count) {
+        spans[piece].push_back({splats[i].splat, count, first});
         for (std::int32_t tile = 0; tile < count; ++tile) ++counts[first + tile];
       });
     }
@@ -200,7 +201,8 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
   parallel_pieces(pieces, [&](int piece) {
     std::int64_t* next = places + n_tiles * piece;
     for (const Span& span : spans[piece]) {
-      for (std::int32_t tile = 0; tile < span.count; ++tile) isect_rows[next[span.first + tile]++] = span.row;
+      for (std::int32_t tile = 0; tile < span.count; ++tile)
+        isect_splats[next[span.first + tile]++] = span.splat;
     }
   });
   return place;

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows are sorted by depth once (depth_order.cuh). Their entries are written in that order with the tile as a
-// key, of 16 bits where the tiles of the launch fit. A stable radix sort over the bits in use then brings
-// each tile's entries together and keeps their order. Which tiles a row touches is found once, in row order,
-// and kept in 16 bytes, so that the data of all rows fit into the L2 cache when they are gathered in depth
-// order. This file is compiled without FMA contraction (cmake/cuda.cmake), as the projection is, because both
-// must count the same tiles.
+// Splats are sorted by depth once (depth_order.cuh). Their entries are written in that order with the tile as
+// a key, of 16 bits where the tiles of the launch fit. A stable radix sort over the bits in use then brings
+// each tile's entries together and keeps their order. Which tiles a splat touches is found once, in splat
+// order, and kept in 16 bytes, so that the data of all splats fit into the L2 cache when they are gathered in
+// depth order. This file is compiled without FMA contraction (cmake/cuda.cmake), as the projection is,
+// because both must count the same tiles.
 #include <cub/device/device_reduce.cuh>
 
 #include <algorithm>
@@ -25,7 +25,7 @@ namespace {
 
 using Input = IntersectInput<float>;
 constexpr int kThreads = 256;
-constexpr int kEmitItems = 4, kEmitRows = kThreads * kEmitItems;  // rows that a thread and a block handle
+constexpr int kEmitItems = 4, kEmitSplats = kThreads * kEmitItems;  // splats that a thread and a block handle
 
 // The digits by which tiles are sorted: as few passes as the number of tiles needs, with digits as narrow as
 // these allow.
@@ -49,19 +49,19 @@ struct TileDigits {
 
 __global__ void count_kernel(const Input in, std::int32_t* counts) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
-  if (i >= in.n_rows) return;
-  counts[i] = i < rows_there(in) ? find_touched(in.grid, load_splat(in, i)).count() : 0;
+  if (i >= in.n_splats) return;
+  counts[i] = i < splats_there(in) ? find_touched(in.grid, load_splat(in, i)).count() : 0;
 }
 
-// Writes the entries of a warp's rows, one row for each lane. The warp's entries begin at `turn`, the lane's
-// at `turn` + `start`.
+// Writes the entries of a warp's splats, one splat for each lane. The warp's entries begin at `turn`, the
+// lane's at `turn` + `start`.
 template <class Key>
-__device__ __forceinline__ void write_entries(const Input& in, std::int32_t row, const Touched& touched,
+__device__ __forceinline__ void write_entries(const Input& in, std::int32_t splat, const Touched& touched,
                                               std::int32_t start, std::int64_t turn, std::int64_t capacity,
                                               Key* keys, std::int32_t* entries, const TileDigits& digits,
                                               std::uint32_t* counts) {
   const int lane = threadIdx.x % 32;
-  // The lanes share all entries of compact rows: each writes every 32nd entry, whichever lane's row it
+  // The lanes share all entries of compact splats: each writes every 32nd entry, whichever lane's splat it
   // belongs to.
   const std::int32_t count = touched.compact() ? touched.count() : 0;
   const std::int32_t until = sum_of_lanes_until(count, lane), total = __shfl_sync(kFullWarp, until, 31);
@@ -75,26 +75,26 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t row,
     }
     const std::int32_t k = entry - __shfl_sync(kFullWarp, begin, source);
     const std::int64_t at = turn + __shfl_sync(kFullWarp, start, source) + k;
-    const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
+    const std::int32_t of_splat = __shfl_sync(kFullWarp, splat, source);
     const Touched its = touched.of_lane(source);
     if (entry < total && at < capacity) {
       const std::uint32_t tile = its.tile(k, in.grid.tiles_x);
       keys[at] = static_cast<Key>(tile);
-      entries[at] = of_row;
+      entries[at] = of_splat;
       digits.count(tile, counts);
     }
   }
-  // All lanes walk the tiles of each other row together.
+  // All lanes walk the tiles of each other splat together.
   for (unsigned left = __ballot_sync(kFullWarp, !touched.compact()); left; left &= left - 1) {
     const int source = __ffs(left) - 1;
-    const std::int32_t of_row = __shfl_sync(kFullWarp, row, source);
+    const std::int32_t of_splat = __shfl_sync(kFullWarp, splat, source);
     std::int64_t at = turn + __shfl_sync(kFullWarp, start, source);
-    const SplatShape splat = load_splat(in, of_row);
-    for_each_owned(in.grid, splat, [&](const Owned& owned) {
+    const SplatShape shape = load_splat(in, of_splat);
+    for_each_owned(in.grid, shape, [&](const Owned& owned) {
       const int n = owned.last - owned.first;
       for (int k = lane; k < n && at + k < capacity; k += 32) {
         keys[at + k] = static_cast<Key>(owned.first + k);
-        entries[at + k] = of_row;
+        entries[at + k] = of_splat;
         digits.count(owned.first + k, counts);
       }
       at += n;
@@ -103,30 +103,30 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t row,
 }
 
 // Writes the entries in depth order, their number, and the histograms of their tiles' digits. A block handles
-// kEmitRows rows, a warp 32 * kEmitItems consecutive ones.
+// kEmitSplats splats, a warp 32 * kEmitItems consecutive ones.
 template <class Key>
 __global__ void __launch_bounds__(kThreads, 4)
-    emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* rows,
-                const std::int64_t* n_rows, RunningSum running, std::int64_t capacity, TileDigits digits,
+    emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* splats,
+                const std::int64_t* n_splats, RunningSum running, std::int64_t capacity, TileDigits digits,
                 Key* keys, std::int32_t* entries, std::uint64_t* histograms, std::int64_t* n_entries) {
   __shared__ std::int64_t warp_sums[kThreads / 32];
   __shared__ std::uint32_t counts[TileDigits::kMost * TileDigits::kBins];
   for (int bin = threadIdx.x; bin < digits.passes * TileDigits::kBins; bin += kThreads) counts[bin] = 0;
   wait_for_earlier_kernels();
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  const std::int64_t n = *n_rows;
+  const std::int64_t n = *n_splats;
   const int block = running.take_turn();
-  const std::int64_t begin = static_cast<std::int64_t>(block) * kEmitRows, end = begin + kEmitRows;
+  const std::int64_t begin = static_cast<std::int64_t>(block) * kEmitSplats, end = begin + kEmitSplats;
   if (begin >= n) return;
   const std::int64_t first = begin + warp * (32 * kEmitItems) + lane;
-  std::int32_t row[kEmitItems];
+  std::int32_t splat[kEmitItems];
   Touched touched[kEmitItems];
 #pragma unroll
-  for (int k = 0; k < kEmitItems; ++k) row[k] = first + 32 * k < n ? rows[first + 32 * k] : -1;
+  for (int k = 0; k < kEmitItems; ++k) splat[k] = first + 32 * k < n ? splats[first + 32 * k] : -1;
 #pragma unroll
-  for (int k = 0; k < kEmitItems; ++k) touched[k] = row[k] >= 0 ? all_touched[row[k]] : Touched{};
+  for (int k = 0; k < kEmitItems; ++k) touched[k] = splat[k] >= 0 ? all_touched[splat[k]] : Touched{};
 
-  std::int32_t start[kEmitItems];  // where each row's entries begin, counted from its warp's first entry
+  std::int32_t start[kEmitItems];  // where each splat's entries begin, counted from its warp's first entry
   std::int64_t turn[kEmitItems], warp_sum = 0;
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
@@ -148,7 +148,7 @@ __global__ void __launch_bounds__(kThreads, 4)
 
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
-    write_entries(in, row[k], touched[k], start[k], before + turn[k], capacity, keys, entries, digits,
+    write_entries(in, splat[k], touched[k], start[k], before + turn[k], capacity, keys, entries, digits,
                   counts);
   }
   __syncthreads();
@@ -174,13 +174,13 @@ __global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entri
   if (lane == 0) tile_offsets[tile] = low;
 }
 
-// The scratch memory of a call, apart from the arrays of its rows and entries.
+// The scratch memory of a call, apart from the arrays of its splats and entries.
 template <class State>
 struct Counters {
   unsigned depth_blocks, tile_blocks, emit_blocks;
   // The first kernel zeroes all of this but the ranges, which it writes.
   std::uint64_t *depth_histograms, *tile_histograms, *running, *turns;
-  std::int64_t *n_rows, *n_entries;
+  std::int64_t *n_splats, *n_entries;
   int *dropped_bits, *width;
   State *depth_states, *tile_states;
   DepthRange* ranges;
@@ -188,9 +188,9 @@ struct Counters {
   std::int64_t n_zeros;  // in units of 16 bytes
 
   Counters(const Input& in, std::int64_t capacity, const TileDigits& digits, Workspace& workspace)
-      : depth_blocks(blocks_for(in.n_rows, kSweepTile)),
+      : depth_blocks(blocks_for(in.n_splats, kSweepTile)),
         tile_blocks(blocks_for(capacity, kSweepTile)),
-        emit_blocks(blocks_for(in.n_rows, kEmitRows)) {
+        emit_blocks(blocks_for(in.n_splats, kEmitSplats)) {
     const std::int64_t bytes = lay_out(nullptr, digits);
     begin = reinterpret_cast<uint4*>(workspace.allocate<std::byte>(bytes));
     lay_out(reinterpret_cast<std::byte*>(begin), digits);
@@ -208,7 +208,7 @@ struct Counters {
     take(tile_histograms, digits.passes * TileDigits::kBins);
     take(running, std::int64_t{emit_blocks} + 1);
     take(turns, kDepthPasses + digits.passes);
-    take(n_rows, 1);
+    take(n_splats, 1);
     take(n_entries, 1);
     take(dropped_bits, 1);
     take(width, 1);
@@ -221,52 +221,52 @@ struct Counters {
 };
 
 struct DepthOrder {
-  Touched* touched;    // [P] of each row
-  std::int32_t* rows;  // [P] by (depth, id)
+  Touched* touched;      // [P] of each splat
+  std::int32_t* splats;  // [P] by (depth, id)
 };
 
 template <class State>
 DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Workspace& workspace,
                           CudaStream stream) {
-  const std::int64_t n = in.n_rows;
-  auto [touched, keys_0, keys_1, rows_0, rows_1] =
+  const std::int64_t n = in.n_splats;
+  auto [touched, keys_0, keys_1, splats_0, splats_1] =
       allocate_arrays<Touched, std::uint32_t, std::uint32_t, std::int32_t, std::int32_t>(n, workspace);
   std::uint32_t* const keys[] = {keys_0, keys_1};
-  std::int32_t* const rows[] = {rows_0, rows_1};
+  std::int32_t* const splats[] = {splats_0, splats_1};
   launch_early("intersect", range_kernel, {kRangeBlocks, kRangeThreads, stream}, in, counters.ranges,
                counters.begin, counters.n_zeros);
   const unsigned blocks =
       std::min(blocks_for(n, kDepthThreads), static_cast<unsigned>(kDepthBlocks * multiprocessors()));
   launch_early("intersect", depth_keys_kernel, {blocks, kDepthThreads, stream}, in, counters.ranges, keys[0],
-               touched, counters.depth_histograms, counters.dropped_bits, counters.width, counters.n_rows);
+               touched, counters.depth_histograms, counters.dropped_bits, counters.width, counters.n_splats);
   int from = 0;
   for (int pass = 0; pass < kDepthPasses; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * kDepthBins;
-    sweep<kDepthBits>(SweepPass<std::uint32_t, State>{keys[from], pass ? rows[from] : nullptr, keys[1 - from],
-                                                      rows[1 - from], counters.n_rows,
+    sweep<kDepthBits>(SweepPass<std::uint32_t, State>{keys[from], pass ? splats[from] : nullptr,
+                                                      keys[1 - from], splats[1 - from], counters.n_splats,
                                                       counters.depth_histograms + bins, counters.turns + pass,
                                                       counters.depth_states + bins * counters.depth_blocks,
                                                       pass, 0, counters.width},
                       counters.depth_blocks, stream);
   }
-  launch_early("intersect", order_ties_kernel, {blocks_for(n, kTieRows), kDepthThreads, stream}, keys[from],
-               rows[from], counters.n_rows, {in.depths, in.ids}, counters.dropped_bits);
-  return {touched, rows[from]};
+  launch_early("intersect", order_ties_kernel, {blocks_for(n, kTieSplats), kDepthThreads, stream}, keys[from],
+               splats[from], counters.n_splats, {in.depths, in.ids}, counters.dropped_bits);
+  return {touched, splats[from]};
 }
 
 template <class Key, class State>
-void list_rows(const Input& in, std::int64_t capacity, std::int32_t* isect_rows, std::int64_t* tile_offsets,
-               Workspace& workspace, CudaStream stream) {
+void list_splats(const Input& in, std::int64_t capacity, std::int32_t* isect_splats,
+                 std::int64_t* tile_offsets, Workspace& workspace, CudaStream stream) {
   const TileDigits digits(in.grid.tile_end - in.grid.tile_begin);
   const Counters<State> counters(in, capacity, digits, workspace);
   const DepthOrder order = order_by_depth(in, counters, workspace, stream);
   auto [keys_0, keys_1, unsorted] = allocate_arrays<Key, Key, std::int32_t>(capacity, workspace);
   Key* const keys[] = {keys_0, keys_1};
-  // The last pass writes isect_rows.
+  // The last pass writes isect_splats.
   const bool even = digits.passes % 2 == 0;
-  std::int32_t* const entries[] = {even ? isect_rows : unsorted, even ? unsorted : isect_rows};
+  std::int32_t* const entries[] = {even ? isect_splats : unsorted, even ? unsorted : isect_splats};
   launch_early("intersect", emit_kernel<Key>, {counters.emit_blocks, kThreads, stream}, in, order.touched,
-               order.rows, counters.n_rows, RunningSum(counters.running), capacity, digits, keys[0],
+               order.splats, counters.n_splats, RunningSum(counters.running), capacity, digits, keys[0],
                entries[0], counters.tile_histograms, counters.n_entries);
   int from = 0;
   for (int pass = 0; pass < digits.passes; ++pass, from = 1 - from) {
@@ -287,14 +287,14 @@ void list_rows(const Input& in, std::int64_t capacity, std::int32_t* isect_rows,
 
 template <>
 std::int64_t count_intersections<float>(const Input& in, Workspace& workspace, CudaStream stream) {
-  if (in.n_rows == 0 || in.grid.tile_end <= in.grid.tile_begin) return 0;
-  auto* counts = workspace.allocate<std::int32_t>(in.n_rows);
+  if (in.n_splats == 0 || in.grid.tile_end <= in.grid.tile_begin) return 0;
+  auto* counts = workspace.allocate<std::int32_t>(in.n_splats);
   auto* total = workspace.allocate<std::int64_t>(1);
-  count_kernel<<<blocks_for(in.n_rows, kThreads), kThreads, 0, stream>>>(in, counts);
+  count_kernel<<<blocks_for(in.n_splats, kThreads), kThreads, 0, stream>>>(in, counts);
   check_launch("intersect");
   std::size_t bytes = 0;
   const auto sum = [&](void* scratch) {
-    return cub::DeviceReduce::Reduce(scratch, bytes, counts, total, in.n_rows,
+    return cub::DeviceReduce::Reduce(scratch, bytes, counts, total, in.n_splats,
                                      ::cuda::std::plus<std::int64_t>{}, std::int64_t{0}, stream);
   };
   check(sum(nullptr), "intersect");
@@ -306,17 +306,17 @@ std::int64_t count_intersections<float>(const Input& in, Workspace& workspace, C
 }
 
 template <>
-std::int64_t intersect<float>(const Input& in, std::int64_t capacity, std::int32_t* isect_rows,
+std::int64_t intersect<float>(const Input& in, std::int64_t capacity, std::int32_t* isect_splats,
                               std::int64_t* tile_offsets, Workspace& workspace, CudaStream stream) {
   const std::int64_t n_tiles = in.grid.tile_end - in.grid.tile_begin;
-  if (in.n_rows == 0 || capacity == 0 || n_tiles <= 0) {
+  if (in.n_splats == 0 || capacity == 0 || n_tiles <= 0) {
     check(cudaMemsetAsync(tile_offsets, 0, (in.grid.count() + 1) * sizeof(std::int64_t), stream),
           "intersect");
     return capacity;
   }
-  const bool small = in.n_rows < kSmallStates && capacity < kSmallStates;
+  const bool small = in.n_splats < kSmallStates && capacity < kSmallStates;
   const auto list = [&](auto key, auto state) {
-    list_rows<decltype(key), decltype(state)>(in, capacity, isect_rows, tile_offsets, workspace, stream);
+    list_splats<decltype(key), decltype(state)>(in, capacity, isect_splats, tile_offsets, workspace, stream);
   };
   using std::uint16_t, std::uint32_t, std::uint64_t;
   if (n_tiles <= 65536) {

@@ -6,7 +6,7 @@
 #include <tuple>
 
 #include "common/op.h"
-#include "common/row_count_op.h"
+#include "common/splat_count_op.h"
 #include "common/tile_grid_op.h"
 
 namespace blitzgs {
@@ -24,44 +24,44 @@ void check_capacity(std::int64_t capacity, std::int64_t count) {
                   " intersections; pass the sum of tiles_touched, or -1 to have them counted");
 }
 
-std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
-                                     const Tensor& depths, const Tensor& camera_ids,
-                                     const std::optional<Tensor>& ids,
+std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
+                                     const Tensor& splat_opacities, const Tensor& depths,
+                                     const Tensor& camera_ids, const std::optional<Tensor>& ids,
                                      const std::vector<std::int64_t>& grid_numbers, std::int64_t n_isects,
-                                     const std::optional<Tensor>& known_rows, bool unchecked) {
+                                     const std::optional<Tensor>& known_splats, bool unchecked) {
   constexpr const char* kOp = "intersect";
   check_floating(kOp, "means2d", means2d);
-  const std::int64_t n_rows = means2d.size(0);
-  check_shape(kOp, "means2d", means2d, {n_rows, 2});
-  check_shape(kOp, "conics", conics, {n_rows, 3});
-  check_shape(kOp, "row_opacities", row_opacities, {n_rows});
-  check_shape(kOp, "depths", depths, {n_rows});
-  check_shape(kOp, "camera_ids", camera_ids, {n_rows});
+  const std::int64_t n_splats = means2d.size(0);
+  check_shape(kOp, "means2d", means2d, {n_splats, 2});
+  check_shape(kOp, "conics", conics, {n_splats, 3});
+  check_shape(kOp, "splat_opacities", splat_opacities, {n_splats});
+  check_shape(kOp, "depths", depths, {n_splats});
+  check_shape(kOp, "camera_ids", camera_ids, {n_splats});
   const ScalarType dtype = means2d.scalar_type();
   check_dtype(kOp, "conics", conics, dtype);
-  check_dtype(kOp, "row_opacities", row_opacities, dtype);
+  check_dtype(kOp, "splat_opacities", splat_opacities, dtype);
   check_dtype(kOp, "depths", depths, dtype);
   check_dtype(kOp, "camera_ids", camera_ids, ScalarType::Int);
   if (ids) {
-    check_shape(kOp, "ids", *ids, {n_rows});
+    check_shape(kOp, "ids", *ids, {n_splats});
     check_dtype(kOp, "ids", *ids, ScalarType::Long);
   }
-  const RowCount row_count = checked_row_count(kOp, known_rows, means2d);
+  const SplatCount splat_count = checked_splat_count(kOp, known_splats, means2d);
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   STD_TORCH_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(),
                   "blitzgs::intersect: tile numbers are 32-bit, got ", grid.count(),
                   " tiles; use larger tiles or render fewer views at once");
-  STD_TORCH_CHECK(n_rows <= std::numeric_limits<std::int32_t>::max(),
-                  "blitzgs::intersect: row indices are 32-bit, got ", n_rows,
-                  " rows; render fewer views at once");
+  STD_TORCH_CHECK(n_splats <= std::numeric_limits<std::int32_t>::max(),
+                  "blitzgs::intersect: splat indices are 32-bit, got ", n_splats,
+                  " splats; render fewer views at once");
 
   const Tensor means = as_contiguous(means2d), shapes = as_contiguous(conics),
-               opacities = as_contiguous(row_opacities), order = as_contiguous(depths),
+               opacities = as_contiguous(splat_opacities), order = as_contiguous(depths),
                cameras = as_contiguous(camera_ids);
-  std::optional<Tensor> id_rows;
-  if (ids) id_rows = as_contiguous(*ids);
+  std::optional<Tensor> id_splats;
+  if (ids) id_splats = as_contiguous(*ids);
   Tensor offsets = make_empty(means, {grid.count() + 1}, ScalarType::Long);
-  Tensor rows;
+  Tensor splats;
   DeviceScope scope(means);
   dispatch_floating(means, [&](auto zero) {
     using T = decltype(zero);
@@ -70,10 +70,10 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
                                data<T>(opacities),
                                data<T>(order),
                                data<std::int32_t>(cameras),
-                               data_or_null<std::int64_t>(id_rows),
-                               row_count.n_rows,
+                               data_or_null<std::int64_t>(id_splats),
+                               splat_count.n_splats,
                                grid,
-                               row_count.known_rows};
+                               splat_count.known_splats};
     std::int64_t capacity = n_isects;
     if (n_isects < 0 || (kWaitsForCounts && !unchecked)) {
       const std::int64_t needed = backend::count_intersections(in, scope.workspace, scope.stream);
@@ -82,19 +82,20 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
     }
     std::int64_t count = 0;
     try {
-      rows = make_empty(means, {capacity}, ScalarType::Int);
-      count = backend::intersect(in, capacity, mutable_data<std::int32_t>(rows),
+      splats = make_empty(means, {capacity}, ScalarType::Int);
+      count = backend::intersect(in, capacity, mutable_data<std::int32_t>(splats),
                                  mutable_data<std::int64_t>(offsets), scope.workspace, scope.stream);
     } catch (const std::exception& error) {
       // An error here means that memory ran out: the length of the lists follows from the splats, not from an
       // argument, so the message states it.
-      STD_TORCH_CHECK(false, "blitzgs::intersect: listing ", capacity, " intersections of ", n_rows,
-                      " rows failed; it takes about ", capacity * 20 / 1000000, " MB. Render fewer views at ",
+      STD_TORCH_CHECK(false, "blitzgs::intersect: listing ", capacity, " intersections of ", n_splats,
+                      " splats failed; it takes about ", capacity * 20 / 1000000,
+                      " MB. Render fewer views at ",
                       "once, in smaller images, or with a larger radius_clip. Cause: ", error.what());
     }
     check_capacity(capacity, count);
   });
-  return {rows, offsets};
+  return {splats, offsets};
 }
 
 }  // namespace

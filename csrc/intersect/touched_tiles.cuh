@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which tiles a row touches, found once and kept in 16 bytes. Only files that are compiled without
+// Which tiles a splat touches, found once and kept in 16 bytes. Only files that are compiled without
 // contraction may include this (cmake/cuda.cmake), because the projection must count the same tiles.
 #pragma once
 #include "common/running_sum.cuh"
@@ -19,10 +19,11 @@ struct SplatShape {
   int camera;
 };
 
-__device__ __forceinline__ SplatShape load_splat(const IntersectInput<float>& in, std::int64_t row) {
-  const float2 mean = reinterpret_cast<const float2*>(in.means2d)[row];
-  const float* const conic = in.conics + 3 * row;
-  const SplatShape s{{mean.x, mean.y}, {conic[0], conic[1], conic[2]}, in.opacities[row], in.camera_ids[row]};
+__device__ __forceinline__ SplatShape load_splat(const IntersectInput<float>& in, std::int64_t index) {
+  const float2 mean = reinterpret_cast<const float2*>(in.means2d)[index];
+  const float* const conic = in.conics + 3 * index;
+  const SplatShape s{
+      {mean.x, mean.y}, {conic[0], conic[1], conic[2]}, in.opacities[index], in.camera_ids[index]};
   // This makes the thread wait for all loads together. Otherwise the compiler moves each load behind the
   // tests before it.
   asm volatile("" ::"f"(s.mean[0]), "f"(s.mean[1]), "f"(s.conic[0]), "f"(s.conic[1]), "f"(s.conic[2]),
@@ -43,7 +44,7 @@ __device__ __forceinline__ void for_each_owned(const TileGrid& grid, const Splat
                     });
 }
 
-// The owned tiles that a row touches. The compact form is tile `first` (counted from tile_begin) and up to
+// The owned tiles that a splat touches. The compact form is tile `first` (counted from tile_begin) and up to
 // twelve tile rows of a byte each: the low half of the byte is the number of tiles, the high half 8 + the
 // shift of the first of them against that of the first tile row. Other shapes have first = kWalk, and their
 // number of tiles in rows[0].
@@ -62,7 +63,7 @@ struct alignas(16) Touched {
 
   __device__ bool compact() const { return first != kWalk; }
 
-  // Returns tile k < count() of a compact row, counted from tile_begin.
+  // Returns tile k < count() of a compact splat, counted from tile_begin.
   __device__ std::uint32_t tile(std::uint32_t k, std::uint32_t tiles_x) const {
     std::uint32_t start = first, word = rows[0];
     // Byte j of `through` is the number of tiles in rows 0 to j of the word.

@@ -103,7 +103,7 @@ BLITZGS_HD float upper_value(const FrustumPlane& plane, const Vec3<float>& mean,
   return mul_add(plane.n_error, norm, mul_add(plane.n[2], mean.z, value));
 }
 
-// False only when project_row would be false whatever the Gaussian's shape.
+// False only when project_splat would be false whatever the Gaussian's shape.
 BLITZGS_HD bool may_be_in_depth(const Frustum& view, const Vec3<float>& mean, float norm) {
   return upper_value(view.planes[0], mean, norm) >= 0.0f && upper_value(view.planes[1], mean, norm) >= 0.0f;
 }

@@ -9,7 +9,7 @@
 #include "common/catch.h"
 #include "math/projection.h"
 #include "math/sh.h"
-#include "project/project_row.h"
+#include "project/project_splat.h"
 
 using namespace blitzgs;
 using Values = std::vector<double>;
@@ -117,36 +117,36 @@ TEST_CASE("spherical harmonics: derivative at every degree") {
 TEST_CASE("conic and compensation: derivative") {
   for (unsigned seed = 30; seed < 34; ++seed) {
     const Values rows = random_values(6, seed, 3.0), weights = random_values(4, seed + 10, 10.0);
-    const auto splat_of = [](const Values& m) {
+    const auto footprint_of = [](const Values& m) {
       const Columns3<double> axes{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
       PixelGradients<double> g{};
       g.gx = load3(m.data());
       g.gy = load3(m.data() + 3);
-      return make_splat(g, axes, 0.3);
+      return make_footprint(g, axes, 0.3);
     };
     Vec3<double> v0, v1;
-    splat_vjp(splat_of(rows), weights.data(), weights[3], &v0, &v1);
+    footprint_vjp(footprint_of(rows), weights.data(), weights[3], &v0, &v1);
     require_gradient(
         [&](const Values& m) {
-          const Splat<double> s = splat_of(m);
+          const Footprint<double> s = footprint_of(m);
           return Values{s.conic[0], s.conic[1], s.conic[2], compensation(s)};
         },
         rows, weights, {v0.x, v0.y, v0.z, v1.x, v1.y, v1.z});
   }
 }
 
-TEST_CASE("a splat seen exactly edge-on has finite gradients") {
+TEST_CASE("a footprint seen exactly edge-on has finite gradients") {
   const Columns3<double> axes{{1, 0, 0}, {0, 0, 0}, {0, 0, 0}};
   const PixelGradients<double> g{{2, 0, 0}, {1, 0, 0}, 0, 0, 1, true, true};
-  const Splat<double> s = make_splat(g, axes, 0.3);
+  const Footprint<double> s = make_footprint(g, axes, 0.3);
   REQUIRE(compensation(s) == 0.0);
   const double v_conic[3] = {1, 2, 3};
   Vec3<double> v0, v1;
-  splat_vjp(s, v_conic, 5.0, &v0, &v1);
+  footprint_vjp(s, v_conic, 5.0, &v0, &v1);
   REQUIRE(is_finite(v0.x + v0.y + v0.z + v1.x + v1.y + v1.z));
 }
 
-TEST_CASE("a row: derivative with respect to mean, axes and pose") {
+TEST_CASE("a splat: derivative with respect to mean, axes and pose") {
   // Inside the image, and outside of the slopes where the Jacobian is clamped (left, and below).
   const double means[3][3] = {{0.1, 0.2, -0.3}, {-2.6, 0.1, 0.2}, {0.3, 2.5, 0.4}};
   for (const auto& mean : means) {
@@ -175,11 +175,11 @@ TEST_CASE("a row: derivative with respect to mean, axes and pose") {
         return gaussian;
       };
       const Values weights = random_values(7, 60, 5.0);
-      const RowGradient<double> v{
+      const GeometryGradient<double> v{
           {weights[0], weights[1]}, {weights[2], weights[3], weights[4]}, weights[5], weights[6]};
       GaussianGradient<double> gradient{};
       PoseGradient<double> pose{};
-      project_row_vjp(camera_of(x), gaussian_of(x), options, v, &gradient, &pose);
+      project_splat_vjp(camera_of(x), gaussian_of(x), options, v, &gradient, &pose);
       Values expected{gradient.mean.x, gradient.mean.y, gradient.mean.z};
       for (const double value : flat(gradient.axes)) expected.push_back(value);
       for (const Vec3<double>& row : {pose.row_x, pose.row_y, pose.row_z, pose.translation}) {
@@ -187,10 +187,10 @@ TEST_CASE("a row: derivative with respect to mean, axes and pose") {
       }
       require_gradient(
           [&](const Values& values) {
-            Row<double> row{};
-            REQUIRE(project_row(camera_of(values), gaussian_of(values), options, &row));
-            return Values{row.mean2d[0], row.mean2d[1], row.conic[0], row.conic[1],
-                          row.conic[2],  row.depth,     row.opacity};
+            Splat<double> splat{};
+            REQUIRE(project_splat(camera_of(values), gaussian_of(values), options, &splat));
+            return Values{splat.mean2d[0], splat.mean2d[1], splat.conic[0], splat.conic[1],
+                          splat.conic[2],  splat.depth,     splat.opacity};
           },
           x, weights, expected);
     }
@@ -206,11 +206,11 @@ TEST_CASE("needles: the stored conic keeps its determinant, the gradient its dig
       const Vec3<float> gx{length * x, -0.5f * y, 0.03f}, gy{length * y, 0.5f * x, 0.02f};
       const PixelGradients<float> g{gx, gy, 0, 0, 1, true, true};
       const PixelGradients<double> wide{{gx.x, gx.y, gx.z}, {gy.x, gy.y, gy.z}, 0, 0, 1, true, true};
-      const Splat<double> exact = make_splat(wide, wide_axes, 0.3);
-      const Splat<float> splat = make_splat(g, axes, 0.3f);
+      const Footprint<double> exact = make_footprint(wide, wide_axes, 0.3);
+      const Footprint<float> footprint = make_footprint(g, axes, 0.3f);
       INFO("length " << length << ", angle " << angle);
       float conic[3];
-      store_conic(splat, conic);
+      store_conic(footprint, conic);
       for (int k = 0; k < 3; ++k) {
         REQUIRE(conic[k] ==
                 Approx(exact.conic[k]).epsilon(1e-5).margin(1e-6 * (exact.conic[0] + exact.conic[2])));
@@ -221,8 +221,8 @@ TEST_CASE("needles: the stored conic keeps its determinant, the gradient its dig
       const double wide_v[3] = {1.0, -2.0, 3.0};
       Vec3<float> v0, v1;
       Vec3<double> w0, w1;
-      splat_vjp(splat, v_conic, 0.5f, &v0, &v1);
-      splat_vjp(exact, wide_v, 0.5, &w0, &w1);
+      footprint_vjp(footprint, v_conic, 0.5f, &v0, &v1);
+      footprint_vjp(exact, wide_v, 0.5, &w0, &w1);
       const double size = std::sqrt(dot(w0, w0) + dot(w1, w1));
       const Values got{v0.x, v0.y, v0.z, v1.x, v1.y, v1.z}, wanted{w0.x, w0.y, w0.z, w1.x, w1.y, w1.z};
       for (int k = 0; k < 6; ++k) REQUIRE(got[k] == Approx(wanted[k]).margin(3e-5 * size));
@@ -242,21 +242,22 @@ TEST_CASE("elongated and extreme splats keep their float determinant") {
       const auto b = activate_gaussian<float>({0.1f, 0.2f, -0.3f}, quat, {length, thin, thin}, 0.9f);
       const Camera<double> camera = test_camera<double>();
       const Camera<float> camera_f = test_camera<float>();
-      const Splat<double> s = make_splat(pixel_gradients(camera, project_mean(camera, a.mean)), a.axes, 0.3);
-      const Splat<float> f =
-          make_splat(pixel_gradients(camera_f, project_mean(camera_f, b.mean)), b.axes, 0.3f);
+      const Footprint<double> s =
+          make_footprint(pixel_gradients(camera, project_mean(camera, a.mean)), a.axes, 0.3);
+      const Footprint<float> f =
+          make_footprint(pixel_gradients(camera_f, project_mean(camera_f, b.mean)), b.axes, 0.3f);
       INFO("size " << size << ", ratio " << ratio);
       REQUIRE(f.root_det * f.magnitude == Approx(s.root_det * s.magnitude).epsilon(1e-5));
       REQUIRE(f.conic[0] == Approx(s.conic[0]).epsilon(1e-5));
       REQUIRE(f.conic[1] == Approx(s.conic[1]).epsilon(1e-5).margin(1e-6 * s.conic[0]));
       REQUIRE(f.conic[2] == Approx(s.conic[2]).epsilon(1e-5));
       REQUIRE(compensation(f) == Approx(compensation(s)).epsilon(1e-4).margin(1e-7));
-      Row<double> row_exact{};
-      Row<float> row{};
-      REQUIRE(project_row(camera, a, exact, &row_exact) == project_row(camera_f, b, rounded, &row));
-      const RowGradient<float> v{{1, 1}, {1, 1, 1}, 1, 1};
+      Splat<double> splat_exact{};
+      Splat<float> splat{};
+      REQUIRE(project_splat(camera, a, exact, &splat_exact) == project_splat(camera_f, b, rounded, &splat));
+      const GeometryGradient<float> v{{1, 1}, {1, 1, 1}, 1, 1};
       GaussianGradient<float> gradient{};
-      project_row_vjp(camera_f, b, rounded, v, &gradient, static_cast<PoseGradient<float>*>(nullptr));
+      project_splat_vjp(camera_f, b, rounded, v, &gradient, static_cast<PoseGradient<float>*>(nullptr));
       for (const Vec3<float>& g : {gradient.mean, gradient.axes.x, gradient.axes.y, gradient.axes.z}) {
         REQUIRE(is_finite(g.x + g.y + g.z));
       }
@@ -264,7 +265,7 @@ TEST_CASE("elongated and extreme splats keep their float determinant") {
   }
 }
 
-TEST_CASE("the frustum never drops a row that exists") {
+TEST_CASE("the frustum never drops a splat that exists") {
   std::mt19937 engine(7);
   std::normal_distribution<float> normal;
   const Camera<float> camera = test_camera<float>();
@@ -277,8 +278,8 @@ TEST_CASE("the frustum never drops a row that exists") {
                             std::exp(normal(engine) - 2)};
     const float quat[4] = {normal(engine), normal(engine), normal(engine), normal(engine)};
     const float opacity = 1 / (1 + std::exp(-3 * normal(engine)));
-    Row<float> row{};
-    const bool exists = project_row(camera, activate_gaussian(mean, quat, scale, opacity), options, &row);
+    Splat<float> splat{};
+    const bool exists = project_splat(camera, activate_gaussian(mean, quat, scale, opacity), options, &splat);
     const float norm = norm1(mean), widest = larger(larger(scale.x, scale.y), scale.z);
     const bool maybe = may_be_in_depth(view, mean, norm) && may_overlap(view, mean, norm, widest);
     REQUIRE((maybe || !exists));
@@ -289,19 +290,20 @@ TEST_CASE("the frustum never drops a row that exists") {
   REQUIRE(spared > 5000);
 }
 
-TEST_CASE("nothing that is not finite becomes a row") {
+TEST_CASE("nothing that is not finite becomes a splat") {
   const float bad[] = {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()};
   const Camera<float> camera = test_camera<float>();
   const ProjectOptions<float> options{64, 48, 16, 0, 1, 0.01f, 1e10f, 0.3f, 0.0f, false, false};
   for (const float value : bad) {
     for (int slot = 0; slot < 11; ++slot) {
       float p[11] = {0.1f, 0.2f, -0.3f, 1, 0, 0, 0, 0.1f, 0.1f, 0.1f, 0.5f};
-      Row<float> row{};
-      REQUIRE(project_row(camera, activate_gaussian(load3(p), p + 3, load3(p + 7), p[10]), options, &row));
+      Splat<float> splat{};
+      REQUIRE(
+          project_splat(camera, activate_gaussian(load3(p), p + 3, load3(p + 7), p[10]), options, &splat));
       p[slot] = value;
       INFO("slot " << slot);
       const auto gaussian = activate_gaussian(load3(p), p + 3, load3(p + 7), p[10]);
-      REQUIRE_FALSE(project_row(camera, gaussian, options, &row));
+      REQUIRE_FALSE(project_splat(camera, gaussian, options, &splat));
     }
   }
 }

@@ -89,9 +89,10 @@ BLITZGS_HD PixelGradients<T> pixel_gradients(const Camera<T>& camera, const Proj
   return g;
 }
 
-// The splat: M's rows, the blurred covariance's diagonal, its inverse (conic a, b, c) and determinant.
+// The footprint of a Gaussian in the image: M's rows, the blurred covariance's diagonal, its inverse (conic
+// a, b, c) and determinant.
 template <class T>
-struct Splat {
+struct Footprint {
   Vec3<T> m0, m1;
   T cov_xx, cov_yy;
   T conic[3];
@@ -105,8 +106,8 @@ struct Splat {
 // Quantities are divided by the larger diagonal entry before they are multiplied, so that neither 1e-8 nor
 // 1e4 pixel scales leave the range of float.
 template <class T>
-BLITZGS_HD Splat<T> make_splat(const PixelGradients<T>& g, const Columns3<T>& axes, T eps2d) {
-  Splat<T> s;
+BLITZGS_HD Footprint<T> make_footprint(const PixelGradients<T>& g, const Columns3<T>& axes, T eps2d) {
+  Footprint<T> s;
   s.m0 = {dot(g.gx, axes.x), dot(g.gx, axes.y), dot(g.gx, axes.z)};
   s.m1 = {dot(g.gy, axes.x), dot(g.gy, axes.y), dot(g.gy, axes.z)};
   const T xx = dot(s.m0, s.m0), xy = dot(s.m0, s.m1), yy = dot(s.m1, s.m1);
@@ -132,7 +133,7 @@ BLITZGS_HD Splat<T> make_splat(const PixelGradients<T>& g, const Columns3<T>& ax
 // hundred times longer than wide. The function therefore tries floats next to a, scales b with a (the axis
 // has the direction (-b, a)), and keeps the pair for which some float c gives the determinant best.
 template <class T>
-BLITZGS_HD void store_conic(const Splat<T>& s, T* conic) {
+BLITZGS_HD void store_conic(const Footprint<T>& s, T* conic) {
   for (int i = 0; i < 3; ++i) conic[i] = s.conic[i];
   if constexpr (sizeof(T) == sizeof(float)) {
     constexpr T kLong = 64;  // ac / (ac - b^2)
@@ -158,7 +159,7 @@ BLITZGS_HD void store_conic(const Splat<T>& s, T* conic) {
 
 // sqrt(det Sigma / det Sigma'): in antialiased mode, the factor by which the blur lowers the peak of a splat.
 template <class T>
-BLITZGS_HD T compensation(const Splat<T>& s) {
+BLITZGS_HD T compensation(const Footprint<T>& s) {
   return s.normal_length / s.root_det;
 }
 
@@ -167,8 +168,8 @@ BLITZGS_HD T compensation(const Splat<T>& s) {
 // M. Computed as a matrix product, Q M loses every digit for a splat a thousand times longer than wide. The
 // form (m1 x n + eps m0, n x m0 + eps m1) / det with n = m0 x m1 loses none.
 template <class T>
-BLITZGS_HD void splat_vjp(const Splat<T>& s, const T* v_conic, T v_compensation, Vec3<T>* v_m0,
-                          Vec3<T>* v_m1) {
+BLITZGS_HD void footprint_vjp(const Footprint<T>& s, const T* v_conic, T v_compensation, Vec3<T>* v_m0,
+                              Vec3<T>* v_m1) {
   const T a = s.conic[0], b = s.conic[1], c = s.conic[2];
   const T p = v_conic[0], q = T(0.5) * v_conic[1], r = v_conic[2];
   const T shrink = T(1) / (s.root_det * s.root_det * s.magnitude);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What the three kernels of the projection share: the prefilter hands the Gaussians that some view may see to
-// the kernel that projects them and writes rows, and that hands the rows to the kernel of the colours.
+// the kernel that projects them and writes splats, and that hands the splats to the kernel of the colours.
 #pragma once
 #include "common/turn_sums.cuh"
 #include "project/project_device.cuh"
@@ -28,10 +28,10 @@ inline std::int64_t most_prefilter_turns(std::int64_t candidates) {
 
 // Gaussians that a block projects at a time, a thread each at first, and the most pairs of one and a view
 // that these make.
-inline constexpr int kRowThreads = 128, kMostPairs = 512;
+inline constexpr int kSplatThreads = 128, kMostPairs = 512;
 
 __host__ __device__ inline int projected_at_once(int n_views) {
-  return n_views > kMostPairs / kRowThreads ? kMostPairs / n_views : kRowThreads;
+  return n_views > kMostPairs / kSplatThreads ? kMostPairs / n_views : kSplatThreads;
 }
 
 // For a RunningSum over so many turns, or their TurnSums.
@@ -51,12 +51,13 @@ __device__ inline std::int64_t candidate_id(const Inputs& in, std::int64_t candi
   return in.active_ids ? in.active_ids[candidate] : candidate;
 }
 
-// What is to be read of rows that write_rows had room for: nothing where they did not fit.
+// What is to be read of splats that write_splats had room for: nothing where they did not fit.
 __device__ inline ProjectSizes fitting(const ProjectCapacity& capacity) {
   if (!capacity.totals) return capacity.sizes;
-  const ProjectSizes sizes{capacity.totals[kTotalVisible], capacity.totals[kTotalRows]};
-  return sizes.visible <= capacity.sizes.visible && sizes.rows <= capacity.sizes.rows ? sizes
-                                                                                      : ProjectSizes{0, 0};
+  const ProjectSizes sizes{capacity.totals[kTotalVisible], capacity.totals[kTotalSplats]};
+  return sizes.visible <= capacity.sizes.visible && sizes.splats <= capacity.sizes.splats
+             ? sizes
+             : ProjectSizes{0, 0};
 }
 
 // The Gaussians that some views may see, in the order of the candidates, and these views as bits:
@@ -75,10 +76,10 @@ struct Prefiltered {
 };
 
 void prefilter(const Inputs&, const Prefiltered&, Workspace&, CudaStream);
-// totals: null, where they are known. With no room rows are counted only.
-void write_rows(const Inputs&, const RankTiles&, const Prefiltered&, const ProjectSizes& capacity,
-                const ProjectColumns<float>&, std::int64_t* totals, Workspace&, CudaStream);
-// Of the rows that write_rows wrote; none without sh.
+// totals: null, where they are known. With no room splats are counted only.
+void write_splats(const Inputs&, const RankTiles&, const Prefiltered&, const ProjectSizes& capacity,
+                  const ProjectColumns<float>&, std::int64_t* totals, Workspace&, CudaStream);
+// Of the splats that write_splats wrote; none without sh.
 void write_colors(const Inputs&, const ProjectCapacity&, const ProjectColumns<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

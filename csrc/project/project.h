@@ -1,34 +1,36 @@
 // SPDX-License-Identifier: Apache-2.0
-// Projection: N Gaussians and B views to rows, one for each Gaussian that a view sees. The arithmetic of one
-// row is project_row.h.
+// Projection: N Gaussians and B views to splats, one for each Gaussian that a view sees. The arithmetic of
+// one splat is project_splat.h.
 //
-// A row exists iff near < z <= far, its opacity (compensated when antialiased) is >= 1/255, the box around
+// A splat exists iff near < z <= far, its opacity (compensated when antialiased) is >= 1/255, the box around
 // alpha >= 1/255 overlaps the image and reaches beyond radius_clip, its view is in the candidate's mask, and
 // its geometry is finite: a NaN or infinite parameter hides its Gaussian and spreads nowhere. With
-// radius_clip = 0 no dropped row could have changed a pixel. A row whose colour is not finite is there but
-// hidden: opacity, colour, radii and tiles_touched are 0, so nothing composites it (SH rows are by far the
-// most bytes, and are read once, for rows alone).
+// radius_clip = 0 no dropped splat could have changed a pixel. A splat whose colour is not finite is there
+// but hidden: opacity, colour, radii and tiles_touched are 0, so nothing composites it (SH rows are by far
+// the most bytes, and are read once, for splats alone).
 //
-// Rows are ordered by (Gaussian, view). Every value of a row depends on its Gaussian and view alone, so rows
-// are bit-identical however Gaussians are divided among calls. O(candidates * B + rows); no output of size N.
+// Splats are ordered by (Gaussian, view). Every value of a splat depends on its Gaussian and view alone, so
+// splats are bit-identical however Gaussians are divided among calls. O(candidates * B + splats); no output
+// of size N.
 //
-// project() counts the rows and writes them, by three kernels on CUDA: the prefilter lists, from few bytes
-// per candidate, the views that may see it; write_rows projects those pairs, counts what are rows and writes
-// each behind those before it, in one launch; write_colors adds the colours. With a capacity given, CUDA does
-// all of that without waiting for the number of rows; without one it waits for the number and then writes.
+// project() counts the splats and writes them, by three kernels on CUDA: the prefilter lists, from few bytes
+// per candidate, the views that may see it; write_splats projects those pairs, counts what are splats and
+// writes each behind those before it, in one launch; write_colors adds the colours. With a capacity given,
+// CUDA does all of that without waiting for the number of splats; without one it waits for the number and
+// then writes.
 //
-// On several ranks, rank_tiles says which tiles each composites. The walk over a row's tiles that counts them
-// then also finds the ranks that the row has to reach.
+// On several ranks, rank_tiles says which tiles each composites. The walk over a splat's tiles that counts
+// them then also finds the ranks that the splat has to reach.
 //
-// project_bwd visits each visible Gaussian once, recomputes its rows and sums their gradients in row order:
-// no atomics, deterministic. The pose gradient is summed in double over fixed blocks of Gaussians.
+// project_bwd visits each visible Gaussian once, recomputes its splats and sums their gradients in splat
+// order: no atomics, deterministic. The pose gradient is summed in double over fixed blocks of Gaussians.
 #pragma once
 #include <cstddef>
 #include <cstdint>
 
 #include "common/stream.h"
 #include "math/rank_tiles.h"
-#include "project/project_row.h"
+#include "project/project_splat.h"
 #include "project/splat_gradients.h"
 
 namespace blitzgs {
@@ -47,10 +49,10 @@ struct ProjectInputs {
   const std::int32_t* n_active = nullptr;
 };
 
-// What project() sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P rows,
-// the tiles they touch (an upper bound: hidden rows count), the rows of each view [B], and for each rank its
-// rows and the tiles they touch there [M, 2].
-inline constexpr int kTotalVisible = 0, kTotalRows = 1, kTotalTiles = 2, kTotalViews = 3;
+// What project() sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P splats,
+// the tiles they touch (an upper bound: hidden splats count), the splats of each view [B], and for each rank
+// its splats and the tiles they touch there [M, 2].
+inline constexpr int kTotalVisible = 0, kTotalSplats = 1, kTotalTiles = 2, kTotalViews = 3;
 
 BLITZGS_HD std::int64_t project_totals(std::int64_t n_views, std::int64_t n_ranks) {
   return kTotalViews + n_views + 2 * n_ranks;
@@ -60,9 +62,9 @@ inline constexpr std::int64_t kProjectBlock = 1024;
 
 inline std::int64_t project_blocks(std::int64_t items) { return (items + kProjectBlock - 1) / kProjectBlock; }
 
-// Visible Gaussians and rows.
+// Visible Gaussians and splats.
 struct ProjectSizes {
-  std::int64_t visible, rows;
+  std::int64_t visible, splats;
 };
 
 // How many there is room for, and what there is, as project_totals where the inputs are; null: exactly so
@@ -72,35 +74,35 @@ struct ProjectCapacity {
   const std::int64_t* totals;
 };
 
-// Which Gaussian and view each row is of, and where the rows of each visible Gaussian begin: [P], [P], [U],
-// [U + 1].
+// Which Gaussian and view each splat is of, and where the splats of each visible Gaussian begin: [P], [P],
+// [U], [U + 1].
 struct ProjectIds {
-  std::int32_t *gaussian_ids, *camera_ids, *visible_ids, *row_offsets;
+  std::int32_t *gaussian_ids, *camera_ids, *visible_ids, *splat_offsets;
 };
 
-// colors is null without sh, rank_masks (bit m: rank m composites tiles of the row) without ranks. row_ids:
-// the persistent ids of the rows' Gaussians, from those of all, ids [N]; null: not wanted.
+// colors is null without sh, rank_masks (bit m: rank m composites tiles of the splat) without ranks.
+// splat_ids: the persistent ids of the splats' Gaussians, from those of all, ids [N]; null: not wanted.
 template <class T>
 struct ProjectOutputs {
   T *means2d, *conics, *depths, *opacities, *colors;
   std::int32_t *radii, *tiles_touched;
-  std::int64_t *rank_masks, *row_ids;
+  std::int64_t *rank_masks, *splat_ids;
   const std::int64_t* ids;
 };
 
-// Where project() puts the rows.
+// Where project() puts the splats.
 template <class T>
 struct ProjectColumns {
   ProjectIds ids;
   ProjectOutputs<T> values;
 };
 
-// Memory for the rows, from the caller of project().
+// Memory for the splats, from the caller of project().
 template <class T>
-class RowMemory {
+class SplatMemory {
  public:
-  virtual ~RowMemory() = default;
-  // CUDA: rows for which the caller has asked for room before their number is known; null: as many as there
+  virtual ~SplatMemory() = default;
+  // CUDA: splats for which the caller has asked for room before their number is known; null: as many as there
   // are.
   virtual const ProjectSizes* capacity() const = 0;
   // Called once.
@@ -116,28 +118,28 @@ struct ProjectGradients {
 };
 
 // What the backward pass knows of the forward pass.
-struct ProjectRows {
-  const std::int32_t *camera_ids, *visible_ids, *row_offsets;
+struct SplatIndex {
+  const std::int32_t *camera_ids, *visible_ids, *splat_offsets;
   std::int64_t n_visible;
 };
 
 namespace cpu {
 template <class T>
-void project(const ProjectInputs<T>&, const RankTiles&, RowMemory<T>&, std::int64_t* totals, Workspace&,
+void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
-// scale_reg [B] or null: adds scale_reg[b] * d(min_j s_j) for each row in view b (the paper's L_scale).
+// scale_reg [B] or null: adds scale_reg[b] * d(min_j s_j) for each splat in view b (the paper's L_scale).
 template <class T>
-void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const SplatGradientColumns<T>&,
+void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
                  const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
-// Where the rows do not fit into the capacity, the totals are right all the same; the columns then hold the
-// first rows without colours.
+// Where the splats do not fit into the capacity, the totals are right all the same; the columns then hold the
+// first splats without colours.
 template <class T>
-void project(const ProjectInputs<T>&, const RankTiles&, RowMemory<T>&, std::int64_t* totals, Workspace&,
+void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
 template <class T>
-void project_bwd(const ProjectInputs<T>&, const ProjectRows&, const SplatGradientSource&, const T* scale_reg,
+void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&, const T* scale_reg,
                  const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cuda
 

@@ -70,18 +70,18 @@ __global__ void __launch_bounds__(kPoseThreads)
   PoseGradient<float> pose{};
   for (int round = 0; round < static_cast<int>(kProjectBlock) / kPoseThreads; ++round) {
     const std::int64_t u = blockIdx.x * kProjectBlock + round * kPoseThreads + threadIdx.x;
-    if (u >= args.rows.n_visible) break;
-    for (std::int64_t r = args.rows.row_offsets[u]; r < args.rows.row_offsets[u + 1]; ++r) {
-      if (args.rows.camera_ids[r] != view) continue;
-      const std::int64_t id = args.rows.visible_ids[u];
+    if (u >= args.splats.n_visible) break;
+    for (std::int64_t r = args.splats.splat_offsets[u]; r < args.splats.splat_offsets[u + 1]; ++r) {
+      if (args.splats.camera_ids[r] != view) continue;
+      const std::int64_t id = args.splats.visible_ids[u];
       const ActiveGaussian<float> gaussian = load_gaussian(in, id);
       GaussianGradient<float> unused{};
-      project_row_vjp(cameras[view], gaussian, in.options, args.v.geometry(r), &unused, &pose);
+      project_splat_vjp(cameras[view], gaussian, in.options, args.v.geometry(r), &unused, &pose);
       if (!in.sh || !args.v.colored()) continue;
       const Vec3<float> v_color = args.v.color(r);
       float v_sh[3 * kMaxShBasis] = {};
-      row_color_vjp(cameras[view], gaussian.mean, in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree,
-                    &v_color.x, v_sh, &unused.mean, &pose);
+      splat_color_vjp(cameras[view], gaussian.mean, in.sh + 3 * in.options.sh_stride * id,
+                      in.options.sh_degree, &v_color.x, v_sh, &unused.mean, &pose);
     }
   }
   const Vec3<float> columns[4] = {pose.row_x, pose.row_y, pose.row_z, pose.translation};
@@ -113,24 +113,24 @@ __global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks
 }  // namespace
 
 template <>
-void project_bwd<float>(const Inputs& in, const ProjectRows& rows, const SplatGradientSource& v,
+void project_bwd<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
                         const float* scale_reg, const ProjectGradients<float>& out, Workspace& workspace,
                         CudaStream stream) {
-  const std::int64_t blocks = project_blocks(rows.n_visible);
+  const std::int64_t blocks = project_blocks(splats.n_visible);
   if (out.viewmats && in.n_views > 0) {
     const std::size_t bytes = 16 * in.n_views * sizeof(float);
     check(cudaMemsetAsync(out.viewmats, 0, bytes, stream), "project_bwd");
   }
   if (blocks == 0) return;
   const StoreGradients sink{out, 3 * in.options.sh_stride};
-  dispatch_backward(in, rows, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
+  dispatch_backward(in, splats, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
     launch_backward<degree.value, quads.value>(args, sink, stream);
   });
   if (!out.viewmats) return;
   auto* partial = workspace.allocate<double>(blocks * in.n_views * 12);
   std::visit(
       [&](const auto& source) {
-        const BackwardInputs<std::decay_t<decltype(source)>> args{in, rows, source, scale_reg};
+        const BackwardInputs<std::decay_t<decltype(source)>> args{in, splats, source, scale_reg};
         const dim3 grid(static_cast<unsigned>(blocks), in.n_views);
         pose_kernel<<<grid, kPoseThreads, 0, stream>>>(args, partial);
       },

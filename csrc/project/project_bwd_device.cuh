@@ -12,18 +12,18 @@ constexpr int kBackwardThreads = 128;
 template <class Source>
 struct BackwardInputs {
   Inputs in;
-  ProjectRows rows;
+  SplatIndex splats;
   Source v;
   const float* scale_reg;
 };
 
 // Calls f(degree, quads, BackwardInputs) with degree and quads as dispatch_sh has them.
 template <class F>
-void dispatch_backward(const Inputs& in, const ProjectRows& rows, const SplatGradientSource& v,
+void dispatch_backward(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
                        const float* scale_reg, const F& f) {
   std::visit(
       [&](const auto& source) {
-        const BackwardInputs<std::decay_t<decltype(source)>> args{in, rows, source, scale_reg};
+        const BackwardInputs<std::decay_t<decltype(source)>> args{in, splats, source, scale_reg};
         dispatch_sh(in, [&](auto degree, auto quads) { f(degree, quads, args); });
       },
       v);
@@ -53,10 +53,10 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   TripleStage& triple = triples[threadIdx.x / 32];
   const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kBackwardThreads) + threadIdx.x / 32 * 32;
   const std::int64_t u = first + lane;
-  const bool exists = u < args.rows.n_visible;
-  const std::int32_t id = exists ? args.rows.visible_ids[u] : -1,
-                     begin = exists ? args.rows.row_offsets[u] : 0,
-                     end = exists ? args.rows.row_offsets[u + 1] : 0;
+  const bool exists = u < args.splats.n_visible;
+  const std::int32_t id = exists ? args.splats.visible_ids[u] : -1,
+                     begin = exists ? args.splats.splat_offsets[u] : 0,
+                     end = exists ? args.splats.splat_offsets[u + 1] : 0;
   const std::int64_t stride = 3 * in.options.sh_stride;
   const bool has_colors = in.sh && args.v.colored();
   using Reader = SplatGradientReader<Source>;
@@ -71,15 +71,15 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   float quat[4];
   load_quat(in, known, quat);
   const float opacity = in.opacities[known];
-  RowGradient<float> v_row{};
+  GeometryGradient<float> v_splat{};
   int view = 0;
-  const auto load_row = [&](std::int64_t r) {
+  const auto load_splat = [&](std::int64_t r) {
     if (r >= end) return;
-    view = args.rows.camera_ids[r];
-    if constexpr (!Reader::kPulls) v_row = args.v.geometry(r);
+    view = args.splats.camera_ids[r];
+    if constexpr (!Reader::kPulls) v_splat = args.v.geometry(r);
   };
-  load_row(begin);
-  const WarpRows warp{first, args.rows.n_visible - first, id, static_cast<int>(threadIdx.x) / 32, lane};
+  load_splat(begin);
+  const WarpRows warp{first, args.splats.n_visible - first, id, static_cast<int>(threadIdx.x) / 32, lane};
   reader.pull(begin, end);
   load_cameras(in, cameras);
   auto own = sink.begin(shared, warp);
@@ -94,10 +94,10 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   PoseGradient<float>* no_pose = nullptr;
   reader.finish_pull(begin, end);
   reader.for_each(begin, end, [&](std::int64_t r, const auto& v) {
-    if constexpr (Reader::kPulls) v_row = v.geometry(r);
-    project_row_vjp(cameras[view], gaussian, in.options, v_row, &gradient, no_pose);
+    if constexpr (Reader::kPulls) v_splat = v.geometry(r);
+    project_splat_vjp(cameras[view], gaussian, in.options, v_splat, &gradient, no_pose);
     if (args.scale_reg) axis_weight += args.scale_reg[view];
-    load_row(r + 1);
+    load_splat(r + 1);
   });
 
   // The colours after the geometry, so that their coefficients are in registers for no longer than needed.
@@ -116,8 +116,8 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
     }
     reader.for_each(begin, end, [&](std::int64_t r, const auto& v) {
       const Vec3<float> v_color = v.color(r);
-      row_color_vjp(cameras[args.rows.camera_ids[r]], mean, sh.values, DEGREE, &v_color.x, v_sh.values,
-                    &gradient.mean, no_pose);
+      splat_color_vjp(cameras[args.splats.camera_ids[r]], mean, sh.values, DEGREE, &v_color.x, v_sh.values,
+                      &gradient.mean, no_pose);
     });
   }
   if constexpr (QUADS) stage.write(lane, v_sh);
@@ -144,7 +144,7 @@ void launch_backward(const BackwardInputs<Source>& args, const Sink& sink, CudaS
     check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)),
           "project_bwd");
   }
-  const unsigned blocks = blocks_for(args.rows.n_visible, kBackwardThreads);
+  const unsigned blocks = blocks_for(args.splats.n_visible, kBackwardThreads);
   kernel<<<blocks, kBackwardThreads, bytes, stream>>>(args, sink);
   check_launch("project_bwd");
 }

@@ -9,23 +9,23 @@
 namespace blitzgs {
 namespace {
 
-// What both ops know of the forward pass: (camera_ids, visible_ids, row_offsets). Held here so that the raw
+// What both ops know of the forward pass: (camera_ids, visible_ids, splat_offsets). Held here so that the raw
 // pointers stay valid.
-struct BackwardRows {
-  Tensor camera_ids, visible_ids, row_offsets;
+struct BackwardSplats {
+  Tensor camera_ids, visible_ids, splat_offsets;
   OptionalTensor scale_reg;
 
-  BackwardRows(const char* op, const ProjectArguments& p, const TensorList& rows,
-               const OptionalTensor& scale_reg_in)
+  BackwardSplats(const char* op, const ProjectArguments& p, const TensorList& splats,
+                 const OptionalTensor& scale_reg_in)
       : scale_reg(contiguous_or_none(scale_reg_in)) {
-    check_group(op, "(camera_ids, visible_ids, row_offsets)", rows, 3, 3);
-    camera_ids = as_contiguous(rows[0]);
-    visible_ids = as_contiguous(rows[1]);
-    row_offsets = as_contiguous(rows[2]);
+    check_group(op, "(camera_ids, visible_ids, splat_offsets)", splats, 3, 3);
+    camera_ids = as_contiguous(splats[0]);
+    visible_ids = as_contiguous(splats[1]);
+    splat_offsets = as_contiguous(splats[2]);
     check_dtype(op, "camera_ids", camera_ids, ScalarType::Int);
     check_dtype(op, "visible_ids", visible_ids, ScalarType::Int);
-    check_dtype(op, "row_offsets", row_offsets, ScalarType::Int);
-    check_shape(op, "row_offsets", row_offsets, {visible() + 1});
+    check_dtype(op, "splat_offsets", splat_offsets, ScalarType::Int);
+    check_shape(op, "splat_offsets", splat_offsets, {visible() + 1});
     if (scale_reg) {
       check_shape(op, "scale_reg", *scale_reg, {p.n_views});
       check_dtype(op, "scale_reg", *scale_reg, p.means.scalar_type());
@@ -34,31 +34,32 @@ struct BackwardRows {
 
   std::int64_t visible() const { return visible_ids.numel(); }
   std::int64_t count() const { return camera_ids.numel(); }
-  ProjectRows pointers() const {
-    return {data<std::int32_t>(camera_ids), data<std::int32_t>(visible_ids), data<std::int32_t>(row_offsets),
-            visible()};
+  SplatIndex pointers() const {
+    return {data<std::int32_t>(camera_ids), data<std::int32_t>(visible_ids),
+            data<std::int32_t>(splat_offsets), visible()};
   }
 };
 
 using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-BackwardTensors project_bwd(const TensorList& gaussians, const TensorList& cameras, const TensorList& rows,
+BackwardTensors project_bwd(const TensorList& gaussians, const TensorList& cameras, const TensorList& splats,
                             const IntList& ints, const FloatList& floats, const TensorList& v_splats,
                             const OptionalTensor& v_depths, const OptionalTensor& scale_reg,
                             bool need_viewmats, bool dense) {
   constexpr const char* kOp = "project_bwd";
   const ProjectArguments p(kOp, gaussians, cameras, ints, floats);
-  const BackwardRows b(kOp, p, rows, scale_reg);
+  const BackwardSplats b(kOp, p, splats, scale_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
-  const auto rows_of = [&](const std::vector<std::int64_t>& shape) {
+  const auto of_visible = [&](const std::vector<std::int64_t>& shape) {
     Tensor gradient = make_empty(p.means, shape);
     if (dense) TORCH_ERROR_CODE_CHECK(aoti_torch_zero_(gradient.get()));
     return gradient;
   };
-  Tensor v_means = rows_of({length, 3}), v_quats = rows_of({length, 4}), v_scales = rows_of({length, 3}),
-         v_opacities = rows_of({length}), v_sh = rows_of({length, p.sh_stride, 3}),
+  Tensor v_means = of_visible({length, 3}), v_quats = of_visible({length, 4}),
+         v_scales = of_visible({length, 3}), v_opacities = of_visible({length}),
+         v_sh = of_visible({length, p.sh_stride, 3}),
          v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {
@@ -75,14 +76,14 @@ BackwardTensors project_bwd(const TensorList& gaussians, const TensorList& camer
 
 void project_bwd_step(TensorList params, TensorList exp_avgs, TensorList exp_avg_sqs, TensorList last_steps,
                       const TensorList& tables, const IntList& steps, const FloatList& decays,
-                      const TensorList& cameras, const TensorList& rows, const IntList& ints,
+                      const TensorList& cameras, const TensorList& splats, const IntList& ints,
                       const FloatList& floats, const TensorList& v_splats, const OptionalTensor& places,
                       const OptionalTensor& scale_reg, const OptionalTensor& means2d_sums) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
   STD_TORCH_CHECK(state.step >= 1, "blitzgs::project_bwd_step_: steps count from 1, got ", state.step);
   const ProjectArguments p(kOp, params, cameras, ints, floats);
-  const BackwardRows b(kOp, p, rows, scale_reg);
+  const BackwardSplats b(kOp, p, splats, scale_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
                              means2d_sums);
   if (b.visible() == 0) return;

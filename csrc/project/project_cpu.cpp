@@ -32,29 +32,30 @@ ActiveGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
                            activate_opacity(in.opacities[id], in.options.raw));
 }
 
-// A row as counting finds it and writing takes it back.
+// A splat as counting finds it and writing takes it back.
 template <class T>
-struct KeptRow {
-  Row<T> row;
+struct KeptSplat {
+  Splat<T> splat;
   std::int32_t tiles;
   std::int64_t ranks;
 };
 
-// What counting finds of a block of kProjectBlock candidates: its rows, the views that see each candidate,
-// and how many visible Gaussians and rows the blocks before it have.
+// What counting finds of a block of kProjectBlock candidates: its splats, the views that see each candidate,
+// and how many visible Gaussians and splats the blocks before it have.
 template <class T>
 struct CountedBlock {
-  std::vector<KeptRow<T>> rows;
+  std::vector<KeptSplat<T>> splats;
   std::vector<std::uint32_t> views;
-  std::int64_t visible = 0, visible_before = 0, rows_before = 0;
+  std::int64_t visible = 0, visible_before = 0, splats_before = 0;
 };
 
-// Projects a candidate into the views that may see it, adds its rows to `rows` and what they are to `totals`,
-// and returns their views.
+// Projects a candidate into the views that may see it, adds its splats to `splats` and what they are to
+// `totals`, and returns their views.
 template <class T>
 std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
                                 const std::vector<Camera<T>>& cameras, const std::vector<Frustum>& frusta,
-                                std::int64_t candidate, std::vector<KeptRow<T>>* rows, std::int64_t* totals) {
+                                std::int64_t candidate, std::vector<KeptSplat<T>>* splats,
+                                std::int64_t* totals) {
   const std::int64_t id = candidate_id(in, candidate);
   const std::uint32_t allowed =
       in.active_views ? static_cast<std::uint32_t>(in.active_views[candidate]) : ~std::uint32_t{0};
@@ -82,15 +83,15 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
       gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity);
       first = 0;
     }
-    KeptRow<T> kept{};
-    if (!project_row(cameras[view], gaussian, in.options, &kept.row)) continue;
-    kept.tiles = row_tiles(kept.row, view, in.options, rank_tiles, &kept.ranks,
-                           [&](int rank, std::int64_t tiles) { by_rank[2 * rank + 1] += tiles; });
+    KeptSplat<T> kept{};
+    if (!project_splat(cameras[view], gaussian, in.options, &kept.splat)) continue;
+    kept.tiles = splat_tiles(kept.splat, view, in.options, rank_tiles, &kept.ranks,
+                             [&](int rank, std::int64_t tiles) { by_rank[2 * rank + 1] += tiles; });
     for (int rank = 0; rank < rank_tiles.n_ranks; ++rank) by_rank[2 * rank] += kept.ranks >> rank & 1;
-    ++totals[kTotalRows];
+    ++totals[kTotalSplats];
     ++totals[kTotalViews + view];
     totals[kTotalTiles] += kept.tiles;
-    rows->push_back(kept);
+    splats->push_back(kept);
     seen |= std::uint32_t{1} << view;
   }
   totals[kTotalVisible] += seen != 0;
@@ -98,42 +99,42 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
 }
 
 template <class T>
-void write_row(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t id, std::int64_t index,
-               const KeptRow<T>& kept, const ProjectOutputs<T>& out) {
-  const Row<T>& row = kept.row;
-  std::copy_n(row.mean2d, 2, out.means2d + 2 * index);
-  std::copy_n(row.conic, 3, out.conics + 3 * index);
-  out.depths[index] = row.depth;
+void write_splat(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t id, std::int64_t index,
+                 const KeptSplat<T>& kept, const ProjectOutputs<T>& out) {
+  const Splat<T>& splat = kept.splat;
+  std::copy_n(splat.mean2d, 2, out.means2d + 2 * index);
+  std::copy_n(splat.conic, 3, out.conics + 3 * index);
+  out.depths[index] = splat.depth;
   const bool shown =
-      !in.sh || row_color(camera, load3(in.means + 3 * id), in.sh + 3 * in.options.sh_stride * id,
-                          in.options.sh_degree, out.colors + 3 * index);
-  out.opacities[index] = shown ? row.opacity : T(0);
-  out.radii[2 * index] = shown ? pixel_radius(row.extent[0]) : 0;
-  out.radii[2 * index + 1] = shown ? pixel_radius(row.extent[1]) : 0;
+      !in.sh || splat_color(camera, load3(in.means + 3 * id), in.sh + 3 * in.options.sh_stride * id,
+                            in.options.sh_degree, out.colors + 3 * index);
+  out.opacities[index] = shown ? splat.opacity : T(0);
+  out.radii[2 * index] = shown ? pixel_radius(splat.extent[0]) : 0;
+  out.radii[2 * index + 1] = shown ? pixel_radius(splat.extent[1]) : 0;
   out.tiles_touched[index] = shown ? kept.tiles : 0;
   if (out.rank_masks) out.rank_masks[index] = kept.ranks;
-  if (out.row_ids) out.row_ids[index] = out.ids[id];
+  if (out.splat_ids) out.splat_ids[index] = out.ids[id];
 }
 
 // Gradients of visible Gaussian u; poses [B] or null.
 template <class T>
-void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras, const ProjectRows& rows,
+void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras, const SplatIndex& splats,
                   const SplatGradientColumns<T>& v, const T* scale_reg, std::int64_t u,
                   PoseGradient<T>* poses, const ProjectGradients<T>& out) {
-  const std::int64_t id = rows.visible_ids[u];
+  const std::int64_t id = splats.visible_ids[u];
   const std::int64_t stride = 3 * in.options.sh_stride;
   const ActiveGaussian<T> gaussian = load_gaussian(in, id);
   GaussianGradient<T> gradient{};
   T axis_weight = T(0);
   const std::int64_t at = out.dense ? id : u;
   if (out.sh) std::fill_n(out.sh + stride * at, stride, T(0));
-  for (std::int64_t r = rows.row_offsets[u]; r < rows.row_offsets[u + 1]; ++r) {
-    const int view = rows.camera_ids[r];
+  for (std::int64_t r = splats.splat_offsets[u]; r < splats.splat_offsets[u + 1]; ++r) {
+    const int view = splats.camera_ids[r];
     PoseGradient<T>* pose = poses ? poses + view : nullptr;
-    project_row_vjp(cameras[view], gaussian, in.options, v.geometry(r), &gradient, pose);
+    project_splat_vjp(cameras[view], gaussian, in.options, v.geometry(r), &gradient, pose);
     if (in.sh && v.colored()) {
-      row_color_vjp(cameras[view], gaussian.mean, in.sh + stride * id, in.options.sh_degree, v.colors + 3 * r,
-                    out.sh + stride * at, &gradient.mean, pose);
+      splat_color_vjp(cameras[view], gaussian.mean, in.sh + stride * id, in.options.sh_degree,
+                      v.colors + 3 * r, out.sh + stride * at, &gradient.mean, pose);
     }
     if (scale_reg) axis_weight += scale_reg[view];
   }
@@ -180,7 +181,7 @@ void for_each_block(std::vector<CountedBlock<T>>& blocks, std::int64_t n_candida
 }  // namespace
 
 template <class T>
-void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, RowMemory<T>& memory,
+void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemory<T>& memory,
              std::int64_t* totals, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   std::vector<Frustum> frusta;
@@ -192,50 +193,51 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, RowMemory<
   for_each_block(blocks, in.n_candidates, [&](CountedBlock<T>& block, std::int64_t first, std::int64_t last) {
     std::vector<std::int64_t> sums(n_totals, 0);
     for (std::int64_t c = first; c < last; ++c) {
-      block.views.push_back(project_candidate(in, rank_tiles, cameras, frusta, c, &block.rows, sums.data()));
+      block.views.push_back(
+          project_candidate(in, rank_tiles, cameras, frusta, c, &block.splats, sums.data()));
     }
     block.visible = sums[kTotalVisible];
     const std::lock_guard<std::mutex> lock(adding);
     for (std::int64_t i = 0; i < n_totals; ++i) totals[i] += sums[i];
   });
-  std::int64_t visible = 0, rows = 0;
+  std::int64_t visible = 0, splats = 0;
   for (CountedBlock<T>& block : blocks) {
     block.visible_before = std::exchange(visible, visible + block.visible);
-    block.rows_before = std::exchange(rows, rows + static_cast<std::int64_t>(block.rows.size()));
+    block.splats_before = std::exchange(splats, splats + static_cast<std::int64_t>(block.splats.size()));
   }
-  const ProjectColumns<T> columns = memory.allocate({visible, rows});
+  const ProjectColumns<T> columns = memory.allocate({visible, splats});
   const ProjectIds& ids = columns.ids;
-  ids.row_offsets[visible] = static_cast<std::int32_t>(rows);
+  ids.splat_offsets[visible] = static_cast<std::int32_t>(splats);
   for_each_block(blocks, in.n_candidates, [&](CountedBlock<T>& block, std::int64_t first, std::int64_t) {
-    std::int64_t u = block.visible_before, index = block.rows_before;
-    const KeptRow<T>* kept = block.rows.data();
+    std::int64_t u = block.visible_before, index = block.splats_before;
+    const KeptSplat<T>* kept = block.splats.data();
     for (std::size_t i = 0; i < block.views.size(); ++i) {
       if (block.views[i] == 0) continue;
       const auto id = static_cast<std::int32_t>(candidate_id(in, first + static_cast<std::int64_t>(i)));
       ids.visible_ids[u] = id;
-      ids.row_offsets[u++] = static_cast<std::int32_t>(index);
+      ids.splat_offsets[u++] = static_cast<std::int32_t>(index);
       for (std::uint32_t rest = block.views[i]; rest != 0; rest &= rest - 1) {
         const int view = __builtin_ctz(rest);
         ids.gaussian_ids[index] = id;
         ids.camera_ids[index] = view;
-        write_row(in, cameras[view], id, index++, *kept++, columns.values);
+        write_splat(in, cameras[view], id, index++, *kept++, columns.values);
       }
     }
   });
 }
 
 template <class T>
-void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const SplatGradientColumns<T>& v,
+void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const SplatGradientColumns<T>& v,
                  const T* scale_reg, const ProjectGradients<T>& out, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
-  const std::int64_t blocks = project_blocks(rows.n_visible);
+  const std::int64_t blocks = project_blocks(splats.n_visible);
   std::vector<double> pose_sums(out.viewmats ? blocks * in.n_views * 12 : 0, 0.0);
   parallel_for(0, blocks, 1, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
       std::vector<PoseGradient<T>> poses(out.viewmats ? in.n_views : 0);
-      const std::int64_t last = std::min(rows.n_visible, (block + 1) * kProjectBlock);
+      const std::int64_t last = std::min(splats.n_visible, (block + 1) * kProjectBlock);
       for (std::int64_t u = block * kProjectBlock; u < last; ++u) {
-        gaussian_bwd(in, cameras, rows, v, scale_reg, u, poses.empty() ? nullptr : poses.data(), out);
+        gaussian_bwd(in, cameras, splats, v, scale_reg, u, poses.empty() ? nullptr : poses.data(), out);
       }
       if (out.viewmats) store_poses(poses, &pose_sums[block * in.n_views * 12]);
     }
@@ -243,10 +245,10 @@ void project_bwd(const ProjectInputs<T>& in, const ProjectRows& rows, const Spla
   if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                              \
-  template void project<T>(const ProjectInputs<T>&, const RankTiles&, RowMemory<T>&, std::int64_t*,         \
-                           Workspace&, CudaStream);                                                         \
-  template void project_bwd<T>(const ProjectInputs<T>&, const ProjectRows&, const SplatGradientColumns<T>&, \
+#define BLITZGS_INSTANTIATE(T)                                                                             \
+  template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,      \
+                           Workspace&, CudaStream);                                                        \
+  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&, \
                                const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)

@@ -43,18 +43,18 @@ RankTiles checked_rank_tiles(const char* op, const IntList& begins_and_ends) {
   return ranks;
 }
 
-// The columns of rows as tensors, in the order in which the op returns them.
-struct RowTensors {
-  Tensor gaussian_ids, camera_ids, visible_ids, row_offsets, means2d, conics, depths, opacities, colors,
-      radii, tiles_touched, rank_masks, row_ids;
+// The columns of splats as tensors, in the order in which the op returns them.
+struct SplatTensors {
+  Tensor gaussian_ids, camera_ids, visible_ids, splat_offsets, means2d, conics, depths, opacities, colors,
+      radii, tiles_touched, rank_masks, splat_ids;
 };
 
 template <class T>
-class TorchRows final : public RowMemory<T> {
+class TorchSplats final : public SplatMemory<T> {
  public:
-  // ids: persistent, of the Gaussians; none: the rows' are not wanted.
-  TorchRows(const Tensor& like, bool with_colors, bool with_masks, const OptionalTensor& ids,
-            const std::optional<ProjectSizes>& capacity, RowTensors* tensors)
+  // ids: persistent, of the Gaussians; none: the splats' are not wanted.
+  TorchSplats(const Tensor& like, bool with_colors, bool with_masks, const OptionalTensor& ids,
+              const std::optional<ProjectSizes>& capacity, SplatTensors* tensors)
       : like_(like),
         with_colors_(with_colors),
         with_masks_(with_masks),
@@ -65,10 +65,10 @@ class TorchRows final : public RowMemory<T> {
   const ProjectSizes* capacity() const override { return capacity_ ? &*capacity_ : nullptr; }
 
   ProjectColumns<T> allocate(const ProjectSizes& sizes) override {
-    const std::int64_t U = sizes.visible, P = sizes.rows;
+    const std::int64_t U = sizes.visible, P = sizes.splats;
     STD_TORCH_CHECK(
         P <= std::numeric_limits<std::int32_t>::max(), "blitzgs::project_fwd: ", P,
-        " rows (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
+        " splats (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
     const auto make = [&](const std::vector<std::int64_t>& shape, ScalarType dtype) {
       return make_empty(like_, shape, dtype);
     };
@@ -76,7 +76,7 @@ class TorchRows final : public RowMemory<T> {
     t_.gaussian_ids = make({P}, ints);
     t_.camera_ids = make({P}, ints);
     t_.visible_ids = make({U}, ints);
-    t_.row_offsets = make({U + 1}, ints);
+    t_.splat_offsets = make({U + 1}, ints);
     t_.means2d = make({P, 2}, floats);
     t_.conics = make({P, 3}, floats);
     t_.depths = make({P}, floats);
@@ -85,14 +85,14 @@ class TorchRows final : public RowMemory<T> {
     t_.radii = make({P, 2}, ints);
     t_.tiles_touched = make({P}, ints);
     t_.rank_masks = make({with_masks_ ? P : 0}, longs);
-    t_.row_ids = make({ids_ ? P : 0}, longs);
+    t_.splat_ids = make({ids_ ? P : 0}, longs);
     return {{mutable_data<std::int32_t>(t_.gaussian_ids), mutable_data<std::int32_t>(t_.camera_ids),
-             mutable_data<std::int32_t>(t_.visible_ids), mutable_data<std::int32_t>(t_.row_offsets)},
+             mutable_data<std::int32_t>(t_.visible_ids), mutable_data<std::int32_t>(t_.splat_offsets)},
             {mutable_data<T>(t_.means2d), mutable_data<T>(t_.conics), mutable_data<T>(t_.depths),
              mutable_data<T>(t_.opacities), mutable_data<T>(t_.colors), mutable_data<std::int32_t>(t_.radii),
              mutable_data<std::int32_t>(t_.tiles_touched),
              with_masks_ ? mutable_data<std::int64_t>(t_.rank_masks) : nullptr,
-             ids_ ? mutable_data<std::int64_t>(t_.row_ids) : nullptr, data_or_null<std::int64_t>(ids_)}};
+             ids_ ? mutable_data<std::int64_t>(t_.splat_ids) : nullptr, data_or_null<std::int64_t>(ids_)}};
   }
 
  private:
@@ -100,14 +100,14 @@ class TorchRows final : public RowMemory<T> {
   bool with_colors_, with_masks_;
   const OptionalTensor& ids_;
   std::optional<ProjectSizes> capacity_;
-  RowTensors& t_;
+  SplatTensors& t_;
 };
 
 std::optional<ProjectSizes> checked_capacity(const char* op, const IntList& capacity) {
   if (capacity.empty()) return std::nullopt;
   STD_TORCH_CHECK(
       capacity.size() == 2 && capacity[0] > 0 && capacity[1] > 0, "blitzgs::", op,
-      ": capacity must be how many visible Gaussians and rows there is room for, at least 1 each");
+      ": capacity must be how many visible Gaussians and splats there is room for, at least 1 each");
   return ProjectSizes{capacity[0], capacity[1]};
 }
 
@@ -128,7 +128,7 @@ Projected project_fwd(const TensorList& gaussians, const TensorList& cameras, co
   }
   const OptionalTensor persistent = contiguous_or_none(ids);
   Tensor totals = make_empty(p.means, {project_totals(p.n_views, ranks.n_ranks)}, ScalarType::Long);
-  RowTensors t;
+  SplatTensors t;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
@@ -137,11 +137,11 @@ Projected project_fwd(const TensorList& gaussians, const TensorList& cameras, co
     in.active_views = data_or_null<std::int32_t>(candidates.views);
     in.n_candidates = candidates.count;
     in.n_active = data_or_null<std::int32_t>(candidates.listed);
-    TorchRows<T> rows(p.means, p.sh.has_value(), ranks.n_ranks > 0, persistent, sizes, &t);
-    backend::project(in, ranks, rows, mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
+    TorchSplats<T> splats(p.means, p.sh.has_value(), ranks.n_ranks > 0, persistent, sizes, &t);
+    backend::project(in, ranks, splats, mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
   });
-  return {t.gaussian_ids, t.camera_ids, t.visible_ids, t.row_offsets,   t.means2d,    t.conics,  t.depths,
-          t.opacities,    t.colors,     t.radii,       t.tiles_touched, t.rank_masks, t.row_ids, totals};
+  return {t.gaussian_ids, t.camera_ids, t.visible_ids, t.splat_offsets, t.means2d,    t.conics,    t.depths,
+          t.opacities,    t.colors,     t.radii,       t.tiles_touched, t.rank_masks, t.splat_ids, totals};
 }
 
 }  // namespace

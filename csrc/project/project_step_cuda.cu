@@ -119,13 +119,13 @@ bool moves_by_packs(const AdamArgs<float>& adam) {
 }  // namespace
 
 template <>
-void project_bwd_step<float>(const Inputs& in, const ProjectRows& rows, const SplatGradientSource& v,
+void project_bwd_step<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
                              const float* scale_reg, AdamArgs<float> adam, Workspace& workspace,
                              CudaStream stream) {
-  if (rows.n_visible == 0) return;
+  if (splats.n_visible == 0) return;
   bool done = false;
   if (moves_by_packs(adam)) {
-    dispatch_backward(in, rows, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
+    dispatch_backward(in, splats, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
       if constexpr (quads.value) {
         launch_backward<degree.value, true>(args, StepRows{adam}, stream);
         done = true;
@@ -134,8 +134,8 @@ void project_bwd_step<float>(const Inputs& in, const ProjectRows& rows, const Sp
   }
   if (done) return;
   // Rows that are no whole packs.
-  const ProjectGradients<float> gradients = scratch_gradients(rows, adam, workspace);
-  project_bwd(in, rows, v, scale_reg, gradients, workspace, stream);
+  const ProjectGradients<float> gradients = scratch_gradients(splats, adam, workspace);
+  project_bwd(in, splats, v, scale_reg, gradients, workspace, stream);
   lazy_adam(adam, workspace, stream);
 }
 

@@ -46,27 +46,27 @@ struct World {
   }
 };
 
-struct Projected final : RowMemory<double> {
+struct Projected final : SplatMemory<double> {
   ProjectSizes sizes{};
   std::vector<std::int64_t> totals, rank_masks;
-  std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, row_offsets, radii, tiles;
+  std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, splat_offsets, radii, tiles;
   std::vector<double> means2d, conics, depths, opacities, colors;
 
   const ProjectSizes* capacity() const override { return nullptr; }
   ProjectColumns<double> allocate(const ProjectSizes& counted) override {
     sizes = counted;
-    const std::size_t U = sizes.visible, P = sizes.rows;
+    const std::size_t U = sizes.visible, P = sizes.splats;
     for (auto* ints : {&gaussian_ids, &camera_ids, &tiles}) ints->resize(P);
     radii.resize(2 * P);
     visible_ids.resize(U);
-    row_offsets.resize(U + 1);
+    splat_offsets.resize(U + 1);
     means2d.resize(2 * P);
     conics.resize(3 * P);
     depths.resize(P);
     opacities.resize(P);
     colors.resize(3 * P);
     rank_masks.resize(P);
-    return {{gaussian_ids.data(), camera_ids.data(), visible_ids.data(), row_offsets.data()},
+    return {{gaussian_ids.data(), camera_ids.data(), visible_ids.data(), splat_offsets.data()},
             {means2d.data(), conics.data(), depths.data(), opacities.data(), colors.data(), radii.data(),
              tiles.data(), rank_masks.data(), nullptr, nullptr}};
   }
@@ -80,17 +80,17 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
   return p;
 }
 
-// A scalar of the rows: the weighted sum of everything differentiable.
+// A scalar of the splats: the weighted sum of everything differentiable.
 struct Weights {
   std::vector<double> means2d, conics, depths, opacities, colors;
   std::vector<double> scale_reg{0.3, 0.0, -0.2};
 
-  explicit Weights(std::int64_t rows) {
+  explicit Weights(std::int64_t splats) {
     std::mt19937 engine(6);
     std::normal_distribution<double> normal;
     for (auto* values : {&means2d, &conics, &depths, &opacities, &colors}) {
       const std::int64_t width = values == &means2d ? 2 : (values == &conics || values == &colors ? 3 : 1);
-      for (std::int64_t i = 0; i < width * rows; ++i) values->push_back(normal(engine));
+      for (std::int64_t i = 0; i < width * splats; ++i) values->push_back(normal(engine));
     }
   }
 
@@ -105,9 +105,9 @@ struct Weights {
     add(depths, p.depths);
     add(opacities, p.opacities);
     add(colors, p.colors);
-    for (std::size_t row = 0; row < p.camera_ids.size(); ++row) {
-      const double* s = &world.scales[3 * p.gaussian_ids[row]];
-      sum += scale_reg[p.camera_ids[row]] * std::exp(std::min({s[0], s[1], s[2]}));
+    for (std::size_t splat = 0; splat < p.camera_ids.size(); ++splat) {
+      const double* s = &world.scales[3 * p.gaussian_ids[splat]];
+      sum += scale_reg[p.camera_ids[splat]] * std::exp(std::min({s[0], s[1], s[2]}));
     }
     return sum;
   }
@@ -115,32 +115,32 @@ struct Weights {
 
 }  // namespace
 
-TEST_CASE("rows are ordered by Gaussian and view, and the totals count them") {
+TEST_CASE("splats are ordered by Gaussian and view, and the totals count them") {
   const World world;
   const Projected p = project(world.inputs());
-  REQUIRE(p.sizes.rows > 2000);
+  REQUIRE(p.sizes.splats > 2000);
   REQUIRE(p.sizes.visible > 1000);
-  REQUIRE(p.row_offsets.front() == 0);
-  REQUIRE(p.row_offsets.back() == p.sizes.rows);
+  REQUIRE(p.splat_offsets.front() == 0);
+  REQUIRE(p.splat_offsets.back() == p.sizes.splats);
   std::int64_t tiles = 0;
-  for (std::int64_t row = 0; row < p.sizes.rows; ++row) {
-    tiles += p.tiles[row];
-    if (row == 0) continue;
-    const std::int64_t before = p.gaussian_ids[row - 1] * World::kViews + p.camera_ids[row - 1];
-    REQUIRE(before < p.gaussian_ids[row] * World::kViews + p.camera_ids[row]);
+  for (std::int64_t splat = 0; splat < p.sizes.splats; ++splat) {
+    tiles += p.tiles[splat];
+    if (splat == 0) continue;
+    const std::int64_t before = p.gaussian_ids[splat - 1] * World::kViews + p.camera_ids[splat - 1];
+    REQUIRE(before < p.gaussian_ids[splat] * World::kViews + p.camera_ids[splat]);
   }
   REQUIRE(tiles == p.totals[kTotalTiles]);
   for (int view = 0; view < World::kViews; ++view) {
     REQUIRE(p.totals[kTotalViews + view] == std::count(p.camera_ids.begin(), p.camera_ids.end(), view));
   }
   for (std::int64_t u = 0; u < p.sizes.visible; ++u) {
-    for (int row = p.row_offsets[u]; row < p.row_offsets[u + 1]; ++row) {
-      REQUIRE(p.gaussian_ids[row] == p.visible_ids[u]);
+    for (int splat = p.splat_offsets[u]; splat < p.splat_offsets[u + 1]; ++splat) {
+      REQUIRE(p.gaussian_ids[splat] == p.visible_ids[u]);
     }
   }
 }
 
-TEST_CASE("candidates and their views select rows and change no bit of them") {
+TEST_CASE("candidates and their views select splats and change no bit of them") {
   const World world;
   const Projected all = project(world.inputs());
   std::vector<std::int32_t> ids, views;
@@ -154,70 +154,71 @@ TEST_CASE("candidates and their views select rows and change no bit of them") {
   in.n_candidates = static_cast<std::int64_t>(ids.size());
   const Projected some = project(in);
   std::size_t next = 0;
-  for (std::int64_t row = 0; row < all.sizes.rows; ++row) {
-    const int id = all.gaussian_ids[row];
-    if (id % 3 != 0 || !(id % 8 >> all.camera_ids[row] & 1)) continue;
+  for (std::int64_t splat = 0; splat < all.sizes.splats; ++splat) {
+    const int id = all.gaussian_ids[splat];
+    if (id % 3 != 0 || !(id % 8 >> all.camera_ids[splat] & 1)) continue;
     REQUIRE(next < some.gaussian_ids.size());
     REQUIRE(some.gaussian_ids[next] == id);
-    REQUIRE(some.camera_ids[next] == all.camera_ids[row]);
-    REQUIRE(some.conics[3 * next] == all.conics[3 * row]);
-    REQUIRE(some.colors[3 * next + 2] == all.colors[3 * row + 2]);
+    REQUIRE(some.camera_ids[next] == all.camera_ids[splat]);
+    REQUIRE(some.conics[3 * next] == all.conics[3 * splat]);
+    REQUIRE(some.colors[3 * next + 2] == all.colors[3 * splat + 2]);
     ++next;
   }
   REQUIRE(next == some.gaussian_ids.size());
   REQUIRE(next > 100);
 }
 
-TEST_CASE("each row knows the ranks that composite its tiles, and the totals count them") {
+TEST_CASE("each splat knows the ranks that composite its tiles, and the totals count them") {
   const World world;
   // Views of 3 x 2 tiles. Rank 1 has none; ranks 0 and 2 overlap.
   const RankTiles ranks{{0, 4, 4, 10}, {7, 4, 12, 18}, 4};
   const Projected p = project(world.inputs(), ranks), alone = project(world.inputs());
   REQUIRE(p.conics == alone.conics);
   std::vector<std::int64_t> expected(8, 0);
-  for (std::size_t row = 0; row < p.rank_masks.size(); ++row) {
+  for (std::size_t splat = 0; splat < p.rank_masks.size(); ++splat) {
     std::int64_t mask = 0;
-    for_each_tile(&p.means2d[2 * row], &p.conics[3 * row], p.opacities[row], 40, 30, 16, [&](int tx, int ty) {
-      const int tile = 6 * p.camera_ids[row] + 3 * ty + tx;
-      for (int m = 0; m < 4; ++m) {
-        if (tile < ranks.begin[m] || tile >= ranks.end[m]) continue;
-        mask |= std::int64_t{1} << m;
-        ++expected[2 * m + 1];
-      }
-    });
-    REQUIRE(p.rank_masks[row] == mask);
+    for_each_tile(&p.means2d[2 * splat], &p.conics[3 * splat], p.opacities[splat], 40, 30, 16,
+                  [&](int tx, int ty) {
+                    const int tile = 6 * p.camera_ids[splat] + 3 * ty + tx;
+                    for (int m = 0; m < 4; ++m) {
+                      if (tile < ranks.begin[m] || tile >= ranks.end[m]) continue;
+                      mask |= std::int64_t{1} << m;
+                      ++expected[2 * m + 1];
+                    }
+                  });
+    REQUIRE(p.rank_masks[splat] == mask);
     for (int m = 0; m < 4; ++m) expected[2 * m] += mask >> m & 1;
   }
   REQUIRE(std::equal(expected.begin(), expected.end(), p.totals.begin() + kTotalViews + World::kViews));
 }
 
-TEST_CASE("the backward pass is the derivative of the rows") {
+TEST_CASE("the backward pass is the derivative of the splats") {
   World world;
   const Projected p = project(world.inputs());
-  const Weights weights(p.sizes.rows);
+  const Weights weights(p.sizes.splats);
   const std::int64_t U = p.sizes.visible;
   std::vector<double> v_means(3 * U), v_quats(4 * U), v_scales(3 * U), v_opacities(U),
       v_sh(3 * World::kBasis * U), v_viewmats(16 * World::kViews);
   TestWorkspace workspace;
   cpu::project_bwd(
-      world.inputs(), ProjectRows{p.camera_ids.data(), p.visible_ids.data(), p.row_offsets.data(), U},
+      world.inputs(), SplatIndex{p.camera_ids.data(), p.visible_ids.data(), p.splat_offsets.data(), U},
       SplatGradientColumns<double>{weights.means2d.data(), weights.conics.data(), weights.depths.data(),
                                    weights.opacities.data(), weights.colors.data()},
       weights.scale_reg.data(),
       ProjectGradients<double>{v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(),
                                v_sh.data(), v_viewmats.data()},
       workspace, nullptr);
-  // Steps of 1e-6 may move a row across the edge of the image; the sums are then of different rows.
+  // Steps of 1e-6 may move a splat across the edge of the image; the sums are then of different splats.
   const auto slope = [&](double* value) {
     const double middle = *value, h = 1e-6;
     *value = middle + h;
     const Projected above = project(world.inputs());
-    const double up = above.sizes.rows == p.sizes.rows ? weights.of(above, world) : 0;
+    const double up = above.sizes.splats == p.sizes.splats ? weights.of(above, world) : 0;
     *value = middle - h;
     const Projected below = project(world.inputs());
-    const double down = below.sizes.rows == p.sizes.rows ? weights.of(below, world) : 0;
+    const double down = below.sizes.splats == p.sizes.splats ? weights.of(below, world) : 0;
     *value = middle;
-    REQUIRE((above.sizes.rows == p.sizes.rows && below.sizes.rows == p.sizes.rows));
+    REQUIRE((above.sizes.splats == p.sizes.splats && below.sizes.splats == p.sizes.splats));
     return (up - down) / (2 * h);
   };
   for (const std::int64_t u : {std::int64_t{0}, U / 3, U - 1}) {
@@ -240,24 +241,24 @@ TEST_CASE("the backward pass is the derivative of the rows") {
   REQUIRE(v_viewmats[15] == 0.0);
 }
 
-TEST_CASE("no Gaussians, no views, and Gaussians of NaN give no rows") {
+TEST_CASE("no Gaussians, no views, and Gaussians of NaN give no splats") {
   World world;
   ProjectInputs<double> in = world.inputs();
   in.n_candidates = 0;
-  REQUIRE(project(in).row_offsets == std::vector<std::int32_t>{0});
+  REQUIRE(project(in).splat_offsets == std::vector<std::int32_t>{0});
   in = world.inputs();
   in.n_views = 0;
-  REQUIRE(project(in).sizes.rows == 0);
+  REQUIRE(project(in).sizes.splats == 0);
   const double nan = std::numeric_limits<double>::quiet_NaN();
   for (auto* values : {&world.means, &world.quats, &world.scales, &world.opacities}) {
     const std::vector<double> before = *values;
     std::fill(values->begin(), values->end(), nan);
-    REQUIRE(project(world.inputs()).sizes.rows == 0);
+    REQUIRE(project(world.inputs()).sizes.splats == 0);
     *values = before;
   }
   world.sh[3 * World::kBasis * 7 + 4] = nan;
   const Projected p = project(world.inputs());
   const auto hidden = std::find(p.gaussian_ids.begin(), p.gaussian_ids.end(), 7) - p.gaussian_ids.begin();
-  REQUIRE(hidden < p.sizes.rows);
+  REQUIRE(hidden < p.sizes.splats);
   REQUIRE((p.opacities[hidden] == 0 && p.colors[3 * hidden] == 0 && p.tiles[hidden] == 0));
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// How the lanes of a warp, neighbours among the visible Gaussians, read the gradients of their rows.
+// How the lanes of a warp, neighbours among the visible Gaussians, read the gradients of their splats.
 #pragma once
 #include "common/warp.cuh"
 #include "project/splat_gradients.h"
@@ -16,7 +16,7 @@ class SplatGradientReader {
   __device__ SplatGradientReader(const Source& source, void*, int) : source_(source) {}
   __device__ __forceinline__ void pull(std::int32_t, std::int32_t) const {}
   __device__ __forceinline__ void finish_pull(std::int32_t, std::int32_t) const {}
-  // Calls f(row, what to ask for its gradients) for the lane's rows [begin, end), as the whole warp does.
+  // Calls f(splat, what to ask for its gradients) for the lane's splats [begin, end), as the whole warp does.
   template <class F>
   __device__ __forceinline__ void for_each(std::int32_t begin, std::int32_t end, const F& f) const {
     for (std::int64_t r = begin; r < end; ++r) f(r, source_);
@@ -26,19 +26,19 @@ class SplatGradientReader {
   const Source& source_;
 };
 
-// Rows in the memory of other GPUs come by way of shared memory. Neighbouring rows lie as neighbours at each
-// rank, too, so a warp pulls them in whole lines, all of them before it waits for anything, where a lane for
-// each row would use a third of the links. Rows that do not fit into the stage (of more than kMostRuns views,
-// or a warp's with very many at several ranks) are read where they are. What lanes have in common is kept in
-// shared memory or worked out anew: they have no registers to spare for it.
+// Splats in the memory of other GPUs come by way of shared memory. Neighbouring splats lie as neighbours at
+// each rank, too, so a warp pulls them in whole lines, all of them before it waits for anything, where a lane
+// for each splat would use a third of the links. Splats that do not fit into the stage (of more than
+// kMostRuns views, or a warp's with very many at several ranks) are read where they are. What lanes have in
+// common is kept in shared memory or worked out anew: they have no registers to spare for it.
 template <>
 class SplatGradientReader<RankSplatGradients> {
-  using Row = SplatGradient;
-  static constexpr int kPieces = sizeof(Row) / 16;  // of 16 bytes in a row
-  static constexpr int kMostRuns = 6;               // of 32 rows that a warp's stage holds: of so many views
-  static constexpr int kSpare = 8;                  // rows more, for some that lie at several ranks
+  using Gradient = SplatGradient;
+  static constexpr int kPieces = sizeof(Gradient) / 16;  // of 16 bytes in a splat
+  static constexpr int kMostRuns = 6;  // of 32 splats that a warp's stage holds: of so many views
+  static constexpr int kSpare = 8;     // splats more, for some that lie at several ranks
 
-  // The rows of a run that lie at one rank: which, the first one's place there and in the stage.
+  // The splats of a run that lie at one rank: which, the first one's place there and in the stage.
   struct Segment {
     std::uint32_t bits;
     std::int32_t from, to;
@@ -47,7 +47,7 @@ class SplatGradientReader<RankSplatGradients> {
     return n_views < 1 ? 1 : n_views < kMostRuns ? n_views : kMostRuns;
   }
   __host__ __device__ static int warp_bytes(int n_runs, int n_ranks) {
-    const int bytes = (32 * n_runs + kSpare + 1) * static_cast<int>(sizeof(Row)) + 32 * n_runs +
+    const int bytes = (32 * n_runs + kSpare + 1) * static_cast<int>(sizeof(Gradient)) + 32 * n_runs +
                       (n_runs + 1) * n_ranks * static_cast<int>(sizeof(Segment));
     return (bytes + 15) / 16 * 16;
   }
@@ -62,7 +62,7 @@ class SplatGradientReader<RankSplatGradients> {
   __device__ __forceinline__ SplatGradientReader(const RankSplatGradients& source, void* memory, int n_views)
       : source_(source), memory_(static_cast<char*>(memory)), n_runs_(runs_for(n_views)) {}
 
-  // Begins to bring the warp's rows into the stage; a lane's are [begin, end).
+  // Begins to bring the warp's splats into the stage; a lane's are [begin, end).
   __device__ __forceinline__ void pull(std::int32_t lane_begin, std::int32_t lane_end) {
     const std::int32_t begin = first_of(lane_begin), end = last_of(lane_end);
     if (lane() < kPieces) reinterpret_cast<float4*>(stage() + nothing())[lane()] = {0.f, 0.f, 0.f, 0.f};
@@ -73,10 +73,12 @@ class SplatGradientReader<RankSplatGradients> {
       const int s = base + lane();
       int count = 0;
       if (s < segments) {
-        const int run = begin / kPlaceRows + s / n_ranks;
-        const RowPlace place = source_.places[begin / kPlaceRows * static_cast<std::int64_t>(n_ranks) + s];
-        const int low = max(begin - kPlaceRows * run, 0), high = min(end - kPlaceRows * run, kPlaceRows);
-        const std::uint32_t bits = place.bits & (~0u << low) & (~0u >> (kPlaceRows - high));
+        const int run = begin / kPlaceSplats + s / n_ranks;
+        const SplatPlace place =
+            source_.places[begin / kPlaceSplats * static_cast<std::int64_t>(n_ranks) + s];
+        const int low = max(begin - kPlaceSplats * run, 0),
+                  high = min(end - kPlaceSplats * run, kPlaceSplats);
+        const std::uint32_t bits = place.bits & (~0u << low) & (~0u >> (kPlaceSplats - high));
         count = count_bits(bits);
         const std::int32_t from = static_cast<std::int32_t>(place.of(low));
         fits &= count == 0 || from + count <= source_.sizes[s % n_ranks];
@@ -112,8 +114,8 @@ class SplatGradientReader<RankSplatGradients> {
       }
     }
   }
-  // Waits for the rows that were pulled, and finds them in the stage: those at several ranks added up, in the
-  // order of these.
+  // Waits for the splats that were pulled, and finds them in the stage: those at several ranks added up, in
+  // the order of these.
   __device__ __forceinline__ void finish_pull(std::int32_t begin, std::int32_t end) const {
     asm volatile("cp.async.wait_all;" ::: "memory");
     __syncwarp();
@@ -122,8 +124,9 @@ class SplatGradientReader<RankSplatGradients> {
     for (std::int32_t r = first + lane(); r < last; r += 32) {
       float2 mean2d{};
       if (fits_) {
-        const Segment* segments = segment_list() + (r / kPlaceRows - first / kPlaceRows) * source_.n_ranks;
-        const std::uint32_t bit = 1u << r % kPlaceRows;
+        const Segment* segments =
+            segment_list() + (r / kPlaceSplats - first / kPlaceSplats) * source_.n_ranks;
+        const std::uint32_t bit = 1u << r % kPlaceSplats;
         int found = nothing();
         for (int m = 0; m < source_.n_ranks; ++m) {
           const Segment segment = segments[m];
@@ -138,7 +141,7 @@ class SplatGradientReader<RankSplatGradients> {
         index()[r - first] = static_cast<std::uint8_t>(found);
         mean2d = {stage()[found].mean2d[0], stage()[found].mean2d[1]};
       } else if (source_.means2d) {
-        const RowGradient<float> v = source_.geometry(r);
+        const GeometryGradient<float> v = source_.geometry(r);
         mean2d = {v.mean2d[0], v.mean2d[1]};
       }
       if (source_.means2d) reinterpret_cast<float2*>(source_.means2d)[r] = mean2d;
@@ -154,11 +157,11 @@ class SplatGradientReader<RankSplatGradients> {
  private:
   struct Found {
     const RankSplatGradients& source;
-    const Row* stage;
+    const Gradient* stage;
     const std::uint8_t* index;
     std::int32_t first;
     bool fits;
-    __device__ __forceinline__ RowGradient<float> geometry(std::int32_t r) const {
+    __device__ __forceinline__ GeometryGradient<float> geometry(std::int32_t r) const {
       return fits ? PackedSplatGradients{stage}.geometry(index[r - first]) : source.geometry(r);
     }
     __device__ __forceinline__ Vec3<float> color(std::int32_t r) const {
@@ -167,12 +170,12 @@ class SplatGradientReader<RankSplatGradients> {
   };
 
   static __device__ __forceinline__ int lane() { return static_cast<int>(threadIdx.x) % 32; }
-  // The runs that rows [begin, end) touch, by ranks.
+  // The runs that splats [begin, end) touch, by ranks.
   __device__ __forceinline__ int n_segments(std::int32_t begin, std::int32_t end) const {
-    return begin == end ? 0 : ((end - 1) / kPlaceRows - begin / kPlaceRows + 1) * source_.n_ranks;
+    return begin == end ? 0 : ((end - 1) / kPlaceSplats - begin / kPlaceSplats + 1) * source_.n_ranks;
   }
 
-  // The warp's rows: the first lane's first, and the last lane's last that has any.
+  // The warp's splats: the first lane's first, and the last lane's last that has any.
   static __device__ __forceinline__ std::int32_t first_of(std::int32_t begin) {
     return __shfl_sync(kFullWarp, begin, 0);
   }
@@ -180,12 +183,12 @@ class SplatGradientReader<RankSplatGradients> {
     return __reduce_max_sync(kFullWarp, end);
   }
 
-  // The stage's last row, zeros, stands for rows that no rank composited.
+  // The stage's last splat, zeros, stands for splats that no rank composited.
   __device__ __forceinline__ int nothing() const { return 32 * n_runs_ + kSpare; }
-  __device__ __forceinline__ Row* stage() const {
-    return reinterpret_cast<Row*>(memory_ + threadIdx.x / 32 * warp_bytes(n_runs_, source_.n_ranks));
+  __device__ __forceinline__ Gradient* stage() const {
+    return reinterpret_cast<Gradient*>(memory_ + threadIdx.x / 32 * warp_bytes(n_runs_, source_.n_ranks));
   }
-  // By row of the stage's: where it is there.
+  // By splat of the stage's: where it is there.
   __device__ __forceinline__ std::uint8_t* index() const {
     return reinterpret_cast<std::uint8_t*>(stage() + nothing() + 1);
   }

@@ -5,7 +5,7 @@
 #include <variant>
 
 #include "common/splat_gradient.h"
-#include "project/project_row.h"
+#include "project/project_splat.h"
 #include "scatter/scatter.h"
 
 namespace blitzgs {
@@ -16,7 +16,7 @@ struct SplatGradientColumns {
   const T *means2d, *conics, *depths, *opacities, *colors;
 
   BLITZGS_HD bool colored() const { return colors != nullptr; }
-  BLITZGS_HD RowGradient<T> geometry(std::int64_t r) const {
+  BLITZGS_HD GeometryGradient<T> geometry(std::int64_t r) const {
     return {{means2d[2 * r], means2d[2 * r + 1]},
             {conics[3 * r], conics[3 * r + 1], conics[3 * r + 2]},
             depths ? depths[r] : T(0),
@@ -27,54 +27,54 @@ struct SplatGradientColumns {
 
 // In the table that the rasteriser's backward pass adds them up in.
 struct PackedSplatGradients {
-  const SplatGradient* rows;
+  const SplatGradient* splats;
 
   BLITZGS_HD bool colored() const { return true; }
-  BLITZGS_HD RowGradient<float> geometry(std::int64_t r) const {
-    const SplatGradient& v = rows[r];
+  BLITZGS_HD GeometryGradient<float> geometry(std::int64_t r) const {
+    const SplatGradient& v = splats[r];
     return {{v.mean2d[0], v.mean2d[1]}, {v.conic[0], v.conic[1], v.conic[2]}, 0.f, v.opacity};
   }
   // By member, so that the compiler knows the alignment.
   BLITZGS_HD Vec3<float> color(std::int64_t r) const {
-    const SplatGradient& v = rows[r];
+    const SplatGradient& v = splats[r];
     return {v.color[0], v.color[1], v.color[2]};
   }
 };
 
-// In such tables of all ranks that composited the rows (CUDA), added up in the order of ranks. The memory is
-// shared: `tables` are mapped here, each from this rank's first row on.
+// In such tables of all ranks that composited the splats (CUDA), added up in the order of ranks. The memory
+// is shared: `tables` are mapped here, each from this rank's first splat on.
 struct RankSplatGradients {
-  const RowPlace* places;
+  const SplatPlace* places;
   int n_ranks;
   const SplatGradient* tables[kMaxPeers];
-  std::int32_t sizes[kMaxPeers];  // this rank's rows in each
+  std::int32_t sizes[kMaxPeers];  // this rank's splats in each
   float* means2d;                 // null, or [P, 2]: where the projection's backward pass leaves these sums
 
   BLITZGS_HD bool colored() const { return true; }
-  BLITZGS_HD RowGradient<float> geometry(std::int64_t r) const {
-    const SplatGradient row = sum(r);
-    return PackedSplatGradients{&row}.geometry(0);
+  BLITZGS_HD GeometryGradient<float> geometry(std::int64_t r) const {
+    const SplatGradient splat = sum(r);
+    return PackedSplatGradients{&splat}.geometry(0);
   }
   BLITZGS_HD Vec3<float> color(std::int64_t r) const {
-    const SplatGradient row = sum(r);
-    return PackedSplatGradients{&row}.color(0);
+    const SplatGradient splat = sum(r);
+    return PackedSplatGradients{&splat}.color(0);
   }
   BLITZGS_HD SplatGradient sum(std::int64_t r) const {
     SplatGradient sum{};
     for (int m = 0; m < n_ranks; ++m) {
-      const SplatGradient* row = at(m, r);
-      if (!row) continue;
-      const SplatGradient v = *row;
+      const SplatGradient* splat = at(m, r);
+      if (!splat) continue;
+      const SplatGradient v = *splat;
       sum.add(v);
     }
     return sum;
   }
-  // The row at rank m; null: that composited none of it.
+  // The splat at rank m; null: that composited none of it.
   BLITZGS_HD const SplatGradient* at(int m, std::uint64_t r) const {
-    const RowPlace place = places[r / kPlaceRows * n_ranks + m];
-    const auto in_run = static_cast<std::uint32_t>(r % kPlaceRows);
-    const std::int64_t row = place.of(in_run);
-    return place.has(in_run) && row < sizes[m] ? tables[m] + row : nullptr;
+    const SplatPlace place = places[r / kPlaceSplats * n_ranks + m];
+    const auto in_run = static_cast<std::uint32_t>(r % kPlaceSplats);
+    const std::int64_t splat = place.of(in_run);
+    return place.has(in_run) && splat < sizes[m] ? tables[m] + splat : nullptr;
   }
 };
 

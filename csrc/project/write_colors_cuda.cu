@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Compiled without FMA contraction (cmake/cuda.cmake), as write_rows_cuda.cu.
+// Compiled without FMA contraction (cmake/cuda.cmake), as write_splats_cuda.cu.
 #include "project/prefilter.cuh"
 
 namespace blitzgs::cuda {
@@ -7,9 +7,9 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kColorThreads = 128, kColorBlocks = 5;  // such blocks fill a multiprocessor
-constexpr int kRowsOfBlock = 2 * kColorThreads;
+constexpr int kSplatsOfBlock = 2 * kColorThreads;
 
-// Writes the colour of row i, of Gaussian id (-1: none), and hides the row if it is not finite; the whole
+// Writes the colour of splat i, of Gaussian id (-1: none), and hides the splat if it is not finite; the whole
 // warp takes part. sh_slot: where `stage` gathers its SH row.
 template <int DEGREE, bool QUADS>
 __device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>& camera,
@@ -22,10 +22,10 @@ __device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>
     if (id < 0) return;
     ShRow<DEGREE> sh;
     stage.read(sh_slot, &sh);
-    shown = row_color(camera, mean, sh.values, DEGREE, out.colors + 3 * i);
+    shown = splat_color(camera, mean, sh.values, DEGREE, out.colors + 3 * i);
   } else if (id >= 0) {
-    shown = row_color(camera, mean, in.sh + 3 * in.options.sh_stride * std::int64_t{id}, DEGREE,
-                      out.colors + 3 * i);
+    shown = splat_color(camera, mean, in.sh + 3 * in.options.sh_stride * std::int64_t{id}, DEGREE,
+                        out.colors + 3 * i);
   }
   if (shown) return;
   out.opacities[i] = 0.f;
@@ -42,16 +42,16 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
   __shared__ TripleStage triples[kColorThreads / 32];
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
-  const std::int64_t n_rows = fitting(capacity).rows, step = gridDim.x * std::int64_t{kRowsOfBlock};
-  const std::int64_t of_block = blockIdx.x * std::int64_t{kRowsOfBlock};
-  if (of_block >= n_rows) return;
+  const std::int64_t n_splats = fitting(capacity).splats, step = gridDim.x * std::int64_t{kSplatsOfBlock};
+  const std::int64_t of_block = blockIdx.x * std::int64_t{kSplatsOfBlock};
+  if (of_block >= n_splats) return;
   load_cameras(in, cameras);
   __syncthreads();
-  for (std::int64_t begin = of_block; begin < n_rows; begin += step) {
+  for (std::int64_t begin = of_block; begin < n_splats; begin += step) {
 #pragma unroll 1
-    for (int first = 0; first < kRowsOfBlock; first += kColorThreads) {
+    for (int first = 0; first < kSplatsOfBlock; first += kColorThreads) {
       const std::int64_t i = begin + first + threadIdx.x;
-      const std::int32_t id = i < n_rows ? ids.gaussian_ids[i] : -1;
+      const std::int32_t id = i < n_splats ? ids.gaussian_ids[i] : -1;
       int sh_slot = 0;
       if constexpr (QUADS) sh_slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
       const int view = id < 0 ? 0 : ids.camera_ids[i];
@@ -66,8 +66,8 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
 
 void write_colors(const Inputs& in, const ProjectCapacity& capacity, const ProjectColumns<float>& columns,
                   CudaStream stream) {
-  if (capacity.sizes.rows == 0 || !in.sh) return;
-  const std::int64_t blocks = (capacity.sizes.rows + kRowsOfBlock - 1) / kRowsOfBlock;
+  if (capacity.sizes.splats == 0 || !in.sh) return;
+  const std::int64_t blocks = (capacity.sizes.splats + kSplatsOfBlock - 1) / kSplatsOfBlock;
   dispatch_sh(in, [&](auto degree, auto quads) {
     color_kernel<degree.value, quads.value><<<static_cast<unsigned>(blocks), kColorThreads, 0, stream>>>(
         in, columns.ids, capacity, columns.values);

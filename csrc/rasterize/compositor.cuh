@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Compositing a pixel on CUDA: one definition for the image and for the contributions of rows, so that both
+// Compositing a pixel on CUDA: one definition for the image and for the contributions of splats, so that both
 // see the same alpha T, bit for bit.
 #pragma once
 #include <cstdint>

@@ -92,7 +92,7 @@ __device__ __forceinline__ EntrySums<CHANNELS> sum_pixels(const float2* group,
   return sums;
 }
 
-// Moments about the subtile's centre to gradients of the row.
+// Moments about the subtile's centre to gradients of the splat.
 template <int CHANNELS, bool ABSOLUTE>
 __device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, const Entry& shape, float x,
                                                  float y) {

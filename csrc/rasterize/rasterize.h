@@ -5,38 +5,38 @@
 //   q     = a dx^2 + 2 b dx dy + c dy^2,  (dx, dy) = pixel centre - mean2d,  conic = (a, b, c)
 //   alpha = min(0.99, opacity * exp(-q / 2));           skipped unless alpha >= 1/255
 //   if T (1 - alpha) < 1e-4 the pixel ends and this splat is not composited
-//   color += alpha T row_color;  T *= 1 - alpha
+//   color += alpha T splat_color;  T *= 1 - alpha
 // and at the end color += T background. No other cut: culling inside the kernel is conservative (q is best
 // evaluated through factor_conic() of math/tiles.h, which the tile test's slack is made for).
 //
-//   means2d [P, 2], conics [P, 3], opacities [P], colors [P, D], backgrounds [B, D] or null, isect_rows and
+//   means2d [P, 2], conics [P, 3], opacities [P], colors [P, D], backgrounds [B, D] or null, isect_splats and
 //   tile_offsets from intersect  ->  renders [B, H, W, D]; transmittances [B, H, W] (final T; alpha = 1 - T);
 //   last_ids int32 [B, H, W]: 1 + index in the tile's list of the last composited entry, 0 for none;
 //   tile_work int32 [B*T]: list entries processed before every pixel of the tile had ended (or the list
 //   had): what the tile cost. Pixels of unowned tiles are zero in all outputs, transmittance included, with
 //   clear_rest; otherwise they are not written.
 //
-// Exact: a pixel depends on its tile's list and the rows in it alone, so tile ranges, batch position, threads
-// and (CPU) the instruction set change no bit. The CPU float32 kernel does the same operations with and
-// without AVX2. CPU and CUDA agree to rounding.
+// Exact: a pixel depends on its tile's list and the splats in it alone, so tile ranges, batch position,
+// threads and (CPU) the instruction set change no bit. The CPU float32 kernel does the same operations with
+// and without AVX2. CPU and CUDA agree to rounding.
 //
-// Gradients, given v_renders [B, H, W, D] and optionally v_alphas [B, H, W]: per row v_means2d [P, 2],
+// Gradients, given v_renders [B, H, W, D] and optionally v_alphas [B, H, W]: per splat v_means2d [P, 2],
 // v_conics [P, 3] (of a, b, c as three independent numbers), v_opacities [P], v_colors [P, D], and with
 // absgrad v_means2d_abs [P, 2] = sum over pixels of |that pixel's gradient of mean2d| per axis. Zero where
 // min(0.99, .) clips; the order, the cut at 1/255 and the end of a pixel are constants. The gradient of the
-// background is sum over pixels of v_renders * T, left to the caller. Rows in no list get zeros. v_renders
+// background is sum over pixels of v_renders * T, left to the caller. Splats in no list get zeros. v_renders
 // of unowned tiles are not read.
 //
-// Forward may be queued with room for more rows than there are (known_rows, common/row_count.h; CUDA alone):
-// it packs, and zeroes gradients of, those that are there; gradients behind them are unspecified. Backward
-// may then be given just these rows.
+// Forward may be queued with room for more splats than there are (known_splats, common/splat_count.h; CUDA
+// alone): it packs, and zeroes gradients of, those that are there; gradients behind them are unspecified.
+// Backward may then be given just these splats.
 //
-// The CPU gradient is bitwise repeatable for any number of threads: one partial sum per (row, tile), added in
-// the order of the tiles. CUDA: when deterministic is set. O(entries processed x pixels of the splat).
+// The CPU gradient is bitwise repeatable for any number of threads: one partial sum per (splat, tile), added
+// in the order of the tiles. CUDA: when deterministic is set. O(entries processed x pixels of the splat).
 #pragma once
 #include <cstdint>
 
-#include "common/row_count.h"
+#include "common/splat_count.h"
 #include "common/splat_gradient.h"
 #include "common/stream.h"
 #include "math/tiles.h"
@@ -50,12 +50,12 @@ struct RasterizeInput {
   const T* opacities;
   const T* colors;
   const T* backgrounds;  // null: black
-  const std::int32_t* isect_rows;
+  const std::int32_t* isect_splats;
   const std::int64_t* tile_offsets;
-  std::int64_t n_rows;
+  std::int64_t n_splats;
   int n_channels;
   TileGrid grid;
-  const std::int64_t* known_rows = nullptr;
+  const std::int64_t* known_splats = nullptr;
 };
 
 template <class T>
@@ -64,7 +64,7 @@ struct RasterizeOutput {
   T* transmittances;
   std::int32_t* last_ids;
   std::int32_t* tile_work;
-  T* row_gradients;  // null, or [P] SplatGradient to be zeroed; up to four channels on CUDA
+  T* splat_gradients;  // null, or [P] SplatGradient to be zeroed; up to four channels on CUDA
   bool clear_rest;
 };
 
@@ -89,16 +89,16 @@ struct RasterizeGradients {
 inline constexpr int kTileOrderClasses = 16;
 
 // What forward leaves for backward besides its outputs, in the backend's own layout. Backward may have fewer
-// rows than forward had room for, and may differentiate fewer tiles than were composited.
+// splats than forward had room for, and may differentiate fewer tiles than were composited.
 struct RasterizeAux {
-  void* packed;             // rows as the kernels read them, rows * rasterize_row_bytes(), 64-byte aligned
-  std::int64_t rows;        // that forward had room for
-  std::int32_t* order;      // [1 + composited, kTileOrderClasses], or null: in the order of their numbers
+  void* packed;         // splats as the kernels read them, splats * rasterize_splat_bytes(), 64-byte aligned
+  std::int64_t splats;  // that forward had room for
+  std::int32_t* order;  // [1 + composited, kTileOrderClasses], or null: in the order of their numbers
   std::int64_t composited;  // tiles
 };
 
 namespace cpu {
-std::int64_t rasterize_row_bytes(int n_channels);
+std::int64_t rasterize_splat_bytes(int n_channels);
 // Whether forward leaves an order of the tiles that it composites.
 bool rasterize_orders_tiles(const TileGrid& grid);
 template <class T>
@@ -111,7 +111,7 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
 }  // namespace cpu
 
 namespace cuda {
-std::int64_t rasterize_row_bytes(int n_channels);
+std::int64_t rasterize_splat_bytes(int n_channels);
 // Whether forward leaves an order of the tiles that it composites.
 bool rasterize_orders_tiles(const TileGrid& grid);
 template <class T>

@@ -12,7 +12,7 @@
 #include "common/launch.cuh"
 #include "common/warp.cuh"
 #include "rasterize/backward_pixel.cuh"
-#include "rasterize/row_entries.cuh"
+#include "rasterize/splat_entries.cuh"
 #include "rasterize/unpack_gradients.cuh"
 
 namespace blitzgs::cuda {
@@ -20,15 +20,15 @@ namespace blitzgs::cuda {
 namespace {
 
 struct BackwardArguments {
-  const PackedRow* rows;
+  const PackedSplat* splats;
   ChannelChunk chunk;
   const float* backgrounds;
-  const std::int32_t* isect_rows;
+  const std::int32_t* isect_splats;
   const std::int64_t* tile_offsets;
   TileGrid grid;
   TileOrder order;
   RasterizeSaved<float> saved;
-  PackedGradient* row_gradients;    // [P], added to atomically, or null
+  PackedGradient* splat_gradients;  // [P], added to atomically, or null
   PackedGradient* entry_gradients;  // [I], written once each (deterministic)
 };
 
@@ -40,7 +40,7 @@ struct BackwardShared {
   SubtileGradient<CHANNELS> v_render[kSubtiles];
   float2 group[kSubtiles][kGroup * kGroupStride];  // weight, g
   PackedGradient partial[DETERMINISTIC ? kWarps : 1][DETERMINISTIC ? kBatch : 1];
-  std::int32_t row[2][kBatch + 1];  // -1 where there is no entry
+  std::int32_t splat[2][kBatch + 1];  // -1 where there is no entry
   int last;
 };
 
@@ -83,7 +83,7 @@ __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINIST
       if (!half) target[2] = gradient.quads[2];
     }
   } else if (touched) {
-    float* target = reinterpret_cast<float*>(args.row_gradients + shared.row[buffer][my_entry]);
+    float* target = reinterpret_cast<float*>(args.splat_gradients + shared.splat[buffer][my_entry]);
     const float4 a = gradient.quads[0], b = gradient.quads[1], c = gradient.quads[2];
     add_quad(target, a.x, a.y, a.z, a.w);
     add_quad(target + 4, b.x, b.y, b.z, b.w);
@@ -121,10 +121,11 @@ __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, c
 }
 
 // v_render . color over all channels.
-__device__ __noinline__ float wide_dot(const BackwardArguments& args, const Pixel& pixel, std::int32_t row) {
+__device__ __noinline__ float wide_dot(const BackwardArguments& args, const Pixel& pixel,
+                                       std::int32_t splat) {
   const int n = args.chunk.n_channels;
   const float* v = args.saved.v_renders + pixel.index * n;
-  const float* color = args.chunk.colors + static_cast<std::int64_t>(row) * n;
+  const float* color = args.chunk.colors + static_cast<std::int64_t>(splat) * n;
   float sum = 0.f;
   for (int k = 0; k < n; ++k) sum = __fmaf_rn(v[k], color[k], sum);
   return sum;
@@ -148,7 +149,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
   const Pixel pixel = locate_pixel(args.grid, tile, thread);
 
   if (thread == 0) shared.last = 0;
-  if (thread < 2) shared.row[thread][kBatch] = -1;
+  if (thread < 2) shared.splat[thread][kBatch] = -1;
   shared.batch.init(thread);
   auto state = start_pixel<CHANNELS, WIDE>(shared, args, pixel, tile.camera);
   const int pixel_last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
@@ -160,31 +161,31 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
   if (lane == 0) atomicMax(&shared.last, list_last);
   __syncthreads();
   const int count = shared.last;
-  const auto row_at = [&](int at) {
-    return thread < kBatch && at >= 0 && at < count ? args.isect_rows[start + at] : -1;
+  const auto splat_at = [&](int at) {
+    return thread < kBatch && at >= 0 && at < count ? args.isect_splats[start + at] : -1;
   };
   int base = (count - 1) / kBatch * kBatch, buffer = 0;
-  std::int32_t row = row_at(base + thread), next_row = row_at(base - kBatch + thread);
-  shared.batch.fetch(0, args.rows, args.chunk, row, thread);
+  std::int32_t splat = splat_at(base + thread), next_splat = splat_at(base - kBatch + thread);
+  shared.batch.fetch(0, args.splats, args.chunk, splat, thread);
   for (; base >= 0 && count > 0; base -= kBatch, buffer ^= 1) {
     if (thread < kBatch) {
-      shared.row[buffer][thread] = row;
-      shared.batch.place(buffer, row >= 0, tile, thread);
+      shared.splat[buffer][thread] = splat;
+      shared.batch.place(buffer, splat >= 0, tile, thread);
     }
     if constexpr (DETERMINISTIC) {
       float4* mine = shared.partial[thread / 32][0].quads;
       for (int i = thread % 32; i < 3 * kBatch; i += 32) mine[i] = {0.f, 0.f, 0.f, 0.f};
     }
     __syncthreads();
-    row = next_row;
-    shared.batch.fetch(buffer ^ 1, args.rows, args.chunk, row, thread);
-    next_row = row_at(base - 2 * kBatch + thread);
+    splat = next_splat;
+    shared.batch.fetch(buffer ^ 1, args.splats, args.chunk, splat, thread);
+    next_splat = splat_at(base - 2 * kBatch + thread);
 
     const char* entries = reinterpret_cast<const char*>(shared.batch.entries[buffer]);
     const auto dot = [&](std::uint32_t offset) {
       if constexpr (WIDE) {
-        const int wide_row = pixel.inside ? shared.row[buffer][offset / sizeof(Entry)] : -1;
-        return wide_row < 0 ? 0.f : wide_dot(args, pixel, wide_row);
+        const int wide_splat = pixel.inside ? shared.splat[buffer][offset / sizeof(Entry)] : -1;
+        return wide_splat < 0 ? 0.f : wide_dot(args, pixel, wide_splat);
       } else {
         const float4 color = *reinterpret_cast<const float4*>(entry_at(entries, offset).color);
         float sum = state.v[0] * color.x;
@@ -248,11 +249,12 @@ void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream 
   }
 }
 
-// The gradients of each row, a chunk of channels at a time.
-class PackedRows {
+// The gradients of each splat, a chunk of channels at a time.
+class SplatGradientSums {
  public:
-  PackedRows(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved, std::int64_t n_isects,
-             const RasterizeAux& aux, bool deterministic, Workspace& workspace, CudaStream stream)
+  SplatGradientSums(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
+                    std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, Workspace& workspace,
+                    CudaStream stream)
       : in_(in),
         saved_(saved),
         aux_(aux),
@@ -262,7 +264,7 @@ class PackedRows {
     check_tile_size("rasterize_bwd", in.grid);
     if (empty_ || !deterministic) return;
     entries_ = static_cast<PackedGradient*>(workspace.allocate_bytes(n_isects * sizeof(PackedGradient)));
-    sorted_ = sort_entries(in.isect_rows, n_isects, in.n_rows, workspace, stream);
+    sorted_ = sort_entries(in.isect_splats, n_isects, in.n_splats, workspace, stream);
   }
 
   ChannelChunk chunk(int first) const {
@@ -276,10 +278,10 @@ class PackedRows {
     if (entries_) {
       check(cudaMemsetAsync(entries_, 0, n_isects_ * sizeof(PackedGradient), stream_), "rasterize_bwd");
     }
-    const BackwardArguments args{packed_rows(aux_),
+    const BackwardArguments args{packed_splats(aux_),
                                  chunk,
                                  in_.backgrounds,
-                                 in_.isect_rows,
+                                 in_.isect_splats,
                                  in_.tile_offsets,
                                  in_.grid,
                                  TileOrder(in_.grid, aux_.composited, aux_.order),
@@ -289,7 +291,7 @@ class PackedRows {
     dispatch_backward(args, absolute, stream_);
     if (!entries_) return;
     sum_entries_kernel<<<blocks_for(3 * n_isects_, 256), 256, 0, stream_>>>(
-        sorted_.rows, sorted_.entries, n_isects_, in_.tile_offsets + in_.grid.count(), entries_, packed);
+        sorted_.splats, sorted_.entries, n_isects_, in_.tile_offsets + in_.grid.count(), entries_, packed);
     check_launch("rasterize_bwd");
   }
 
@@ -300,7 +302,7 @@ class PackedRows {
   std::int64_t n_isects_;
   CudaStream stream_;
   bool empty_;
-  EntriesByRow sorted_{};
+  EntriesBySplat sorted_{};
   PackedGradient* entries_ = nullptr;
 };
 
@@ -311,26 +313,26 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
                           std::int64_t n_isects, const RasterizeAux& aux, bool deterministic,
                           const RasterizeGradients<float>& gradients, Workspace& workspace,
                           CudaStream stream) {
-  if (in.n_rows == 0) return;
+  if (in.n_splats == 0) return;
   const bool absolute = gradients.v_means2d_abs != nullptr;
-  const PackedRows rows(in, saved, n_isects, aux, deterministic, workspace, stream);
-  auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(in.n_rows * sizeof(PackedGradient)));
+  const SplatGradientSums splats(in, saved, n_isects, aux, deterministic, workspace, stream);
+  auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(in.n_splats * sizeof(PackedGradient)));
   for (int first = 0; first < in.n_channels; first += kChunkChannels) {
-    const ChannelChunk chunk = rows.chunk(first);
-    check(cudaMemsetAsync(packed, 0, in.n_rows * sizeof(PackedGradient), stream), "rasterize_bwd");
-    rows.add(chunk, absolute, packed);
+    const ChannelChunk chunk = splats.chunk(first);
+    check(cudaMemsetAsync(packed, 0, in.n_splats * sizeof(PackedGradient), stream), "rasterize_bwd");
+    splats.add(chunk, absolute, packed);
     launch_early("rasterize_bwd", unpack_kernel,
-                 {blocks_for(in.n_rows, kUnpackThreads), kUnpackThreads, stream}, packed, in.n_rows, chunk,
-                 absolute && first > 0, gradients);
+                 {blocks_for(in.n_splats, kUnpackThreads), kUnpackThreads, stream}, packed, in.n_splats,
+                 chunk, absolute && first > 0, gradients);
   }
 }
 
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
                           std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, float* packed,
                           Workspace& workspace, CudaStream stream) {
-  if (in.n_rows == 0) return;
-  const PackedRows rows(in, saved, n_isects, aux, deterministic, workspace, stream);
-  rows.add(rows.chunk(0), false, reinterpret_cast<PackedGradient*>(packed));
+  if (in.n_splats == 0) return;
+  const SplatGradientSums splats(in, saved, n_isects, aux, deterministic, workspace, stream);
+  splats.add(splats.chunk(0), false, reinterpret_cast<PackedGradient*>(packed));
 }
 
 }  // namespace blitzgs::cuda

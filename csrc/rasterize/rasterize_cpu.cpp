@@ -61,20 +61,21 @@ std::vector<Chunk> cut_chunks(const TileGrid& grid, const std::int32_t* used, st
   return chunks;
 }
 
-// Adds a chunk's partial gradients to the sums [P, width], each row by one thread, in the order of the tiles.
+// Adds a chunk's partial gradients to the sums [P, width], each splat by one thread, in the order of the
+// tiles.
 template <class T>
 void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const std::int32_t* used,
                   const T* partials, int width, T* sums) {
-  parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(0, in.n_splats, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
     const T* partial = partials;
     for (std::int64_t tile = chunk.begin; tile < chunk.end; ++tile) {
-      const std::int32_t* list = in.isect_rows + in.tile_offsets[tile];
+      const std::int32_t* list = in.isect_splats + in.tile_offsets[tile];
       const std::int32_t length = used[tile - in.grid.tile_begin];
       for (std::int32_t entry = 0; entry < length; ++entry, partial += width) {
         __builtin_prefetch(sums + static_cast<std::int64_t>(list[std::min(entry + 8, length - 1)]) * width);
-        const std::int64_t row = list[entry];
-        if (row < begin || row >= end) continue;
-        T* sum = sums + row * width;
+        const std::int64_t splat = list[entry];
+        if (splat < begin || splat >= end) continue;
+        T* sum = sums + splat * width;
         for (int i = 0; i < width; ++i) sum[i] += partial[i];
       }
     }
@@ -84,15 +85,15 @@ void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const std::in
 template <class T>
 void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
                      const RasterizeGradients<T>& gradients) {
-  parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t row = begin; row < end; ++row) {
-      const T* sum = sums + row * width;
-      std::copy_n(sum + kMeanX, 2, gradients.v_means2d + 2 * row);
-      std::copy_n(sum + kConicA, 3, gradients.v_conics + 3 * row);
-      gradients.v_opacities[row] = sum[kOpacity];
-      std::copy_n(sum + kColor, in.n_channels, gradients.v_colors + row * in.n_channels);
+  parallel_for(0, in.n_splats, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t splat = begin; splat < end; ++splat) {
+      const T* sum = sums + splat * width;
+      std::copy_n(sum + kMeanX, 2, gradients.v_means2d + 2 * splat);
+      std::copy_n(sum + kConicA, 3, gradients.v_conics + 3 * splat);
+      gradients.v_opacities[splat] = sum[kOpacity];
+      std::copy_n(sum + kColor, in.n_channels, gradients.v_colors + splat * in.n_channels);
       if (gradients.v_means2d_abs) {
-        std::copy_n(sum + kColor + in.n_channels, 2, gradients.v_means2d_abs + 2 * row);
+        std::copy_n(sum + kColor + in.n_channels, 2, gradients.v_means2d_abs + 2 * splat);
       }
     }
   });
@@ -100,8 +101,8 @@ void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
 
 }  // namespace
 
-// The prepared rows of float32; float64, which is for checking, prepares them again in the backward pass.
-std::int64_t rasterize_row_bytes(int) { return sizeof(SplatRow<float>); }
+// The prepared splats of float32; float64, which is for checking, prepares them again in the backward pass.
+std::int64_t rasterize_splat_bytes(int) { return sizeof(PreparedSplat<float>); }
 
 bool rasterize_orders_tiles(const TileGrid&) { return false; }
 
@@ -109,8 +110,9 @@ template <class T>
 void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
                    Workspace& workspace, CudaStream) {
   if (out.clear_rest) clear_unowned(in, out);
-  const SplatRow<T>* splats = pack_rows(
-      in, sizeof(T) == 4 ? static_cast<SplatRow<T>*>(aux.packed) : allocate_rows<T>(in.n_rows, workspace));
+  const PreparedSplat<T>* splats =
+      pack_splats(in, sizeof(T) == 4 ? static_cast<PreparedSplat<T>*>(aux.packed)
+                                     : allocate_splats<T>(in.n_splats, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, false);
   const TileMemory<T> memory(in, workspace);
   parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](std::int64_t task, int worker) {
@@ -136,12 +138,13 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   std::int64_t most = 0;
   for (const Chunk& chunk : chunks) most = std::max(most, chunk.partials);
   auto* partials = workspace.allocate<T>(most * width);
-  auto* sums = workspace.allocate<T>(in.n_rows * width);
-  parallel_for(0, in.n_rows * width, 1 << 16,
+  auto* sums = workspace.allocate<T>(in.n_splats * width);
+  parallel_for(0, in.n_splats * width, 1 << 16,
                [&](std::int64_t begin, std::int64_t end) { std::fill(sums + begin, sums + end, T(0)); });
 
-  const SplatRow<T>* splats = sizeof(T) == 4 ? static_cast<const SplatRow<T>*>(aux.packed)
-                                             : pack_rows(in, allocate_rows<T>(in.n_rows, workspace));
+  const PreparedSplat<T>* splats = sizeof(T) == 4
+                                       ? static_cast<const PreparedSplat<T>*>(aux.packed)
+                                       : pack_splats(in, allocate_splats<T>(in.n_splats, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, absgrad);
   const TileMemory<T> memory(in, workspace);
   for (const Chunk& chunk : chunks) {

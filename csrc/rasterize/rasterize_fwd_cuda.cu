@@ -5,23 +5,23 @@
 #include "common/launch.cuh"
 #include "common/warp.cuh"
 #include "rasterize/compositor.cuh"
-#include "rasterize/pack_rows.cuh"
+#include "rasterize/pack_splats.cuh"
 
 namespace blitzgs::cuda {
 
 namespace {
 
 struct ForwardArguments {
-  const PackedRow* rows;
+  const PackedSplat* splats;
   ChannelChunk chunk;
   const float* backgrounds;
-  const std::int32_t* isect_rows;
+  const std::int32_t* isect_splats;
   const std::int64_t* tile_offsets;
   TileGrid grid;
   TileOrder order;
   RasterizeOutput<float> out;
-  std::int64_t zero_rows, rows_per_block;  // of out.row_gradients, to be zeroed on the way
-  const std::int64_t* known_rows;          // null, or how many of these rows are there
+  std::int64_t zero_splats, splats_per_block;  // of out.splat_gradients, to be zeroed on the way
+  const std::int64_t* known_splats;            // null, or how many of these splats are there
 };
 
 // What four entries add to the colour of a pixel.
@@ -30,10 +30,11 @@ __device__ __forceinline__ void add_colors(const char* entries, const QuadOffset
                                            const QuadWeights& weights, float* color) {
 #pragma unroll
   for (int k = 0; k < 4; ++k) {
-    const float4 row_color = *reinterpret_cast<const float4*>(entry_at(entries, offsets.at[k]).color);
+    const float4 splat_color = *reinterpret_cast<const float4*>(entry_at(entries, offsets.at[k]).color);
     if (weights.touched[k]) {
 #pragma unroll
-      for (int c = 0; c < CHANNELS; ++c) color[c] = __fmaf_rn(weights.at[k], channel(row_color, c), color[c]);
+      for (int c = 0; c < CHANNELS; ++c)
+        color[c] = __fmaf_rn(weights.at[k], channel(splat_color, c), color[c]);
     }
   }
 }
@@ -61,14 +62,14 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
 
 // At most so many 16-byte stores of zeros a thread; where tiles are too few for that, they are no help.
 constexpr int kMostZeros = 16;
-constexpr int kQuads = kSplatGradient / 4;  // such stores for a row
+constexpr int kQuads = kSplatGradient / 4;  // such stores for a splat
 
 // This block's share of the zeros that backward starts from. Compositing waits for instructions, not for
-// memory, so the stores cost next to nothing; they ask for no room in the L2 cache, which the rows need.
-__device__ __forceinline__ void zero_share(const ForwardArguments& args, std::int64_t n_rows, int threads) {
-  auto* quads = reinterpret_cast<float4*>(args.out.row_gradients);
-  const std::int64_t begin = blockIdx.x * args.rows_per_block * kQuads;
-  const std::int64_t end = min(begin + args.rows_per_block * kQuads, n_rows * kQuads);
+// memory, so the stores cost next to nothing; they ask for no room in the L2 cache, which the splats need.
+__device__ __forceinline__ void zero_share(const ForwardArguments& args, std::int64_t n_splats, int threads) {
+  auto* quads = reinterpret_cast<float4*>(args.out.splat_gradients);
+  const std::int64_t begin = blockIdx.x * args.splats_per_block * kQuads;
+  const std::int64_t end = min(begin + args.splats_per_block * kQuads, n_splats * kQuads);
   for (std::int64_t i = begin + threadIdx.x; i < end; i += threads) __stcs(quads + i, float4{});
 }
 
@@ -81,7 +82,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
   __shared__ int tile_work;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   wait_for_earlier_kernels();
-  const std::int64_t zero_rows = rows_there(args.zero_rows, args.known_rows);
+  const std::int64_t zero_splats = splats_there(args.zero_splats, args.known_splats);
   const int block = static_cast<int>(blockIdx.x), owned = args.order.n_tiles;
   const std::int64_t index = block < owned                          ? args.order.tile(block)
                              : block - owned < args.grid.tile_begin ? block - owned
@@ -89,7 +90,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
   const TilePlace tile = locate_tile(args.grid, index);
   const Pixel pixel = locate_pixel(args.grid, tile, thread);
   if (block >= owned) {
-    zero_share(args, zero_rows, Tile::kThreads);
+    zero_share(args, zero_splats, Tile::kThreads);
     constexpr float kBlack[CHANNELS] = {};
     if (pixel.inside) write_pixel<CHANNELS>(args, pixel, tile.camera, kBlack, 0.f, 0);
     if (thread == 0 && args.chunk.first == 0) args.out.tile_work[tile.tile] = 0;
@@ -104,18 +105,18 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
   float color[CHANNELS] = {};
   state.limit = pixel.inside ? kLog2Cut : INFINITY;
   int last = 0, work = pixel.inside ? count : 0;
-  const auto row_at = [&](int at) {
-    return thread < kBatch && at < count ? args.isect_rows[start + at] : -1;
+  const auto splat_at = [&](int at) {
+    return thread < kBatch && at < count ? args.isect_splats[start + at] : -1;
   };
-  std::int32_t row = row_at(thread), next_row = row_at(thread + kBatch);
-  zero_share(args, zero_rows, Tile::kThreads);  // while the list is on its way
-  batch.fetch(0, args.rows, args.chunk, row, thread);
+  std::int32_t splat = splat_at(thread), next_splat = splat_at(thread + kBatch);
+  zero_share(args, zero_splats, Tile::kThreads);  // while the list is on its way
+  batch.fetch(0, args.splats, args.chunk, splat, thread);
   for (int base = 0, buffer = 0; base < count; base += kBatch, buffer ^= 1) {
-    if (thread < kBatch) batch.place(buffer, row >= 0, tile, thread);
+    if (thread < kBatch) batch.place(buffer, splat >= 0, tile, thread);
     if (__syncthreads_and(state.done())) break;
-    row = next_row;
-    batch.fetch(buffer ^ 1, args.rows, args.chunk, row, thread);
-    next_row = row_at(base + 2 * kBatch + thread);
+    splat = next_splat;
+    batch.fetch(buffer ^ 1, args.splats, args.chunk, splat, thread);
+    next_splat = splat_at(base + 2 * kBatch + thread);
     const unsigned done = __ballot_sync(kFullWarp, state.done()) >> (thread & kHalfWarp) & 0xffffu;
     const int quads =
         batch.template list<false, false>(buffer, pixel.subtile, lane, done == 0xffffu ? 0 : kBatch);
@@ -144,20 +145,20 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
   if (thread == 0) args.out.tile_work[tile.tile] = tile_work;
 }
 
-void zero_gradients(const RasterizeOutput<float>& out, std::int64_t n_rows, CudaStream stream) {
-  if (n_rows == 0) return;
-  check(cudaMemsetAsync(out.row_gradients, 0, n_rows * kSplatGradient * sizeof(float), stream),
+void zero_gradients(const RasterizeOutput<float>& out, std::int64_t n_splats, CudaStream stream) {
+  if (n_splats == 0) return;
+  check(cudaMemsetAsync(out.splat_gradients, 0, n_splats * kSplatGradient * sizeof(float), stream),
         "rasterize_fwd");
 }
 
 void launch_forward(ForwardArguments args, CudaStream stream) {
   const auto tiles = static_cast<unsigned>(args.out.clear_rest ? args.grid.count() : args.order.n_tiles);
-  if (kQuads * args.zero_rows > tiles * std::int64_t{kMostZeros * Tile::kThreads}) {
-    zero_gradients(args.out, args.zero_rows, stream);
-    args.zero_rows = 0;
+  if (kQuads * args.zero_splats > tiles * std::int64_t{kMostZeros * Tile::kThreads}) {
+    zero_gradients(args.out, args.zero_splats, stream);
+    args.zero_splats = 0;
   }
   if (tiles == 0) return;
-  args.rows_per_block = (args.zero_rows + tiles - 1) / tiles;
+  args.splats_per_block = (args.zero_splats + tiles - 1) / tiles;
   const auto kernel = args.chunk.count == 4 ? forward_kernel<4> : forward_kernel<3>;
   constexpr int kBytes = sizeof(EntryBatch<kForwardBatch>);
   check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_fwd");
@@ -166,8 +167,8 @@ void launch_forward(ForwardArguments args, CudaStream stream) {
 
 }  // namespace
 
-std::int64_t rasterize_row_bytes(int n_channels) {
-  return sizeof(PackedRow) + (n_channels <= kChunkChannels ? sizeof(float4) : 0);
+std::int64_t rasterize_splat_bytes(int n_channels) {
+  return sizeof(PackedSplat) + (n_channels <= kChunkChannels ? sizeof(float4) : 0);
 }
 
 bool rasterize_orders_tiles(const TileGrid& grid) { return grid.tile_end - grid.tile_begin != grid.count(); }
@@ -176,28 +177,28 @@ template <>
 void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput<float>& out,
                           const RasterizeAux& aux, Workspace&, CudaStream stream) {
   check_tile_size("rasterize_fwd", in.grid);
-  const std::int64_t zero_rows = out.row_gradients ? in.n_rows : 0;
+  const std::int64_t zero_splats = out.splat_gradients ? in.n_splats : 0;
   if (in.grid.count() == 0) {
-    zero_gradients(out, zero_rows, stream);
+    zero_gradients(out, zero_splats, stream);
     return;
   }
-  PackedRow* const rows = packed_rows(aux);
+  PackedSplat* const splats = packed_splats(aux);
   float4* const colors = packed_colors(aux, in.n_channels);
   const TileOrder order(in.grid, aux.composited, aux.order);
-  prepare("rasterize_fwd", in, rows, colors, order, stream);
+  prepare("rasterize_fwd", in, splats, colors, order, stream);
   for (int first = 0; first < in.n_channels; first += kChunkChannels) {
     const ForwardArguments args{
-        rows,
+        splats,
         {colors, in.colors, in.n_channels, first, std::min(kChunkChannels, in.n_channels - first)},
         in.backgrounds,
-        in.isect_rows,
+        in.isect_splats,
         in.tile_offsets,
         in.grid,
         order,
         out,
-        zero_rows,
+        zero_splats,
         0,
-        in.known_rows};
+        in.known_splats};
     launch_forward(args, stream);
   }
 }

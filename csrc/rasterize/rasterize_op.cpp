@@ -5,13 +5,13 @@
 #include <tuple>
 
 #include "common/op.h"
-#include "common/row_count_op.h"
+#include "common/splat_count_op.h"
 #include "common/tile_grid_op.h"
 
 namespace blitzgs {
 namespace {
 
-// Whether gradients of rows can be left packed.
+// Whether gradients of splats can be left packed.
 #ifdef BLITZGS_BACKEND_CUDA
 constexpr bool kPacked = true;
 #else
@@ -21,38 +21,40 @@ constexpr bool kPacked = false;
 // The arguments that forward and backward share, checked and contiguous.
 struct Splats {
   Splats(const char* op, const Tensor& means2d_in, const Tensor& conics_in, const Tensor& opacities_in,
-         const Tensor& colors_in, const std::optional<Tensor>& backgrounds_in, const Tensor& isect_rows_in,
+         const Tensor& colors_in, const std::optional<Tensor>& backgrounds_in, const Tensor& isect_splats_in,
          const Tensor& tile_offsets_in, const TileGrid& grid_in,
-         const std::optional<Tensor>& known_rows = std::nullopt)
-      : grid(grid_in), n_rows(means2d_in.size(0)), row_count(checked_row_count(op, known_rows, means2d_in)) {
+         const std::optional<Tensor>& known_splats = std::nullopt)
+      : grid(grid_in),
+        n_splats(means2d_in.size(0)),
+        splat_count(checked_splat_count(op, known_splats, means2d_in)) {
     check_floating(op, "means2d", means2d_in);
-    check_shape(op, "means2d", means2d_in, {n_rows, 2});
-    check_shape(op, "conics", conics_in, {n_rows, 3});
-    check_shape(op, "row_opacities", opacities_in, {n_rows});
-    check_shape(op, "colors", colors_in, {n_rows, -1});
+    check_shape(op, "means2d", means2d_in, {n_splats, 2});
+    check_shape(op, "conics", conics_in, {n_splats, 3});
+    check_shape(op, "splat_opacities", opacities_in, {n_splats});
+    check_shape(op, "colors", colors_in, {n_splats, -1});
     n_channels = colors_in.size(1);
-    STD_TORCH_CHECK(n_rows <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
-                    ": row indices are 32-bit, got ", n_rows, " rows; render fewer views at once");
+    STD_TORCH_CHECK(n_splats <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
+                    ": splat indices are 32-bit, got ", n_splats, " splats; render fewer views at once");
     STD_TORCH_CHECK(n_channels > 0 && n_channels <= 4096, "blitzgs::", op,
                     ": colors must have 1 to 4096 channels, got ", n_channels);
     const ScalarType dtype = means2d_in.scalar_type();
     check_dtype(op, "conics", conics_in, dtype);
-    check_dtype(op, "row_opacities", opacities_in, dtype);
+    check_dtype(op, "splat_opacities", opacities_in, dtype);
     check_dtype(op, "colors", colors_in, dtype);
     if (backgrounds_in) {
       check_shape(op, "backgrounds", *backgrounds_in, {grid.n_cameras, n_channels});
       check_dtype(op, "backgrounds", *backgrounds_in, dtype);
       backgrounds = as_contiguous(*backgrounds_in);
     }
-    check_shape(op, "isect_rows", isect_rows_in, {-1});
-    check_dtype(op, "isect_rows", isect_rows_in, ScalarType::Int);
+    check_shape(op, "isect_splats", isect_splats_in, {-1});
+    check_dtype(op, "isect_splats", isect_splats_in, ScalarType::Int);
     check_shape(op, "tile_offsets", tile_offsets_in, {grid.count() + 1});
     check_dtype(op, "tile_offsets", tile_offsets_in, ScalarType::Long);
     means2d = as_contiguous(means2d_in);
     conics = as_contiguous(conics_in);
     opacities = as_contiguous(opacities_in);
     colors = as_contiguous(colors_in);
-    isect_rows = as_contiguous(isect_rows_in);
+    isect_splats = as_contiguous(isect_splats_in);
     tile_offsets = as_contiguous(tile_offsets_in);
   }
 
@@ -63,25 +65,25 @@ struct Splats {
             data<T>(opacities),
             data<T>(colors),
             data_or_null<T>(backgrounds),
-            data<std::int32_t>(isect_rows),
+            data<std::int32_t>(isect_splats),
             data<std::int64_t>(tile_offsets),
-            row_count.n_rows,
+            splat_count.n_splats,
             static_cast<int>(n_channels),
             grid,
-            row_count.known_rows};
+            splat_count.known_splats};
   }
 
   TileGrid grid;
-  std::int64_t n_rows, n_channels = 0;  // of the columns
-  RowCount row_count;
-  Tensor means2d, conics, opacities, colors, isect_rows, tile_offsets;
+  std::int64_t n_splats, n_channels = 0;  // of the columns
+  SplatCount splat_count;
+  Tensor means2d, conics, opacities, colors, isect_splats, tile_offsets;
   std::optional<Tensor> backgrounds;
 };
 
 using CompositedTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-// Zeroes row_gradients, if there are any.
-CompositedTensors composite(const Splats& splats, std::optional<Tensor> row_gradients, bool clear_rest) {
+// Zeroes splat_gradients, if there are any.
+CompositedTensors composite(const Splats& splats, std::optional<Tensor> splat_gradients, bool clear_rest) {
   const TileGrid& grid = splats.grid;
   Tensor renders = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width, splats.n_channels});
   Tensor transmittances = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width});
@@ -89,12 +91,12 @@ CompositedTensors composite(const Splats& splats, std::optional<Tensor> row_grad
   Tensor tile_work = make_empty(splats.means2d, {grid.count()}, ScalarType::Int);
   const std::int64_t composited = grid.tile_end - grid.tile_begin;
   Tensor packed = make_empty(
-      splats.means2d, {splats.n_rows, backend::rasterize_row_bytes(static_cast<int>(splats.n_channels))},
+      splats.means2d, {splats.n_splats, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))},
       ScalarType::Byte);
   Tensor order = make_empty(splats.means2d,
                             {backend::rasterize_orders_tiles(grid) ? 1 + composited : 0, kTileOrderClasses},
                             ScalarType::Int);
-  const RasterizeAux aux{mutable_data<void>(packed), splats.n_rows,
+  const RasterizeAux aux{mutable_data<void>(packed), splats.n_splats,
                          order.size(0) > 0 ? mutable_data<std::int32_t>(order) : nullptr, composited};
   DeviceScope scope(splats.means2d);
   dispatch_floating(splats.means2d, [&](auto zero) {
@@ -103,7 +105,7 @@ CompositedTensors composite(const Splats& splats, std::optional<Tensor> row_grad
                                  mutable_data<T>(transmittances),
                                  mutable_data<std::int32_t>(last_ids),
                                  mutable_data<std::int32_t>(tile_work),
-                                 row_gradients ? mutable_data<T>(*row_gradients) : nullptr,
+                                 splat_gradients ? mutable_data<T>(*splat_gradients) : nullptr,
                                  clear_rest};
     backend::rasterize_fwd(splats.input<T>(), out, aux, scope.workspace, scope.stream);
   });
@@ -111,18 +113,18 @@ CompositedTensors composite(const Splats& splats, std::optional<Tensor> row_grad
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
-    const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
-    const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
+    const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
+    const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
     const std::vector<std::int64_t>& grid_numbers, const std::optional<Tensor>&, bool clear_rest,
-    bool backward_follows, const std::optional<Tensor>& known_rows) {
+    bool backward_follows, const std::optional<Tensor>& known_splats) {
   constexpr const char* kOp = "rasterize_fwd";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
-  const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
-                      grid, known_rows);
+  const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
+                      grid, known_splats);
   const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
-  Tensor row_gradients = make_empty(splats.means2d, {packed ? splats.n_rows : 0, kSplatGradient});
-  auto composited = composite(splats, packed ? std::optional(row_gradients) : std::nullopt, clear_rest);
-  return std::tuple_cat(std::move(composited), std::tuple(row_gradients));
+  Tensor splat_gradients = make_empty(splats.means2d, {packed ? splats.n_splats : 0, kSplatGradient});
+  auto composited = composite(splats, packed ? std::optional(splat_gradients) : std::nullopt, clear_rest);
+  return std::tuple_cat(std::move(composited), std::tuple(splat_gradients));
 }
 
 // What the backward ops need of the forward pass, checked and contiguous: (transmittances, last_ids,
@@ -153,16 +155,16 @@ struct Composited {
       v_alphas = as_contiguous(*v_alphas_in);
     }
     check_shape(op, "packed_splats", packed,
-                {-1, backend::rasterize_row_bytes(static_cast<int>(splats.n_channels))});
+                {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
     check_dtype(op, "packed_splats", packed, ScalarType::Byte);
     check_shape(op, "tile_order", order, {-1, kTileOrderClasses});
     check_dtype(op, "tile_order", order, ScalarType::Int);
-    STD_TORCH_CHECK(packed.size(0) >= splats.n_rows && tiles() >= grid.tile_end - grid.tile_begin &&
+    STD_TORCH_CHECK(packed.size(0) >= splats.n_splats && tiles() >= grid.tile_end - grid.tile_begin &&
                         packed.is_contiguous() && order.is_contiguous() &&
                         reinterpret_cast<std::uintptr_t>(packed.const_data_ptr()) % 64 == 0,
                     "blitzgs::", op,
                     ": packed_splats and tile_order must be as rasterize_fwd returned them, ", "for ",
-                    splats.n_rows, " rows and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
+                    splats.n_splats, " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
                     packed.size(0), " and ", tiles());
   }
 
@@ -187,28 +189,28 @@ struct Composited {
 };
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
-    const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities, const Tensor& colors,
-    const std::optional<Tensor>& backgrounds, const Tensor& isect_rows, const Tensor& tile_offsets,
+    const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
+    const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
     const std::vector<Tensor>& composited_in, const Tensor& v_renders, const std::optional<Tensor>& v_alphas,
     const std::vector<std::int64_t>& grid_numbers, bool absgrad, bool deterministic) {
   constexpr const char* kOp = "rasterize_bwd";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
-  const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
+  const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
                       grid);
   const Composited composited(kOp, splats, composited_in, v_renders, v_alphas);
-  const std::int64_t n_rows = splats.n_rows;
-  Tensor v_means2d = make_empty(splats.means2d, {n_rows, 2});
-  Tensor v_conics = make_empty(splats.means2d, {n_rows, 3});
-  Tensor v_opacities = make_empty(splats.means2d, {n_rows});
-  Tensor v_colors = make_empty(splats.means2d, {n_rows, splats.n_channels});
-  Tensor v_means2d_abs = make_empty(splats.means2d, {absgrad ? n_rows : 0, 2});
+  const std::int64_t n_splats = splats.n_splats;
+  Tensor v_means2d = make_empty(splats.means2d, {n_splats, 2});
+  Tensor v_conics = make_empty(splats.means2d, {n_splats, 3});
+  Tensor v_opacities = make_empty(splats.means2d, {n_splats});
+  Tensor v_colors = make_empty(splats.means2d, {n_splats, splats.n_channels});
+  Tensor v_means2d_abs = make_empty(splats.means2d, {absgrad ? n_splats : 0, 2});
   DeviceScope scope(splats.means2d);
   dispatch_floating(splats.means2d, [&](auto zero) {
     using T = decltype(zero);
     const RasterizeGradients<T> gradients{mutable_data<T>(v_means2d), mutable_data<T>(v_conics),
                                           mutable_data<T>(v_opacities), mutable_data<T>(v_colors),
                                           absgrad ? mutable_data<T>(v_means2d_abs) : nullptr};
-    backend::rasterize_bwd(splats.input<T>(), composited.saved<T>(), splats.isect_rows.size(0),
+    backend::rasterize_bwd(splats.input<T>(), composited.saved<T>(), splats.isect_splats.size(0),
                            composited.aux(), deterministic, gradients, scope.workspace, scope.stream);
   });
   return {v_means2d, v_conics, v_opacities, v_colors, v_means2d_abs};
@@ -219,39 +221,39 @@ void check_packed(const char* op, const Splats& splats, const Tensor& packed) {
   STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", op, ": colors must have 1 to 4 channels, got ",
                   splats.n_channels);
   check_shape(op, "packed", packed, {-1, kSplatGradient});
-  STD_TORCH_CHECK(packed.size(0) >= splats.n_rows, "blitzgs::", op, ": packed must have ", splats.n_rows,
-                  " rows or more, got ", packed.size(0));
+  STD_TORCH_CHECK(packed.size(0) >= splats.n_splats, "blitzgs::", op, ": packed must have ", splats.n_splats,
+                  " splats or more, got ", packed.size(0));
   check_dtype(op, "packed", packed, ScalarType::Float);
   STD_TORCH_CHECK(packed.is_contiguous(), "blitzgs::", op, ": packed must be contiguous");
 }
 
 CompositedTensors rasterize_fwd_packed(const Tensor& means2d, const Tensor& conics,
-                                       const Tensor& row_opacities, const Tensor& colors,
-                                       const std::optional<Tensor>& backgrounds, const Tensor& isect_rows,
+                                       const Tensor& splat_opacities, const Tensor& colors,
+                                       const std::optional<Tensor>& backgrounds, const Tensor& isect_splats,
                                        const Tensor& tile_offsets,
                                        const std::vector<std::int64_t>& grid_numbers, Tensor packed,
-                                       const std::optional<Tensor>& known_rows) {
+                                       const std::optional<Tensor>& known_splats) {
   constexpr const char* kOp = "rasterize_fwd_packed_";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
-  const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
-                      grid, known_rows);
+  const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
+                      grid, known_splats);
   check_packed(kOp, splats, packed);
   return composite(splats, packed, false);
 }
 
-void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Tensor& row_opacities,
+void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities,
                           const Tensor& colors, const std::optional<Tensor>& backgrounds,
-                          const Tensor& isect_rows, const Tensor& tile_offsets,
+                          const Tensor& isect_splats, const Tensor& tile_offsets,
                           const std::vector<Tensor>& composited_in, const Tensor& v_renders,
                           const std::vector<std::int64_t>& grid_numbers, bool deterministic, Tensor packed) {
   constexpr const char* kOp = "rasterize_bwd_packed_";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
-  const Splats splats(kOp, means2d, conics, row_opacities, colors, backgrounds, isect_rows, tile_offsets,
+  const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
                       grid);
   check_packed(kOp, splats, packed);
   const Composited composited(kOp, splats, composited_in, v_renders, std::nullopt);
   DeviceScope scope(splats.means2d);
-  cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_rows.size(0),
+  cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_splats.size(0),
                              composited.aux(), deterministic, mutable_data<float>(packed), scope.workspace,
                              scope.stream);
 }

@@ -29,18 +29,18 @@ struct Scene {
   std::vector<T> means2d{T(20.5), T(10.5), T(12), T(8)};
   std::vector<T> conics{T(0.02), T(0.005), T(0.03), T(0.25), T(0), T(0.25)};
   std::vector<T> opacities{T(0.8), T(0.5)}, depths{T(2), T(1)}, colors{T(1), T(0.5), T(0), T(0), T(0), T(1)};
-  std::vector<std::int32_t> cameras{0, 0}, rows;
+  std::vector<std::int32_t> cameras{0, 0}, splats;
   std::vector<std::int64_t> offsets = std::vector<std::int64_t>(7);
   std::vector<T> renders = std::vector<T>(2400), rest = std::vector<T>(800);
   std::vector<std::int32_t> last = std::vector<std::int32_t>(800), work = std::vector<std::int32_t>(6);
   HeapWorkspace workspace;
 
-  void intersect_rows() {
+  void intersect_splats() {
     const IntersectInput<T> in{
         means2d.data(), conics.data(), opacities.data(), depths.data(), cameras.data(), nullptr, 2, grid};
-    rows.resize(cpu::count_intersections(in, workspace, nullptr));
-    REQUIRE(cpu::intersect(in, rows.size(), rows.data(), offsets.data(), workspace, nullptr) ==
-            static_cast<std::int64_t>(rows.size()));
+    splats.resize(cpu::count_intersections(in, workspace, nullptr));
+    REQUIRE(cpu::intersect(in, splats.size(), splats.data(), offsets.data(), workspace, nullptr) ==
+            static_cast<std::int64_t>(splats.size()));
   }
 
   RasterizeInput<T> input() const {
@@ -49,7 +49,7 @@ struct Scene {
             opacities.data(),
             colors.data(),
             nullptr,
-            rows.data(),
+            splats.data(),
             offsets.data(),
             2,
             3,
@@ -69,16 +69,16 @@ struct Scene {
 }  // namespace
 
 // The near splat reaches 6.2 px around (12, 8): the first two tiles of the upper row.
-TEST_CASE("intersection lists rows front to back") {
+TEST_CASE("intersection lists splats front to back") {
   Scene<float> scene;
-  scene.intersect_rows();
+  scene.intersect_splats();
   REQUIRE(scene.offsets == std::vector<std::int64_t>{0, 2, 4, 5, 6, 7, 8});
-  REQUIRE(scene.rows == std::vector<std::int32_t>{1, 0, 1, 0, 0, 0, 0, 0});
+  REQUIRE(scene.splats == std::vector<std::int32_t>{1, 0, 1, 0, 0, 0, 0, 0});
 }
 
 TEST_CASE("a pixel composites front to back") {
   Scene<double> scene;
-  scene.intersect_rows();
+  scene.intersect_splats();
   scene.render();
   const int pixel = 8 * 40 + 13;  // centre (13.5, 8.5)
   const double front = 0.5 * std::exp(-0.5 * 0.25 * (1.5 * 1.5 + 0.5 * 0.5));
@@ -91,13 +91,13 @@ TEST_CASE("a pixel composites front to back") {
 
 TEST_CASE("the gradient predicts a small step") {
   Scene<double> scene;
-  scene.intersect_rows();
+  scene.intersect_splats();
   scene.render();
   const std::vector<double> ones(2400, 1.0);
   std::vector<double> v_means(4), v_conics(6), v_opacities(2), v_colors(6), v_abs(4);
   cpu::rasterize_bwd<double>(
       scene.input(), {scene.rest.data(), scene.last.data(), ones.data(), nullptr},
-      static_cast<std::int64_t>(scene.rows.size()), {}, true,
+      static_cast<std::int64_t>(scene.splats.size()), {}, true,
       {v_means.data(), v_conics.data(), v_opacities.data(), v_colors.data(), v_abs.data()}, scene.workspace,
       nullptr);
   const auto slope = [&scene](double& value) {

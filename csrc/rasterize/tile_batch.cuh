@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the CUDA rasteriser's forward and backward share: packed rows, the arithmetic of alpha, and how a
+// What the CUDA rasteriser's forward and backward share: packed splats, the arithmetic of alpha, and how a
 // block reads a batch of its tile's list.
 //
 // A block is a tile, half a warp a 4x4 subtile of it, a lane a pixel. The block fetches the list in batches;
@@ -25,10 +25,10 @@ inline constexpr float kInverseScale2 = 1.38629436112f;  // 1 / kFactorScale^2
 inline constexpr int kSubtile = 4;                       // edge in pixels
 inline constexpr int kHalfWarp = 16;
 
-// A row as the kernels read it: one 32-byte sector, so a gather moves no byte it does not use. With
+// A splat as the kernels read it: one 32-byte sector, so a gather moves no byte it does not use. With
 // conic = L^T L (factor_conic), l11, l21, l22 are scaled by sqrt(log2(e) / 2), so that
 // log2(alpha) = log2_opacity - (l11 dx + l21 dy)^2 - (l22 dy)^2.
-struct __align__(32) PackedRow {
+struct __align__(32) PackedSplat {
   float x, y, l11, l21;
   float l22, log2_opacity;
   float dx_per_dy;  // where alpha peaks along a row of pixels: dx = dx_per_dy * dy
@@ -51,11 +51,11 @@ inline void check_tile_size(const char* op, const TileGrid& grid) {
                            std::to_string(grid.tile_size));
 }
 
-inline PackedRow* packed_rows(const RasterizeAux& aux) { return static_cast<PackedRow*>(aux.packed); }
+inline PackedSplat* packed_splats(const RasterizeAux& aux) { return static_cast<PackedSplat*>(aux.packed); }
 
-// The colours, behind all rows; null where there are too many channels to pack.
+// The colours, behind all splats; null where there are too many channels to pack.
 inline float4* packed_colors(const RasterizeAux& aux, int n_channels) {
-  return n_channels <= kChunkChannels ? reinterpret_cast<float4*>(packed_rows(aux) + aux.rows) : nullptr;
+  return n_channels <= kChunkChannels ? reinterpret_cast<float4*>(packed_splats(aux) + aux.splats) : nullptr;
 }
 
 // The channels of one launch: up to 4 of n_channels, from `first`.
@@ -78,12 +78,12 @@ __device__ __forceinline__ void copy_float(void* shared, const void* global) {
 
 __device__ __forceinline__ void copies_done() { asm volatile("cp.async.wait_all;" ::: "memory"); }
 
-__device__ __forceinline__ void copy_color(float* shared, const ChannelChunk& chunk, std::int32_t row) {
+__device__ __forceinline__ void copy_color(float* shared, const ChannelChunk& chunk, std::int32_t splat) {
   if (chunk.packed) {
-    copy_quad(shared, chunk.packed + row);
+    copy_quad(shared, chunk.packed + splat);
     return;
   }
-  const float* color = chunk.colors + static_cast<std::int64_t>(row) * chunk.n_channels + chunk.first;
+  const float* color = chunk.colors + static_cast<std::int64_t>(splat) * chunk.n_channels + chunk.first;
   for (int k = 0; k < 4; ++k) {
     if (k < chunk.count) {
       copy_float(shared + k, color + k);
@@ -188,19 +188,19 @@ __device__ __forceinline__ std::uint32_t ceil_bits(float scale, float value, flo
 
 // One bit per subtile, row by row: can alpha reach 1/255 at one of its pixel centres? Over each row of
 // subtiles, the ellipse of those points spans an interval of x with ends in closed form (as in math/tiles.h).
-__device__ __forceinline__ void subtile_mask(const PackedRow& row, const TilePlace& place,
+__device__ __forceinline__ void subtile_mask(const PackedSplat& splat, const TilePlace& place,
                                              std::uint32_t* masks) {
   constexpr int kColumns = Tile::kColumns;
   constexpr std::uint32_t kRow = (1u << kColumns) - 1u;
   // From the centre of the tile's first pixel to the mean.
-  const float x = row.x - (static_cast<float>(place.left) + 0.5f);
-  const float y = row.y - (static_cast<float>(place.top) + 0.5f);
+  const float x = splat.x - (static_cast<float>(place.left) + 0.5f);
+  const float y = splat.y - (static_cast<float>(place.top) + 0.5f);
   // The slack covers the rounding of this test and of log2_alpha().
-  const float terms = fabsf(row.l11) * (fabsf(x) + kTileSize) + fabsf(row.l21) * (fabsf(y) + kTileSize);
-  const float cut = (row.log2_opacity - kLog2Cut) * 1.00003f + 3e-5f + 2e-6f * terms;
-  const float slack = 2e-6f * (fabsf(x) + fabsf(row.dx_per_dy) * (fabsf(y) + kTileSize)) + 1e-5f;
-  const float inverse = 1.000003f * reciprocal_approx(row.l11);
-  const float turn = row.turn * sqrt_approx(cut);
+  const float terms = fabsf(splat.l11) * (fabsf(x) + kTileSize) + fabsf(splat.l21) * (fabsf(y) + kTileSize);
+  const float cut = (splat.log2_opacity - kLog2Cut) * 1.00003f + 3e-5f + 2e-6f * terms;
+  const float slack = 2e-6f * (fabsf(x) + fabsf(splat.dx_per_dy) * (fabsf(y) + kTileSize)) + 1e-5f;
+  const float inverse = 1.000003f * reciprocal_approx(splat.l11);
+  const float turn = splat.turn * sqrt_approx(cut);
   const float left = x - slack - (kSubtile - 1), right = x + slack;
 #pragma unroll
   for (int word = 0; word < Tile::kMaskWords; ++word) masks[word] = 0;
@@ -208,12 +208,12 @@ __device__ __forceinline__ void subtile_mask(const PackedRow& row, const TilePla
   for (int i = 0; i < kColumns; ++i) {
     const float y0 = static_cast<float>(i * kSubtile) - y, y1 = y0 + (kSubtile - 1);
     const float dy_left = clamp_between(-turn, y0, y1), dy_right = clamp_between(turn, y0, y1);
-    const float v_left = row.l22 * dy_left, v_right = row.l22 * dy_right;
+    const float v_left = splat.l22 * dy_left, v_right = splat.l22 * dy_right;
     const float rest_left = cut - v_left * v_left, rest_right = cut - v_right * v_right;
     const float reach_left = sqrt_approx(fmaxf(rest_left, 0.f)) * inverse;
     const float reach_right = sqrt_approx(fmaxf(rest_right, 0.f)) * inverse;
-    const float end_left = row.dx_per_dy * dy_left - reach_left + left;
-    const float end_right = row.dx_per_dy * dy_right + reach_right + right;
+    const float end_left = splat.dx_per_dy * dy_left - reach_left + left;
+    const float end_right = splat.dx_per_dy * dy_right + reach_right + right;
     // Subtile c holds the pixels 4 c to 4 c + 3. A NaN bound does not bound.
     const std::uint32_t skip_left =
         ceil_bits(0.25f, fminf(fmaxf(end_left, 1.f - kSubtile), static_cast<float>(kTileSize)), 0.f);
@@ -247,7 +247,7 @@ struct __align__(16) Entry {
 };
 
 // log2 of the unclipped alpha at a pixel. Written out with the fused operations, because forward and backward
-// must agree bit by bit on which pixels a row touches.
+// must agree bit by bit on which pixels a splat touches.
 __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pixel) {
   const float4 a = reinterpret_cast<const float4*>(&entry)[0];
   const float2 b = reinterpret_cast<const float2*>(&entry)[2];
@@ -278,17 +278,17 @@ struct EntryBatch {
     }
   }
 
-  // Starts to copy entry `at` of a batch that no thread reads at the time; row < 0 where the list has ended.
-  // `chunk` is what copy_color() takes.
+  // Starts to copy entry `at` of a batch that no thread reads at the time; splat < 0 where the list has
+  // ended. `chunk` is what copy_color() takes.
   template <class Chunk>
-  __device__ __forceinline__ void fetch(int buffer, const PackedRow* rows, const Chunk& chunk,
-                                        std::int32_t row, int at) {
-    if (row < 0) return;
+  __device__ __forceinline__ void fetch(int buffer, const PackedSplat* splats, const Chunk& chunk,
+                                        std::int32_t splat, int at) {
+    if (splat < 0) return;
     auto* target = reinterpret_cast<float4*>(&entries[buffer][at]);
-    const auto* source = reinterpret_cast<const float4*>(rows + row);
+    const auto* source = reinterpret_cast<const float4*>(splats + splat);
     copy_quad(target, source);
     copy_quad(target + 1, source + 1);
-    copy_color(entries[buffer][at].color, chunk, row);
+    copy_color(entries[buffer][at].color, chunk, splat);
   }
 
   // Turns what fetch() copied into an entry and tests it; called by whole warps.

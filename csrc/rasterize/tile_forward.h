@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Compositing one tile, front to back, and what is made of it: the image, or the contributions of rows.
+// Compositing one tile, front to back, and what is made of it: the image, or the contributions of splats.
 // Compiled twice, plain and with AVX2; see tile_kernels.h.
 #pragma once
 #include <algorithm>
@@ -37,7 +37,7 @@ struct RowSpans {
 
 // Fills spans and returns the set of rows with a pixel in reach, one bit each.
 template <class Lanes, class T>
-std::uint64_t find_spans(const SplatRow<T>& splat, const TileJob<T>& tile, RowSpans<T>& spans) {
+std::uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, RowSpans<T>& spans) {
   const T top = static_cast<T>(tile.y0) + T(0.5);
   const T low = splat.y - splat.half_height - top, high = splat.y + splat.half_height - top;
   const T bottom = static_cast<T>(tile.height - 1);
@@ -76,9 +76,9 @@ int channels(const TileJob<T>& tile) {
 }
 
 template <int D, class T>
-const T* splat_color(const TileJob<T>& tile, std::int32_t row) {
-  if constexpr (D > 0 && D <= kPackedChannels) return tile.splats[row].color;
-  return tile.colors + static_cast<std::int64_t>(row) * channels<D>(tile);
+const T* splat_color(const TileJob<T>& tile, std::int32_t index) {
+  if constexpr (D > 0 && D <= kPackedChannels) return tile.splats[index].color;
+  return tile.colors + static_cast<std::int64_t>(index) * channels<D>(tile);
 }
 
 template <class T>
@@ -126,8 +126,8 @@ void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
 
 // Composites a splat at eight pixels of a row and gives the sink their alpha T, zero where it is not drawn.
 template <class Lanes, class T, class Sink>
-inline void composite(const SplatRow<T>& splat, const RowSpans<T>& spans, std::int32_t entry, int row, int x,
-                      ForwardState<T>& state, Sink& sink) {
+inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, std::int32_t entry, int row,
+                      int x, ForwardState<T>& state, Sink& sink) {
   const int pixel = row * state.layout.stride + x;
   const Lanes before = Lanes::load(state.transmittance + pixel);
   const auto running = Lanes::greater(before, Lanes::zero());
@@ -166,21 +166,21 @@ void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
   }
 }
 
-// Lists name rows in no order that the hardware could foresee, so they are fetched some entries ahead. Both
+// Lists name splats in no order that the hardware could foresee, so they are fetched some entries ahead. Both
 // loops write it out, because gcc drops calls of a function that does nothing but prefetch.
 constexpr std::int32_t kPrefetchDistance = 6;
 
-// Composites the tile's list and returns the number of entries processed. The sink gets begin(row), then
-// add(alpha T of eight pixels, first of them) for the pixels the splat may reach, then end(row).
+// Composites the tile's list and returns the number of entries processed. The sink gets begin(index), then
+// add(alpha T of eight pixels, first of them) for the pixels the splat may reach, then end(index).
 template <class Lanes, class T, class Sink>
 std::int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink& sink) {
   RowSpans<T> spans;
   std::int32_t entry = 0;
   for (; entry < tile.n_entries && state.alive_rows; ++entry) {
     __builtin_prefetch(tile.splats + tile.list[std::min(entry + kPrefetchDistance, tile.n_entries - 1)]);
-    const std::int32_t splat_row = tile.list[entry];
-    const SplatRow<T>& splat = tile.splats[splat_row];
-    sink.begin(splat_row);
+    const std::int32_t index = tile.list[entry];
+    const PreparedSplat<T>& splat = tile.splats[index];
+    sink.begin(index);
     std::uint64_t rows = find_spans<Lanes>(splat, tile, spans) & state.alive_rows;
     for (; rows; rows &= rows - 1) {
       const int row = std::countr_zero(rows);
@@ -188,12 +188,12 @@ std::int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink
         composite<Lanes>(splat, spans, entry, row, x, state, sink);
       }
     }
-    sink.end(splat_row);
+    sink.end(index);
   }
   return entry;
 }
 
-// Adds the colours of rows up in the planes of the pixels.
+// Adds the colours of splats up in the planes of the pixels.
 template <class Lanes, int D, class T>
 struct ColorSink {
   const TileJob<T>& tile;
@@ -201,7 +201,7 @@ struct ColorSink {
   std::ptrdiff_t plane;
   const T* color = nullptr;
 
-  void begin(std::int32_t row) { color = splat_color<D>(tile, row); }
+  void begin(std::int32_t index) { color = splat_color<D>(tile, index); }
   void add(Lanes share, int pixel) const {
     for (int c = 0; c < channels<D>(tile); ++c) {
       T* sum = planes + c * plane + pixel;
@@ -222,7 +222,7 @@ std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
   return entries;
 }
 
-// Adds the contributions of rows up, in units of 2^-32: integers, so the order of tiles does not matter.
+// Adds the contributions of splats up, in units of 2^-32: integers, so the order of tiles does not matter.
 template <class Lanes, class T>
 struct ContributionSink {
   const ContributionSums& sums;
@@ -238,10 +238,10 @@ struct ContributionSink {
       pixels += alpha_t > T(0);
     }
   }
-  void end(std::int32_t row) const {
+  void end(std::int32_t index) const {
     if (pixels == 0) return;
-    std::atomic_ref(sums.weights[row]).fetch_add(weight, std::memory_order_relaxed);
-    std::atomic_ref(sums.pixels[row]).fetch_add(pixels, std::memory_order_relaxed);
+    std::atomic_ref(sums.weights[index]).fetch_add(weight, std::memory_order_relaxed);
+    std::atomic_ref(sums.pixels[index]).fetch_add(pixels, std::memory_order_relaxed);
   }
 };
 

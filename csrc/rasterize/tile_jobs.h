@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What drives the CPU tile kernels: rows prepared for them, and the jobs of tiles.
+// What drives the CPU tile kernels: splats prepared for them, and the jobs of tiles.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -22,24 +22,24 @@ TileKernels<T> tile_kernels(int n_channels, bool absgrad) {
 }
 
 template <class T>
-SplatRow<T> pack_row(const RasterizeInput<T>& in, std::int64_t row) {
+PreparedSplat<T> pack_splat(const RasterizeInput<T>& in, std::int64_t index) {
   constexpr T kScale = ExponentScale<T>::value;
   constexpr T kRounding = sizeof(T) == 4 ? T(2e-6) : T(2e-14);
-  SplatRow<T> splat{};
+  PreparedSplat<T> splat{};
   SplatEllipse<T> e;
-  splat.x = in.means2d[2 * row];
-  splat.y = in.means2d[2 * row + 1];
+  splat.x = in.means2d[2 * index];
+  splat.y = in.means2d[2 * index + 1];
   splat.half_height = T(-1);
   splat.cut = T(-1);
   splat.opacity = T(1);
   if (!tiles::finite(splat.x) || !tiles::finite(splat.y)) return splat;
-  if (!make_ellipse(in.conics + 3 * row, in.opacities[row], &e)) return splat;
-  const ConicFactor<T> factor = factor_conic(in.conics + 3 * row);
+  if (!make_ellipse(in.conics + 3 * index, in.opacities[index], &e)) return splat;
+  const ConicFactor<T> factor = factor_conic(in.conics + 3 * index);
   const T root = std::sqrt(kScale);
   splat.l11 = factor.l11 * root;
   splat.l21 = factor.l21 * root;
   splat.l22 = factor.l22 * root;
-  splat.opacity = in.opacities[row];
+  splat.opacity = in.opacities[index];
   splat.cut = e.cut * kScale;
   splat.inv_l11 = T(1) / splat.l11;
   splat.shear = e.shear;
@@ -48,37 +48,37 @@ SplatRow<T> pack_row(const RasterizeInput<T>& in, std::int64_t row) {
   splat.slack = kRounding * (std::fabs(splat.x) + std::fabs(e.shear) * (std::fabs(splat.y) + height) +
                              std::sqrt(splat.cut) * splat.inv_l11);
   for (int c = 0; c < std::min(in.n_channels, kPackedChannels); ++c) {
-    splat.color[c] = in.colors[row * in.n_channels + c];
+    splat.color[c] = in.colors[index * in.n_channels + c];
   }
   return splat;
 }
 
 template <class T>
-const SplatRow<T>* pack_rows(const RasterizeInput<T>& in, SplatRow<T>* splats) {
-  parallel_for(0, in.n_rows, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t row = begin; row < end; ++row) splats[row] = pack_row(in, row);
+const PreparedSplat<T>* pack_splats(const RasterizeInput<T>& in, PreparedSplat<T>* splats) {
+  parallel_for(0, in.n_splats, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t index = begin; index < end; ++index) splats[index] = pack_splat(in, index);
   });
   return splats;
 }
 
-// Memory for the rows that lasts as long as the workspace.
+// Memory for the splats that lasts as long as the workspace.
 template <class T>
-SplatRow<T>* allocate_rows(std::int64_t n_rows, Workspace& workspace) {
-  const std::size_t bytes = static_cast<std::size_t>(n_rows + 1) * sizeof(SplatRow<T>);
+PreparedSplat<T>* allocate_splats(std::int64_t n_splats, Workspace& workspace) {
+  const std::size_t bytes = static_cast<std::size_t>(n_splats + 1) * sizeof(PreparedSplat<T>);
   const auto address = reinterpret_cast<std::uintptr_t>(workspace.allocate_bytes(bytes));
-  return reinterpret_cast<SplatRow<T>*>((address + 63) / 64 * 64);
+  return reinterpret_cast<PreparedSplat<T>*>((address + 63) / 64 * 64);
 }
 
 // The part of a job that is the tile's place in the images and its list.
 template <class T>
-TileJob<T> make_job(const RasterizeInput<T>& in, const SplatRow<T>* splats, std::int64_t tile) {
+TileJob<T> make_job(const RasterizeInput<T>& in, const PreparedSplat<T>* splats, std::int64_t tile) {
   const TileGrid& grid = in.grid;
   const std::int64_t camera = tile / grid.per_image(), within = tile % grid.per_image();
   TileJob<T> job{};
   job.splats = splats;
   job.colors = in.colors;
   job.background = in.backgrounds ? in.backgrounds + camera * in.n_channels : nullptr;
-  job.list = in.isect_rows + in.tile_offsets[tile];
+  job.list = in.isect_splats + in.tile_offsets[tile];
   job.n_entries = static_cast<std::int32_t>(in.tile_offsets[tile + 1] - in.tile_offsets[tile]);
   job.n_channels = in.n_channels;
   job.tile_size = grid.tile_size;

@@ -64,7 +64,7 @@ struct GradientSums {
 };
 
 template <class Lanes, int D, bool kAbs, class T>
-inline void differentiate(const TileJob<T>& tile, const SplatRow<T>& splat, const T* splat_colors,
+inline void differentiate(const TileJob<T>& tile, const PreparedSplat<T>& splat, const T* splat_colors,
                           const RowSpans<T>& spans, std::int32_t entry, int row, int x,
                           BackwardState<T>& state, GradientSums<Lanes, kAbs>& sums, Lanes* v_color) {
   const int pixel = row * state.layout.stride + x;
@@ -81,7 +81,7 @@ inline void differentiate(const TileJob<T>& tile, const SplatRow<T>& splat, cons
   const Lanes before = after / (Lanes::broadcast(T(1)) - alpha);
   Lanes::select(drawn, before, after).store(state.transmittance + pixel);
   const Lanes share = Lanes::keep(drawn, alpha * before);
-  Lanes own = Lanes::zero();  // v_renders . row colour
+  Lanes own = Lanes::zero();  // v_renders . colour of the splat
   for (int c = 0; c < channels<D>(tile); ++c) {
     const Lanes v = Lanes::load(state.v_render + c * state.layout.plane + pixel);
     own = Lanes::fma(v, Lanes::broadcast(splat_colors[c]), own);
@@ -110,7 +110,7 @@ inline void differentiate(const TileJob<T>& tile, const SplatRow<T>& splat, cons
 
 // The order of PartialGradient.
 template <class Lanes, bool kAbs, class T>
-void write_partial(const SplatRow<T>& splat, const GradientSums<Lanes, kAbs>& sums, const Lanes* v_color,
+void write_partial(const PreparedSplat<T>& splat, const GradientSums<Lanes, kAbs>& sums, const Lanes* v_color,
                    int n_channels, T* partial) {
   constexpr T kInverse = T(1) / ExponentScale<T>::value;
   const T gu = sums.gu.sum() * kInverse, gy = sums.gy.sum() * kInverse;
@@ -137,7 +137,7 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
   std::vector<Lanes> many(D > 0 ? 0 : n_channels);
   for (std::int32_t entry = tile.n_entries - 1; entry >= 0; --entry) {
     __builtin_prefetch(tile.splats + tile.list[std::max(entry - kPrefetchDistance, 0)]);
-    const SplatRow<T>& splat = tile.splats[tile.list[entry]];
+    const PreparedSplat<T>& splat = tile.splats[tile.list[entry]];
     const T* color = splat_color<D>(tile, tile.list[entry]);
     GradientSums<Lanes, kAbs> sums;
     Lanes few[D > 0 ? D : 1];

@@ -25,11 +25,11 @@ struct ExponentScale<double> {
   static constexpr double value = 0.5;
 };
 
-// A row prepared for the kernels, one cache line in float32. Drawn where u^2 + w^2 <= cut, in rows within
+// A splat prepared for the kernels, one cache line in float32. Drawn where u^2 + w^2 <= cut, in rows within
 // half_height of y (-1: nowhere); a chord at dy is centred on x - shear dy and reaches
 // sqrt(cut - w^2) * inv_l11 + slack.
 template <class T>
-struct alignas(64) SplatRow {
+struct alignas(64) PreparedSplat {
   T x, y, l11, l21, l22, opacity, cut, inv_l11, shear, half_height, slack;
   T color[kPackedChannels];
 };
@@ -48,7 +48,7 @@ inline std::size_t tile_memory(int tile_size, int n_channels) {
 
 template <class T>
 struct TileJob {
-  const SplatRow<T>* splats;
+  const PreparedSplat<T>* splats;
   const T* colors;      // [P, D], for more than kPackedChannels channels
   const T* background;  // [D] or null
   const std::int32_t* list;
@@ -63,7 +63,7 @@ struct TileJob {
   std::int32_t* last_memory;  // PlaneLayout::plane numbers
 };
 
-// Layout of one row's partial gradient from one tile: these, then D colours, then two absolute sums.
+// Layout of one splat's partial gradient from one tile: these, then D colours, then two absolute sums.
 enum PartialGradient { kMeanX, kMeanY, kConicA, kConicB, kConicC, kOpacity, kColor };
 constexpr int partial_width(int n_channels, bool absgrad) { return kColor + n_channels + (absgrad ? 2 : 0); }
 

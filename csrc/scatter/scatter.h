@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows on their way between ranks. Bit m of masks[p] sends row p to rank m; the rows for one rank are a
-// group. All data are 32-bit words: a column of w words a row is int32 [P, w].
+// Splats on their way between ranks. Bit m of masks[p] sends splat p to rank m; the splats for one rank are a
+// group. All data are 32-bit words: a column of w words a splat is int32 [P, w].
 //
 //   scatter: columns, masks -> one group per rank, each column of a group consecutive; and places [runs, M]:
-//            where in each group the rows of each run of kPlaceRows rows are. Within a block of kScatterBlock
-//            rows they keep their order; blocks may come in any order, so this is all that the way back
-//            needs.
+//            where in each group the splats of each run of kPlaceSplats splats are. Within a block of
+//            kScatterBlock splats they keep their order; blocks may come in any order, so this is all that
+//            the way back needs.
 //   gather:  groups that arrived, one after the other -> columns.
 //   sum:     values [S, F], groups in the layout of `scatter` one after the other -> columns [P, w], the sum
-//            over the groups of each row in the order of ranks, starting from zero: deterministic.
+//            over the groups of each splat in the order of ranks, starting from zero: deterministic.
 //
-// O(words moved). Rows beyond a group's announced size are dropped, whatever the masks say.
+// O(words moved). Splats beyond a group's announced size are dropped, whatever the masks say.
 #pragma once
 #include <cstdint>
 
@@ -21,12 +21,14 @@
 namespace blitzgs {
 
 constexpr int kScatterBlock = 256;
-constexpr int kPlaceRows = 32;
-constexpr int kMaxRowColumns = 8;
+constexpr int kPlaceSplats = 32;
+constexpr int kMaxSplatColumns = 8;
 
-inline std::int64_t scatter_blocks(std::int64_t rows) { return (rows + kScatterBlock - 1) / kScatterBlock; }
+inline std::int64_t scatter_blocks(std::int64_t splats) {
+  return (splats + kScatterBlock - 1) / kScatterBlock;
+}
 
-inline std::int64_t place_runs(std::int64_t rows) { return (rows + kPlaceRows - 1) / kPlaceRows; }
+inline std::int64_t place_runs(std::int64_t splats) { return (splats + kPlaceSplats - 1) / kPlaceSplats; }
 
 BLITZGS_HD int count_bits(std::uint32_t bits) {
 #ifdef __CUDA_ARCH__
@@ -45,65 +47,66 @@ BLITZGS_HD int lowest_bit(std::uint64_t bits) {
 #endif
 }
 
-// The rows of a run that went to one rank: where the first of them is among the rank's, and which they are.
+// The splats of a run that went to one rank: where the first of them is among the rank's, and which they are.
 // The ops pass it as an int64.
-struct alignas(8) RowPlace {
+struct alignas(8) SplatPlace {
   std::int32_t first;
   std::uint32_t bits;
 
-  // row: of the run, in [0, kPlaceRows).
-  BLITZGS_HD bool has(std::uint32_t row) const { return (bits >> row) & 1u; }
-  BLITZGS_HD std::int64_t of(std::uint32_t row) const {
-    return first + count_bits(bits & ((1u << row) - 1u));
+  // splat: of the run, in [0, kPlaceSplats).
+  BLITZGS_HD bool has(std::uint32_t splat) const { return (bits >> splat) & 1u; }
+  BLITZGS_HD std::int64_t of(std::uint32_t splat) const {
+    return first + count_bits(bits & ((1u << splat) - 1u));
   }
 };
 
-// Columns of one table, and where each begins in a row of all of them; the last begin is the row's length.
+// Columns of one table, and where each begins in a splat of all of them; the last begin is the splat's
+// length.
 template <class Word>
-struct RowColumns {
-  Word* data[kMaxRowColumns];
-  int begin[kMaxRowColumns + 1];
+struct SplatColumns {
+  Word* data[kMaxSplatColumns];
+  int begin[kMaxSplatColumns + 1];
   int count;
 };
 
-// Rows of each group and the rows before it; M groups.
-struct RowGroups {
+// Splats of each group and the splats before it; M groups.
+struct SplatGroups {
   std::int64_t size[kMaxRanks], start[kMaxRanks];
   int count;
 };
 
 // Where each column of each rank's group begins.
 struct ScatterTargets {
-  std::int32_t* words[kMaxRanks][kMaxRowColumns];
+  std::int32_t* words[kMaxRanks][kMaxSplatColumns];
 };
 
-// The rows to scatter.
-struct ScatterRows {
-  RowColumns<const std::int32_t> columns;
+// The splats to scatter.
+struct ScatterSplats {
+  SplatColumns<const std::int32_t> columns;
   const std::int64_t* masks;
   std::int64_t count;
 };
 
-// Values of rows, `width` apart, that came back from each rank that a row went to.
+// Values of splats, `width` apart, that came back from each rank that a splat went to.
 template <class T>
-struct RowValues {
+struct SplatValues {
   const T* values;
   int width;
   std::int64_t count;
-  const RowPlace* places;
-  RowGroups groups;
+  const SplatPlace* places;
+  SplatGroups groups;
 
-  // Calls f(pointer to a row's values), for each rank in order.
+  // Calls f(pointer to a splat's values), for each rank in order.
   template <class F>
-  BLITZGS_HD void for_each(std::uint64_t row, const F& f) const {
-    const RowPlace* run = places + row / kPlaceRows * groups.count;
-    const auto in_run = static_cast<std::uint32_t>(row % kPlaceRows);
+  BLITZGS_HD void for_each(std::uint64_t splat, const F& f) const {
+    const SplatPlace* run = places + splat / kPlaceSplats * groups.count;
+    const auto in_run = static_cast<std::uint32_t>(splat % kPlaceSplats);
     std::uint64_t ranks = 0;
 #ifdef __CUDA_ARCH__
 #pragma unroll 4  // as many loads at once; the compiler's own choice is 16
 #endif
     for (int m = 0; m < groups.count; ++m) ranks |= std::uint64_t{run[m].has(in_run)} << m;
-    // Most rows went to a single rank: this way the threads of a warp load their first at once.
+    // Most splats went to a single rank: this way the threads of a warp load their first at once.
     for (; ranks != 0; ranks &= ranks - 1) {
       const int m = lowest_bit(ranks);
       const std::int64_t at = run[m].of(in_run);
@@ -113,21 +116,21 @@ struct RowValues {
 };
 
 namespace cpu {
-void scatter(const ScatterRows&, const RowGroups&, const ScatterTargets&, RowPlace* places, Workspace&,
+void scatter(const ScatterSplats&, const SplatGroups&, const ScatterTargets&, SplatPlace* places, Workspace&,
              CudaStream);
-void gather(const std::int32_t* packed, const RowGroups&, const RowColumns<std::int32_t>&, Workspace&,
+void gather(const std::int32_t* packed, const SplatGroups&, const SplatColumns<std::int32_t>&, Workspace&,
             CudaStream);
 template <class T>
-void sum(const RowValues<T>&, const RowColumns<T>&, Workspace&, CudaStream);
+void sum(const SplatValues<T>&, const SplatColumns<T>&, Workspace&, CudaStream);
 }  // namespace cpu
 
 namespace cuda {
-void scatter(const ScatterRows&, const RowGroups&, const ScatterTargets&, RowPlace* places, Workspace&,
+void scatter(const ScatterSplats&, const SplatGroups&, const ScatterTargets&, SplatPlace* places, Workspace&,
              CudaStream);
-void gather(const std::int32_t* packed, const RowGroups&, const RowColumns<std::int32_t>&, Workspace&,
+void gather(const std::int32_t* packed, const SplatGroups&, const SplatColumns<std::int32_t>&, Workspace&,
             CudaStream);
 template <class T>
-void sum(const RowValues<T>&, const RowColumns<T>&, Workspace&, CudaStream);
+void sum(const SplatValues<T>&, const SplatColumns<T>&, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// One block's rows to the ranks that need them. Runs of consecutive words leave for each rank and column, in
-// whole memory transactions but for their ends, so that a target across a link is written in few packets.
+// One block's splats to the ranks that need them. Runs of consecutive words leave for each rank and column,
+// in whole memory transactions but for their ends, so that a target across a link is written in few packets.
 // Only the place of a run is agreed on, with one atomic per block and rank.
 #pragma once
 #include <type_traits>
@@ -11,7 +11,7 @@
 namespace blitzgs::cuda {
 
 inline constexpr int kScatterWarps = kScatterBlock / 32;
-static_assert(kPlaceRows == 32, "a warp's rows are a run");
+static_assert(kPlaceSplats == 32, "a warp's splats are a run");
 inline constexpr int kFewRanks = 8;  // what most hosts have: needs less shared memory than kMaxRanks
 
 // Calls f(integral constant: an upper bound of the ranks).
@@ -26,13 +26,13 @@ void dispatch_ranks(int n_ranks, const F& f) {
 
 template <int RANKS>
 struct ScatterShared {
-  std::uint8_t list[RANKS][kScatterBlock];  // the block's rows that go to each rank, ascending
+  std::uint8_t list[RANKS][kScatterBlock];  // the block's splats that go to each rank, ascending
   int before[RANKS][kScatterWarps];
   int count[RANKS], base[RANKS];
-  std::int64_t target[RANKS];  // the row of the rank's columns that the block's begin at
+  std::int64_t target[RANKS];  // the splat of the rank's columns that the block's begin at
 };
 
-// How many rows go to each rank.
+// How many splats go to each rank.
 struct ScatterSizes {
   const std::int64_t* sizes;
   int n_ranks;
@@ -41,7 +41,7 @@ struct ScatterSizes {
 // What all blocks share: how far each group is filled (zeroed before), and what `scatter` returns.
 struct ScatterState {
   std::int64_t* filled;
-  RowPlace* places;
+  SplatPlace* places;
 
   // Takes `count` places of group m; returns the first.
   __device__ std::int64_t take(int m, int count) const {
@@ -51,7 +51,7 @@ struct ScatterState {
   }
 };
 
-// Counts a warp's rows for each rank, whose masks the lanes bring.
+// Counts a warp's splats for each rank, whose masks the lanes bring.
 __device__ __forceinline__ void count_by_warp(int (*counts)[kScatterWarps], int slot, std::int64_t mask,
                                               int n_ranks) {
   for (int m = 0; m < n_ranks; ++m) {
@@ -72,7 +72,7 @@ __device__ __forceinline__ int scan_warps(int* counts) {
   return sum;
 }
 
-// Rows for one rank before row `slot` of the block; `going` tells those of its warp.
+// Splats for one rank before splat `slot` of the block; `going` tells those of its warp.
 __device__ __forceinline__ int place_in_block(const int* before, int slot, unsigned going) {
   return before[slot / 32] + __popc(going & ((1u << slot % 32) - 1u));
 }
@@ -93,8 +93,8 @@ __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::ui
     std::int32_t values[kAhead];
 #pragma unroll
     for (int k = 0; k < kAhead; ++k) {
-      const int i = first + 32 * k, row = i / width;
-      if (i >= 0 && i < words) values[k] = from[list[row] * width + (i - row * width)];
+      const int i = first + 32 * k, splat = i / width;
+      if (i >= 0 && i < words) values[k] = from[list[splat] * width + (i - splat * width)];
     }
 #pragma unroll
     for (int k = 0; k < kAhead; ++k) {
@@ -118,21 +118,21 @@ __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::ui
   }
 }
 
-// Scatters rows [kScatterBlock * blockIdx.x, ...) of n_rows, whatever rows.count says. All THREADS threads of
-// the block call this; the rows must be visible to all of them.
+// Scatters splats [kScatterBlock * blockIdx.x, ...) of n_splats, whatever splats.count says. All THREADS
+// threads of the block call this; the splats must be visible to all of them.
 template <int THREADS, int RANKS>
-__device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& rows, std::int64_t n_rows,
-                              const ScatterSizes& groups, const ScatterTargets& targets,
-                              const ScatterState& state) {
+__device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterSplats& splats,
+                              std::int64_t n_splats, const ScatterSizes& groups,
+                              const ScatterTargets& targets, const ScatterState& state) {
   constexpr int kRounds = kScatterBlock / THREADS;
   const int n_ranks = groups.n_ranks;
-  const RowColumns<const std::int32_t>& columns = rows.columns;
+  const SplatColumns<const std::int32_t>& columns = splats.columns;
   const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
   std::int64_t masks[kRounds];
 #pragma unroll
   for (int round = 0; round < kRounds; ++round) {
     const int slot = round * THREADS + static_cast<int>(threadIdx.x);
-    masks[round] = first + slot < n_rows ? rows.masks[first + slot] : 0;
+    masks[round] = first + slot < n_splats ? splats.masks[first + slot] : 0;
     count_by_warp(shared.before, slot, masks[round], n_ranks);
   }
   __syncthreads();
@@ -154,8 +154,8 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterRows& r
       const unsigned going = __ballot_sync(kFullWarp, goes);
       if (goes)
         shared.list[m][place_in_block(shared.before[m], slot, going)] = static_cast<std::uint8_t>(slot);
-      if (slot % 32 == 0 && first + slot < n_rows) {
-        state.places[(first + slot) / kPlaceRows * n_ranks + m] = {
+      if (slot % 32 == 0 && first + slot < n_splats) {
+        state.places[(first + slot) / kPlaceSplats * n_ranks + m] = {
             shared.base[m] + shared.before[m][slot / 32], going};
       }
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Arguments that the ops on scattered rows share, checked the same way.
+// Arguments that the ops on scattered splats share, checked the same way.
 #pragma once
 #include <limits>
 
@@ -8,78 +8,80 @@
 
 namespace blitzgs {
 
-inline RowGroups checked_groups(const char* op, const char* name, const std::vector<std::int64_t>& sizes) {
+inline SplatGroups checked_groups(const char* op, const char* name, const std::vector<std::int64_t>& sizes) {
   const auto count = static_cast<std::int64_t>(sizes.size());
   STD_TORCH_CHECK(count >= 1 && count <= kMaxRanks, "blitzgs::", op, ": ", name, " must have 1 to ",
                   kMaxRanks, " entries, got ", count);
-  RowGroups groups{};
+  SplatGroups groups{};
   groups.count = static_cast<int>(count);
-  std::int64_t rows = 0;
+  std::int64_t splats = 0;
   for (std::int64_t m = 0; m < count; ++m) {
     STD_TORCH_CHECK(sizes[m] >= 0 && sizes[m] <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
                     ": ", name, " must be in [0, 2^31), got ", sizes[m]);
     groups.size[m] = sizes[m];
-    groups.start[m] = rows;
-    rows += sizes[m];
+    groups.start[m] = splats;
+    splats += sizes[m];
   }
   return groups;
 }
 
-inline std::int64_t total_rows(const RowGroups& groups) {
+inline std::int64_t total_splats(const SplatGroups& groups) {
   return groups.start[groups.count - 1] + groups.size[groups.count - 1];
 }
 
-// Appends a column of `width` words a row.
+// Appends a column of `width` words a splat.
 template <class Word>
-void add_column(const char* op, RowColumns<Word>& columns, Word* data, std::int64_t width) {
-  STD_TORCH_CHECK(columns.count < kMaxRowColumns, "blitzgs::", op, ": at most ", kMaxRowColumns, " columns");
+void add_column(const char* op, SplatColumns<Word>& columns, Word* data, std::int64_t width) {
+  STD_TORCH_CHECK(columns.count < kMaxSplatColumns, "blitzgs::", op, ": at most ", kMaxSplatColumns,
+                  " columns");
   const std::int64_t end = columns.begin[columns.count] + width;
-  STD_TORCH_CHECK(width >= 0 && end <= 4096, "blitzgs::", op, ": a row may have 4096 words, got ", end);
+  STD_TORCH_CHECK(width >= 0 && end <= 4096, "blitzgs::", op, ": a splat may have 4096 words, got ", end);
   columns.data[columns.count] = data;
   columns.begin[++columns.count] = static_cast<int>(end);
 }
 
 // Columns int32 [P, w] and masks int64 [P]; keeps the contiguous forms alive.
-struct HeldRows {
-  HeldRows(const char* op, const std::vector<Tensor>& columns, const Tensor& masks_in)
+struct HeldSplats {
+  HeldSplats(const char* op, const std::vector<Tensor>& columns, const Tensor& masks_in)
       : masks(as_contiguous(masks_in)) {
     check_shape(op, "masks", masks, {-1});
     check_dtype(op, "masks", masks, ScalarType::Long);
-    rows.masks = data<std::int64_t>(masks);
-    rows.count = masks.size(0);
-    STD_TORCH_CHECK(rows.count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ", rows.count,
-                    " rows exceed 2^31 - 1; project fewer views at a time");
+    splats.masks = data<std::int64_t>(masks);
+    splats.count = masks.size(0);
+    STD_TORCH_CHECK(splats.count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ",
+                    splats.count, " splats exceed 2^31 - 1; project fewer views at a time");
     for (const Tensor& column : columns) {
       check_dtype(op, "a column", column, ScalarType::Int);
-      check_shape(op, "a column", column, {rows.count, -1});
+      check_shape(op, "a column", column, {splats.count, -1});
       held.push_back(as_contiguous(column));
-      add_column(op, rows.columns, data<std::int32_t>(held.back()), column.size(1));
+      add_column(op, splats.columns, data<std::int32_t>(held.back()), column.size(1));
     }
   }
 
   Tensor masks;
   std::vector<Tensor> held;
-  ScatterRows rows{};
+  ScatterSplats splats{};
 };
 
-// Places of rows in the groups of so many ranks, contiguous.
-inline Tensor checked_places(const char* op, const Tensor& places, std::int64_t rows, std::int64_t n_ranks) {
-  check_shape(op, "places", places, {place_runs(rows), n_ranks});
+// Places of splats in the groups of so many ranks, contiguous.
+inline Tensor checked_places(const char* op, const Tensor& places, std::int64_t splats,
+                             std::int64_t n_ranks) {
+  check_shape(op, "places", places, {place_runs(splats), n_ranks});
   check_dtype(op, "places", places, ScalarType::Long);
   return as_contiguous(places);
 }
 
-inline const RowPlace* places_in(const Tensor& places) {
-  return reinterpret_cast<const RowPlace*>(data<std::int64_t>(places));
+inline const SplatPlace* places_in(const Tensor& places) {
+  return reinterpret_cast<const SplatPlace*>(data<std::int64_t>(places));
 }
 
-inline Tensor make_places(const Tensor& like, std::int64_t rows, std::int64_t n_ranks) {
-  return make_empty(like, {place_runs(rows), n_ranks}, ScalarType::Long);
+inline Tensor make_places(const Tensor& like, std::int64_t splats, std::int64_t n_ranks) {
+  return make_empty(like, {place_runs(splats), n_ranks}, ScalarType::Long);
 }
 
-inline RowPlace* places_of(Tensor& places) {
-  static_assert(sizeof(RowPlace) == sizeof(std::int64_t));
-  return reinterpret_cast<RowPlace*>(mutable_data<std::int64_t>(places));
+inline SplatPlace* places_of(Tensor& places) {
+  static_assert(sizeof(SplatPlace) == sizeof(std::int64_t));
+  return reinterpret_cast<SplatPlace*>(mutable_data<std::int64_t>(places));
 }
 
 }  // namespace blitzgs

@@ -14,8 +14,8 @@ struct NoWorkspace final : Workspace {
   void* allocate_bytes(std::size_t) override { std::abort(); }
 };
 
-RowGroups make_groups(const std::vector<std::int64_t>& sizes) {
-  RowGroups groups{};
+SplatGroups make_groups(const std::vector<std::int64_t>& sizes) {
+  SplatGroups groups{};
   for (const std::int64_t size : sizes) {
     const int m = groups.count++;
     groups.size[m] = size;
@@ -26,19 +26,19 @@ RowGroups make_groups(const std::vector<std::int64_t>& sizes) {
 
 }  // namespace
 
-TEST_CASE("scattered rows arrive in order, and their sums return", "[scatter]") {
+TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]") {
   const int n = 9000, n_ranks = 3;  // more than one chunk
   std::vector<std::int32_t> a(2 * n), b(n);
   std::vector<std::int64_t> masks(n), sizes(n_ranks);
   for (int i = 0; i < n; ++i) {
     a[2 * i] = i, a[2 * i + 1] = -i, b[i] = 7 * i;
-    masks[i] = (i % 2 ? 1 : 0) | (i % 5 ? 0 : 4);  // rank 1 gets nothing, some rows go nowhere
+    masks[i] = (i % 2 ? 1 : 0) | (i % 5 ? 0 : 4);  // rank 1 gets nothing, some splats go nowhere
     for (int m = 0; m < n_ranks; ++m) sizes[m] += (masks[i] >> m) & 1;
   }
-  const RowGroups groups = make_groups(sizes);
+  const SplatGroups groups = make_groups(sizes);
   const std::int64_t total = groups.start[2] + groups.size[2];
   std::vector<std::int32_t> packed(3 * total);
-  std::vector<RowPlace> places(place_runs(n) * n_ranks);
+  std::vector<SplatPlace> places(place_runs(n) * n_ranks);
   ScatterTargets targets{};
   for (int m = 0; m < n_ranks; ++m) {
     targets.words[m][0] = packed.data() + 3 * groups.start[m];
@@ -76,11 +76,11 @@ TEST_CASE("scattered rows arrive in order, and their sums return", "[scatter]") 
   }
 }
 
-TEST_CASE("rows beyond a group's size are dropped", "[scatter]") {
+TEST_CASE("splats beyond a group's size are dropped", "[scatter]") {
   const std::int32_t column[4] = {1, 2, 3, 4};
   const std::int64_t masks[4] = {1, 1, 1, 1};
   std::int32_t packed[4] = {-1, -1, -1, -1};
-  RowPlace place;
+  SplatPlace place;
   ScatterTargets targets{};
   targets.words[0][0] = packed;
   NoWorkspace workspace;

@@ -18,16 +18,16 @@ inline void check_peers(const char* op, const std::vector<Tensor>& buffers, Scal
   }
 }
 
-// Where the columns of each rank's buffer begin when they are `capacity` rows long.
+// Where the columns of each rank's buffer begin when they are `capacity` splats long.
 template <class Word>
-ScatterTargets peer_targets(const char* op, std::vector<Tensor>& buffers, const RowColumns<Word>& columns,
+ScatterTargets peer_targets(const char* op, std::vector<Tensor>& buffers, const SplatColumns<Word>& columns,
                             std::int64_t capacity, int n_ranks) {
   check_peers(op, buffers, ScalarType::Int);
   STD_TORCH_CHECK(static_cast<int>(buffers.size()) == n_ranks, "blitzgs::", op, ": ", n_ranks,
                   " ranks need as many buffers, got ", buffers.size());
   STD_TORCH_CHECK(capacity >= 0 && capacity <= std::numeric_limits<std::int32_t>::max() &&
                       capacity * columns.begin[columns.count] <= buffers[0].size(0),
-                  "blitzgs::", op, ": ", capacity, " rows do not fit into a buffer of ", buffers[0].size(0),
+                  "blitzgs::", op, ": ", capacity, " splats do not fit into a buffer of ", buffers[0].size(0),
                   " words");
   ScatterTargets targets{};
   for (int m = 0; m < n_ranks; ++m) {

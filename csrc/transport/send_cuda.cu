@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows to the ranks that composite them, straight into these ranks' memory.
+// Splats to the ranks that composite them, straight into these ranks' memory.
 #include <algorithm>
 
 #include "common/multiprocessors.h"
@@ -15,23 +15,23 @@ namespace {
 constexpr int kSendBlocks = 2;
 constexpr int kSendPlaces = 6;  // with as many registers as if there were so many
 
-// One warp, a lane a rank. If the rows of any rank do not fit somewhere, this rank sends none.
+// One warp, a lane a rank. If the splats of any rank do not fit somewhere, this rank sends none.
 __global__ void plan_kernel(const __grid_constant__ SendArguments args) {
   const int m = threadIdx.x, n_ranks = args.n_ranks;
-  const std::int64_t stride = project_totals(args.n_views, n_ranks), capacity = args.rows.count;
-  const auto rows = [&](int source, int target) {
+  const std::int64_t stride = project_totals(args.n_views, n_ranks), capacity = args.splats.count;
+  const auto splats = [&](int source, int target) {
     return args.everyone[source * stride + kTotalViews + args.n_views + 2 * target];
   };
   SendPlan* const out = args.plan;
   std::int64_t own = 0, sent = 0, received = 0, start = 0;
   if (m < n_ranks) {
-    own = args.everyone[m * stride + kTotalRows];
+    own = args.everyone[m * stride + kTotalSplats];
     for (int other = 0; other < n_ranks; ++other) {
       if (other == args.rank) start = received;
-      sent += rows(m, other);
-      received += rows(other, m);
+      sent += splats(m, other);
+      received += splats(other, m);
     }
-    out->groups.size[m] = rows(args.rank, m);
+    out->groups.size[m] = splats(args.rank, m);
     out->groups.start[m] = start;
     out->filled[m] = 0;
   }
@@ -39,59 +39,60 @@ __global__ void plan_kernel(const __grid_constant__ SendArguments args) {
   const std::int64_t own_here = __shfl_sync(kFullWarp, own, args.rank),
                      received_here = __shfl_sync(kFullWarp, received, args.rank);
   if (m > 0) return;
-  out->rows = fits ? own_here : 0;
+  out->splats = fits ? own_here : 0;
   out->received = fits ? received_here : 0;
   out->groups.count = n_ranks;
 }
 
-// Warps take a block of rows and a rank at a time: the rows of the one for the other are one run of the
+// Warps take a block of splats and a rank at a time: the splats of the one for the other are one run of the
 // rank's columns (scatter_device.cuh). No warp waits for another, so that the links always have something to
 // do.
 struct Jobs {
   std::int64_t first, step, end;
   int n_ranks;
 
-  __device__ Jobs(std::int64_t n_rows, int n_ranks_in)
+  __device__ Jobs(std::int64_t n_splats, int n_ranks_in)
       : first(blockIdx.x * std::int64_t{kScatterWarps} + threadIdx.x / 32),
         step(gridDim.x * std::int64_t{kScatterWarps}),
-        end((n_rows + kScatterBlock - 1) / kScatterBlock * n_ranks_in),
+        end((n_splats + kScatterBlock - 1) / kScatterBlock * n_ranks_in),
         n_ranks(n_ranks_in) {}
   __device__ int rank(std::int64_t job) const { return static_cast<int>(job % n_ranks); }
-  __device__ std::int64_t row(std::int64_t job) const { return job / n_ranks * kScatterBlock; }
+  __device__ std::int64_t splat(std::int64_t job) const { return job / n_ranks * kScatterBlock; }
 };
 
 // How many of a run, which begins at place `first` of a group of `size`, the group has room for.
-__device__ int fitting_rows(int count, std::int64_t size, std::int64_t first) {
+__device__ int fitting_splats(int count, std::int64_t size, std::int64_t first) {
   return static_cast<int>(min(max(size - first, std::int64_t{0}), std::int64_t{count}));
 }
 
 __global__ void __launch_bounds__(kScatterBlock, kSendPlaces)
-    send_kernel(const __grid_constant__ ScatterRows rows, const __grid_constant__ ScatterTargets targets,
+    send_kernel(const __grid_constant__ ScatterSplats splats, const __grid_constant__ ScatterTargets targets,
                 const SendPlan* __restrict__ plan, const ScatterState state, int n_ranks) {
   __shared__ std::uint8_t lists[kScatterWarps][kScatterBlock];
   const int lane = threadIdx.x % 32;
-  const std::int64_t n_rows = plan->rows;
-  const RowGroups& groups = plan->groups;
-  const RowColumns<const std::int32_t>& columns = rows.columns;
+  const std::int64_t n_splats = plan->splats;
+  const SplatGroups& groups = plan->groups;
+  const SplatColumns<const std::int32_t>& columns = splats.columns;
   std::uint8_t* const list = lists[threadIdx.x / 32];
-  const Jobs jobs(n_rows, n_ranks);
+  const Jobs jobs(n_splats, n_ranks);
   for (std::int64_t job = jobs.first; job < jobs.end; job += jobs.step) {
     const int m = jobs.rank(job);
-    const std::int64_t begin = jobs.row(job);
+    const std::int64_t begin = jobs.splat(job);
     std::uint32_t masks[kScatterWarps];  // kMaxPeers bits are enough
 #pragma unroll
     for (int run = 0; run < kScatterWarps; ++run) {
-      const std::int64_t row = begin + kPlaceRows * run + lane;
-      masks[run] = row < n_rows ? static_cast<std::uint32_t>(rows.masks[row]) : 0;
+      const std::int64_t splat = begin + kPlaceSplats * run + lane;
+      masks[run] = splat < n_splats ? static_cast<std::uint32_t>(splats.masks[splat]) : 0;
     }
     int count = 0;
-    RowPlace place{0, 0};  // of run `lane`
+    SplatPlace place{0, 0};  // of run `lane`
 #pragma unroll
     for (int run = 0; run < kScatterWarps; ++run) {
       const bool goes = masks[run] >> m & 1;
       const std::uint32_t bits = __ballot_sync(kFullWarp, goes);
       if (goes) {
-        list[count + __popc(bits & ((1u << lane) - 1u))] = static_cast<std::uint8_t>(kPlaceRows * run + lane);
+        list[count + __popc(bits & ((1u << lane) - 1u))] =
+            static_cast<std::uint8_t>(kPlaceSplats * run + lane);
       }
       if (lane == run) place = {count, bits};
       count += __popc(bits);
@@ -102,10 +103,10 @@ __global__ void __launch_bounds__(kScatterBlock, kSendPlaces)
     }
     first = __shfl_sync(kFullWarp, first, 0);
     __syncwarp();
-    if (lane < kScatterWarps && begin + kPlaceRows * lane < n_rows) {
-      state.places[(begin / kPlaceRows + lane) * n_ranks + m] = {first + place.first, place.bits};
+    if (lane < kScatterWarps && begin + kPlaceSplats * lane < n_splats) {
+      state.places[(begin / kPlaceSplats + lane) * n_ranks + m] = {first + place.first, place.bits};
     }
-    const int n = fitting_rows(count, groups.size[m], first);
+    const int n = fitting_splats(count, groups.size[m], first);
     const std::int64_t to = groups.start[m] + first;
     for (int c = 0; c < columns.count; ++c) {
       const int width = columns.begin[c + 1] - columns.begin[c];
@@ -120,11 +121,11 @@ __global__ void __launch_bounds__(kScatterBlock, kSendPlaces)
 void send_splats(const SendArguments& args, CudaStream stream) {
   plan_kernel<<<1, 32, 0, stream>>>(args);
   check_launch("send_splats");
-  if (args.rows.count == 0) return;
+  if (args.splats.count == 0) return;
   const auto blocks =
-      std::min<std::int64_t>(scatter_blocks(args.rows.count), kSendBlocks * multiprocessors());
+      std::min<std::int64_t>(scatter_blocks(args.splats.count), kSendBlocks * multiprocessors());
   send_kernel<<<static_cast<unsigned>(blocks), kScatterBlock, 0, stream>>>(
-      args.rows, args.targets, args.plan, {args.plan->filled, args.places}, args.n_ranks);
+      args.splats, args.targets, args.plan, {args.plan->filled, args.places}, args.n_ranks);
   check_launch("send_splats");
 }
 

@@ -7,7 +7,7 @@
 namespace blitzgs {
 namespace {
 
-// Returns places, and the SendPlan: the number of rows that arrive here is its first word.
+// Returns places, and the SendPlan: the number of splats that arrive here is its first word.
 std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const Tensor& rank_masks,
                                        const Tensor& everyone, std::int64_t rank, std::vector<Tensor> buffers,
                                        std::int64_t capacity) {
@@ -17,23 +17,23 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
                   ": columns must be means2d, conics, opacities, colors, depths, camera_ids and ids, got ",
                   columns.size());
   STD_TORCH_CHECK(columns[0].size(0) >= capacity, "blitzgs::", kOp, ": columns must have room for ", capacity,
-                  " rows, got ", columns[0].size(0));
+                  " splats, got ", columns[0].size(0));
   SendArguments arguments{};
   arguments.targets = peer_targets(kOp, buffers, kSentColumns, capacity, static_cast<int>(n_ranks));
-  arguments.rows.columns = kSentColumns;
-  arguments.rows.count = capacity;
+  arguments.splats.columns = kSentColumns;
+  arguments.splats.count = capacity;
   for (int c = 0; c < kSentColumns.count; ++c) {
     const Tensor& column = columns[c];
     const std::int64_t words = kSentColumns.begin[c + 1] - kSentColumns.begin[c];
     STD_TORCH_CHECK(
         column.is_contiguous() && column.size(0) == columns[0].size(0) &&
             column.numel() * static_cast<std::int64_t>(column.element_size()) == 4 * words * column.size(0),
-        "blitzgs::", kOp, ": column ", c, " must be contiguous, of ", words, " words a row");
-    arguments.rows.columns.data[c] = static_cast<const std::int32_t*>(column.const_data_ptr());
+        "blitzgs::", kOp, ": column ", c, " must be contiguous, of ", words, " words a splat");
+    arguments.splats.columns.data[c] = static_cast<const std::int32_t*>(column.const_data_ptr());
   }
   check_shape(kOp, "rank_masks", rank_masks, {columns[0].size(0)});
   check_dtype(kOp, "rank_masks", rank_masks, ScalarType::Long);
-  arguments.rows.masks = data<std::int64_t>(rank_masks);
+  arguments.splats.masks = data<std::int64_t>(rank_masks);
   check_shape(kOp, "everyone", everyone, {n_ranks, -1});
   check_dtype(kOp, "everyone", everyone, ScalarType::Long);
   const std::int64_t n_views = everyone.size(1) - project_totals(0, n_ranks);

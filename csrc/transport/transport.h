@@ -2,12 +2,12 @@
 // How ranks that reach each other's memory exchange splats. CUDA only. Every rank holds the same kind of
 // buffers; `buffers[m]` is rank m's, mapped here.
 //
-// send_splats_ writes each row to the ranks of its rank mask: into every rank's buffer behind the rows of the
-// ranks before this one, column c from word capacity * kSentColumns.begin[c] on. If any rank has more than
-// `capacity` rows of its own, to send or to get, no rank writes anything: each finds that from the same
-// totals.
+// send_splats_ writes each splat to the ranks of its rank mask: into every rank's buffer behind the splats of
+// the ranks before this one, column c from word capacity * kSentColumns.begin[c] on. If any rank has more
+// than `capacity` splats of its own, to send or to get, no rank writes anything: each finds that from the
+// same totals.
 //
-// The way back needs no op of its own: the owner of rows reads their gradients where the ranks that
+// The way back needs no op of its own: the owner of splats reads their gradients where the ranks that
 // composited them added them up (RankSplatGradients, project/splat_gradients.h).
 //
 // device_barrier_, a barrier in stream order: what any rank queued before it is done, and visible, when what
@@ -27,24 +27,24 @@ struct ControlWords {
   int count, rank;
 };
 
-// What other ranks need of a row: means2d, conics, opacities, colors, depths, camera_ids and the Gaussian's
+// What other ranks need of a splat: means2d, conics, opacities, colors, depths, camera_ids and the Gaussian's
 // persistent id, in words.
-inline constexpr RowColumns<const std::int32_t> kSentColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
+inline constexpr SplatColumns<const std::int32_t> kSentColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
 
 // What this rank writes to the others, as its device works it out.
 struct SendPlan {
-  std::int64_t received;  // rows that arrive here: the first word, for what takes that number on the device
-  std::int64_t rows;      // of this rank
-  RowGroups groups;       // rows for each rank, and the row of its target that they begin at
+  std::int64_t received;  // splats that arrive here: the first word, for what takes that number on the device
+  std::int64_t splats;    // of this rank
+  SplatGroups groups;     // splats for each rank, and the splat of its target that they begin at
   std::int64_t filled[kMaxRanks];  // how many of these have been given a place
 };
 
-// everyone: project_totals of each rank, on the device; targets: where the columns of each rank's rows begin.
-// plan and places are written too.
+// everyone: project_totals of each rank, on the device; targets: where the columns of each rank's splats
+// begin. plan and places are written too.
 struct SendArguments {
-  ScatterRows rows;  // columns as kSentColumns has them; count is the capacity
+  ScatterSplats splats;  // columns as kSentColumns has them; count is the capacity
   SendPlan* plan;
-  RowPlace* places;
+  SplatPlace* places;
   const std::int64_t* everyone;
   int n_views, n_ranks, rank;
   ScatterTargets targets;

@@ -42,7 +42,7 @@ def test_what_a_trace_says():
 
     trace = [
         {"ph": "M", "name": "process_name"},
-        work(0, 40, "void blitzgs::cuda::(anonymous namespace)::rows_kernel<3, (bool)1>(float const*)"),
+        work(0, 40, "void blitzgs::cuda::(anonymous namespace)::splats_kernel<3, (bool)1>(float const*)"),
         work(60, 80, "Memcpy DtoH (Device -> Pinned)"),
         work(70, 75, "beneath"),
         work(81, 100, "void at::native::fill_kernel<int>(int)"),
@@ -53,6 +53,6 @@ def test_what_a_trace_says():
     ]
     use = bm_training.stream_use(trace)
     assert use.busy == pytest.approx(0.79) and use.waiting == pytest.approx(0.25) and use.launches == 5
-    assert use.gaps == {("rows_kernel", "Memcpy DtoH"): [20]}
+    assert use.gaps == {("splats_kernel", "Memcpy DtoH"): [20]}
     (gap,) = bm_training.longest_gaps(use, 2)
-    assert gap == {"before": "rows_kernel", "after": "Memcpy DtoH", "us a step": 10, "times a step": 0.5}
+    assert gap == {"before": "splats_kernel", "after": "Memcpy DtoH", "us a step": 10, "times a step": 0.5}

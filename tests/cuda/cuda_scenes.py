@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, Rows, project_rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
 
 ops = torch.ops.blitzgs
 
@@ -48,8 +48,8 @@ class Scene:
         active = [tensor for tensor in (active_ids, active_views) if tensor is not None]
         return ProjectionInputs(gaussians, (viewmats, Ks), options, active)
 
-    def project(self, device: str, dtype: torch.dtype = torch.float32, **changes: Any) -> Rows:
-        return project_rows(self.inputs(device, dtype, **changes))
+    def project(self, device: str, dtype: torch.dtype = torch.float32, **changes: Any) -> ProjectedSplats:
+        return project_splats(self.inputs(device, dtype, **changes))
 
     def grid(self, tile_size: int = 16, begin: int = 0, end: int = -1) -> list[int]:
         return [len(self.Ks), self.width, self.height, tile_size, begin, end]

@@ -7,18 +7,18 @@ from cuda_scenes import Scene, ops, relative_error
 
 
 def survey(scene, device="cuda", dtype=torch.float32, tile_size=16, begin=0, end=-1):
-    """Rows, lists and contributions of a scene whose rows are those of the CPU in float32."""
-    rows = scene.project("cpu")
-    splats = [rows.means2d, rows.conics, rows.opacities]
+    """Splats, lists and contributions of a scene whose splats are those of the CPU in float32."""
+    projected = scene.project("cpu")
+    splats = [projected.means2d, projected.conics, projected.opacities]
     grid = scene.grid(tile_size, begin, end)
-    lists = ops.intersect(*splats, rows.depths, rows.camera_ids, None, grid, -1)
+    lists = ops.intersect(*splats, projected.depths, projected.camera_ids, None, grid, -1)
     moved = [t.to(device, dtype) for t in splats]
     lists = [t.to(device) for t in lists]
     return moved, lists, grid, ops.contributions(*moved, *lists, grid)
 
 
 def test_a_crowded_scene_has_the_bits_of_its_image():
-    """A row's own channel: four rows an image."""
+    """A splat's own channel: four splats an image."""
     scene = Scene(5000, width=170, height=110)
     splats, lists, grid, (weights, pixels) = survey(scene)
     count = len(splats[0])
@@ -57,7 +57,7 @@ def test_repeats_and_adds_up():
     assert torch.equal(sum(part[1] for part in parts), pixels)
 
 
-def test_room_behind_the_rows_is_not_read():
+def test_room_behind_the_splats_is_not_read():
     splats, lists, grid, (weights, pixels) = survey(Scene(500))
     count = len(splats[0])
     roomy = [torch.cat((t, torch.full_like(t, float("nan")))) for t in splats]
@@ -74,9 +74,9 @@ def test_a_splat_over_every_pixel_fits():
     opacities = torch.tensor([1.0, 0.9, 0.95], device="cuda")
     grid = [1, 128, 128, 16, 0, -1]
     tiles = (128 // 16) ** 2
-    rows = torch.arange(3, dtype=torch.int32, device="cuda").repeat(tiles)
+    entries = torch.arange(3, dtype=torch.int32, device="cuda").repeat(tiles)
     offsets = torch.arange(0, 3 * tiles + 1, 3, device="cuda")
-    weights, pixels = ops.contributions(means2d, conics, opacities, rows, offsets, grid)
+    weights, pixels = ops.contributions(means2d, conics, opacities, entries, offsets, grid)
     assert pixels.tolist() == [128 * 128, 128 * 128, 0]  # the third would take T below 1e-4
     alpha = torch.tensor(0.99)
     units = (alpha.double() * 2.0**32).round().long().item() * 128 * 128

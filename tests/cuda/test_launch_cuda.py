@@ -10,15 +10,20 @@ SIZES = (3000, 40, 30_000, 700)
 
 
 class Calls:
-    """Lists, image, loss and gradients of some rows, without a word to the host in between."""
+    """Lists, image, loss and gradients of some splats, without a word to the host in between."""
 
     def __init__(self, n: int) -> None:
         g = torch.Generator().manual_seed(n)
         scene = Scene(n, views=2, seed=n)
-        rows = [r.cuda() if torch.is_tensor(r) else r for r in scene.project("cpu")]
+        projected = [r.cuda() if torch.is_tensor(r) else r for r in scene.project("cpu")]
         self.grid = scene.grid()
-        self.splats = (rows[4], rows[5], rows[7], torch.rand(len(rows[0]), 3, generator=g).cuda())
-        self.depths, self.cameras = rows[6], rows[1]
+        self.splats = (
+            projected[4],
+            projected[5],
+            projected[7],
+            torch.rand(len(projected[0]), 3, generator=g).cuda(),
+        )
+        self.depths, self.cameras = projected[6], projected[1]
         means2d, conics, opacities, _ = self.splats
         listed, _ = ops.intersect(means2d, conics, opacities, self.depths, self.cameras, None, self.grid, -1)
         self.capacity = len(listed)

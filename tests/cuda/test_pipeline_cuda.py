@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training path's backward pass, where the gradients of the rows stay in the rasteriser's table."""
+"""The training path's backward pass, where the gradients of the splats stay in the rasteriser's table."""
 
 import dataclasses
 
@@ -29,9 +29,9 @@ def test_gradients_are_those_from_columns(degree):
     v_renders = torch.randn_like(frame.renders)
     (packed,) = pipeline.backward_splats(frame, v_renders).parts
     assert packed.shape == (len(frame.splats.depths), 12)
-    rows, splats = frame.rows, frame.splats
+    projected, splats = frame.projected, frame.splats
     *unpacked, _ = ops.rasterize_bwd(
-        splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_rows,
+        splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_splats,
         frame.tile_offsets,
         [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order], v_renders, None,
         [len(views), views.width, views.height, options.tile_size, 0, -1], False, True,
@@ -42,8 +42,8 @@ def test_gradients_are_those_from_columns(degree):
     projection = options.projection(views)
     *expected, _ = ops.project_bwd(
         list(table.parameters), [views.viewmats, views.Ks],
-        [rows.camera_ids, rows.visible_ids, rows.row_offsets], projection.ints, projection.floats, unpacked,
-        None, scale_reg, False,
+        [projected.camera_ids, projected.visible_ids, projected.splat_offsets], projection.ints,
+        projection.floats, unpacked, None, scale_reg, False,
     )  # fmt: skip
     gradients = parameter_gradients(table, frame, v_renders, scale_reg)
     for x, y in zip(gradients, expected, strict=True):
@@ -70,7 +70,7 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
     table = GaussianTable({name: small[name].cuda() for name in small})
     options, views = dataclasses.replace(OPTIONS, deterministic=True), cameras(3, device="cuda")
     plain = pipeline.forward(table, views, options)
-    needed = plain.rows.counts.tolist()
+    needed = plain.projected.counts.tolist()
     v_renders = torch.randn_like(plain.renders)
     expected = parameter_gradients(table, plain, v_renders)
     rooms = [tuple(n * k // 100 for n in needed) for k in (100, 101, 250)]
@@ -83,7 +83,7 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
         )
         assert attempts.count("raster") == (1 if enough else 2)
         assert transport.capacity.sizes.holds(needed)
-        for x, y in zip(frame.rows, plain.rows, strict=True):
+        for x, y in zip(frame.projected, plain.projected, strict=True):
             assert torch.equal(x, y)
         for x, y in zip(frame.splats, plain.splats, strict=True):
             assert torch.equal(x, y)
@@ -93,7 +93,7 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
             assert torch.equal(x, y)
 
 
-def test_a_frame_without_rows_takes_no_room_and_any():
+def test_a_frame_without_splats_takes_no_room_and_any():
     small = random_gaussians(500)
     table = GaussianTable({name: small[name].cuda() for name in small})
     table["means"].add_(1e6)
@@ -101,6 +101,6 @@ def test_a_frame_without_rows_takes_no_room_and_any():
     for sizes in (Sizes(10, 10, 10), Sizes(1, 1, 1), None):
         transport = LocalTransport(CapacityEstimate(sizes))
         frame = pipeline.forward(table, views, OPTIONS, transport=transport, backward_follows=True)
-        assert len(frame.rows.gaussian_ids) == 0 and (frame.transmittances == 1).all()
+        assert len(frame.projected.gaussian_ids) == 0 and (frame.transmittances == 1).all()
         v_renders = torch.ones_like(frame.renders)
         assert not any(g.any() for g in parameter_gradients(table, frame, v_renders))

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rasterisation on CUDA against the CPU kernel in float64, on the same rows and lists."""
+"""Rasterisation on CUDA against the CPU kernel in float64, on the same splats and lists."""
 
 import pytest
 import torch
 from cuda_scenes import Scene, ops, relative_error
 
-# Where rounding decides whether a row takes part, the images differ by up to about alpha = 1/255.
+# Where rounding decides whether a splat takes part, the images differ by up to about alpha = 1/255.
 CUT_SHARE = 2e-3
 
 
@@ -16,16 +16,16 @@ def kept_by(outputs):
 
 
 class Job:
-    """Rows and lists of a scene, and its rasterisation on either device."""
+    """Splats and lists of a scene, and its rasterisation on either device."""
 
     def __init__(self, scene: Scene, channels: int, tile_size: int = 16, begin: int = 0, end: int = -1):
         g = torch.Generator().manual_seed(5)
-        rows = scene.project("cpu")
+        splats = scene.project("cpu")
         self.grid = scene.grid(tile_size, begin, end)
-        self.splats = [rows[4], rows[5], rows[7], torch.rand(len(rows[0]), channels, generator=g)]
+        self.splats = [splats[4], splats[5], splats[7], torch.rand(len(splats[0]), channels, generator=g)]
         self.backgrounds = torch.rand(len(scene.Ks), channels, generator=g)
         means2d, conics, opacities, _ = self.splats
-        self.lists = ops.intersect(means2d, conics, opacities, rows[6], rows[1], None, self.grid, -1)
+        self.lists = ops.intersect(means2d, conics, opacities, splats[6], splats[1], None, self.grid, -1)
 
     def inputs(self, device, dtype):
         moved = [t.to(device, dtype) for t in (*self.splats, self.backgrounds)]
@@ -91,20 +91,25 @@ def test_packed_gradients_are_the_same(scene, channels):
     assert torch.equal(room[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
 
 
-@pytest.mark.parametrize("rows", [0, 1, 1000, 300_000])
+@pytest.mark.parametrize("n_splats", [0, 1, 1000, 300_000])
 @pytest.mark.parametrize("begin,end", [(0, -1), (3, 9), (5, 5)])
-def test_backward_finds_zeros(rows, begin, end):
-    """For few rows and many, some tiles and none: whoever writes them."""
+def test_backward_finds_zeros(n_splats, begin, end):
+    """For few splats and many, some tiles and none: whoever writes them."""
     job = Job(Scene(4, views=1, width=90, height=50), 3, 16, begin, end)
-    job.splats = [torch.zeros(rows, 2), torch.ones(rows, 3), torch.ones(rows), torch.ones(rows, 3)]
+    job.splats = [
+        torch.zeros(n_splats, 2),
+        torch.ones(n_splats, 3),
+        torch.ones(n_splats),
+        torch.ones(n_splats, 3),
+    ]
     job.lists = [torch.zeros(0, dtype=torch.int32), torch.zeros(25, dtype=torch.int64)]
-    torch.full((rows, 12), float("nan"), device="cuda")  # what the room would hold otherwise
+    torch.full((n_splats, 12), float("nan"), device="cuda")  # what the room would hold otherwise
     assert len(job.forward("cuda")[6]) == 0
     room = job.forward("cuda", backward_follows=True)[6]
-    assert room.shape == (rows, 12) and not room.any()
+    assert room.shape == (n_splats, 12) and not room.any()
 
 
-def test_rows_of_many_channels_get_no_room(scene):
+def test_splats_of_many_channels_get_no_room(scene):
     assert len(Job(scene, 9).forward("cuda", backward_follows=True)[6]) == 0
 
 
@@ -157,17 +162,17 @@ def test_gradients_of_some_of_the_composited_tiles(scene, deterministic):
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_entries_of_no_tile_name_any_row(scene, deterministic):
+def test_entries_of_no_tile_name_any_splat(scene, deterministic):
     """Lists may be longer than what the tiles have."""
     job = Job(scene, 3)
     saved = job.forward("cuda")
     v = torch.randn_like(saved[0]), torch.randn_like(saved[1])
     expected = job.backward("cuda", torch.float32, saved, *v, False, deterministic)
-    rows, offsets = job.lists
+    entries, offsets = job.lists
     g = torch.Generator().manual_seed(9)
     anything = torch.randint(-(2**31), 2**31, (5000,), generator=g).int()
-    anything[::2] = rows[torch.randint(len(rows), (2500,), generator=g)]
-    job.lists = torch.cat((rows, anything)), offsets
+    anything[::2] = entries[torch.randint(len(entries), (2500,), generator=g)]
+    job.lists = torch.cat((entries, anything)), offsets
     gradients = job.backward("cuda", torch.float32, saved, *v, False, deterministic)
     for value, target in zip(gradients, expected, strict=True):
         assert relative_error(value, target) <= (0 if deterministic else 1e-5)

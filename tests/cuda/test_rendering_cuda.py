@@ -7,7 +7,7 @@ import torch
 import blitzgs
 from tests.helpers import PARAMETERS, random_scene, relative_error
 
-PER_ROW = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")
+PER_SPLAT = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")
 
 
 class Rendering:
@@ -52,7 +52,7 @@ def require_agreement(scene, backgrounds=None, **options):
 
 def require_same_meta(ours, exact, absgrad):
     assert ours.keys() == exact.keys()
-    for name in PER_ROW:
+    for name in PER_SPLAT:
         assert ours[name].shape == exact[name].shape, name
         assert relative_error(ours[name].detach().double().cpu(), exact[name].detach().double()) <= 1e-3, name
     for name in ("camera_ids", "gaussian_ids"):

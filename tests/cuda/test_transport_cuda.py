@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows written to other ranks' memory, and their gradients read there: ranks take turns on one GPU."""
+"""Splats written to other ranks' memory, and their gradients read there: ranks take turns on one GPU."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from blitzgs.distributed.transport.base import Splats
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerBuffers
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection import rows_of
+from blitzgs.ops.projection import splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.helpers import sum_of_ranks
@@ -34,15 +34,15 @@ class Rank:
         self.totals = self.projected.totals
 
     def send(self, everyone, buffers, capacity):
-        rows, ids, totals = self.inputs.run(Sizes(capacity, capacity, 0), RANGES)
+        splats, ids, totals = self.inputs.run(Sizes(capacity, capacity, 0), RANGES)
         assert torch.equal(totals, self.totals)
         places, plan = ops.send_splats_(
-            list(Splats.of(rows, ids)), rows.rank_masks, everyone, self.number, buffers, capacity
+            list(Splats.of(splats, ids)), splats.rank_masks, everyone, self.number, buffers, capacity
         )
         counts, rest = totals[:3].cpu(), everyone[:, 3 + VIEWS :]
         most = max(everyone[:, 1].max(), rest[:, ::2].sum(0).max(), rest[:, ::2].sum(1).max())
         assert plan[0] == (rest[:, 2 * self.number].sum() if most <= capacity else 0)
-        return [*rows_of(rows[:12], counts)[:12], places[: runs_of(int(counts[1]))]]
+        return [*splats_of(splats[:12], counts)[:12], places[: runs_of(int(counts[1]))]]
 
 
 def exchange(counts, slack=0, capacity=None):
@@ -63,15 +63,15 @@ def exchange(counts, slack=0, capacity=None):
 @pytest.mark.parametrize("counts", [(3000, 900, 0, 40), (1, 0, 0, 2), (60_000, 0, 3, 90_000)])
 def test_splats_arrive_and_their_gradients_are_found(counts, slack):
     ranks, traffic, buffers, sent = exchange(counts, slack)
-    expected = [rank.projected.rows[:12] for rank in ranks]
+    expected = [rank.projected.splats[:12] for rank in ranks]
     for got, want in zip(sent, expected, strict=True):
         for a, b in zip(got[:12], want, strict=True):
             assert torch.equal(a, b)
     for m, (its, place) in enumerate(zip(traffic, buffers, strict=True)):
         wanted = []
-        for rank, rows in zip(ranks, expected, strict=True):
-            here = (rows[11] >> m & 1).bool()
-            columns = Splats.of(rank.projected.rows, rank.projected.ids)
+        for rank, splats in zip(ranks, expected, strict=True):
+            here = (splats[11] >> m & 1).bool()
+            columns = Splats.of(rank.projected.splats, rank.projected.ids)
             part = [column[here] for column in columns]
             order = (part[6] * VIEWS + part[5]).argsort()
             wanted.append([column[order] for column in part])
@@ -89,11 +89,11 @@ def test_splats_arrive_and_their_gradients_are_found(counts, slack):
         table = place.tables[m][: len(splats.depths)]
         table.copy_(torch.cat([*columns, torch.full_like(splats.conics, torch.nan)], 1))
     for m, (its, place) in enumerate(zip(traffic, buffers, strict=True)):
-        rows, masks = expected[m], sent[m][11]
+        splats, masks = expected[m], sent[m][11]
         mine = zip(place.tables, its.starts, its.sent, strict=True)
         gradients = SplatGradients([table[start : start + n] for table, start, n in mine], sent[m][12])
         times = sum((masks >> k & 1) for k in range(len(ranks)))[:, None]
-        sums = [times * column for column in (rows[4], rows[5], rows[7][:, None], rows[8])]
+        sums = [times * column for column in (splats[4], splats[5], splats[7][:, None], splats[8])]
         assert torch.equal(sum_of_ranks(gradients, len(masks))[:, :9], torch.cat(sums, 1))
 
 
@@ -108,10 +108,10 @@ def test_nothing_is_written_where_room_is_too_small(counts):
 
 def test_splats_need_the_room_that_others_count_on():
     rank = Rank(0, 100)
-    rows, ids, _ = rank.inputs.run(Sizes(64, 63, 0), RANGES)
-    with pytest.raises(RuntimeError, match="columns must have room for 64 rows, got 63"):
+    splats, ids, _ = rank.inputs.run(Sizes(64, 63, 0), RANGES)
+    with pytest.raises(RuntimeError, match="columns must have room for 64 splats, got 63"):
         ops.send_splats_(
-            list(Splats.of(rows, ids)), rows.rank_masks, rank.totals[None], 0,
+            list(Splats.of(splats, ids)), splats.rank_masks, rank.totals[None], 0,
             [torch.zeros(WORDS_PER_SPLAT * 64, dtype=torch.int32, device="cuda")], 64,
         )  # fmt: skip
 

@@ -103,7 +103,7 @@ def _render(ranks):
         gradients = parameter_gradients(table, frame, terms.v_renders, terms.scale_reg)
         dense = [torch.zeros_like(column) for column in table.parameters]
         for column, gradient in zip(dense, gradients, strict=True):
-            column[frame.rows.visible_ids.long()] = gradient
+            column[frame.projected.visible_ids.long()] = gradient
         tiles = (0, len(frame.tile_work)) if assignment is None else assignment.tiles
         composited = tiles if assignment is None else assignment.composited
         out.append(

@@ -53,7 +53,7 @@ def _exchange(table, ranks, transport):
         columns = [g[:, None] if g.dim() == 1 else g for g in gradients]
         packed = frame.exchange.cleared_table()
         packed.copy_(torch.cat((*columns, torch.ones_like(got.conics)), 1))
-        returned = sum_of_ranks(frame.exchange.return_gradients([packed]), len(frame.rows.means2d))
+        returned = sum_of_ranks(frame.exchange.return_gradients([packed]), len(frame.projected.means2d))
         sums = [column.contiguous() for column in gradient_columns(returned)]
     else:
         sums = frame.exchange.return_gradients(gradients).parts
@@ -70,7 +70,7 @@ def _both_ways(ranks):
         transport = PeerTransport(ranks)
         written, needed = _exchange(table, ranks, transport)
         for room in (needed.isects, needed.isects // 2):  # for lists: enough, too little
-            given = needed._replace(rows=min(needed.rows, 1000), isects=max(room, 1))
+            given = needed._replace(splats=min(needed.splats, 1000), isects=max(room, 1))
             transport, before = PeerTransport(ranks, CapacityEstimate(given)), memory.generation
             again, _ = _exchange(table, ranks, transport)
             assert all(torch.equal(x, y) for x, y in zip(written, again, strict=True))
@@ -113,12 +113,12 @@ def _gradients(ranks):
             gradients.append(parameter_gradients(table, frame, v_renders))  # from zeros again
             copy = GaussianTable({name: table[name].clone() for name in table})
             if transport is transports[1]:
-                kept = torch.full_like(frame.rows.means2d, torch.nan)
+                kept = torch.full_like(frame.projected.means2d, torch.nan)
             optimiser.step(copy, frame, splats[-1], None, 1, kept)
             moments.append(copy.exp_avgs)
             frames.append(frame)
         assert splats[0].places is None and splats[1].means2d is None
-        found = sum_of_ranks(splats[1], len(frames[1].rows.means2d))
+        found = sum_of_ranks(splats[1], len(frames[1].projected.means2d))
         for x, y in zip(gradient_columns(found), splats[0].parts, strict=True):
             assert torch.equal(x, y)
         for pair in (gradients, moments):  # the first moments of a first step are the gradients, but a factor
@@ -154,7 +154,7 @@ def _hidden(ranks):
         frame = pipeline.forward(parts[0], views, OPTIONS, assignment=assignment, transport=transport)
         assert torch.equal(frame.renders[own], alone.renders[own])
         assert torch.equal(frame.transmittances[own], alone.transmittances[own])
-    hidden = frame.rows.opacities == 0
+    hidden = frame.projected.opacities == 0
     assert hidden.any() and not hidden.all()
     return True
 

@@ -12,8 +12,8 @@ from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
 from blitzgs.distributed.transport.testing import LoneMemory, RecordingTransport
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_rows
-from blitzgs.ops.scatter import scatter_rows
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
+from blitzgs.ops.scatter import scatter_splats
 from tests.distributed.rank_harness import run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import parameter_gradients, sum_of_ranks
@@ -75,24 +75,24 @@ def _round_trip(ranks, half, capacity):
     with transport.start(inputs, assignment, capacity) as exchange:
         got = exchange.receive().splats
         assert exchange.gradient_table() is None
-        rows, splats, visible, traffic = exchange.finish()
+        projected, splats, visible, traffic = exchange.finish()
     assert splats is got and sum(traffic.received) == len(got.ids)
     for _ in range(2):
         exchange.expect_gradients()
         returned = exchange.return_gradients(gradients_of(got, ranks.rank))
     assert returned.places is None
-    ids = (inputs.ids[rows.gaussian_ids.long()] - 2**40) * CAMERAS + rows.camera_ids
+    ids = (inputs.ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
     return ids, returned.parts, got._asdict(), visible
 
 
-def masks_by_lists(rows, world_size):
+def masks_by_lists(projected, world_size):
     """Which ranks a splat has to reach, by what intersection lists for each."""
-    masks, ranges = torch.zeros(len(rows.depths), dtype=torch.int64), ranges_for(world_size)
+    masks, ranges = torch.zeros(len(projected.depths), dtype=torch.int64), ranges_for(world_size)
     for rank in range(world_size):
         begin, end = ranges.composited(rank)
         listed, _ = intersect(
-            rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, n_cameras=CAMERAS,
-            width=WIDTH, height=HEIGHT, tile_begin=begin, tile_end=end,
+            projected.means2d, projected.conics, projected.opacities, projected.depths, projected.camera_ids,
+            n_cameras=CAMERAS, width=WIDTH, height=HEIGHT, tile_begin=begin, tile_end=end,
         )  # fmt: skip
         masks[listed.long().unique()] |= 1 << rank
     return masks
@@ -102,24 +102,24 @@ def masks_by_lists(rows, world_size):
 @pytest.mark.parametrize("capacity", [None, Sizes(1, 1, 1), Sizes(500, 1000, 1)])
 def test_splats_reach_their_tiles_and_gradients_return(world_size, capacity):
     whole = scene(dtype=torch.float64)
-    rows = project_rows(whole)
-    masks = masks_by_lists(rows, world_size)
+    projected = project_splats(whole)
+    masks = masks_by_lists(projected, world_size)
     assert masks.unique().numel() > 2
     answers = run_ranks(_round_trip, world_size, False, capacity)
     ids = torch.cat([a[0] for a in answers])
-    keys = (whole.ids[rows.gaussian_ids.long()] - 2**40) * CAMERAS + rows.camera_ids
+    keys = (whole.ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
     order, reference = ids.argsort(), keys.argsort()
     assert torch.equal(ids[order], keys[reference])
     times = sum(((masks >> m) & 1) * (1 + m) for m in range(world_size)).double()
-    w = times * ((whole.ids[rows.gaussian_ids.long()] * 2654435761 >> 7) % 1000).double() / 1000
+    w = times * ((whole.ids[projected.gaussian_ids.long()] * 2654435761 >> 7) % 1000).double() / 1000
     wanted = [
-        2 * w[:, None] * rows.means2d, w[:, None].expand(-1, 3), 3 * w * rows.opacities**2,
-        2 * w[:, None] * rows.colors,
+        2 * w[:, None] * projected.means2d, w[:, None].expand(-1, 3), 3 * w * projected.opacities**2,
+        2 * w[:, None] * projected.colors,
     ]  # fmt: skip
     for i, want in enumerate(wanted):
         got = torch.cat([a[1][i] for a in answers])[order]
         torch.testing.assert_close(got, want[reference], rtol=1e-12, atol=1e-12)
-    place = {int(key): row for row, key in enumerate(keys)}
+    place = {int(key): at for at, key in enumerate(keys)}
     for rank, (_, _, received, visible) in enumerate(answers):
         key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
         at = torch.tensor([place[int(k)] for k in key], dtype=torch.int64)
@@ -127,28 +127,28 @@ def test_splats_reach_their_tiles_and_gradients_return(world_size, capacity):
         assert torch.equal(at.sort().values, ((masks >> rank) & 1).nonzero().squeeze(1))
         for name, column in received.items():
             if name != "ids":
-                assert torch.equal(column, getattr(rows, name)[at]), name
-        assert torch.equal(visible, torch.bincount(rows.camera_ids, minlength=CAMERAS))
+                assert torch.equal(column, getattr(projected, name)[at]), name
+        assert torch.equal(visible, torch.bincount(projected.camera_ids, minlength=CAMERAS))
 
 
 def test_half_precision_is_close():
     answers = run_ranks(_round_trip, 2, True, None)
-    rows = project_rows(scene())
-    keys = (scene().ids[rows.gaussian_ids.long()] - 2**40) * CAMERAS + rows.camera_ids
-    place = {int(key): row for row, key in enumerate(keys)}
+    projected = project_splats(scene())
+    keys = (scene().ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
+    place = {int(key): splat for splat, key in enumerate(keys)}
     for _, gradients, received, _ in answers:
         key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
         at = torch.tensor([place[int(k)] for k in key])
-        assert torch.equal(received["means2d"], rows.means2d[at])
-        assert torch.equal(received["depths"], rows.depths[at])
-        torch.testing.assert_close(received["colors"], rows.colors[at], rtol=1e-3, atol=1e-6)
-        torch.testing.assert_close(received["opacities"], rows.opacities[at], rtol=1e-3, atol=1e-6)
-        scale = (rows.conics[at, 0] * rows.conics[at, 2]).sqrt()[:, None]
-        assert ((received["conics"] - rows.conics[at]).abs() / scale).max() < 4e-3
+        assert torch.equal(received["means2d"], projected.means2d[at])
+        assert torch.equal(received["depths"], projected.depths[at])
+        torch.testing.assert_close(received["colors"], projected.colors[at], rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(received["opacities"], projected.opacities[at], rtol=1e-3, atol=1e-6)
+        scale = (projected.conics[at, 0] * projected.conics[at, 2]).sqrt()[:, None]
+        assert ((received["conics"] - projected.conics[at]).abs() / scale).max() < 4e-3
         a, b, c = received["conics"].unbind(1)
         assert (a * c - b * b > 0).all()
         assert all(g.isfinite().all() for g in gradients)
-    exact = [project_rows(owned_by(scene(), rank, 2)) for rank in range(2)]
+    exact = [project_splats(owned_by(scene(), rank, 2)) for rank in range(2)]
     for rank, (_, gradients, _, _) in enumerate(answers):
         mine, inputs = exact[rank], owned_by(scene(), rank, 2)
         masks = masks_by_lists(mine, 2)
@@ -164,17 +164,17 @@ def alone(monkeypatch):
     """One rank that writes to its own memory, without a GPU: the op that sends is played by another."""
 
     def send(columns, masks, everyone, rank, buffers, capacity):
-        rows = int(everyone[0, 1])
-        plan = torch.tensor([int(everyone[0, -2]) if rows <= capacity else 0])
-        goes = (masks[:rows] == 1).nonzero().squeeze(1) if rows <= capacity else masks[:0]
+        n_splats = int(everyone[0, 1])
+        plan = torch.tensor([int(everyone[0, -2]) if n_splats <= capacity else 0])
+        goes = (masks[:n_splats] == 1).nonzero().squeeze(1) if n_splats <= capacity else masks[:0]
         begin = 0
         for column in columns:
             words = column.reshape(len(column), -1).view(torch.int32)
             target = buffers[0][begin:][: capacity * words.shape[1]].view(capacity, words.shape[1])
             target[: len(goes)] = words[goes]
             begin += capacity * words.shape[1]
-        number = torch.arange(rows, dtype=torch.int32)
-        return scatter_rows([number], masks[:rows], [int((masks[:rows] == 1).sum())])[1], plan
+        number = torch.arange(n_splats, dtype=torch.int32)
+        return scatter_splats([number], masks[:n_splats], [int((masks[:n_splats] == 1).sum())])[1], plan
 
     monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", send)
 
@@ -191,9 +191,9 @@ def alone(monkeypatch):
 
 
 def _rasterize_into(*arguments):
-    *rest, table, n_rows = arguments
-    table[: int(n_rows)] = 0
-    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_rows)[:6]
+    *rest, table, n_splats = arguments
+    table[: int(n_splats)] = 0
+    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_splats)[:6]
 
 
 def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
@@ -210,15 +210,15 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
 
     exchange, counts = transport.capacity.run(attempt)
     assert alone.memory.generation == 2  # the first had no room
-    assert len(alone.memory.buffers[0]) >= len(counts.rows.depths) * WORDS_PER_SPLAT
-    rows = project_rows(inputs)
-    assert all(torch.equal(a, b) for a, b in zip(counts.rows[:11], rows[:11], strict=True))
-    masks = masks_by_lists(rows, 1)
-    assert torch.equal(counts.splats.means2d, rows.means2d[masks == 1])
+    assert len(alone.memory.buffers[0]) >= len(counts.projected.depths) * WORDS_PER_SPLAT
+    projected = project_splats(inputs)
+    assert all(torch.equal(a, b) for a, b in zip(counts.projected[:11], projected[:11], strict=True))
+    masks = masks_by_lists(projected, 1)
+    assert torch.equal(counts.splats.means2d, projected.means2d[masks == 1])
     table = exchange.cleared_table()
     table.copy_(torch.arange(table.numel()).view_as(table))
     returned = exchange.return_gradients([table])
-    sums = sum_of_ranks(returned, len(rows.depths))
+    sums = sum_of_ranks(returned, len(projected.depths))
     assert torch.equal(sums[masks == 1], table) and not sums[masks == 0].any()
     later, _ = transport.capacity.run(attempt)
     later.expect_gradients()
@@ -272,7 +272,7 @@ def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
     names = [name for name, _ in transport.calls]
     assert names == ["start", "receive", "finish"] * 3
     capacities = [capacity for name, capacity in transport.calls if name == "start"]
-    assert capacities[0] is None and capacities[1].holds(expected.rows.counts)
+    assert capacities[0] is None and capacities[1].holds(expected.projected.counts)
     assert torch.equal(frame.renders, expected.renders)
     v_renders = torch.ones_like(frame.renders)
     gradients = parameter_gradients(table, frame, v_renders)

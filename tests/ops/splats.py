@@ -21,7 +21,7 @@ class Splats:
         floats = (self.means2d, self.conics, self.opacities, self.colors, self.depths)
         return Splats(*(t.to(dtype) for t in floats), self.camera_ids)
 
-    def rows(self):
+    def geometry(self):
         """What `intersect` takes."""
         return self.means2d, self.conics, self.opacities, self.depths, self.camera_ids
 
@@ -83,11 +83,11 @@ def dense_composite(splats, width, height, n_cameras=1, backgrounds=None):
     order = torch.argsort(splats.depths, stable=True)
     renders, remainders = [], []
     for camera in range(n_cameras):
-        rows = order[splats.camera_ids[order] == camera]
-        alphas = pixel_alphas(*(t[rows] for t in splats.values()[:3]), width, height)
+        here = order[splats.camera_ids[order] == camera]
+        alphas = pixel_alphas(*(t[here] for t in splats.values()[:3]), width, height)
         alphas = torch.where(_drawn(alphas.detach()), alphas, 0.0)
         ends = torch.cumprod(torch.cat([torch.ones_like(alphas[:1]), 1 - alphas]), 0)
-        color = torch.einsum("phw,phw,pd->hwd", alphas, ends[:-1], splats.colors[rows])
+        color = torch.einsum("phw,phw,pd->hwd", alphas, ends[:-1], splats.colors[here])
         if backgrounds is not None:
             color = color + ends[-1][..., None] * backgrounds[camera]
         renders.append(color)
@@ -116,7 +116,7 @@ def near_a_cut(splats, width, height, margin=1e-5):
 
 
 def with_room(column, room):
-    """A column of `room` rows that begins with these; what lies behind them would not go unnoticed."""
+    """A column of `room` splats that begins with these; what lies behind them would not go unnoticed."""
     garbage = float("nan") if column.is_floating_point() else torch.iinfo(column.dtype).max - 3
     padded = column.new_full((room, *column.shape[1:]), garbage)
     padded[: len(column)] = column

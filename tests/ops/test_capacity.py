@@ -16,7 +16,7 @@ def test_an_estimate_follows_the_largest_of_late():
     assert estimate.sizes.holds((897, 3600, 18)) and not estimate.sizes.holds((898,))
     for _ in range(3000):  # forgotten slowly
         estimate.learn((80, 80, 16))
-    assert estimate.sizes.rows < 400
+    assert estimate.sizes.splats < 400
 
 
 def test_attempts_are_given_what_the_last_one_needed():
@@ -58,14 +58,14 @@ def test_an_attempt_that_fails_leaves_the_estimate():
 def test_threads_may_share_an_estimate():
     estimate = CapacityEstimate()
 
-    def learn(rows):
+    def learn(splats):
         for _ in range(2000):
-            estimate.learn((1, rows, 1))
+            estimate.learn((1, splats, 1))
 
-    threads = [threading.Thread(target=learn, args=(rows,)) for rows in (8, 80, 80_000)]
+    threads = [threading.Thread(target=learn, args=(splats,)) for splats in (8, 80, 80_000)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     estimate.learn((1, 80_000, 1))
-    assert estimate.sizes.rows >= 80_000
+    assert estimate.sizes.splats >= 80_000

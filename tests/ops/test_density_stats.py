@@ -97,7 +97,7 @@ def test_errors_name_the_value():
     sums, counts, radii = state()
     with pytest.raises(RuntimeError, match="grad_count must be Int, got Float"):
         density_stats_(sums, sums.clone(), radii, visible, offsets, gradients, conics, WIDTH, HEIGHT, 1.0)
-    with pytest.raises(RuntimeError, match=r"row_offsets must have shape \[18\]"):
+    with pytest.raises(RuntimeError, match=r"splat_offsets must have shape \[18\]"):
         density_stats_(sums, counts, radii, visible, offsets[1:], gradients, conics, WIDTH, HEIGHT, 1.0)
 
 

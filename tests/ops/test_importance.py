@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.ops.importance import UNITS, row_contributions
+from blitzgs.ops.importance import UNITS, splat_contributions
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
 from blitzgs.ops.rasterize import rasterize
@@ -14,19 +14,19 @@ from tests.helpers import BACKENDS, random_scene
 
 
 def lists_of(scene, tile_size=16):
-    """Projected rows and their lists, and the grid as keywords."""
-    rows = project(
+    """Projected splats and their lists, and the grid as keywords."""
+    projected = project(
         scene.means, scene.quats, scene.scales, scene.opacities, None, scene.viewmats, scene.Ks, scene.width,
         scene.height, raw=False,
     )  # fmt: skip
-    splats = rows.means2d, rows.conics, rows.opacities
+    splats = projected.means2d, projected.conics, projected.opacities
     grid = {
         "n_cameras": len(scene.Ks),
         "width": scene.width,
         "height": scene.height,
         "tile_size": tile_size,
     }
-    return splats, intersect(*splats, rows.depths, rows.camera_ids, **grid), grid
+    return splats, intersect(*splats, projected.depths, projected.camera_ids, **grid), grid
 
 
 def crowded(device="cpu", dtype=torch.float32):
@@ -41,12 +41,12 @@ def crowded(device="cpu", dtype=torch.float32):
 def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
     if backend[0] == "cuda" and tile_size != 16:
         pytest.skip("CUDA composites tiles of 16 pixels")
-    """One channel per row: its image is alpha T of that row."""
+    """One channel per splat: its image is alpha T of that splat."""
     splats, lists, grid = lists_of(crowded(*backend), tile_size)
     count = len(splats[0])
     channels = torch.eye(count, device=backend[0], dtype=backend[1])
     images, _ = rasterize(*splats, channels, *lists, **grid)
-    weights, pixels = row_contributions(*splats, *lists, **grid)
+    weights, pixels = splat_contributions(*splats, *lists, **grid)
     shares = images.double() * UNITS
     assert torch.equal(weights, shares.round().long().sum((0, 1, 2)))
     assert torch.equal(pixels, (images > 0).sum((0, 1, 2)).int())
@@ -56,17 +56,17 @@ def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_parts_add_up_and_repeat(backend):
     splats, lists, grid = lists_of(crowded(*backend))
-    weights, pixels = row_contributions(*splats, *lists, **grid)
+    weights, pixels = splat_contributions(*splats, *lists, **grid)
     tiles = len(lists[1]) - 1
     cuts = [0, 1, 1, 7, 20, tiles]
     parts = [
-        row_contributions(*splats, *lists, **grid, tile_begin=begin, tile_end=end)
+        splat_contributions(*splats, *lists, **grid, tile_begin=begin, tile_end=end)
         for begin, end in zip(cuts, cuts[1:], strict=False)
     ]
     assert torch.equal(sum(part[0] for part in parts), weights)
     assert torch.equal(sum(part[1] for part in parts), pixels)
     for _ in range(3):
-        again = row_contributions(*splats, *lists, **grid)
+        again = splat_contributions(*splats, *lists, **grid)
         assert torch.equal(again[0], weights) and torch.equal(again[1], pixels)
 
 
@@ -116,8 +116,8 @@ def test_what_is_not_there_contributes_nothing():
 def test_bad_arguments_are_named():
     splats, lists, grid = lists_of(random_scene(5))
     with pytest.raises(RuntimeError, match="contributions: conics must have shape"):
-        row_contributions(splats[0], splats[1][:, :2], splats[2], *lists, **grid)
+        splat_contributions(splats[0], splats[1][:, :2], splats[2], *lists, **grid)
     with pytest.raises(RuntimeError, match="tile_begin and tile_end must be a range"):
-        row_contributions(*splats, *lists, **grid, tile_begin=5, tile_end=99)
+        splat_contributions(*splats, *lists, **grid, tile_begin=5, tile_end=99)
     with pytest.raises(ValueError, match="rasterize_mode must be 'classic' or 'antialiased', got 'ewa'"):
         blitzgs.contributions(*splats, splats[2], *lists, 4, 4, rasterize_mode="ewa")

@@ -12,13 +12,13 @@ WIDTH, HEIGHT = 91, 70
 def listed(splats, width, height, tile_size, **options):
     """The lists as sets: bool [P, tiles]."""
     n_cameras = options.pop("n_cameras", 1)
-    rows, offsets = intersect(
-        *splats.rows(), n_cameras=n_cameras, width=width, height=height, tile_size=tile_size, **options
+    entries, offsets = intersect(
+        *splats.geometry(), n_cameras=n_cameras, width=width, height=height, tile_size=tile_size, **options
     )
     tiles = torch.repeat_interleave(torch.arange(len(offsets) - 1), offsets.diff())
     result = torch.zeros(len(splats.depths), len(offsets) - 1, dtype=torch.bool)
-    result[rows[: offsets[-1]].long(), tiles] = True
-    assert int(result.sum()) == int(offsets[-1])  # no row twice in a tile
+    result[entries[: offsets[-1]].long(), tiles] = True
+    assert int(result.sum()) == int(offsets[-1])  # no splat twice in a tile
     return result
 
 
@@ -84,11 +84,11 @@ def test_lists_are_ordered_by_depth_then_id():
     splats.depths = (splats.depths * 40).round() / 40  # many ties
     ids = torch.randperm(2000, generator=torch.Generator().manual_seed(3))
     for given in (None, ids):
-        rows, offsets = intersect(*splats.rows(), given, n_cameras=3, width=WIDTH, height=HEIGHT)
+        entries, offsets = intersect(*splats.geometry(), given, n_cameras=3, width=WIDTH, height=HEIGHT)
         tiebreak = torch.arange(2000) if given is None else given
         per_image = (len(offsets) - 1) // 3
         for tile in range(len(offsets) - 1):
-            part = rows[offsets[tile] : offsets[tile + 1]].long()
+            part = entries[offsets[tile] : offsets[tile + 1]].long()
             assert (splats.camera_ids[part] == tile // per_image).all()
             keys = list(zip(splats.depths[part].tolist(), tiebreak[part].tolist(), strict=True))
             assert keys == sorted(keys)
@@ -97,20 +97,20 @@ def test_lists_are_ordered_by_depth_then_id():
 def test_negative_and_float64_depths_keep_their_order():
     splats = random_splats(400, WIDTH, HEIGHT, largest=60, dtype=torch.float64)
     splats.depths = torch.randn(400, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 1e3
-    rows, offsets = intersect(*splats.rows(), n_cameras=1, width=WIDTH, height=HEIGHT)
+    entries, offsets = intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT)
     for tile in range(len(offsets) - 1):
-        depths = splats.depths[rows[offsets[tile] : offsets[tile + 1]].long()]
+        depths = splats.depths[entries[offsets[tile] : offsets[tile + 1]].long()]
         assert (depths.diff() > 0).all()
 
 
 def test_tile_ranges_are_parts_of_the_whole():
     splats = random_splats(1500, WIDTH, HEIGHT, cameras=2)
     options = {"n_cameras": 2, "width": WIDTH, "height": HEIGHT}
-    rows, offsets = intersect(*splats.rows(), **options)
+    entries, offsets = intersect(*splats.geometry(), **options)
     n_tiles = len(offsets) - 1
     for begin, end in [(0, 7), (7, 33), (33, 33), (33, n_tiles)]:
-        part, part_offsets = intersect(*splats.rows(), tile_begin=begin, tile_end=end, **options)
-        assert torch.equal(part, rows[offsets[begin] : offsets[end]])
+        part, part_offsets = intersect(*splats.geometry(), tile_begin=begin, tile_end=end, **options)
+        assert torch.equal(part, entries[offsets[begin] : offsets[end]])
         assert torch.equal(part_offsets, offsets.clamp(offsets[begin], offsets[end]) - offsets[begin])
 
 
@@ -121,7 +121,7 @@ def test_does_not_depend_on_threads():
     try:
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            results.append(intersect(*splats.rows(), n_cameras=1, width=WIDTH, height=HEIGHT))
+            results.append(intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT))
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r, strict=True))
@@ -131,17 +131,17 @@ def test_does_not_depend_on_threads():
 def test_capacity(device):
     splats = Splats(*(t.to(device) for t in vars(random_splats(100, WIDTH, HEIGHT)).values()))
     options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
-    rows, offsets = intersect(*splats.rows(), **options)
-    roomy, same_offsets = intersect(*splats.rows(), n_isects=len(rows) + 5, **options)
-    assert len(roomy) == len(rows) + 5
-    assert torch.equal(roomy[: len(rows)], rows)
+    entries, offsets = intersect(*splats.geometry(), **options)
+    roomy, same_offsets = intersect(*splats.geometry(), n_isects=len(entries) + 5, **options)
+    assert len(roomy) == len(entries) + 5
+    assert torch.equal(roomy[: len(entries)], entries)
     assert torch.equal(offsets, same_offsets)
-    with pytest.raises(RuntimeError, match=f"n_isects is {len(rows) - 1} but there are {len(rows)}"):
-        intersect(*splats.rows(), n_isects=len(rows) - 1, **options)
+    with pytest.raises(RuntimeError, match=f"n_isects is {len(entries) - 1} but there are {len(entries)}"):
+        intersect(*splats.geometry(), n_isects=len(entries) - 1, **options)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_rows_that_are_not_finite_touch_nothing(value):
+def test_splats_that_are_not_finite_touch_nothing(value):
     base = random_splats(4, WIDTH, HEIGHT)
     for name, column in [("means2d", 0), ("means2d", 1), ("conics", 0), ("conics", 1), ("conics", 2)]:
         splats = Splats(*(t.clone() for t in vars(base).values()))
@@ -163,39 +163,39 @@ def test_a_conic_rounded_to_a_stripe_covers_its_line():
     assert not found[2:, 0].any()
 
 
-def test_empty_and_one_row():
+def test_empty_and_one_splat():
     empty = random_splats(0, WIDTH, HEIGHT)
-    rows, offsets = intersect(*empty.rows(), n_cameras=2, width=WIDTH, height=HEIGHT)
-    assert rows.shape == (0,)
+    entries, offsets = intersect(*empty.geometry(), n_cameras=2, width=WIDTH, height=HEIGHT)
+    assert entries.shape == (0,)
     assert offsets.shape == (2 * 6 * 5 + 1,)
     assert not offsets.any()
     one = random_splats(1, WIDTH, HEIGHT)
     one.means2d[0] = torch.tensor([40.0, 40.0])
     one.opacities[0] = 0.5
-    rows, offsets = intersect(*one.rows(), n_cameras=1, width=WIDTH, height=HEIGHT)
-    assert len(rows) >= 1
-    assert not rows.any()
+    entries, offsets = intersect(*one.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT)
+    assert len(entries) >= 1
+    assert not entries.any()
 
 
 def test_errors_name_the_value():
     splats = random_splats(3, WIDTH, HEIGHT)
     options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     with pytest.raises(RuntimeError, match=r"conics must have shape \[3, 3\], got \[3, 2\]"):
-        intersect(splats.means2d, splats.conics[:, :2], *splats.rows()[2:], **options)
+        intersect(splats.means2d, splats.conics[:, :2], *splats.geometry()[2:], **options)
     with pytest.raises(RuntimeError, match="camera_ids must be Int"):
-        intersect(*splats.rows()[:4], splats.camera_ids.long(), **options)
+        intersect(*splats.geometry()[:4], splats.camera_ids.long(), **options)
     with pytest.raises(RuntimeError, match=r"range of the 30 tiles, got \[5, 31\)"):
-        intersect(*splats.rows(), tile_begin=5, tile_end=31, **options)
+        intersect(*splats.geometry(), tile_begin=5, tile_end=31, **options)
     with pytest.raises(RuntimeError, match=r"tile_size must be in \[1, 64\], got 0"):
-        torch.ops.blitzgs.intersect(*splats.rows(), None, [1, WIDTH, HEIGHT, 0, 0, -1], -1)
+        torch.ops.blitzgs.intersect(*splats.geometry(), None, [1, WIDTH, HEIGHT, 0, 0, -1], -1)
     with pytest.raises(RuntimeError, match="tile numbers are 32-bit, got 4294967296 tiles"):
-        intersect(*splats.rows(), n_cameras=1, width=2**20, height=2**20)
+        intersect(*splats.geometry(), n_cameras=1, width=2**20, height=2**20)
 
 
 @pytest.mark.parametrize("known", [False, True])
 def test_opcheck(known):
     splats = random_splats(20, WIDTH, HEIGHT)
-    n_isects = len(intersect(*splats.rows(), n_cameras=1, width=WIDTH, height=HEIGHT)[0]) if known else -1
+    n_isects = len(intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT)[0]) if known else -1
     torch.library.opcheck(
-        torch.ops.blitzgs.intersect, (*splats.rows(), None, [1, WIDTH, HEIGHT, 16, 0, -1], n_isects)
+        torch.ops.blitzgs.intersect, (*splats.geometry(), None, [1, WIDTH, HEIGHT, 16, 0, -1], n_isects)
     )

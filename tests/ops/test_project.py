@@ -37,17 +37,17 @@ def before_activation(scene):
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 3e-6), (torch.float64, 1e-13)])
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_rows_match_the_reference(dtype, tolerance, antialiased, degree):
+def test_splats_match_the_reference(dtype, tolerance, antialiased, degree):
     scene = random_scene(n=200, cameras=3, dtype=dtype)
     scene.sh_degree = degree
-    rows = project_scene(scene, sh_degree=degree, antialiased=antialiased)
-    assert len(rows.means2d) > 100
+    splats = project_scene(scene, sh_degree=degree, antialiased=antialiased)
+    assert len(splats.means2d) > 100
     for c, image in enumerate(reference_images(scene, antialiased=antialiased)):
-        seen = (rows.camera_ids == c).nonzero()[:, 0]
+        seen = (splats.camera_ids == c).nonzero()[:, 0]
         place = {g: i for i, g in enumerate(image.splats.ids.tolist())}
-        same = [place[g] for g in rows.gaussian_ids[seen].tolist()]
+        same = [place[g] for g in splats.gaussian_ids[seen].tolist()]
         for name in FLOATS:
-            actual, expected = getattr(rows, name)[seen], getattr(image.splats, name)[same]
+            actual, expected = getattr(splats, name)[seen], getattr(image.splats, name)[same]
             assert relative_error(actual, expected) < tolerance, name
 
 
@@ -55,8 +55,8 @@ def test_rows_match_the_reference(dtype, tolerance, antialiased, degree):
 def test_only_what_cannot_touch_a_pixel_is_culled(antialiased):
     scene = random_scene(n=400, cameras=3, width=24, height=20, dtype=torch.float64, scale=0.05)
     scene.means *= 2.5
-    rows = project_scene(scene, antialiased=antialiased)
-    pairs = set(zip(rows.camera_ids.tolist(), rows.gaussian_ids.tolist(), strict=True))
+    splats = project_scene(scene, antialiased=antialiased)
+    pairs = set(zip(splats.camera_ids.tolist(), splats.gaussian_ids.tolist(), strict=True))
     x, y = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(20) + 0.5, indexing="xy")
     culled = 0
     for c, image in enumerate(reference_images(scene, antialiased=antialiased)):
@@ -71,20 +71,20 @@ def test_only_what_cannot_touch_a_pixel_is_culled(antialiased):
     assert culled > 100
 
 
-def test_rows_are_ordered_and_indexed_by_gaussian():
-    rows = project_scene(random_scene(n=3000, cameras=3))
-    U, P, tiles = rows.counts.tolist()
-    assert (len(rows.visible_ids), len(rows.gaussian_ids)) == (U, P)
-    assert tiles == rows.tiles_touched.sum().item() > 0
-    key = rows.gaussian_ids.long() * 32 + rows.camera_ids
+def test_splats_are_ordered_and_indexed_by_gaussian():
+    splats = project_scene(random_scene(n=3000, cameras=3))
+    U, P, tiles = splats.counts.tolist()
+    assert (len(splats.visible_ids), len(splats.gaussian_ids)) == (U, P)
+    assert tiles == splats.tiles_touched.sum().item() > 0
+    key = splats.gaussian_ids.long() * 32 + splats.camera_ids
     assert (key[1:] > key[:-1]).all()
-    assert rows.row_offsets[0] == 0 and rows.row_offsets[-1] == P
-    counts = rows.row_offsets[1:] - rows.row_offsets[:-1]
-    assert torch.equal(rows.visible_ids.repeat_interleave(counts.long()), rows.gaussian_ids)
+    assert splats.splat_offsets[0] == 0 and splats.splat_offsets[-1] == P
+    counts = splats.splat_offsets[1:] - splats.splat_offsets[:-1]
+    assert torch.equal(splats.visible_ids.repeat_interleave(counts.long()), splats.gaussian_ids)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_row_depends_on_its_gaussian_and_view_alone(dtype):
+def test_a_splat_depends_on_its_gaussian_and_view_alone(dtype):
     scene = random_scene(n=2100, cameras=3, dtype=dtype)
     full = project_scene(scene)
     generator = torch.Generator().manual_seed(1)
@@ -126,13 +126,13 @@ def test_gradcheck(antialiased, raw, degree):
     scene.colors[0] -= 1.0  # clipped at zero
     leaves = scene.leaves()
 
-    def rows(*tensors):
+    def splats(*tensors):
         for name, tensor in zip(PARAMETERS, tensors, strict=True):
             setattr(leaves, name, tensor)
         result = project_scene(leaves, antialiased=antialiased, raw=raw, sh_degree=degree)
         return tuple(getattr(result, name) for name in FLOATS)
 
-    assert torch.autograd.gradcheck(rows, [getattr(leaves, name) for name in PARAMETERS])
+    assert torch.autograd.gradcheck(splats, [getattr(leaves, name) for name in PARAMETERS])
 
 
 def test_gradcheck_of_clamped_slopes():
@@ -142,7 +142,7 @@ def test_gradcheck_of_clamped_slopes():
     quats = torch.tensor([[1.0, 0.2, -0.4, 0.3]] * 3, dtype=torch.float64)
     scales = torch.tensor([[1.0, 0.5, 0.8]] * 3, dtype=torch.float64)
 
-    def rows(means, quats, scales, viewmats):
+    def splats(means, quats, scales, viewmats):
         result = project(
             means, quats, scales, torch.full((3,), 0.7).double(), None, viewmats, K, 20, 16, raw=False
         )
@@ -150,15 +150,20 @@ def test_gradcheck_of_clamped_slopes():
         return result.means2d, result.conics, result.depths
 
     inputs = [t.requires_grad_() for t in (means, quats, scales, orbit_camera(0.0, 0.01)[None])]
-    assert torch.autograd.gradcheck(rows, inputs)
+    assert torch.autograd.gradcheck(splats, inputs)
 
 
 def test_gradients_are_repeatable_and_sum_over_views():
     scene = random_scene(n=1500, cameras=2).leaves()
 
     def gradients(scene):
-        rows = project_scene(scene)
-        loss = rows.means2d.square().mean() + rows.conics.sum() + rows.colors.sum() + rows.opacities.sum()
+        splats = project_scene(scene)
+        loss = (
+            splats.means2d.square().mean()
+            + splats.conics.sum()
+            + splats.colors.sum()
+            + splats.opacities.sum()
+        )
         return torch.autograd.grad(loss, [getattr(scene, name) for name in PARAMETERS])
 
     threads = torch.get_num_threads()
@@ -177,10 +182,10 @@ def test_dense_gradients_are_the_compact_ones_where_they_belong(backend, degree,
     scene = random_scene(n=700, cameras=2, width=20, height=16, dtype=dtype, device=device)
     scene.means[::2] *= 20.0  # seen by no view
     sh = None if degree is None else scene.colors[:, :coefficients].contiguous()
-    rows = project_scene(scene, sh=sh, sh_degree=degree or 0)
+    splats = project_scene(scene, sh=sh, sh_degree=degree or 0)
     generator = torch.Generator().manual_seed(1)
     means2d, conics, depths, opacities, colors = (
-        torch.randn(len(rows.depths), width, generator=generator).to(device, dtype)
+        torch.randn(len(splats.depths), width, generator=generator).to(device, dtype)
         for width in (2, 3, 1, 1, 3)
     )
     options = ProjectionOptions(scene.width, scene.height, sh_degree=degree or 0, antialiased=True, raw=False)
@@ -189,12 +194,12 @@ def test_dense_gradients_are_the_compact_ones_where_they_belong(backend, degree,
     if sh is not None:
         gaussians, v_splats = [*gaussians, sh], [*v_splats, colors]
     arguments = (
-        gaussians, [scene.viewmats, scene.Ks], [rows.camera_ids, rows.visible_ids, rows.row_offsets],
+        gaussians, [scene.viewmats, scene.Ks], [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
         options.ints, options.floats, v_splats, depths[:, 0], None, True,
     )  # fmt: skip
     compact = torch.ops.blitzgs.project_bwd(*arguments)
     dense = torch.ops.blitzgs.project_bwd(*arguments, dense=True)
-    ids = rows.visible_ids.long()
+    ids = splats.visible_ids.long()
     assert 10 < len(ids) < 600
     for part, whole in zip(compact[:5], dense[:5], strict=True):
         expected = part.new_zeros(700, *part.shape[1:]).index_copy(0, ids, part)
@@ -205,43 +210,43 @@ def test_dense_gradients_are_the_compact_ones_where_they_belong(backend, degree,
 
 def test_scale_regulariser_adds_the_slope_of_the_smallest_axis():
     scene = before_activation(random_scene(n=50, cameras=2, dtype=torch.float64))
-    rows = project_scene(scene, raw=True)
-    P = len(rows.depths)
+    splats = project_scene(scene, raw=True)
+    P = len(splats.depths)
     zeros = torch.zeros(P, 3, dtype=torch.float64)
     weights = torch.tensor([0.5, 2.0], dtype=torch.float64)
     options = ProjectionOptions(scene.width, scene.height)
     v_scales = torch.ops.blitzgs.project_bwd(
         [scene.means, scene.quats, scene.scales, scene.opacities], [scene.viewmats, scene.Ks],
-        [rows.camera_ids, rows.visible_ids, rows.row_offsets], options.ints, options.floats,
+        [splats.camera_ids, splats.visible_ids, splats.splat_offsets], options.ints, options.floats,
         [zeros[:, :2], zeros, zeros[:, 0]], None, weights, False,
     )[2]  # fmt: skip
     log_scales = scene.scales.requires_grad_()
-    smallest = log_scales.exp().amin(dim=1)[rows.gaussian_ids.long()]
-    (smallest * weights[rows.camera_ids.long()]).sum().backward()
-    assert relative_error(v_scales, log_scales.grad[rows.visible_ids.long()]) < 1e-14
+    smallest = log_scales.exp().amin(dim=1)[splats.gaussian_ids.long()]
+    (smallest * weights[splats.camera_ids.long()]).sum().backward()
+    assert relative_error(v_scales, log_scales.grad[splats.visible_ids.long()]) < 1e-14
 
 
 def test_nothing_finite_is_lost_and_nothing_else_spreads():
     scene = random_scene(n=40, cameras=2)
     clean = project_scene(scene)
     poisoned = {3: "means", 7: "quats", 11: "scales", 13: "opacities", 17: "colors"}
-    for row, name in poisoned.items():
-        getattr(scene, name)[row] = math.nan if row % 2 else math.inf
+    for splat, name in poisoned.items():
+        getattr(scene, name)[splat] = math.nan if splat % 2 else math.inf
     scene.means[19] = math.inf
     scene.scales[23, 1] = -math.inf
     gone = torch.tensor([*(set(poisoned) - {17}), 19, 23], dtype=torch.int32)
     leaves = scene.leaves()
-    rows = project_scene(leaves)
+    splats = project_scene(leaves)
     keep = ~torch.isin(clean.gaussian_ids, gone)
-    assert torch.equal(rows.gaussian_ids, clean.gaussian_ids[keep])
-    # Where only the colour is not finite there are rows, but nothing composites them.
-    hidden = rows.gaussian_ids == 17
+    assert torch.equal(splats.gaussian_ids, clean.gaussian_ids[keep])
+    # Where only the colour is not finite there are splats, but nothing composites them.
+    hidden = splats.gaussian_ids == 17
     assert hidden.any()
     for name in ("opacities", "colors", "radii", "tiles_touched"):
-        assert (getattr(rows, name)[hidden] == 0).all()
+        assert (getattr(splats, name)[hidden] == 0).all()
     for name in FLOATS:
-        assert torch.equal(getattr(rows, name)[~hidden], getattr(clean, name)[keep][~hidden]), name
-    sum(getattr(rows, name).square().sum() for name in FLOATS).backward()
+        assert torch.equal(getattr(splats, name)[~hidden], getattr(clean, name)[keep][~hidden]), name
+    sum(getattr(splats, name).square().sum() for name in FLOATS).backward()
     for name in PARAMETERS:
         assert getattr(leaves, name).grad.isfinite().all(), name
         if name != "viewmats":
@@ -249,23 +254,23 @@ def test_nothing_finite_is_lost_and_nothing_else_spreads():
     assert (leaves.colors.grad[17] == 0).all()
 
 
-def test_each_row_knows_the_ranks_that_composite_its_tiles():
+def test_each_splat_knows_the_ranks_that_composite_its_tiles():
     scene = random_scene(n=500, cameras=2, width=70, height=40)  # 5 x 3 tiles a view
     ranges = [(0, 18), (12, 12), (12, 30)]
     inputs = inputs_of(scene)
-    rows, ids, totals = inputs._replace(ids=torch.arange(500) + 7).run(None, ranges)
-    assert torch.equal(ids, rows.gaussian_ids + 7)
-    masks = torch.zeros_like(rows.rank_masks)
+    splats, ids, totals = inputs._replace(ids=torch.arange(500) + 7).run(None, ranges)
+    assert torch.equal(ids, splats.gaussian_ids + 7)
+    masks = torch.zeros_like(splats.rank_masks)
     for rank, (begin, end) in enumerate(ranges):
         listed, _ = intersect(
-            rows.means2d, rows.conics, rows.opacities, rows.depths, rows.camera_ids, n_cameras=2, width=70,
-            height=40, tile_begin=begin, tile_end=end,
+            splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, n_cameras=2,
+            width=70, height=40, tile_begin=begin, tile_end=end,
         )  # fmt: skip
         masks[listed.long().unique()] |= 1 << rank
         assert totals[5 + 2 * rank :][:2].tolist() == [len(listed.unique()), len(listed)]
-    assert torch.equal(rows.rank_masks, masks) and masks.unique().numel() > 2
-    assert torch.equal(totals[3:5], torch.bincount(rows.camera_ids, minlength=2))
-    assert totals[:3].tolist() == [len(rows.visible_ids), len(rows.depths), rows.tiles_touched.sum()]
+    assert torch.equal(splats.rank_masks, masks) and masks.unique().numel() > 2
+    assert torch.equal(totals[3:5], torch.bincount(splats.camera_ids, minlength=2))
+    assert totals[:3].tolist() == [len(splats.visible_ids), len(splats.depths), splats.tiles_touched.sum()]
 
 
 @pytest.mark.parametrize("quat", [[0.0, 0, 0, 0], [1e30, -1e30, 2e30, 0], [1e-30, 0, 3e-30, 1e-30]])
@@ -273,20 +278,20 @@ def test_quaternions_of_any_length(quat):
     scene = random_scene(n=30, cameras=1)
     scene.quats[:] = torch.tensor(quat)
     leaves = scene.leaves()
-    rows = project_scene(leaves)
+    splats = project_scene(leaves)
     scale = max(map(abs, quat)) or 1.0
     scene.quats[:] = torch.tensor([q / scale for q in quat] if any(quat) else [1.0, 0, 0, 0])
-    assert relative_error(rows.conics, project_scene(scene).conics) < 1e-5
-    rows.conics.sum().backward()
+    assert relative_error(splats.conics, project_scene(scene).conics) < 1e-5
+    splats.conics.sum().backward()
     assert leaves.quats.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("n, cameras", [(0, 2), (5, 0), (0, 0)])
 def test_empty_input(n, cameras):
     leaves = random_scene(n=n, cameras=cameras).leaves()
-    rows = project_scene(leaves)
-    assert rows.counts.tolist() == [0, 0, 0] and rows.row_offsets.tolist() == [0]
-    rows.means2d.sum().backward()
+    splats = project_scene(leaves)
+    assert splats.counts.tolist() == [0, 0, 0] and splats.splat_offsets.tolist() == [0]
+    splats.means2d.sum().backward()
     assert leaves.means.grad.shape == (n, 3) and (leaves.means.grad == 0).all()
 
 
@@ -303,13 +308,13 @@ def test_near_plane_behind_and_opacity_below_the_cut():
 
 def test_radius_clip_drops_small_splats_only():
     scene = random_scene(n=200, cameras=1)
-    rows = project_scene(scene)
-    clip = rows.radii.max(dim=1).values.median().item()
+    splats = project_scene(scene)
+    clip = splats.radii.max(dim=1).values.median().item()
     kept = project_scene(scene, radius_clip=clip)
     assert set(kept.gaussian_ids.tolist()) == set(
-        rows.gaussian_ids[rows.radii.max(dim=1).values > clip].tolist()
+        splats.gaussian_ids[splats.radii.max(dim=1).values > clip].tolist()
     )
-    assert 0 < len(kept.depths) < len(rows.depths)
+    assert 0 < len(kept.depths) < len(splats.depths)
 
 
 def test_errors_name_the_argument():
@@ -369,10 +374,14 @@ def test_compiles_into_one_graph_with_the_same_gradients():
     inputs = [getattr(scene, name) for name in PARAMETERS]
 
     def loss(means, quats, scales, opacities, colors, viewmats):
-        rows = project(
+        splats = project(
             means, quats, scales, opacities, colors, viewmats, scene.Ks, 40, 32, sh_degree=3, raw=False
         )
-        return rows.means2d.sum() + (rows.conics * rows.opacities[:, None]).sum() + rows.colors.square().sum()
+        return (
+            splats.means2d.sum()
+            + (splats.conics * splats.opacities[:, None]).sum()
+            + splats.colors.square().sum()
+        )
 
     with torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True):
         compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")

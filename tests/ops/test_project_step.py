@@ -8,7 +8,7 @@ from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam
 from blitzgs.ops.project import project
 from blitzgs.ops.project_step import project_bwd_step_
 from blitzgs.ops.projection import ProjectionOptions
-from blitzgs.ops.scatter import scatter_rows
+from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from tests.helpers import DEVICES, needs_cuda, sum_of_ranks
 
@@ -17,7 +17,7 @@ STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
 
 
 class Scene:
-    """Gaussians before some cameras, an optimiser's state, and gradients of the rows."""
+    """Gaussians before some cameras, an optimiser's state, and gradients of the splats."""
 
     def __init__(self, n, k, views, device, dtype):
         generator = torch.Generator().manual_seed(n + k)
@@ -49,11 +49,11 @@ class Scene:
         return self.last_step, self.moment_step
 
     def render(self, antialiased):
-        self.rows = project(
+        self.splats = project(
             *self.params, self.viewmats, self.Ks, WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D,
             antialiased=antialiased,
         )  # fmt: skip
-        shapes = (self.rows.means2d, self.rows.conics, self.rows.opacities, self.rows.colors)
+        shapes = (self.splats.means2d, self.splats.conics, self.splats.opacities, self.splats.colors)
         self.v = SplatGradients(
             [torch.randn(s.shape, generator=self.seed, dtype=torch.float64).to(s) for s in shapes]
         )
@@ -61,12 +61,12 @@ class Scene:
             WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D, antialiased=antialiased
         )
 
-    def row_ids(self):
-        return [self.rows.camera_ids, self.rows.visible_ids, self.rows.row_offsets]
+    def splat_ids(self):
+        return [self.splats.camera_ids, self.splats.visible_ids, self.splats.splat_offsets]
 
     def backward_arguments(self, need_viewmats=False):
         return (
-            self.params, [self.viewmats, self.Ks], self.row_ids(), self.options.ints, self.options.floats,
+            self.params, [self.viewmats, self.Ks], self.splat_ids(), self.options.ints, self.options.floats,
             list(self.v.parts), None, self.scale_reg, need_viewmats,
         )  # fmt: skip
 
@@ -74,13 +74,13 @@ class Scene:
         return torch.ops.blitzgs.project_bwd(*self.backward_arguments(need_viewmats))
 
     def one_after_the_other(self, sparse):
-        r = self.rows
+        r = self.splats
         *gradients, _ = self.backward()
         lazy_adam_step_(*self.columns(), gradients, r.visible_ids, *self.stands(), *self.optimiser, sparse)
 
     def at_once(self, sparse, means2d_sums=None):
         project_bwd_step_(
-            *self.columns(), *self.stands(), *self.optimiser, sparse, self.rows, (self.viewmats, self.Ks),
+            *self.columns(), *self.stands(), *self.optimiser, sparse, self.splats, (self.viewmats, self.Ks),
             self.options, self.v, self.scale_reg, means2d_sums,
         )  # fmt: skip
 
@@ -96,20 +96,20 @@ class Scene:
 
     def spread(self):
         """Replace the gradients by others, in tables of ranks amid what is of no use; return their sums."""
-        rows, starts, ranks = len(self.rows.camera_ids), [5, 0, 900, 1], 4
-        masks = torch.randint(0, 2**ranks, (rows,), generator=self.seed) & ~2  # rank 1 had nothing
-        alone = torch.rand(rows, generator=self.seed) < 0.6  # as most rows are
+        splats, starts, ranks = len(self.splats.camera_ids), [5, 0, 900, 1], 4
+        masks = torch.randint(0, 2**ranks, (splats,), generator=self.seed) & ~2  # rank 1 had nothing
+        alone = torch.rand(splats, generator=self.seed) < 0.6  # as most splats are
         masks[alone] = 2 ** (2 * (masks[alone] % 2))
         sizes = [int((masks >> m & 1).sum()) for m in range(ranks)]
-        numbers = torch.arange(rows, dtype=torch.int32, device=self.rows.means2d.device)
-        _, places = scatter_rows([numbers], masks.to(numbers.device), sizes)
+        numbers = torch.arange(splats, dtype=torch.int32, device=self.splats.means2d.device)
+        _, places = scatter_splats([numbers], masks.to(numbers.device), sizes)
         parts = []
         for start, size in zip(starts, sizes, strict=True):
             table = torch.full((start + size + 1, 12), torch.nan)
             table[start : start + size] = torch.randn(size, 12, generator=self.seed)
             parts.append(table.to(numbers.device)[start : start + size])
         self.v = SplatGradients(parts, places)
-        sums = gradient_columns(sum_of_ranks(self.v, rows))
+        sums = gradient_columns(sum_of_ranks(self.v, splats))
         return SplatGradients([column.contiguous() for column in sums])
 
 
@@ -141,7 +141,7 @@ def test_equals_backward_and_step(device, sparse, n, k, degree, views):
     scenes[0].one_after_the_other(sparse)
     scenes[1].at_once(sparse)
     compare(*scenes, exact=device == "cpu")
-    visible = scenes[0].rows.visible_ids.long()
+    visible = scenes[0].splats.visible_ids.long()
     assert len(visible) and bool((scenes[1].moment_step[visible] == STEP).all())
     if k > (degree + 1) ** 2:  # coefficients not in use yet still decay
         assert not torch.equal(before[4][visible][:, -1], scenes[1].params[4][visible][:, -1])
@@ -181,9 +181,9 @@ def test_gradients_in_tables_of_ranks(n, k, degree, views):
     for scene in (plain, other):
         scene.degree = degree
         scene.render(antialiased=False)
-    assert n == 1 or len(plain.rows.camera_ids) > 2 * n * views // 3  # more than a warp holds at many views
+    assert n == 1 or len(plain.splats.camera_ids) > 2 * n * views // 3  # more than a warp holds at many views
     plain.v = other.spread()
-    sums = torch.full_like(plain.rows.means2d, torch.nan)
+    sums = torch.full_like(plain.splats.means2d, torch.nan)
     agree(plain, other, False, sums)
     assert torch.equal(sums, plain.v.parts[0])
 
@@ -220,7 +220,7 @@ def test_float64_and_nothing_visible():
     scene.render(False)
     before = [p.clone() for p in scene.params]
     scene.at_once(False)
-    assert len(scene.rows.visible_ids) == 0
+    assert len(scene.splats.visible_ids) == 0
     assert all(torch.equal(x, y) for x, y in zip(before, scene.params, strict=True))
 
 
@@ -248,7 +248,7 @@ def test_errors_name_what_is_wrong_with_tables():
         scene.backward()
     scene.render(False)
     with pytest.raises(RuntimeError, match="means2d_sums needs gradients at ranks"):
-        scene.at_once(False, torch.zeros_like(scene.rows.means2d))
+        scene.at_once(False, torch.zeros_like(scene.splats.means2d))
 
 
 @pytest.mark.cuda
@@ -277,7 +277,7 @@ def test_opcheck():
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,
         (*scene.columns(), [*scene.stands()], tables, [STEP, explicit_steps(BETA1, BETA2, torch.float32), 0],
-         [BETA1, BETA2, EPS], [scene.viewmats, scene.Ks], scene.row_ids(), scene.options.ints,
+         [BETA1, BETA2, EPS], [scene.viewmats, scene.Ks], scene.splat_ids(), scene.options.ints,
          scene.options.floats, list(scene.v.parts), None, scene.scale_reg),
     )  # fmt: skip
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, scene.backward_arguments(True))

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def lists(splats, n_cameras=1, width=WIDTH, height=HEIGHT, tile_size=16, **tile_range):
     return intersect(
-        *splats.rows(), n_cameras=n_cameras, width=width, height=height, tile_size=tile_size, **tile_range
+        *splats.geometry(), n_cameras=n_cameras, width=width, height=height, tile_size=tile_size, **tile_range
     )
 
 
@@ -168,7 +168,7 @@ def test_thousands_of_layers_stay_accurate():
 
 def test_last_ids_and_tile_work():
     splats = random_splats(400, WIDTH, HEIGHT, smallest=3, opacity=(0.5, 1.0))
-    rows, offsets = lists(splats)
+    entries, offsets = lists(splats)
     _, transmittances, last_ids, tile_work, *_ = forward(splats)
     tiles_x, _ = tile_counts(WIDTH, HEIGHT, 16)
     lengths = offsets.diff()
@@ -179,7 +179,7 @@ def test_last_ids_and_tile_work():
         last = last_ids[0, y : y + 16, x : x + 16]
         assert last.max() <= work
         # Entries past tile_work change nothing: drop them and render again.
-        shorter = rows[offsets[tile] : offsets[tile] + work]
+        shorter = entries[offsets[tile] : offsets[tile] + work]
         alone = torch.zeros_like(offsets)
         alone[tile + 1 :] = work
         again = torch.ops.blitzgs.rasterize_fwd(
@@ -292,7 +292,7 @@ def test_scalar_code_gives_the_same_bits(tmp_path):
         assert torch.equal(a, b)
 
 
-def test_zero_rows_and_empty_lists():
+def test_zero_splats_and_empty_lists():
     splats = random_splats(0, WIDTH, HEIGHT)
     backgrounds = torch.tensor([[0.1, 0.2, 0.3]])
     outputs = forward(splats, backgrounds=backgrounds)
@@ -306,7 +306,7 @@ def test_zero_rows_and_empty_lists():
     assert not any(t.any() for t in backward(hidden, outputs, torch.ones_like(outputs[0])))
 
 
-def test_a_row_that_is_not_finite_leaves_the_others_alone():
+def test_a_splat_that_is_not_finite_leaves_the_others_alone():
     splats = random_splats(40, WIDTH, HEIGHT)
     tile_lists = lists(splats)
     clean = torch.ops.blitzgs.rasterize_fwd(

@@ -71,9 +71,9 @@ def dense_survey(table):
                 batch.views.viewmats[one], batch.views.Ks[one], batch.views.width, batch.views.height
             )
             found = survey(table, views, OPTIONS)
-            rows = found.rows.gaussian_ids.long().cpu()
-            units[column, rows], pixels[column, rows] = found.weights.cpu(), found.pixels.long().cpu()
-            visible[column, rows] = True
+            ids = found.splats.gaussian_ids.long().cpu()
+            units[column, ids], pixels[column, ids] = found.weights.cpu(), found.pixels.long().cpu()
+            visible[column, ids] = True
     return units, pixels, visible
 
 

@@ -54,12 +54,14 @@ def frame(tmp_path_factory):
 @pytest.mark.parametrize("name", ["means2d", "conics", "depths", "opacities", "colors"])
 def test_the_guard_names_op_gaussian_and_view(frame, name):
     table, rendered = frame
-    column = getattr(rendered.rows, name).clone()
+    column = getattr(rendered.projected, name).clone()
     column[5] = float("inf")
-    rows = rendered.rows._replace(**{name: column})
-    wanted = int(table["id"][rows.gaussian_ids[5]]), ("a", "b")[rows.camera_ids[5]]
+    splats = rendered.projected._replace(**{name: column})
+    wanted = int(table["id"][splats.gaussian_ids[5]]), ("a", "b")[splats.camera_ids[5]]
     with pytest.raises(NonFiniteError) as failure:
-        LossGuard().check(9, ("a", "b"), Sums(0, 0, float("nan"), 0), table, rendered._replace(rows=rows))
+        LossGuard().check(
+            9, ("a", "b"), Sums(0, 0, float("nan"), 0), table, rendered._replace(projected=splats)
+        )
     assert str(failure.value) == (
         "step 9: the loss of view 'a' is not finite; it first appears in op project, output "
         f"{name}: Gaussian id {wanted[0]} in view '{wanted[1]}', and 0 more"
@@ -88,7 +90,7 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     )
     assert "in step 10 the parameters are finite" in text and "view 'c', 'd'" in text
     guard.check(9, ("a", "b"), bad, table, late)
-    rows = rendered.rows._replace(depths=rendered.rows.depths * torch.inf)
-    spoiled = Broken(rendered._replace(rows=rows), "cuda")
+    splats = rendered.projected._replace(depths=rendered.projected.depths * torch.inf)
+    spoiled = Broken(rendered._replace(projected=splats), "cuda")
     with pytest.raises(NonFiniteError, match="looked at in step 10: .* op project, output depths"):
         guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, spoiled)

@@ -71,7 +71,7 @@ def whole_run(tmp_path_factory):
     def watched(self, step, options, batch, mark=None, gate=None):
         frame, *rest = forward(self, step, options, batch, gate=gate)
         table = {name: self._table[name].clone() for name in self._table}
-        steps[step] = (gate, frame.rows, batch.indices, table)
+        steps[step] = (gate, frame.projected, batch.indices, table)
         return frame, *rest
 
     with pytest.MonkeyPatch.context() as patch:
@@ -95,7 +95,7 @@ def test_each_phase_leaves_out_what_the_schedule_says(whole_run):
         seen[rows.visible_ids.long()] = True
         everything = pipeline.forward(
             GaussianTable(table), trainer.state.views.pick([index]), trainer.state.render_options
-        ).rows
+        ).projected
         allowed = torch.ones_like(seen)
         if gate.lod_views:
             centre = trainer.state.views.centres([index])

@@ -172,7 +172,7 @@ def test_training_behind_the_gate_is_dense_adams(device):
             options = RenderOptions(0, 0.05, 100.0, deterministic=True)
             frame, terms, _ = stepper.forward(step, options, batch, gate=gate)
             stepper.backward(step, frame, terms)
-            rows = frame.rows
+            rows = frame.projected
             pairs = zip(rows.gaussian_ids.tolist(), rows.camera_ids.tolist(), strict=True)
             sets[pays_at_once].append(set(pairs))
         assert int((table["moment_step"] < steps - 3).sum()) > 10  # these owe steps

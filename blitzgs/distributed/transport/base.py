@@ -29,12 +29,12 @@ from torch import Tensor
 
 from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.projection import ProjectionInputs, Rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs
 from blitzgs.ops.splat_gradients import SplatGradients
 
 
 class Splats(NamedTuple):
-    """Projected Gaussians as compositing sees them; P rows.
+    """Projected Gaussians as compositing sees them; P splats.
 
     Attributes:
         means2d: [P, 2] pixels.
@@ -55,9 +55,17 @@ class Splats(NamedTuple):
     ids: Tensor
 
     @classmethod
-    def of(cls, rows: Rows, ids: Tensor) -> Splats:
-        """Return what is composited of projected rows with these ids."""
-        return cls(rows.means2d, rows.conics, rows.opacities, rows.colors, rows.depths, rows.camera_ids, ids)
+    def of(cls, splats: ProjectedSplats, ids: Tensor) -> Splats:
+        """Return what is composited of projected splats with these ids."""
+        return cls(
+            splats.means2d,
+            splats.conics,
+            splats.opacities,
+            splats.colors,
+            splats.depths,
+            splats.camera_ids,
+            ids,
+        )
 
     def first(self, count: int) -> Splats:
         """Return the first `count` of them."""
@@ -127,13 +135,13 @@ class HostCounts(NamedTuple):
     """What the host knows of an exchange in the end.
 
     Attributes:
-        rows: this rank's own, no more than there are.
+        projected: this rank's own, no more than there are.
         splats: what this rank composites, no more than there are.
         visible: int64 [B], splats of each view over all ranks; valid until the next exchange.
         traffic: what went where; None: there is one rank.
     """
 
-    rows: Rows
+    projected: ProjectedSplats
     splats: Splats
     visible: Tensor
     traffic: Traffic | None

@@ -14,8 +14,16 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Traffic, Transport
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import Projected, ProjectionInputs, rows_of
-from blitzgs.ops.scatter import RUN, as_column, gather_rows, scatter_rows, sum_rows, words_of, words_per_row
+from blitzgs.ops.projection import Projected, ProjectionInputs, splats_of
+from blitzgs.ops.scatter import (
+    RUN,
+    as_column,
+    gather_splats,
+    scatter_splats,
+    sum_splats,
+    words_of,
+    words_per_splat,
+)
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 
 
@@ -55,7 +63,7 @@ def carry_sums(sums: Tensor, places: Tensor, traffic: Traffic, splats: int, rank
 
     Args:
         sums: int64 [R, C], of the splats that arrived here.
-        places: of this rank's splats, as `scatter_rows` returns them.
+        places: of this rank's splats, as `scatter_splats` returns them.
         traffic: what went where.
         splats: P.
         ranks: the job.
@@ -67,8 +75,8 @@ def carry_sums(sums: Tensor, places: Tensor, traffic: Traffic, splats: int, rank
         # The splats of a run lie together: the first one's place, and which of them are there (csrc/scatter).
         here = runs[:, None] >> (32 + lanes) & 1
         at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
-        rows = here.flatten().nonzero().squeeze(1)
-        total.index_add_(0, rows, group[at.flatten()[rows]])
+        which = here.flatten().nonzero().squeeze(1)
+        total.index_add_(0, which, group[at.flatten()[which]])
     return total
 
 
@@ -104,8 +112,8 @@ class _CollectiveExchange(Exchange):
     ) -> None:
         super().__init__()
         self._ranks, self._codec, self._traffic, self._visible = ranks, codec, traffic, visible
-        self._rows = rows_of(projected.rows[:12], traffic.counts)
-        self._own = Splats.of(self._rows, projected.ids[: len(self._rows.camera_ids)])
+        self._projected = splats_of(projected.splats[:12], traffic.counts)
+        self._own = Splats.of(self._projected, projected.ids[: len(self._projected.camera_ids)])
         self.needed = Sizes._make(traffic.counts.tolist())
 
     def _receive(self) -> Arrived:
@@ -114,17 +122,17 @@ class _CollectiveExchange(Exchange):
         columns = [own.means2d, own.depths, own.camera_ids, own.ids]
         columns += [codec.encode(*shape)] if codec is not None else shape
         sent, received = traffic.sent, traffic.received
-        packed, self._places = scatter_rows(columns, self._rows.rank_masks, sent)
-        words = sum(map(words_per_row, columns))
+        packed, self._places = scatter_splats(columns, self._projected.rank_masks, sent)
+        words = sum(map(words_per_splat, columns))
         arrived = self._ranks.all_to_all(packed, [words * n for n in sent], [words * n for n in received])
-        means2d, depths, camera_ids, ids, *rest = gather_rows(arrived, columns, received)
+        means2d, depths, camera_ids, ids, *rest = gather_splats(arrived, columns, received)
         conics, opacities, colors = rest if codec is None else codec.decode(rest[0], means2d.dtype)
         self._splats = Splats(means2d, conics, opacities, colors, depths, camera_ids, ids)
         # Rounding may let splats touch some tiles more.
         return Arrived(self._splats, None, traffic.n_isects if codec is None else -1)
 
     def _finish(self) -> HostCounts:
-        return HostCounts(self._rows, self._splats, self._visible, self._traffic)
+        return HostCounts(self._projected, self._splats, self._visible, self._traffic)
 
     def _return_gradients(self, parts: Sequence[Tensor]) -> SplatGradients:
         columns = gradient_columns(parts[0]) if len(parts) == 1 else parts
@@ -138,8 +146,8 @@ class _CollectiveExchange(Exchange):
             halves = torch.cat(flat, 1).bfloat16()
             carried = self._ranks.all_to_all(words_of(halves), received, sent)
             returned = as_column(carried, halves).to(dtype)
-        sums = sum_rows(returned, self._places, sent, len(self._rows.camera_ids), widths)
+        sums = sum_splats(returned, self._places, sent, len(self._projected.camera_ids), widths)
         return SplatGradients([s.reshape(-1, *g.shape[1:]) for s, g in zip(sums, columns, strict=True)])
 
     def _return_sums(self, sums: Tensor) -> Tensor:
-        return carry_sums(sums, self._places, self._traffic, len(self._rows.camera_ids), self._ranks)
+        return carry_sums(sums, self._places, self._traffic, len(self._projected.camera_ids), self._ranks)

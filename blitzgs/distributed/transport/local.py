@@ -11,7 +11,7 @@ from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Transport
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection import ProjectionInputs, rows_of
+from blitzgs.ops.projection import ProjectionInputs, splats_of
 from blitzgs.ops.splat_gradients import SplatGradients
 
 
@@ -37,7 +37,7 @@ class _LocalExchange(Exchange):
         self._visible = self._projected.totals[3 : 3 + inputs.n_views]
 
     def _receive(self) -> Arrived:
-        splats = Splats.of(self._projected.rows, self._projected.ids)
+        splats = Splats.of(self._projected.splats, self._projected.ids)
         if self._capacity is None:
             return Arrived(splats, None, int(self._copy.read()[2]))
         return Arrived(splats, self._projected.totals[1:2], self._capacity.isects)
@@ -47,8 +47,8 @@ class _LocalExchange(Exchange):
         self.needed = Sizes._make(counts.tolist())
         if self._capacity is not None and not self._capacity.holds(self.needed):
             return None
-        splats = Splats.of(self._projected.rows, self._projected.ids).first(self.needed.rows)
-        return HostCounts(rows_of(self._projected.rows[:12], counts), splats, self._visible, None)
+        splats = Splats.of(self._projected.splats, self._projected.ids).first(self.needed.splats)
+        return HostCounts(splats_of(self._projected.splats[:12], counts), splats, self._visible, None)
 
     def _return_gradients(self, parts: Sequence[Tensor]) -> SplatGradients:
         return SplatGradients(parts)

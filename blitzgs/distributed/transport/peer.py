@@ -38,7 +38,7 @@ from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Traffic, Transport
 from blitzgs.distributed.transport.collective import carry_sums
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.projection import ProjectionInputs, rows_of
+from blitzgs.ops.projection import ProjectionInputs, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
 
@@ -103,7 +103,7 @@ class PeerTransport(Transport):
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
         if capacity is not None:
-            splats = -(-capacity.rows // _ALIGNMENT) * _ALIGNMENT
+            splats = -(-capacity.splats // _ALIGNMENT) * _ALIGNMENT
             if len(self._memory.buffers[0]) < splats * WORDS_PER_SPLAT:
                 self._ranks.reading(partial(self._memory.reserve, splats * WORDS_PER_SPLAT))
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
@@ -128,13 +128,13 @@ class _PeerExchange(Exchange):
         self._traffic: Traffic | None = None
         room = Sizes(buffers.length, buffers.length, 0)
         projected = inputs.run(room, assignment.all_composited)
-        self._rows = projected.rows
+        self._projected = projected.splats
         self._shared = memory.share(projected.totals)  # barrier A
         self._counted = torch.cuda.Event()
         self._counted.record()
-        own = Splats.of(projected.rows, projected.ids)
+        own = Splats.of(projected.splats, projected.ids)
         self._places, self._plan = torch.ops.blitzgs.send_splats_(
-            list(own), projected.rows.rank_masks, self._shared.everyone, ranks.rank, buffers.buffers,
+            list(own), projected.splats.rank_masks, self._shared.everyone, ranks.rank, buffers.buffers,
             buffers.length,
         )  # fmt: skip
         memory.barrier()  # B
@@ -155,10 +155,10 @@ class _PeerExchange(Exchange):
             return None
         if self._n_isects is not None and traffic.most_isects > self._n_isects:
             return None
-        rows = rows_of(self._rows[:12], traffic.counts)
-        self._places = self._places[: runs_of(len(rows.camera_ids))]
+        projected = splats_of(self._projected[:12], traffic.counts)
+        self._places = self._places[: runs_of(len(projected.camera_ids))]
         visible = self._shared.sums[3 : 3 + self._n_views]
-        return HostCounts(rows, self._buffers.splats.first(sum(traffic.received)), visible, traffic)
+        return HostCounts(projected, self._buffers.splats.first(sum(traffic.received)), visible, traffic)
 
     def _read(self) -> Traffic:
         """Wait for the counts of all ranks."""
@@ -170,7 +170,7 @@ class _PeerExchange(Exchange):
     def _check_current(self) -> None:
         if self._generation != self._memory.generation:
             raise RuntimeError(
-                "a later exchange has overwritten this one's rows: run the backward pass of a frame before "
+                "a later exchange has overwritten this one's splats: run the backward pass of a frame before "
                 "the next forward pass"
             )
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The second kernel of the projection: the exact test of what the prefilter kept, and the rows.
-// Compiled without FMA contraction (cmake/cuda.cmake): rows that are projected twice must get the same bits.
+// The second kernel of the projection: the exact test of what the prefilter kept, and the splats.
+// Compiled without FMA contraction (cmake/cuda.cmake): splats that are projected twice must get the same
+// bits.
 #include <algorithm>
 
 #include "common/multiprocessors.h"
@@ -11,12 +12,12 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kWarps = kRowThreads / 32, kBlocksPerMultiprocessor = 6;
+constexpr int kWarps = kSplatThreads / 32, kBlocksPerMultiprocessor = 6;
 
 // A block's sums for project_totals. Adding 64-bit numbers in shared memory is slow, so tiles carry by hand.
 struct Sums {
-  unsigned views[kMaxViews], rank_rows[kMaxRanks], tiles_low[kMaxRanks], tiles_high[kMaxRanks];
-  unsigned long long visible, rows, tiles;
+  unsigned views[kMaxViews], rank_splats[kMaxRanks], tiles_low[kMaxRanks], tiles_high[kMaxRanks];
+  unsigned long long visible, splats, tiles;
 
   __device__ void add_tiles(int rank, unsigned tiles) {
     const unsigned before = atomicAdd(&tiles_low[rank], tiles);
@@ -29,38 +30,38 @@ __device__ void store_sums(const Sums& sums, const Inputs& in, int n_ranks, unsi
   const int thread = threadIdx.x;
   if (thread == 0) {
     atomicAdd(totals + kTotalVisible, sums.visible);
-    atomicAdd(totals + kTotalRows, sums.rows);
+    atomicAdd(totals + kTotalSplats, sums.splats);
     atomicAdd(totals + kTotalTiles, sums.tiles);
   }
   if (thread < in.n_views && sums.views[thread]) {
     atomicAdd(totals + kTotalViews + thread, static_cast<unsigned long long>(sums.views[thread]));
   }
-  if (thread < n_ranks && sums.rank_rows[thread]) {
+  if (thread < n_ranks && sums.rank_splats[thread]) {
     unsigned long long* target = totals + kTotalViews + in.n_views + 2 * thread;
-    atomicAdd(target, static_cast<unsigned long long>(sums.rank_rows[thread]));
+    atomicAdd(target, static_cast<unsigned long long>(sums.rank_splats[thread]));
     atomicAdd(target + 1,
               static_cast<unsigned long long>(sums.tiles_high[thread]) << 32 | sums.tiles_low[thread]);
   }
 }
 
-// Pairs that turned out to be rows, until it is known where they belong.
-constexpr std::uint16_t kNoRow = 0xffff;
+// Pairs that turned out to be splats, until it is known where they belong.
+constexpr std::uint16_t kNoSplat = 0xffff;
 struct Pending {
   float2 means2d[kMostPairs];
   float conics[3][kMostPairs], depths[kMostPairs], opacities[kMostPairs];
   int2 radii[kMostPairs];
   std::int32_t tiles[kMostPairs];
   std::int64_t ranks[kMostPairs];
-  std::uint16_t pairs[kMostPairs];  // kMaxViews * Gaussian + view; kNoRow: not a row
+  std::uint16_t pairs[kMostPairs];  // kMaxViews * Gaussian + view; kNoSplat: not a splat
 };
-// Tiles of a row, and which ranks want it; what each of them wants goes to `sums`.
-__device__ __forceinline__ std::int32_t find_tiles(const Row<float>& row, int view, const Inputs& in,
+// Tiles of a splat, and which ranks want it; what each of them wants goes to `sums`.
+__device__ __forceinline__ std::int32_t find_tiles(const Splat<float>& splat, int view, const Inputs& in,
                                                    const RankTiles& rank_tiles, std::int64_t* ranks,
                                                    Sums& sums) {
-  int current = -1;  // most rows are of one rank: its pieces are added up here
+  int current = -1;  // most splats are of one rank: its pieces are added up here
   unsigned of_rank = 0;
   const std::int32_t tiles =
-      row_tiles(row, view, in.options, rank_tiles, ranks, [&](int rank, std::int64_t count) {
+      splat_tiles(splat, view, in.options, rank_tiles, ranks, [&](int rank, std::int64_t count) {
         if (rank != current) {
           if (current >= 0) sums.add_tiles(current, of_rank);
           current = rank;
@@ -70,19 +71,19 @@ __device__ __forceinline__ std::int32_t find_tiles(const Row<float>& row, int vi
       });
   if (current >= 0) sums.add_tiles(current, of_rank);
   for (std::int64_t rest = *ranks; rest; rest &= rest - 1) {
-    atomicAdd(&sums.rank_rows[__ffsll(rest) - 1], 1u);
+    atomicAdd(&sums.rank_splats[__ffsll(rest) - 1], 1u);
   }
   return tiles;
 }
 
 // Gaussians that a block projects together.
 struct Group {
-  std::uint32_t seen[kRowThreads];  // views that do see them
-  std::int32_t ids[kRowThreads];
-  std::int32_t before[kRowThreads];  // visible ones << 16 | rows of those before
+  std::uint32_t seen[kSplatThreads];  // views that do see them
+  std::int32_t ids[kSplatThreads];
+  std::int32_t before[kSplatThreads];  // visible ones << 16 | splats of those before
   int of_warps[kWarps];
   int next_turn;
-  std::int64_t of_turns_before;  // visible << 31 | rows
+  std::int64_t of_turns_before;  // visible << 31 | splats
 };
 
 // The sum of `value` over the threads before, and of all. A barrier, and wants one between two calls.
@@ -101,34 +102,34 @@ __device__ __forceinline__ int sum_of_threads_before(int value, Group& group, in
   return before;
 }
 
-// Closes the rows of the last visible Gaussian; all: visible << 31 | rows.
-__device__ __forceinline__ void end_rows(std::int64_t all, const ProjectSizes& capacity,
-                                         const ProjectIds& ids) {
+// Closes the splats of the last visible Gaussian; all: visible << 31 | splats.
+__device__ __forceinline__ void end_splats(std::int64_t all, const ProjectSizes& capacity,
+                                           const ProjectIds& ids) {
   const std::int64_t visible = all >> 31;
-  if (capacity.rows > 0 && visible <= capacity.visible) {
-    ids.row_offsets[visible] = static_cast<std::int32_t>(all & 0x7fffffff);
+  if (capacity.splats > 0 && visible <= capacity.visible) {
+    ids.splat_offsets[visible] = static_cast<std::int32_t>(all & 0x7fffffff);
   }
 }
 
-// Writes a group's rows, as far as there is capacity. before: visible << 31 | rows of the turns before.
-__device__ __forceinline__ void write_rows(const Group& group, std::int64_t before, const Pending& pending,
-                                           int n_pairs, const ProjectSizes& capacity, const ProjectIds& ids,
-                                           const ProjectOutputs<float>& out) {
+// Writes a group's splats, as far as there is capacity. before: visible << 31 | splats of the turns before.
+__device__ __forceinline__ void write_splats(const Group& group, std::int64_t before, const Pending& pending,
+                                             int n_pairs, const ProjectSizes& capacity, const ProjectIds& ids,
+                                             const ProjectOutputs<float>& out) {
   const int thread = threadIdx.x;
-  const std::int64_t visible_before = before >> 31, rows_before = before & 0x7fffffff;
+  const std::int64_t visible_before = before >> 31, splats_before = before & 0x7fffffff;
   const std::int32_t in_group = group.before[thread];
   const std::int64_t u = visible_before + (in_group >> 16);
   if (group.seen[thread] && u < capacity.visible) {
     ids.visible_ids[u] = group.ids[thread];
-    ids.row_offsets[u] = static_cast<std::int32_t>(rows_before + (in_group & 0xffff));
+    ids.splat_offsets[u] = static_cast<std::int32_t>(splats_before + (in_group & 0xffff));
   }
-  for (int p = thread; p < n_pairs; p += kRowThreads) {
+  for (int p = thread; p < n_pairs; p += kSplatThreads) {
     const int pair = pending.pairs[p], slot = pair / kMaxViews, view = pair % kMaxViews;
-    if (pair == kNoRow) continue;
+    if (pair == kNoSplat) continue;
     const std::uint32_t of_slot = group.seen[slot];
     const std::int64_t i =
-        rows_before + (group.before[slot] & 0xffff) + __popc(of_slot & ((1u << view) - 1u));
-    if (i >= capacity.rows) continue;
+        splats_before + (group.before[slot] & 0xffff) + __popc(of_slot & ((1u << view) - 1u));
+    if (i >= capacity.splats) continue;
     ids.gaussian_ids[i] = group.ids[slot];
     ids.camera_ids[i] = view;
     reinterpret_cast<float2*>(out.means2d)[i] = pending.means2d[p];
@@ -138,18 +139,19 @@ __device__ __forceinline__ void write_rows(const Group& group, std::int64_t befo
     reinterpret_cast<int2*>(out.radii)[i] = pending.radii[p];
     out.tiles_touched[i] = pending.tiles[p];
     if (out.rank_masks) out.rank_masks[i] = pending.ranks[p];
-    if (out.row_ids) out.row_ids[i] = out.ids[group.ids[slot]];
+    if (out.splat_ids) out.splat_ids[i] = out.ids[group.ids[slot]];
   }
 }
 
-// A block takes Gaussians turn by turn, a thread each, and writes their rows behind those of the turns
-// before. To find which pairs are rows takes every block about the same time. To find the tiles that they
-// touch takes some blocks much longer, so a block first tells the others how many rows it has, then finds the
-// tiles, and only then asks how many rows the blocks before it have. No block waits for the slowest one.
-__global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
-    rows_kernel(const Inputs in, const __grid_constant__ RankTiles rank_tiles, const Prefiltered kept,
-                const ProjectSizes capacity, const ProjectIds ids, const ProjectOutputs<float> out,
-                unsigned long long* totals, const TurnSums turns) {
+// A block takes Gaussians turn by turn, a thread each, and writes their splats behind those of the turns
+// before. To find which pairs are splats takes every block about the same time. To find the tiles that they
+// touch takes some blocks much longer, so a block first tells the others how many splats it has, then finds
+// the tiles, and only then asks how many splats the blocks before it have. No block waits for the slowest
+// one.
+__global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
+    splats_kernel(const Inputs in, const __grid_constant__ RankTiles rank_tiles, const Prefiltered kept,
+                  const ProjectSizes capacity, const ProjectIds ids, const ProjectOutputs<float> out,
+                  unsigned long long* totals, const TurnSums turns) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ TripleStage triples[kWarps];
   __shared__ Sums sums;
@@ -159,15 +161,15 @@ __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
   const std::int64_t n_gaussians = *kept.count;
   const int at_once = projected_at_once(in.n_views);
   const int n_turns = static_cast<int>((n_gaussians + at_once - 1) / at_once);
-  if (blockIdx.x == 0 && thread == 0 && n_turns == 0) end_rows(0, capacity, ids);
+  if (blockIdx.x == 0 && thread == 0 && n_turns == 0) end_splats(0, capacity, ids);
   if (static_cast<int>(blockIdx.x) > n_turns) return;
-  const bool writes = capacity.rows > 0;
-  for (int i = thread; i < static_cast<int>(sizeof(Sums) / 4); i += kRowThreads) {
+  const bool writes = capacity.splats > 0;
+  for (int i = thread; i < static_cast<int>(sizeof(Sums) / 4); i += kSplatThreads) {
     reinterpret_cast<unsigned*>(&sums)[i] = 0;
   }
   load_cameras(in, cameras);
   std::int64_t tiles = 0;
-  unsigned of_view = 0;  // rows of view `lane`
+  unsigned of_view = 0;  // splats of view `lane`
   int turn = turns.first();
   if (turn < 0) {
     if (warp == 0 && writes) turns.add_up(n_turns);
@@ -189,16 +191,16 @@ __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
       const ActiveGaussian<float> gaussian = make_gaussian(in, id, mean, scale);
       for (; maybe; maybe &= maybe - 1, ++p) {
         const int view = __ffs(maybe) - 1;
-        Row<float> row{};
-        pending.pairs[p] = kNoRow;
-        if (!project_row(cameras[view], gaussian, in.options, &row)) continue;
+        Splat<float> splat{};
+        pending.pairs[p] = kNoSplat;
+        if (!project_splat(cameras[view], gaussian, in.options, &splat)) continue;
         seen |= 1u << view;
         pending.pairs[p] = static_cast<std::uint16_t>(kMaxViews * thread + view);
-        pending.means2d[p] = {row.mean2d[0], row.mean2d[1]};
-        for (int k = 0; k < 3; ++k) pending.conics[k][p] = row.conic[k];
-        pending.depths[p] = row.depth;
-        pending.opacities[p] = row.opacity;
-        pending.radii[p] = {pixel_radius(row.extent[0]), pixel_radius(row.extent[1])};
+        pending.means2d[p] = {splat.mean2d[0], splat.mean2d[1]};
+        for (int k = 0; k < 3; ++k) pending.conics[k][p] = splat.conic[k];
+        pending.depths[p] = splat.depth;
+        pending.opacities[p] = splat.opacity;
+        pending.radii[p] = {pixel_radius(splat.extent[0]), pixel_radius(splat.extent[1])};
       }
     }
     for (int view = 0; view < in.n_views; ++view) {
@@ -214,18 +216,18 @@ __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
     if (thread == 0) {
       if (writes) turns.publish(turn, own);
       sums.visible += all >> 16;
-      sums.rows += all & 0xffff;
+      sums.splats += all & 0xffff;
     }
-    for (p = thread; p < n_pairs; p += kRowThreads) {
+    for (p = thread; p < n_pairs; p += kSplatThreads) {
       const int pair = pending.pairs[p];
-      if (pair == kNoRow) continue;
+      if (pair == kNoSplat) continue;
       const float2 mean2d = pending.means2d[p];
-      const Row<float> row{{mean2d.x, mean2d.y},
-                           {pending.conics[0][p], pending.conics[1][p], pending.conics[2][p]},
-                           pending.depths[p],
-                           pending.opacities[p],
-                           {}};
-      pending.tiles[p] = find_tiles(row, pair % kMaxViews, in, rank_tiles, &pending.ranks[p], sums);
+      const Splat<float> splat{{mean2d.x, mean2d.y},
+                               {pending.conics[0][p], pending.conics[1][p], pending.conics[2][p]},
+                               pending.depths[p],
+                               pending.opacities[p],
+                               {}};
+      pending.tiles[p] = find_tiles(splat, pair % kMaxViews, in, rank_tiles, &pending.ranks[p], sums);
       tiles += pending.tiles[p];
     }
     int next = 0;
@@ -236,8 +238,8 @@ __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
     __syncthreads();
     if (writes) {
       const std::int64_t before = group.of_turns_before;
-      write_rows(group, before, pending, n_pairs, capacity, ids, out);
-      if (turn == n_turns - 1 && thread == 0) end_rows(before + own, capacity, ids);
+      write_splats(group, before, pending, n_pairs, capacity, ids, out);
+      if (turn == n_turns - 1 && thread == 0) end_splats(before + own, capacity, ids);
     }
     if (thread == 0) group.next_turn = next;
     __syncthreads();
@@ -247,27 +249,27 @@ __global__ void __launch_bounds__(kRowThreads, kBlocksPerMultiprocessor)
   for (int step = 16; step > 0; step /= 2) tiles += __shfl_xor_sync(kFullWarp, tiles, step);
   if (lane == 0) atomicAdd(&sums.tiles, static_cast<unsigned long long>(tiles));
   __syncthreads();
-  if (sums.rows > 0) store_sums(sums, in, rank_tiles.n_ranks, totals);
+  if (sums.splats > 0) store_sums(sums, in, rank_tiles.n_ranks, totals);
 }
 
 }  // namespace
 
-void write_rows(const Inputs& in, const RankTiles& rank_tiles, const Prefiltered& kept,
-                const ProjectSizes& capacity, const ProjectColumns<float>& columns, std::int64_t* totals,
-                Workspace& workspace, CudaStream stream) {
+void write_splats(const Inputs& in, const RankTiles& rank_tiles, const Prefiltered& kept,
+                  const ProjectSizes& capacity, const ProjectColumns<float>& columns, std::int64_t* totals,
+                  Workspace& workspace, CudaStream stream) {
   const ProjectIds& ids = columns.ids;
   if (totals) {
     const std::size_t bytes = project_totals(in.n_views, rank_tiles.n_ranks) * sizeof(std::int64_t);
     check(cudaMemsetAsync(totals, 0, bytes, stream), "project");
   }
-  if (capacity.rows == 0 && ids.row_offsets) {
-    check(cudaMemsetAsync(ids.row_offsets, 0, sizeof(*ids.row_offsets), stream), "project");
+  if (capacity.splats == 0 && ids.splat_offsets) {
+    check(cudaMemsetAsync(ids.splat_offsets, 0, sizeof(*ids.splat_offsets), stream), "project");
     if (!totals) return;
   }
   const int at_once = projected_at_once(in.n_views);
   const std::int64_t turns = std::max<std::int64_t>(1, (in.n_candidates + at_once - 1) / at_once);
   const std::int64_t blocks = std::min<std::int64_t>(1 + turns, kBlocksPerMultiprocessor * multiprocessors());
-  rows_kernel<<<static_cast<unsigned>(blocks), kRowThreads, 0, stream>>>(
+  splats_kernel<<<static_cast<unsigned>(blocks), kSplatThreads, 0, stream>>>(
       in, rank_tiles, kept, capacity, ids, columns.values, reinterpret_cast<unsigned long long*>(totals),
       TurnSums(turn_zeros(turns, workspace, stream)));
   check_launch("project");

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns with room for more rows than there are, whose number is read on the device."""
+"""Columns with room for more splats than there are, whose number is read on the device."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ def kept_by(outputs):
     return [transmittances, last_ids, packed_splats, tile_order]
 
 
-class Rows:
+class Columns:
     """Splats, and the same at the start of columns with room for more."""
 
     def __init__(self, n, room, device, channels=3, cameras=1):
@@ -34,21 +34,21 @@ class Rows:
 
 
 def empty_room(device, number):
-    """Columns of 500 rows, none of which is there, and the number that says so."""
-    return Rows(0, 500, device).roomy, torch.tensor([number], device=device)
+    """Columns of 500 splats, none of which is there, and the number that says so."""
+    return Columns(0, 500, device).roomy, torch.tensor([number], device=device)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("with_ids", [False, True])
 @pytest.mark.parametrize("n", [0, 1, 1024, 8192, 20_000])
-def test_lists_are_those_of_the_rows_alone(n, with_ids, device):
-    rows = Rows(n, 40_000, device, cameras=2)
-    ids, roomy_ids = (rows.ids, rows.roomy_ids) if with_ids else (None, None)
+def test_lists_are_those_of_the_splats_alone(n, with_ids, device):
+    columns = Columns(n, 40_000, device, cameras=2)
+    ids, roomy_ids = (columns.ids, columns.roomy_ids) if with_ids else (None, None)
     view = {"n_cameras": 2, "width": WIDTH, "height": HEIGHT}
-    expected, offsets = intersect(*rows.alone.rows(), ids, **view)
+    expected, offsets = intersect(*columns.alone.geometry(), ids, **view)
     for room in (-1, len(expected), len(expected) + 30_000):
         found, found_offsets = intersect(
-            *rows.roomy.rows(), roomy_ids, **view, n_isects=room, n_rows=rows.count
+            *columns.roomy.geometry(), roomy_ids, **view, n_isects=room, n_splats=columns.count
         )
         assert len(found) == (len(expected) if room < 0 else room)
         assert torch.equal(found_offsets, offsets)
@@ -57,14 +57,14 @@ def test_lists_are_those_of_the_rows_alone(n, with_ids, device):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("number", [0, -1, 501, 2**62, -(2**63)])
-def test_a_number_out_of_range_is_no_row(number, device):
+def test_a_number_out_of_range_is_no_splat(number, device):
     splats, count = empty_room(device, number)
     for room in (-1, 100):
-        rows, offsets = ops.intersect(*splats.rows(), None, [*VIEW, 0, -1], room, count)
-        assert len(rows) == max(room, 0) and not offsets.any()
+        entries, offsets = ops.intersect(*splats.geometry(), None, [*VIEW, 0, -1], room, count)
+        assert len(entries) == max(room, 0) and not offsets.any()
     background = torch.rand(1, 3, device=device)
     image = ops.rasterize_fwd(
-        *splats.values(), background, rows, offsets, [*VIEW, 0, -1], None, True, True, count
+        *splats.values(), background, entries, offsets, [*VIEW, 0, -1], None, True, True, count
     )
     assert torch.equal(image[0], background.expand(1, HEIGHT, WIDTH, 3))
     assert (image[1] == 1).all() and not image[2].any() and not image[3].any()
@@ -72,11 +72,11 @@ def test_a_number_out_of_range_is_no_row(number, device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_no_room_at_all(device):
-    rows = Rows(0, 0, device)
-    lists = ops.intersect(*rows.roomy.rows(), None, [*VIEW, 0, -1], 10, rows.count)
+    columns = Columns(0, 0, device)
+    lists = ops.intersect(*columns.roomy.geometry(), None, [*VIEW, 0, -1], 10, columns.count)
     assert not lists[1].any()
     renders = ops.rasterize_fwd(
-        *rows.roomy.values(), None, *lists, [*VIEW, 0, -1], None, True, True, rows.count
+        *columns.roomy.values(), None, *lists, [*VIEW, 0, -1], None, True, True, columns.count
     )[0]
     assert not renders.any()
 
@@ -88,13 +88,13 @@ def test_no_room_at_all(device):
      (9, (3, 30), (3, 30))],
 )  # fmt: skip
 @pytest.mark.parametrize("n", [1, 700])
-def test_images_and_gradients_are_those_of_the_rows_alone(n, channels, composited, owned, device):
-    """Backward has columns of the rows alone in either case."""
-    rows = Rows(n, 1500, device, channels)
-    lists = ops.intersect(*rows.alone.rows(), None, [*VIEW, *composited], -1)
-    plain = ops.rasterize_fwd(*rows.alone.values(), None, *lists, [*VIEW, *composited], None)
+def test_images_and_gradients_are_those_of_the_splats_alone(n, channels, composited, owned, device):
+    """Backward has columns of the splats alone in either case."""
+    columns = Columns(n, 1500, device, channels)
+    lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, *composited], -1)
+    plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *composited], None)
     roomy = ops.rasterize_fwd(
-        *rows.roomy.values(), None, *lists, [*VIEW, *composited], None, True, True, rows.count
+        *columns.roomy.values(), None, *lists, [*VIEW, *composited], None, True, True, columns.count
     )
     for found, expected in zip(roomy[:4], plain[:4], strict=True):
         assert torch.equal(found, expected)
@@ -104,7 +104,7 @@ def test_images_and_gradients_are_those_of_the_rows_alone(n, channels, composite
             *columns, None, *lists, kept_by(image), v_renders, None, [*VIEW, *owned], True, True
         )
         for columns, image in (
-            (rows.alone.values(), plain), ([c[:n] for c in rows.roomy.values()], roomy),
+            (columns.alone.values(), plain), ([c[:n] for c in columns.roomy.values()], roomy),
         )
     ]  # fmt: skip
     assert n == 1 or gradients[0][0].any()
@@ -116,21 +116,23 @@ def test_images_and_gradients_are_those_of_the_rows_alone(n, channels, composite
 @pytest.mark.cuda
 @pytest.mark.parametrize("tiles", [(0, -1), (3, 9)])
 @pytest.mark.parametrize(("n", "room"), [(700, 1500), (0, 900), (50_000, 60_000)])
-def test_a_table_of_gradients_is_zeroed_for_the_rows(n, room, tiles):
+def test_a_table_of_gradients_is_zeroed_for_the_splats(n, room, tiles):
     """Also where tiles are too few to write the zeros."""
-    rows = Rows(n, room, "cuda")
+    columns = Columns(n, room, "cuda")
     memory = torch.full((room + 100, SPLAT_GRADIENT), float("nan"), device="cuda")
     table = memory[40 : room + 60]
-    lists = ops.intersect(*rows.alone.rows(), None, [*VIEW, *tiles], -1)
-    plain = ops.rasterize_fwd(*rows.alone.values(), None, *lists, [*VIEW, *tiles], None, False)
-    image = ops.rasterize_fwd_packed_(*rows.roomy.values(), None, *lists, [*VIEW, *tiles], table, rows.count)
+    lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, *tiles], -1)
+    plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *tiles], None, False)
+    image = ops.rasterize_fwd_packed_(
+        *columns.roomy.values(), None, *lists, [*VIEW, *tiles], table, columns.count
+    )
     assert (table[:n] == 0).all()
     assert memory[:40].isnan().all() and memory[40 + room :].isnan().all()
     v_renders = torch.randn(plain[0].shape, generator=torch.Generator().manual_seed(1)).cuda()
-    arguments = (*[c[:n] for c in rows.roomy.values()], None, *lists, kept_by(image), v_renders)
+    arguments = (*[c[:n] for c in columns.roomy.values()], None, *lists, kept_by(image), v_renders)
     ops.rasterize_bwd_packed_(*arguments, [*VIEW, *tiles], True, table)
     expected = ops.rasterize_bwd(
-        *rows.alone.values(), None, *lists, kept_by(plain), v_renders, None, [*VIEW, *tiles], False, True
+        *columns.alone.values(), None, *lists, kept_by(plain), v_renders, None, [*VIEW, *tiles], False, True
     )
     assert torch.equal(table[:n, :9], torch.cat([c if c.dim() == 2 else c[:, None] for c in expected[:4]], 1))
     assert memory[:40].isnan().all() and memory[40 + room :].isnan().all()
@@ -140,13 +142,13 @@ def test_a_table_of_gradients_is_zeroed_for_the_rows(n, room, tiles):
 @pytest.mark.cuda
 @pytest.mark.parametrize("share", [0.999, 0.5, 0.1, 0.0])
 @pytest.mark.parametrize("tiles", [(0, -1), (5, 40)])
-def test_lists_with_too_little_room_are_the_nearest_rows(share, tiles):
-    rows = Rows(20_000, 30_000, "cuda", cameras=2)
+def test_lists_with_too_little_room_are_the_nearest_splats(share, tiles):
+    columns = Columns(20_000, 30_000, "cuda", cameras=2)
     view = [2, *VIEW[1:], *tiles]
-    whole, offsets = (t.cpu() for t in ops.intersect(*rows.alone.rows(), None, view, -1))
+    whole, offsets = (t.cpu() for t in ops.intersect(*columns.alone.geometry(), None, view, -1))
     room = int(share * len(whole))
     cut, cut_offsets = (
-        t.cpu() for t in ops.intersect(*rows.roomy.rows(), None, view, room, rows.count, True)
+        t.cpu() for t in ops.intersect(*columns.roomy.geometry(), None, view, room, columns.count, True)
     )
     assert len(cut) == room == cut_offsets[-1]
     assert (cut_offsets.diff() >= 0).all() and cut_offsets[0] == 0
@@ -158,31 +160,31 @@ def test_lists_with_too_little_room_are_the_nearest_rows(share, tiles):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_lists_with_too_little_room_are_an_error(device):
-    rows = Rows(100, 150, device)
-    count = len(ops.intersect(*rows.alone.rows(), None, [*VIEW, 0, -1], -1)[0])
+    columns = Columns(100, 150, device)
+    count = len(ops.intersect(*columns.alone.geometry(), None, [*VIEW, 0, -1], -1)[0])
     with pytest.raises(RuntimeError, match=f"n_isects is {count - 1} but there are {count}"):
-        ops.intersect(*rows.roomy.rows(), None, [*VIEW, 0, -1], count - 1, rows.count)
+        ops.intersect(*columns.roomy.geometry(), None, [*VIEW, 0, -1], count - 1, columns.count)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_errors(device):
-    rows = Rows(100, 150, device)
+    columns = Columns(100, 150, device)
     view = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
-    with pytest.raises(RuntimeError, match="n_rows must be Long, got Int"):
-        intersect(*rows.roomy.rows(), **view, n_rows=rows.count.int())
-    with pytest.raises(RuntimeError, match=r"n_rows must have shape \[1\], got \[2\]"):
-        intersect(*rows.roomy.rows(), **view, n_rows=rows.count.repeat(2))
-    lists = intersect(*rows.alone.rows(), **view)
-    image = ops.rasterize_fwd(*rows.alone.values(), None, *lists, [*VIEW, 0, -1])
-    arguments = (*rows.roomy.values(), None, *lists, kept_by(image), image[0], None, [*VIEW, 0, -1])
-    with pytest.raises(RuntimeError, match="for 150 rows and 30 tiles or more, got 100 and 30"):
+    with pytest.raises(RuntimeError, match="n_splats must be Long, got Int"):
+        intersect(*columns.roomy.geometry(), **view, n_splats=columns.count.int())
+    with pytest.raises(RuntimeError, match=r"n_splats must have shape \[1\], got \[2\]"):
+        intersect(*columns.roomy.geometry(), **view, n_splats=columns.count.repeat(2))
+    lists = intersect(*columns.alone.geometry(), **view)
+    image = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, 0, -1])
+    arguments = (*columns.roomy.values(), None, *lists, kept_by(image), image[0], None, [*VIEW, 0, -1])
+    with pytest.raises(RuntimeError, match="for 150 splats and 30 tiles or more, got 100 and 30"):
         ops.rasterize_bwd(*arguments, False, True)
     if device == "cuda":
-        with pytest.raises(RuntimeError, match="n_rows must be on the device of the rows"):
-            intersect(*rows.roomy.rows(), **view, n_rows=rows.count.cpu())
-        with pytest.raises(RuntimeError, match="packed must have 150 rows or more, got 149"):
+        with pytest.raises(RuntimeError, match="n_splats must be on the device of the splats"):
+            intersect(*columns.roomy.geometry(), **view, n_splats=columns.count.cpu())
+        with pytest.raises(RuntimeError, match="packed must have 150 splats or more, got 149"):
             ops.rasterize_fwd_packed_(
-                *rows.roomy.values(),
+                *columns.roomy.values(),
                 None,
                 *lists,
                 [*VIEW, 0, -1],
@@ -192,15 +194,15 @@ def test_errors(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_opcheck(device):
-    rows = Rows(20, 30, device)
-    arguments = (*rows.roomy.rows(), None, [*VIEW, 0, -1])
-    torch.library.opcheck(ops.intersect, (*arguments, -1, rows.count))
-    lists = ops.intersect(*rows.alone.rows(), None, [*VIEW, 0, -1], -1)
-    torch.library.opcheck(ops.intersect, (*arguments, len(lists[0]), rows.count))
-    values = [t.requires_grad_() for t in rows.roomy.values()]
+    columns = Columns(20, 30, device)
+    arguments = (*columns.roomy.geometry(), None, [*VIEW, 0, -1])
+    torch.library.opcheck(ops.intersect, (*arguments, -1, columns.count))
+    lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, 0, -1], -1)
+    torch.library.opcheck(ops.intersect, (*arguments, len(lists[0]), columns.count))
+    values = [t.requires_grad_() for t in columns.roomy.values()]
     torch.library.opcheck(
         ops.rasterize_fwd,
-        (*values, None, *lists, [*VIEW, 0, -1], None, True, False, rows.count),
+        (*values, None, *lists, [*VIEW, 0, -1], None, True, False, columns.count),
         # Not those that compare the memory between forward and backward, which is not all written.
         test_utils=("test_schema", "test_autograd_registration", "test_faketensor"),
     )

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// One row: a Gaussian projected into a view, forward and backward, from the maths headers. Both backends call
-// these functions, so they compute the same row. CUDA should compile them without FMA contraction: two
-// kernels that project the same row (counting, then writing) must get the same bits.
+// One splat: a Gaussian projected into a view, forward and backward, from the maths headers. Both backends
+// call these functions, so they compute the same splat. CUDA should compile them without FMA contraction: two
+// kernels that project the same splat (counting, then writing) must get the same bits.
 #pragma once
 #include <cstdint>
 
@@ -22,7 +22,7 @@ struct ProjectOptions {
   bool antialiased, raw;
 };
 
-// A Gaussian after activation, shared by its rows.
+// A Gaussian after activation, shared by its splats.
 template <class T>
 struct ActiveGaussian {
   Vec3<T> mean, scale;
@@ -32,7 +32,7 @@ struct ActiveGaussian {
 };
 
 template <class T>
-struct Row {
+struct Splat {
   T mean2d[2], conic[3], depth, opacity;
   T extent[2];  // half width and height of the box around alpha >= 1/255, px
 };
@@ -87,41 +87,41 @@ BLITZGS_HD ActiveGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* qua
   return gaussian;
 }
 
-// False when the row does not exist: outside (near, far], alpha below 1/255 everywhere, no overlap with the
+// False when the splat does not exist: outside (near, far], alpha below 1/255 everywhere, no overlap with the
 // image, no larger than radius_clip, or anything not finite.
 template <class T>
-BLITZGS_HD bool project_row(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
-                            const ProjectOptions<T>& options, Row<T>* row) {
+BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
+                              const ProjectOptions<T>& options, Splat<T>* splat) {
   const ProjectedMean p = project_mean(camera, gaussian.mean);
-  row->depth = T(p.z);
-  if (!in_depth_range(row->depth, options)) return false;
-  pixel_position(camera, p, row->mean2d);
-  const Splat<T> splat = make_splat(pixel_gradients(camera, p), gaussian.axes, options.eps2d);
-  store_conic(splat, row->conic);
-  row->opacity = options.antialiased ? gaussian.opacity * compensation(splat) : gaussian.opacity;
-  const T sigmas = reach(row->opacity);
-  if (sigmas < T(0) || !is_finite(splat.conic[0] + splat.conic[1] + splat.conic[2])) return false;
-  row->extent[0] = sigmas * std::sqrt(splat.cov_xx);
-  row->extent[1] = sigmas * std::sqrt(splat.cov_yy);
-  if (options.radius_clip > T(0) && !(larger(row->extent[0], row->extent[1]) > options.radius_clip)) {
+  splat->depth = T(p.z);
+  if (!in_depth_range(splat->depth, options)) return false;
+  pixel_position(camera, p, splat->mean2d);
+  const Footprint<T> footprint = make_footprint(pixel_gradients(camera, p), gaussian.axes, options.eps2d);
+  store_conic(footprint, splat->conic);
+  splat->opacity = options.antialiased ? gaussian.opacity * compensation(footprint) : gaussian.opacity;
+  const T sigmas = reach(splat->opacity);
+  if (sigmas < T(0) || !is_finite(footprint.conic[0] + footprint.conic[1] + footprint.conic[2])) return false;
+  splat->extent[0] = sigmas * std::sqrt(footprint.cov_xx);
+  splat->extent[1] = sigmas * std::sqrt(footprint.cov_yy);
+  if (options.radius_clip > T(0) && !(larger(splat->extent[0], splat->extent[1]) > options.radius_clip)) {
     return false;
   }
   // 1.0001: an extent rounded down must not lose a pixel at the border.
-  return touches_image(row->mean2d, T(1.0001) * row->extent[0], T(1.0001) * row->extent[1], options);
+  return touches_image(splat->mean2d, T(1.0001) * splat->extent[0], T(1.0001) * splat->extent[1], options);
 }
 
-// How many tiles a row touches, and in *ranks which ranks want it: f(rank, tiles) for every piece of a tile
+// How many tiles a splat touches, and in *ranks which ranks want it: f(rank, tiles) for every piece of a tile
 // row that a rank wants.
 template <class T, class F>
-BLITZGS_HD std::int32_t row_tiles(const Row<T>& row, int view, const ProjectOptions<T>& options,
-                                  const RankTiles& rank_tiles, std::int64_t* ranks, const F& f) {
+BLITZGS_HD std::int32_t splat_tiles(const Splat<T>& splat, int view, const ProjectOptions<T>& options,
+                                    const RankTiles& rank_tiles, std::int64_t* ranks, const F& f) {
   const int tiles_x = (options.width + options.tile_size - 1) / options.tile_size;
   const int tiles_y = (options.height + options.tile_size - 1) / options.tile_size;
   const std::int64_t image = static_cast<std::int64_t>(view) * tiles_x * tiles_y;
   std::int32_t count = 0;
   std::int64_t wanted = 0;
-  for_each_tile_row(row.mean2d, row.conic, row.opacity, options.width, options.height, options.tile_size,
-                    [&](int ty, int begin, int end) {
+  for_each_tile_row(splat.mean2d, splat.conic, splat.opacity, options.width, options.height,
+                    options.tile_size, [&](int ty, int begin, int end) {
                       count += end - begin;
                       const std::int64_t first = image + static_cast<std::int64_t>(ty) * tiles_x;
                       for_each_rank(rank_tiles, first + begin, first + end,
@@ -163,9 +163,9 @@ BLITZGS_HD bool finite_color(const Vec3<T>& color) {
 }
 
 // color = max(sum_k basis_k sh_k + 0.5, 0); sh [K, 3]. False, and zeros, when the sum is not finite, as with
-// any coefficient in use that is not: the row is hidden.
+// any coefficient in use that is not: the splat is hidden.
 template <class T>
-BLITZGS_HD bool row_color(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree, T* color) {
+BLITZGS_HD bool splat_color(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree, T* color) {
   Vec3<T> direction;
   view_direction(camera, mean, &direction);
   T basis[kMaxShBasis];
@@ -178,8 +178,8 @@ BLITZGS_HD bool row_color(const Camera<T>& camera, const Vec3<T>& mean, const T*
 
 // v_sh [K, 3] += and v_mean +=; pose (null: not wanted) += . Zero where the colour is clipped at 0 or hidden.
 template <class T>
-BLITZGS_HD void row_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree,
-                              const T* v_color, T* v_sh, Vec3<T>* v_mean, PoseGradient<T>* pose) {
+BLITZGS_HD void splat_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree,
+                                const T* v_color, T* v_sh, Vec3<T>* v_mean, PoseGradient<T>* pose) {
   Vec3<T> direction;
   const T inverse_distance = view_direction(camera, mean, &direction);
   T basis[kMaxShBasis], v_basis[kMaxShBasis] = {};
@@ -199,11 +199,11 @@ BLITZGS_HD void row_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, cons
 }
 
 template <class T>
-struct RowGradient {
+struct GeometryGradient {
   T mean2d[2], conic[3], depth, opacity;
 };
 
-// Gradients of an activated Gaussian, summed over its rows.
+// Gradients of an activated Gaussian, summed over its splats.
 template <class T>
 struct GaussianGradient {
   Vec3<T> mean;
@@ -211,17 +211,17 @@ struct GaussianGradient {
   T opacity;
 };
 
-// Adds one row's share to gradient and to pose (null: not wanted). Recomputes the row.
+// Adds one splat's share to gradient and to pose (null: not wanted). Recomputes the splat.
 template <class T>
-BLITZGS_HD void project_row_vjp(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
-                                const ProjectOptions<T>& options, const RowGradient<T>& v,
-                                GaussianGradient<T>* gradient, PoseGradient<T>* pose) {
+BLITZGS_HD void project_splat_vjp(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
+                                  const ProjectOptions<T>& options, const GeometryGradient<T>& v,
+                                  GaussianGradient<T>* gradient, PoseGradient<T>* pose) {
   const ProjectedMean p = project_mean(camera, gaussian.mean);
   const PixelGradients<T> g = pixel_gradients(camera, p);
-  const Splat<T> splat = make_splat(g, gaussian.axes, options.eps2d);
-  gradient->opacity += options.antialiased ? v.opacity * compensation(splat) : v.opacity;
+  const Footprint<T> footprint = make_footprint(g, gaussian.axes, options.eps2d);
+  gradient->opacity += options.antialiased ? v.opacity * compensation(footprint) : v.opacity;
   Vec3<T> v_m0, v_m1, v_gx, v_gy;
-  splat_vjp(splat, v.conic, options.antialiased ? v.opacity * gaussian.opacity : T(0), &v_m0, &v_m1);
+  footprint_vjp(footprint, v.conic, options.antialiased ? v.opacity * gaussian.opacity : T(0), &v_m0, &v_m1);
   factor_vjp(g, gaussian.axes, v_m0, v_m1, &v_gx, &v_gy, &gradient->axes);
   const Vec3<T> v_p = pixel_gradients_vjp(camera, p, g, v_gx, v_gy, v.mean2d, v.depth, pose);
   camera_point_vjp(camera, gaussian.mean, v_p, &gradient->mean, pose);
@@ -246,7 +246,7 @@ struct ParameterGradients {
 };
 
 // From the activated Gaussian back to the stored parameters (log scales and logit when raw). axis_weight: the
-// summed weights of the scale regulariser over the rows. Overwrites the slots.
+// summed weights of the scale regulariser over the splats. Overwrites the slots.
 template <class T>
 BLITZGS_HD void activate_gaussian_vjp(const ActiveGaussian<T>& gaussian, bool raw,
                                       const GaussianGradient<T>& gradient, T axis_weight,
