@@ -143,7 +143,11 @@ def test_images_are_those_of_the_gaussians_that_are_kept_with_blocks_and_without
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_training_behind_the_gate_is_dense_adams(device):
-    """Rows that wait behind the gate owe steps; a twin that pays every row at every step ends alike."""
+    """Rows that wait behind the gate owe steps; a twin that pays every row at every step ends alike.
+
+    Adam turns a gradient of rounding size into a whole step, so two trainings that differ by rounding alone
+    come apart. A third one measures how far: dense as the twin, its means start a rounding error away.
+    """
     steps, tables = 120, []
     overrides = ("schedule.iterations=200", "optimiser.position=2e-3", "optimiser.position_final=1e-3")
     config = tiny_config(*overrides)
@@ -153,9 +157,11 @@ def test_training_behind_the_gate_is_dense_adams(device):
     targets = torch.randint(0, 256, (2, HEIGHT // 2, WIDTH // 2, 3), generator=generator, dtype=torch.uint8)
     samples = torch.full((2,), 3.0 * targets[0, ..., 0].numel(), device=device)
     K = torch.tensor([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]], device=device).repeat(2, 1, 1)
-    sets = {False: [], True: []}
-    for pays_at_once in (False, True):
+    trainings = []
+    for pays_at_once, nudge in ((False, 1.0), (True, 1.0), (True, 1.0 + 2.0**-22)):
         small = random_gaussians(300)
+        small["means"] *= nudge
+        sets = []
         table = GaussianTable({name: small[name].to(device) for name in small})
         table["level"] = levels.to(device)
         optimiser = LazyAdam(config.optimiser, schedule, 1.0, device)
@@ -174,18 +180,23 @@ def test_training_behind_the_gate_is_dense_adams(device):
             stepper.backward(step, frame, terms)
             rows = frame.projected
             pairs = zip(rows.gaussian_ids.tolist(), rows.camera_ids.tolist(), strict=True)
-            sets[pays_at_once].append(set(pairs))
+            sets.append(set(pairs))
         assert int((table["moment_step"] < steps - 3).sum()) > 10  # these owe steps
         optimiser.catch_up(table, None, steps)
         tables.append(table)
-    lazy, dense = tables
-    assert sets[False] == sets[True]
-    assert sum(len(a ^ b) for a, b in pairwise(sets[True])) > 1000  # Gaussians cross the borders of the gate
-    for name, before in zip(("means", "quats", "scales", "opacities", "sh"), lazy.parameters, strict=True):
-        # Rounding may carry a pixel over the cut of alpha, and then a Gaussian or two move otherwise.
-        close = torch.isclose(before, dense[name], rtol=1e-4, atol=1e-5)
-        assert close.double().mean() > 0.99, name
-        torch.testing.assert_close(before, dense[name], rtol=0, atol=0.01)
+        trainings.append(sets)
+    lazy, dense, rounded = tables
+    assert trainings[0] == trainings[1]
+    assert (
+        sum(len(a ^ b) for a, b in pairwise(trainings[1])) > 1000
+    )  # Gaussians cross the borders of the gate
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        apart, by_rounding = (
+            1.0 - torch.isclose(table[name], dense[name], rtol=1e-4, atol=1e-5).double().mean()
+            for table in (lazy, rounded)
+        )
+        assert apart < 0.01 + 0.25 * by_rounding, name
+        torch.testing.assert_close(lazy[name], dense[name], rtol=0, atol=0.01)
 
 
 @pytest.mark.parametrize("device", DEVICES)
