@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Very many steps of a trainer: the lazy optimiser stays with dense Adam, and memory does not grow.
+
+torch's Adam goes along with the trainer, in float64: it is given the gradients of every step, zeros for the
+rows that the step does not show, and moves all rows. The trainer leaves most rows alone for a hundred steps
+and more between their views.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.pipeline import RenderOptions
+from blitzgs.training.trainer import Trainer
+from blitzgs.training.views import Space, ViewSet
+from tests.helpers import needs_cuda
+from tests.training.tiny import Camera, Capture, Images, tiny_config
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+WIDTH, HEIGHT = 32, 24
+ACROSS, SPACING = 16, 2.0  # cameras in a row and a column, and how far apart
+COUNT = 2400
+# What a parameter may be off by after T steps. Each rounds it to float32, by 2^-24 of its size at most, and
+# the errors walk at random: 2^-24 sqrt(T) times the size. The largest of 50,000 normal numbers is 4.4 times
+# their deviation; the rest of the factor is for gradients and moments, which are rounded, too.
+WALK, LARGEST = 2.0**-24, 8
+# Bytes that the host and the GPU may need more at the end than at a fifth of the run.
+MOST_GROWTH = 8_000_000, 1_000_000
+
+
+def carpet(count, seed):
+    """Gaussians beneath all cameras, turned every way, no two axes alike."""
+    g = torch.Generator().manual_seed(seed)
+    size = torch.tensor([ACROSS * SPACING, ACROSS * SPACING, 0.5])
+    return {
+        "means": (torch.rand(count, 3, generator=g) - 0.5) * size,
+        "quats": torch.randn(count, 4, generator=g),
+        "scales": torch.rand(count, 3, generator=g) * 1.5 - 2.5,
+        "opacities": torch.rand(count, generator=g) * 3,
+        "sh": torch.randn(count, 16, 3, generator=g) * torch.tensor([0.8] + [0.1] * 15)[:, None],
+    }
+
+
+def bookkeeping(count):
+    numbers = torch.zeros(count, dtype=torch.int32)
+    return {
+        "last_step": numbers,
+        "id": torch.arange(count),
+        "parent": torch.full((count,), -1),
+        "birth": numbers.clone(),
+        "level": torch.zeros(count, dtype=torch.uint8),
+    }
+
+
+def carpet_capture(device):
+    """A grid of cameras that look down, each on a hundredth of a carpet."""
+    K, cameras = np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), []
+    for i in range(ACROSS**2):
+        pose = np.eye(4)
+        at = (np.array(divmod(i, ACROSS)) + 0.5 - ACROSS / 2) * SPACING
+        pose[:3, 3] = [-at[0], -at[1], 3.0]
+        cameras.append(Camera(f"{i:04}.png", WIDTH, HEIGHT, K, pose))
+    parameters = carpet(COUNT, 1)
+    truth = GaussianTable.create(
+        {name: column.to(device) for name, column in (parameters | bookkeeping(COUNT)).items()}
+    )
+    views = ViewSet(cameras, Space((0.0, 0.0, 0.0), 1.0, 1.0), truth.device)
+    images = [(picture(truth, views, i).clamp(0, 1) * 255 + 0.5).byte().cpu() for i in range(len(cameras))]
+    colors = np.full((COUNT, 3), 128, np.uint8)
+    train = list(range(len(cameras) - 1))
+    points = parameters["means"].double().numpy()
+    capture = Capture(cameras, points, colors, train, [len(train)], 10.0, np.zeros(3))
+    return capture, Images(images)
+
+
+def picture(table, views, index):
+    return pipeline.forward(table, views.pick([index]), RenderOptions(3, 0.01, 1e6)).renders[0]
+
+
+def flat(columns):
+    """Columns of a table side by side, [N, 59] in float64."""
+    return torch.cat([c.flatten(1) if c.dim() > 1 else c[:, None] for c in columns], 1).double()
+
+
+class DenseAdam:
+    """torch's Adam over all rows of a table, with the gradients of the trainer's steps."""
+
+    def __init__(self, table, optimiser):
+        self.params = flat(table.parameters)
+        self.widths = [p[0].numel() for p in table.parameters]
+        # Rates differ between columns: Adam moves `move` from zero at a rate of one.
+        self.move = torch.zeros_like(self.params, requires_grad=True)
+        self.move.grad = torch.zeros_like(self.params)
+        # One image a step: Adam's own constants.
+        self.adam = torch.optim.Adam([self.move], 1.0, (0.9, 0.999), 1e-15, fused=True)
+        groups = torch.tensor([3, 4, 3, 1, 3, 45], device=table.device)  # the colours have two rates
+        self.rates = optimiser.lr_table.double().repeat_interleave(groups, 1)
+
+    def step(self, table, frame, gradients, scale_reg, step):
+        """Take a step with the gradients that the trainer's optimiser is about to be given."""
+        rows, options = frame.rows, frame.options.projection(frame.views)
+        *v, _ = torch.ops.blitzgs.project_bwd(
+            list(table.parameters), [frame.views.viewmats, frame.views.Ks],
+            [rows.camera_ids, rows.visible_ids, rows.row_offsets], options.ints, options.floats,
+            list(gradients.parts), None, scale_reg, False,
+        )  # fmt: skip
+        self.move.grad.zero_().index_copy_(0, rows.visible_ids.long(), flat(v))
+        self.adam.step()
+        self.params.addcmul_(self.move.data, self.rates[step])
+        self.move.data.zero_()
+
+    def columns(self):
+        return self.params.split(self.widths, 1)
+
+
+def memory(device):
+    """Bytes in use: of this process on the host, and of tensors on the GPU."""
+    resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return resident, torch.cuda.memory_allocated() if device == "cuda" else 0
+
+
+def start_trainer(folder, device, steps):
+    capture, images = carpet_capture(device)
+    config = tiny_config(
+        f"schedule.iterations={steps}", f"schedule.position_decay={steps}", "schedule.densify_from=0",
+        "schedule.densify_until=0", f"log.every={steps // 10}", "log.checkpoint_seconds=0",
+    )  # fmt: skip
+    trainer = Trainer(config, capture, images, folder, Ranks(device=torch.device(device)))
+    table, unit = trainer.state.table, trainer.state.space.unit
+    # The octree's Gaussians are round: their quaternions' gradients are rounding alone, which Adam magnifies.
+    for name, values in carpet(len(table), 2).items():
+        values = values / unit if name == "means" else values
+        table[name].copy_(values - np.log(unit) if name == "scales" else values)
+    trainer.state.stepper.reindex()
+    return trainer
+
+
+@pytest.mark.parametrize(
+    ("device", "steps"),
+    [
+        ("cpu", 1000),
+        pytest.param("cuda", 100_000, marks=[pytest.mark.slow, pytest.mark.cuda, needs_cuda]),
+    ],
+)
+@torch.no_grad()
+def test_a_long_run_stays_with_dense_adam_and_needs_no_more_memory(tmp_path, device, steps):
+    trainer = start_trainer(tmp_path, device, steps)
+    state = trainer.state
+    table, optimiser = state.table, state.optimiser
+    dense, start, lazy_step = DenseAdam(table, optimiser), flat(table.parameters), optimiser.step
+
+    def both(table, frame, gradients, scale_reg, step, sums=None):
+        dense.step(table, frame, gradients, scale_reg, step)
+        lazy_step(table, frame, gradients, scale_reg, step, sums)
+
+    optimiser.step = both
+    for step in range(1, steps + 1):
+        trainer.step(step)
+        if step == steps // 5:
+            before = memory(device)
+    after = memory(device)
+    trainer.close()
+    growth = [b - a for a, b in zip(before, after, strict=True)]
+    print(f"{device}, {steps:,} steps: bytes more on host and GPU since a fifth of them: {growth}")
+
+    behind = steps - table["moment_step"]
+    assert int(behind.max()) > 100 and float((behind < 1000).float().mean()) > 0.9
+    state.catch_up()
+    moved = (dense.params - start).split(dense.widths, 1)
+    walk = WALK * steps**0.5
+    for name, ours, expected, way in zip(PARAMETERS, table.parameters, dense.columns(), moved, strict=True):
+        error, size = flat([ours]) - expected, expected.abs().max()
+        rms, largest = error.square().mean().sqrt() / size, error.abs().max() / size
+        print(f"{name}: error {rms / walk:.3f} rms, {largest / walk:.3f} at most, in units of the walk")
+        assert rms <= walk and largest <= LARGEST * walk, name
+        assert way.square().mean().sqrt() > 100 * rms * size, name
+    other = GaussianTable({name: column.clone() for name, column in table.columns.items()})
+    for column, values in zip(other.parameters, dense.columns(), strict=True):
+        column.copy_(values.view(column.shape))
+    for index in range(0, ACROSS**2, 16):
+        pictures = [picture(gaussians, state.views, index) for gaussians in (table, other)]
+        assert (pictures[0] - pictures[1]).abs().max() < 1e-3
+    assert all(grown <= most for grown, most in zip(growth, MOST_GROWTH, strict=True))
