@@ -23,6 +23,8 @@ SPLIT_SHRINK = 1.6
 CHILDREN_OF_A_SPLIT = 2
 # Columns of the importance passes, once there are any, that children have of their parent.
 INHERITED = (PHI, CULL)
+# Columns that gather what happens between density events.
+STATISTICS = ("grad_sum", "grad_count", "max_radii")
 _ID_MASK = (1 << 63) - 1
 
 
@@ -53,13 +55,23 @@ class DensityRules:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What an event did on this rank; `held_back` candidates did not grow because of the cap."""
+    """What an event did on this rank.
+
+    Attributes:
+        cloned: copies made.
+        split: Gaussians that gave way to two.
+        pruned: Gaussians taken out.
+        held_back: candidates, or with relocation copies, that the cap kept back.
+        vetoed: candidates that the veto kept back.
+        relocated: dead Gaussians for which copies of live ones stand in, which count as cloned.
+    """
 
     cloned: int
     split: int
     pruned: int
     held_back: int
     vetoed: int = 0
+    relocated: int = 0
 
 
 def densify(
@@ -113,9 +125,9 @@ def densify(
     splits = (candidates & ~small).nonzero().squeeze(1)
     new = _children(table, clones, splits, time, seed, level_count)
     new["last_step"] = torch.full_like(new["birth"], step)
-    causes = _causes(table.columns, table["max_radii"], rules)
+    causes = death_causes(table.columns, table["max_radii"], rules)
     causes[splits] = Cause.SPLIT
-    causes = torch.cat((causes, _causes(new, None, rules)))
+    causes = torch.cat((causes, death_causes(new, None, rules)))
     rows = (causes == 0).nonzero().squeeze(1)
     if lineage is not None:
         _log(lineage, table, new, (clones, splits), causes, time, step, extent, level_count)
@@ -231,7 +243,7 @@ def rotations(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
-def _causes(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRules) -> Tensor:
+def death_causes(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRules) -> Tensor:
     """Tell why rows have to go: `Cause.OPACITY`, else `Cause.SIZE` (screen or world); 0: they stay."""
     logit = math.log(rules.min_opacity / (1.0 - rules.min_opacity)) if rules.min_opacity > 0 else -math.inf
     causes = torch.zeros_like(rows["level"])

@@ -49,6 +49,7 @@ class Cause(enum.IntEnum):
     PASS_1 = 4  # not drawn by the first importance pass
     PASS_2 = 5  # outside the mass that the second pass keeps
     LATE_OPACITY = 6  # within it, but too transparent
+    RELOCATED = 7  # dead at a density event, where a copy of a live one took its place
 
 
 class LineageError(RuntimeError):

@@ -166,15 +166,18 @@ class OptimiserConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """(1 - ssim) L1 + ssim (1 - SSIM) + scale L_scale per view.
+    """(1 - ssim) L1 + ssim (1 - SSIM) + scale L_scale + opacity L_opacity per view.
 
     Attributes:
         ssim: weight of the SSIM term.
+        opacity: weight of the mean opacity of the visible Gaussians (3DGS-MCMC has that of all Gaussians;
+            those that a step does not see are left alone here).
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.
     """
 
     ssim: float = 0.2
+    opacity: float = 0.0
     scale: float = 10.0
     scale_reference: float = 10.0
 
@@ -184,6 +187,11 @@ class PopulationConfig:
     """Density control: which Gaussians are cloned, split and pruned, and the two importance passes.
 
     Attributes:
+        strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
+            (3DGS-MCMC: Gaussians that would be pruned become copies of others, drawn by opacity, and the
+            population grows by `growth`).
+        relocate: with "density", Gaussians that would be pruned become copies of others, too.
+        growth: share of the population that "relocation" adds at each event.
         grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
             densified.
         clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split.
@@ -214,6 +222,9 @@ class PopulationConfig:
             of a step that sees it; they are gathered over as many density events as that takes.
     """
 
+    strategy: str = "density"
+    relocate: bool = False
+    growth: float = 0.05
     grad_threshold: float = 2e-4
     clone_scale: float = 0.01
     min_opacity: float = 0.005

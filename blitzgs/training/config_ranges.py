@@ -92,8 +92,10 @@ RANGES: Mapping[str, Range] = {
     "optimiser.beta2": _BETA,
     "optimiser.eps": Range(1e-30, 1),
     "loss.ssim": Range(0, 1),
+    "loss.opacity": Range(0, 1e6),
     "loss.scale": Range(0, 1e6),
     "loss.scale_reference": Range(1e-6, 1e6),
+    "population.growth": Range(0, 10),
     "population.grad_threshold": Range(0, 1e30),
     "population.clone_scale": _LENGTH,
     "population.min_opacity": Range(0, 1, high_open=True),
@@ -124,6 +126,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "data.undistort": ("crop", "mask"),
     "data.exif": ("auto", "apply", "ignore"),
     "ranks.transport": get_args(Transport),
+    "population.strategy": ("density", "relocation"),
     "population.score": get_args(ScoreRule),
 }
 
@@ -147,7 +150,8 @@ def problems(config: Config) -> Iterator[str]:
             f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
             f"all Gaussians are pruned; got {population.reset_opacity}"
         )
-
+    if population.strategy == "relocation" and population.gate is not None:
+        yield "population.gate: withholds candidates of population.strategy=density; relocation has none"
     if config.view.cull and not population.importance:
         yield "view.cull: needs population.importance=true, whose passes make the mask"
 

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event that clones, splits and prunes Gaussians."""
+"""The event that clones, splits, prunes and relocates Gaussians."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import torch
 
-from blitzgs.population.density import DensityRules, decay_opacities, densify
+from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, decay_opacities, densify
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import redistribute
+from blitzgs.population.relocation import relocate
 from blitzgs.training.guard import ModelLostError, check_table
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
@@ -35,18 +37,7 @@ def run(state: TrainingState, event: Event) -> None:
         population.pixels_per_gaussian,
         memory_limit(state.table, state.ranks),
     )
-    report = densify(
-        state.table,
-        density_rules(state, event.time, limit),
-        time=event.time,
-        step=step,
-        seed=state.config.seed,
-        level_count=state.progress.level_count,
-        ranks=state.ranks,
-        extent=state.space.extent,
-        veto=state.veto if state.schedule.gates(event.time) else None,
-        lineage=state.lineage,
-    )
+    report = change_population(state, event.time, density_rules(state, event.time, limit))
     counts = dataclasses.asdict(report) | {"gaussians": len(state.table)}
     values = state.ranks.all_reduce(torch.tensor(list(counts.values()), device=state.ranks.device))
     counts = dict(zip(counts, values.tolist(), strict=True))
@@ -74,6 +65,30 @@ def run(state: TrainingState, event: Event) -> None:
             )
             state.growth_was_limited = True
     state.log.event(event.time, "densify", record, text)
+
+
+def change_population(state: TrainingState, time: int, rules: DensityRules) -> DensityReport:
+    """Run the strategy of `population.strategy`; rows are caught up. Every rank calls this."""
+    population, progress = state.config.population, state.progress
+    call: dict[str, Any] = {
+        "time": time,
+        "step": progress.step,
+        "seed": state.config.seed,
+        "level_count": progress.level_count,
+        "ranks": state.ranks,
+        "extent": state.space.extent,
+        "lineage": state.lineage,
+    }
+    if population.strategy == "relocation":
+        report = relocate(state.table, rules, growth=population.growth, **call)
+        for name in STATISTICS:
+            state.table[name].zero_()
+        return report
+    moved = relocate(state.table, rules, growth=0.0, **call) if population.relocate else None
+    report = densify(state.table, rules, veto=state.veto if state.schedule.gates(time) else None, **call)
+    if moved is None:
+        return report
+    return dataclasses.replace(report, cloned=report.cloned + moved.cloned, relocated=moved.relocated)
 
 
 def training_pixels(state: TrainingState) -> int:

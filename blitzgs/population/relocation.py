@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Relocation (3DGS-MCMC): dead Gaussians become copies of live ones, which share what the live one did."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.selection import sampling_keys, smallest
+from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.population.candidates import spawn_features
+from blitzgs.population.density import (
+    CHILDREN_OF_A_SPLIT,
+    INHERITED,
+    DensityReport,
+    DensityRules,
+    child_ids,
+    death_causes,
+)
+from blitzgs.population.lineage import Births, Cause, Lineage
+from blitzgs.view.blocks import morton_order
+
+# Of one Gaussian in one event, itself included; the paper's code has the same limit.
+MOST_COPIES = 51
+# Opacities are drawn by as integers in units of 2^-31, whose sums no order of adding changes.
+_WEIGHT_BITS = 31
+
+
+@torch.no_grad()
+def relocate(
+    table: GaussianTable,
+    rules: DensityRules,
+    *,
+    growth: float,
+    time: int,
+    step: int,
+    seed: int,
+    ranks: Ranks,
+    extent: float = 1.0,
+    level_count: int = 1,
+    lineage: Lineage | None = None,
+) -> DensityReport:
+    """Move the dead Gaussians of a table whose rows have all been caught up onto live ones, and let it grow.
+
+    Dead are those that density control would prune. As many copies are made as keep the population, and
+    `growth` more, drawn from the live ones by their opacity (Kheradmand et al. 2024, "3D Gaussian Splatting
+    as Markov Chain Monte Carlo", section 3.4). A Gaussian and its copies lie at one place and share opacity
+    and size such that together they look as it did (`shared`). Both begin with fresh moments. Copies have the
+    level, phi and cull row of what they are copies of, and no statistics. Draws and ids follow from (seed,
+    time, id) alone, so that the outcome depends neither on the order of the rows nor on the number of ranks.
+
+    Args:
+        table: changed in place; left in `morton_order`.
+        rules: who is dead, and the cap of the growth.
+        growth: share of the population that the event adds.
+        time: of the event, in images.
+        step: the optimiser step just taken; new rows stand there.
+        seed: of the run.
+        ranks: whose tables together make the population; every rank calls this.
+        extent: of the scene, in the unit of the means; for the lineage's features alone.
+        level_count: number of octree levels; for the same.
+        lineage: logs births and deaths, or None.
+
+    Returns:
+        The report; `cloned` counts all copies on this rank, `relocated` the dead that they stand in for.
+    """
+    causes = death_causes(table.columns, table["max_radii"], rules)
+    dead = causes != 0
+    counts = torch.tensor([len(table), int(dead.sum())], device=table.device)
+    population, deaths = ranks.all_reduce(counts).tolist()
+    grown = math.floor(population * (1.0 + growth))
+    wanted = max(population, grown if rules.max_gaussians is None else min(grown, rules.max_gaussians))
+    weights = (table["opacities"].double().sigmoid().float().double() * 2**_WEIGHT_BITS).long()
+    weights[dead] = 0
+    draws = draw(weights, wanted - population + deaths, table["id"], seed, time, ranks)
+    sources, gone = draws.nonzero().squeeze(1), dead.nonzero().squeeze(1)
+    parents = sources.repeat_interleave(draws[sources])
+    features = None
+    if lineage is not None:
+        features = spawn_features(table, parents, torch.zeros_like(parents).bool(), time, extent, level_count)
+    _share(table, sources, draws[sources] + 1, rules.min_opacity)
+    new = _copies(table, parents, draws[sources], time, step)
+    if lineage is not None and features is not None:
+        lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
+        lineage.died(table["id"][gone], torch.full_like(gone, Cause.RELOCATED), time, step)
+    kept = torch.cat((~dead, dead.new_ones(len(new["id"])))).nonzero().squeeze(1)
+    means = torch.cat((table["means"], new["means"])).index_select(0, kept)
+    table.renew(kept[morton_order(means)], new)
+    held_back = max(0, grown - wanted) if ranks.rank == 0 else 0
+    return DensityReport(cloned=len(new["id"]), split=0, pruned=0, held_back=held_back, relocated=len(gone))
+
+
+def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Return opacity and scales of each of N Gaussians at one place that together look as one did.
+
+    Along a line through the centre, the integral of what N Gaussians composite is that of the one: with
+    o' = 1 - (1 - o)^(1/N),
+
+        s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k + 1)
+
+    (Kheradmand et al. 2024, eq. 9). The sum over i of C(i-1, k) is C(N, k+1), which leaves one sum.
+
+    Args:
+        opacities: logits, [M].
+        scales: logarithms, [M, 3].
+        copies: N, int64 [M], 1 to `MOST_COPIES`.
+
+    Returns:
+        Logits and logarithms, float64; the sum alternates, and its terms exceed it by up to 10^5.
+    """
+    logits, n = opacities.double(), copies.double()
+    # -log(1 - o') = -log(1 - o) / N
+    depth = softplus(logits) / n
+    opacity = -torch.expm1(-depth)
+    term, total = torch.full_like(n, -1.0), torch.zeros_like(n)
+    for k in range(1, MOST_COPIES + 1):
+        term = term * (n - (k - 1)) / k * -opacity
+        total += term / math.sqrt(k)
+    factor = torch.nn.functional.logsigmoid(logits) - total.log()
+    return depth.expm1().log(), scales.double() + factor[:, None]
+
+
+def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: Ranks) -> Tensor:
+    """Draw `count` times in proportion to weights, over all ranks.
+
+    The expectation of each row is that of a multinomial draw, count w / sum(w). Its whole part is certain,
+    and its fraction is drawn for without replacement: as random as it has to be, and exactly `count` in all,
+    but that no row is drawn `MOST_COPIES` times.
+
+    Args:
+        weights: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks.
+        count: below 2^31.
+        ids: int64 [N_rank], persistent.
+        seed: of the run.
+        time: of the event, in images.
+        ranks: the job; every rank calls this.
+
+    Returns:
+        int64 [N_rank], how often each was drawn; the same for the same ids at every world size. Zeros where
+        all weights are 0.
+    """
+    total = int(ranks.all_reduce(weights.sum()))
+    if total == 0 or count <= 0:
+        return torch.zeros_like(weights)
+    whole = weights * count // total
+    rest = count - int(ranks.all_reduce(whole.sum()))
+    # Other events that draw count their times from 0 up.
+    keys = sampling_keys((weights * count % total).float(), ids, seed, -1 - time)
+    return (whole + smallest(keys, ids, rest, ranks)).clamp(max=MOST_COPIES - 1)
+
+
+def _share(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
+    """Give the rows `sources` what is theirs when they become so many, and fresh moments, in place."""
+    opacities, scales = shared(table["opacities"][sources], table["scales"][sources], copies)
+    if min_opacity > 0:
+        # Who was just above the limit does not die of being shared.
+        opacities = opacities.clamp(min=math.log(min_opacity / (1.0 - min_opacity)))
+    table["opacities"][sources] = opacities.float()
+    table["scales"][sources] = scales.float()
+    for name in (*EXP_AVGS, *EXP_AVG_SQS):
+        table[name][sources] = 0
+
+
+def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step: int) -> dict[str, Tensor]:
+    """Return new rows, copies of `rows`, in which each source is repeated as often as `counts` says."""
+    first = counts.cumsum(0) - counts
+    # Slots behind those of clones and splits, which may have the same parents in the same event.
+    slots = torch.arange(len(rows), device=rows.device) - first.repeat_interleave(counts)
+    slots += CHILDREN_OF_A_SPLIT + 1
+    inherited = [*PARAMETERS, "level", *(name for name in INHERITED if name in table)]
+    new = {name: table[name].index_select(0, rows) for name in inherited}
+    parents = table["id"][rows]
+    return new | {
+        "id": child_ids(parents, time, slots),
+        "parent": parents,
+        "birth": torch.full_like(table["birth"][rows], time),
+        "last_step": torch.full_like(table["birth"][rows], step),
+    }

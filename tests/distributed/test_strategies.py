@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options of density control in whole runs: resumed, and on two ranks, they end as on one rank in one go."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training import run
+from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import run_ranks
+from tests.distributed.test_training import records, sorted_table
+from tests.training.tiny import tiny_config, tiny_scene
+
+# 30 steps of 2 images, with a checkpoint after 10, and density events after 28, 36, 44 and 52 images.
+SETTINGS = (
+    "schedule.iterations=60",
+    "schedule.batch_size=2",
+    "schedule.densify_from=28",
+    "schedule.densify_until=60",
+    "schedule.densify_every=8",
+    "schedule.size_prune_after=0",
+    "schedule.checkpoint_every=19",
+    "population.grad_threshold=4e-3",
+    "population.clone_scale=0.02",
+    "population.min_opacity=0.06",
+    "population.reset_opacity=0.07",
+    "model.antialiased=true",
+    "optimiser.opacity=0.1",
+    "optimiser.position_noise=1e6",
+    "log.every=2",
+    "log.keep_checkpoints=9",
+    "ranks.max_imbalance=1.02",
+)
+RELOCATION = ("population.strategy=relocation", "population.max_gaussians=450")
+OPTIONS = {
+    "relocation": RELOCATION,
+    "relocate": ("population.relocate=true", "population.max_gaussians=490"),
+}
+FIRST = Path("checkpoints") / "checkpoint_000000"
+
+
+def _train(ranks, folder, *overrides):
+    torch.set_num_threads(1)
+    Trainer(tiny_config(*SETTINGS, *overrides), *tiny_scene(), folder, ranks, resume=True).train()
+
+
+@pytest.fixture(scope="module", params=OPTIONS)
+def whole(request, tmp_path_factory):
+    """A run on one rank: the options, its folder, and a folder that has its first checkpoint alone."""
+    folder, base = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("base")
+    _train(Ranks(), folder, *OPTIONS[request.param])
+    shutil.copytree(folder / FIRST, base / FIRST)
+    return OPTIONS[request.param], folder, base
+
+
+def test_a_resumed_run_is_the_same(whole, tmp_path):
+    options, folder, base = whole
+    shutil.copytree(base, tmp_path / "run")
+    _train(Ranks(), tmp_path / "run", *options)
+    resumed, expected = (run.restore(f, Ranks()).table for f in (tmp_path / "run", folder))
+    for name in expected:
+        assert torch.equal(resumed[name], expected[name]), name
+
+
+def test_two_ranks_agree_with_one(whole, tmp_path):
+    options, folder, base = whole
+    shutil.copytree(base, tmp_path / "run")
+    run_ranks(_train, 2, tmp_path / "run", *options)
+    losses, events = records(tmp_path / "run")
+    expected_losses, expected_events = records(folder)
+    expected_losses = [record for record in expected_losses if record["t"] > 20]
+    for got, want in zip(losses, expected_losses, strict=True):
+        assert got["gaussians"] == want["gaussians"]
+        assert abs(got["loss"] - want["loss"]) <= 1e-5 * want["loss"]
+    assert len(events) == 4 and sum(event["cloned"] for event in events) > 30
+    for got, want in zip(events, expected_events, strict=True):
+        names = ("t", "cloned", "split", "pruned", "relocated", "held_back", "gaussians")
+        assert [got[name] for name in names] == [want[name] for name in names]
+    got, want = sorted_table(tmp_path / "run"), sorted_table(folder)
+    for name in ("id", "parent", "birth", "level", "last_step", "moment_step"):
+        assert torch.equal(got[name], want[name]), name
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert (got[name] - want[name]).norm() <= 1e-5 * want[name].norm(), name
+
+
+def test_relocation_keeps_the_population_and_grows_to_the_cap(whole):
+    options, folder, _ = whole
+    _, events = records(folder)
+    assert sum(event["relocated"] for event in events) > 5
+    if options is RELOCATION:
+        counts = [event["gaussians"] for event in events]
+        assert counts == sorted(counts) and counts[-1] == 450
+        assert all(event["pruned"] == event["split"] == 0 for event in events)
+
+
+def test_births_less_deaths_are_the_living(whole, tmp_path):
+    pytest.importorskip("pyarrow")
+    from blitzgs.population.lineage import Cause, read_lineage
+
+    options, _, _ = whole
+    _train(Ranks(), tmp_path, "population.lineage=true", *options)
+    log = read_lineage(tmp_path / run.LINEAGE)
+    relocated = log["deaths"]["id"][log["deaths"]["cause"] == Cause.RELOCATED]
+    living = set(log["births"]["id"].tolist()) - set(log["deaths"]["id"].tolist())
+    assert len(relocated) > 5 and living == set(run.restore(tmp_path, Ranks()).table["id"].tolist())

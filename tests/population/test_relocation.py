@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Relocation: the closed form against its double sum and by quadrature, and the event row by row."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.ops.counter_random import hash_keys
+from blitzgs.population.density import DensityRules
+from blitzgs.population.lineage import Cause
+from blitzgs.population.relocation import MOST_COPIES, draw, relocate, shared
+from tests.distributed.rank_harness import run_ranks
+from tests.helpers import needs_cuda
+from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
+
+RULES = DensityRules(grad_threshold=1.0, clone_scale=0.05, min_opacity=0.05, max_scale=0.9)
+CALL = {"time": TIME, "step": STEP, "seed": SEED, "level_count": LEVELS}
+
+
+def by_the_double_sum(opacity: float, copies: int) -> tuple[float, float]:
+    """Return opacity and factor of the scales as eq. 9 of the paper has them, in rational numbers."""
+    new = 1.0 - (1.0 - opacity) ** (1.0 / copies)
+    total = Fraction(0)
+    for i in range(1, copies + 1):
+        for k in range(i):
+            root = Fraction(1 / math.sqrt(k + 1))
+            total += math.comb(i - 1, k) * (-1) ** k * root * Fraction(new) ** (k + 1)
+    return new, opacity / float(total)
+
+
+@pytest.mark.parametrize("copies", [1, 2, 3, 7, 20, MOST_COPIES])
+def test_the_closed_form_is_the_paper_s_double_sum(copies):
+    opacities = torch.tensor([0.006, 0.1, 0.5, 0.9, 0.99, 0.999999], dtype=torch.float64)
+    scales = torch.randn(len(opacities), 3, dtype=torch.float64)
+    logits, logarithms = shared(opacities.logit(), scales, torch.full((len(opacities),), copies))
+    for i, opacity in enumerate(opacities.tolist()):
+        new, factor = by_the_double_sum(opacity, copies)
+        assert math.isclose(float(logits[i].sigmoid()), new, rel_tol=1e-9)
+        assert torch.allclose(logarithms[i], scales[i] + math.log(factor), atol=1e-8)
+
+
+@pytest.mark.parametrize("copies", [2, 5, 30])
+def test_copies_together_show_what_the_one_did(copies):
+    """At the centre, and integrated along a line through it."""
+    opacity, x = torch.tensor([0.8], dtype=torch.float64), torch.linspace(-12, 12, 20001, dtype=torch.float64)
+    logits, logarithms = shared(opacity.logit(), torch.zeros(1, 3).double(), torch.tensor([copies]))
+    new, scale = logits.sigmoid(), logarithms.exp()[0, 0]
+    assert torch.allclose(1 - (1 - new) ** copies, opacity)
+    alone = torch.trapezoid(opacity * torch.exp(-(x**2) / 2), x)
+    together = torch.trapezoid(1 - (1 - new * torch.exp(-((x / scale) ** 2) / 2)) ** copies, x)
+    assert math.isclose(float(together), float(alone), rel_tol=1e-9)
+
+
+def test_draws_follow_the_weights_and_are_as_many_as_asked():
+    g = torch.Generator().manual_seed(1)
+    weights = (torch.rand(500, generator=g) ** 4 * 2**31).long()
+    weights[::7] = 0
+    ids, total = torch.randperm(5000, generator=g)[:500], torch.zeros(500).double()
+    for event in range(400):
+        drawn = draw(weights, 60, ids, SEED, event, Ranks())
+        assert int(drawn.sum()) == 60 and not drawn[weights == 0].any()
+        total += drawn
+    expected = 400 * 60 * weights / weights.sum()
+    # A draw has a variance of at most its expectation.
+    assert ((total - expected).abs() <= 5 * expected.sqrt() + 1).all()
+    assert draw(weights, 0, ids, SEED, 0, Ranks()).sum() == 0
+    assert draw(torch.zeros_like(weights), 60, ids, SEED, 0, Ranks()).sum() == 0
+    alone = draw(torch.tensor([5, 0]), 1000, torch.tensor([1, 2]), SEED, 0, Ranks())
+    assert alone.tolist() == [MOST_COPIES - 1, 0]
+
+
+@pytest.mark.parametrize(("growth", "cap"), [(0.0, None), (0.05, None), (0.5, 450), (0.5, 100)])
+def test_matches_row_by_row(growth, cap):
+    table = random_table(400)
+    before = {int(i): {name: table[name][k].clone() for name in table} for k, i in enumerate(table["id"])}
+    dead = {
+        i
+        for i, row in before.items()
+        if row["opacities"].sigmoid() < RULES.min_opacity or row["scales"].max().exp() > RULES.max_scale
+    }
+    assert 20 < len(dead) < 380
+    rules = DensityRules(**(vars(RULES) | {"max_gaussians": cap}))
+    report = relocate(table, rules, growth=growth, ranks=Ranks(), **CALL)
+    wanted = max(400, min(int(400 * (1 + growth)), cap or 1000))
+    assert len(table) == wanted and report.relocated == len(dead)
+    assert report.cloned == wanted - 400 + len(dead) and report.held_back == int(400 * (1 + growth)) - wanted
+    after = {int(i): {name: table[name][k] for name in table} for k, i in enumerate(table["id"])}
+    assert len(after) == wanted and dead.isdisjoint(after)
+    born = {i: row for i, row in after.items() if i not in before}
+    counts: dict[int, int] = {}
+    for row in born.values():
+        counts[int(row["parent"])] = counts.get(int(row["parent"]), 0) + 1
+    assert max(counts.values()) > 1
+    for i in before.keys() - dead:
+        copies = [(0, after[i])]
+        for slot in range(counts.get(i, 0)):
+            key = int(hash_keys(torch.tensor([i]), TIME, slot + 3)) & (2**63 - 1)
+            copies.append((1, born.pop(key)))
+        old, n = before[i], len(copies)
+        opacity, factor = by_the_double_sum(float(old["opacities"].double().sigmoid()), n)
+        for is_copy, row in copies:
+            expected = old | ({"parent": torch.tensor(i), "birth": torch.tensor(TIME)} if is_copy else {})
+            if n > 1:
+                opacity = max(opacity, RULES.min_opacity)
+                expected["opacities"] = torch.tensor(math.log(opacity / (1 - opacity)))
+                expected["scales"] = old["scales"] + math.log(factor)
+            for name in (*PARAMETERS, "parent", "birth", "level", "last_step"):
+                np.testing.assert_allclose(row[name], expected[name], rtol=2e-6, atol=1e-6, err_msg=name)
+            for name in table:
+                if name.startswith("exp_avg"):
+                    assert torch.equal(row[name], old[name] if n == 1 else torch.zeros_like(old[name]))
+    assert not born
+
+
+def test_no_live_gaussian_leaves_nothing_to_copy():
+    table = random_table(5)
+    table["opacities"].fill_(-9)
+    report = relocate(table, RULES, growth=0.05, ranks=Ranks(), **CALL)
+    assert (len(table), report.cloned, report.relocated) == (0, 0, 5)
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_cuda_does_the_same():
+    tables = []
+    for device in ("cpu", "cuda"):
+        ranks, table = Ranks(device=torch.device(device)), random_table(400)
+        table = GaussianTable({name: table[name].to(device) for name in table})
+        relocate(table, RULES, growth=0.2, ranks=ranks, **CALL)
+        order = table["id"].argsort()
+        tables.append({name: table[name][order].cpu() for name in table})
+    for name in tables[0]:
+        assert torch.allclose(*(table[name] for table in tables), rtol=1e-6, atol=0), name
+
+
+def _relocate_a_share(ranks, growth):
+    """Return this rank's part of an event on a table that is dealt unevenly."""
+    table, logged = random_table(400), _Log()
+    first = int(400 * 0.7) if ranks.world_size > 1 else 400
+    mine = torch.arange(400) < first if ranks.rank == 0 else torch.arange(400) >= first
+    table.keep(mine)
+    report = relocate(table, RULES, growth=growth, ranks=ranks, lineage=logged, **CALL)
+    return {name: table[name] for name in table}, vars(report), logged
+
+
+class _Log:
+    """Takes what a lineage is told."""
+
+    def __init__(self):
+        self.births, self.deaths = [], []
+
+    def born(self, births, step):
+        self.births += births.ids.tolist()
+        assert births.features.isfinite().all() and step == STEP
+
+    def died(self, ids, causes, time, step):
+        self.deaths += ids.tolist()
+        assert (causes == Cause.RELOCATED).all() and (time, step) == (TIME, STEP)
+
+
+def test_any_number_of_ranks_and_any_order_give_the_same():
+    alone, report, log = _relocate_a_share(Ranks(), 0.2)
+    shares = run_ranks(_relocate_a_share, 2, 0.2)
+    order = alone["id"].argsort()
+    together = {name: torch.cat([share[0][name] for share in shares]) for name in alone}
+    positions = together["id"].argsort()
+    for name in alone:
+        assert torch.equal(alone[name][order], together[name][positions]), name
+    assert report == {name: sum(share[1][name] for share in shares) for name in report}
+    assert sorted(log.births) == sorted(shares[0][2].births + shares[1][2].births)
+    assert sorted(log.deaths) == sorted(shares[0][2].deaths + shares[1][2].deaths)
+    live = set(random_table(400)["id"].tolist()) - set(log.deaths) | set(log.births)
+    assert live == set(alone["id"].tolist())
