@@ -54,7 +54,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // v_splats: (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] splats, int[] ints, float[] floats, "
-      "Tensor[] v_splats, Tensor? v_depths, Tensor? scale_reg, bool need_viewmats, bool dense=False) -> ("
+      "Tensor[] v_splats, Tensor? v_depths, Tensor? scale_reg, bool need_viewmats, bool dense=False, "
+      "Tensor? opacity_reg=None) -> ("
       "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
       "Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the
@@ -64,7 +65,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
       "Tensor(d!)[] last_steps, Tensor[] tables, int[] steps, float[] decays, Tensor[] cameras, "
       "Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, Tensor? places=None, "
-      "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None) -> ()");
+      "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None, Tensor? opacity_reg=None) -> ()");
   // Where the parts of a splat gradient begin in its floats, and last how many these are: mean2d, conic,
   // opacity, color, mean2d_abs.
   m.def("splat_gradient_layout() -> int[]");

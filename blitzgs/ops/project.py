@@ -173,6 +173,7 @@ def _(
     scale_reg: Tensor | None,
     need_viewmats: bool,
     dense: bool = False,
+    opacity_reg: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
     means, (_, visible_ids, _) = gaussians[0], splats
     length = (means if dense else visible_ids).shape[0]

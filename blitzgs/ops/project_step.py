@@ -33,6 +33,7 @@ def project_bwd_step_(
     gradients: SplatGradients,
     scale_reg: Tensor | None = None,
     means2d_sums: Tensor | None = None,
+    opacity_reg: Tensor | None = None,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
@@ -60,6 +61,7 @@ def project_bwd_step_(
         scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
             term.
         means2d_sums: [P, 2], becomes the gradient of `splats.means2d` where `gradients` has it at ranks.
+        opacity_reg: as `scale_reg`, of the opacity (without the compensation of antialiased splats).
 
     Raises:
         ValueError: decay rates outside their range.
@@ -81,6 +83,7 @@ def project_bwd_step_(
         gradients.places,
         scale_reg,
         means2d_sums,
+        opacity_reg,
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM) + beta L_scale, averaged over a batch's views."""
+"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM) and two regularisers, averaged over a batch."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ class LossTerms(NamedTuple):
         v_renders: gradient of the batch's mean loss by the images, [B, H, W, 3].
         scale_reg: weight of the smallest axis of each visible Gaussian, per view [B]; None when the term is
             off.
+        opacity_reg: the same of its opacity.
     """
 
     parts: Tensor
     v_renders: Tensor
     scale_reg: Tensor | None
+    opacity_reg: Tensor | None
 
 
 def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: float) -> LossTerms:
@@ -61,7 +63,8 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: floa
         visible=frame.visible if config.scale > 0 else None,
         scale_weight=config.scale / (length_unit * count),
     )
-    return LossTerms(parts, v_renders, scale_reg if config.scale > 0 else None)
+    opacity_reg = config.opacity / (count * frame.visible.clamp(min=1)) if config.opacity > 0 else None
+    return LossTerms(parts, v_renders, scale_reg if config.scale > 0 else None, opacity_reg)
 
 
 @lru_cache(maxsize=64)
@@ -87,8 +90,18 @@ def photometric(sums: Tensor, samples: Tensor, config: LossConfig) -> Tensor:
 def scale_term(frame: Frame, table: GaussianTable, length_unit: float) -> Tensor:
     """Return L_scale of each view, float32 [B]: the mean smallest axis of the Gaussians visible in it."""
     smallest = table["scales"][frame.projected.gaussian_ids].amin(dim=1).exp() / length_unit
-    views = torch.arange(len(frame.views), device=smallest.device)
-    sums = (smallest[:, None] * (frame.projected.camera_ids[:, None] == views)).sum(dim=0)
+    return _mean_over_visible(frame, smallest)
+
+
+def opacity_term(frame: Frame, table: GaussianTable) -> Tensor:
+    """Return L_opacity of each view, float32 [B]: the mean opacity of the Gaussians visible in it."""
+    return _mean_over_visible(frame, table["opacities"][frame.projected.gaussian_ids].sigmoid())
+
+
+def _mean_over_visible(frame: Frame, values: Tensor) -> Tensor:
+    """Return the mean of a value of each splat over each view's splats at all ranks, [B]."""
+    views = torch.arange(len(frame.views), device=values.device)
+    sums = (values[:, None] * (frame.projected.camera_ids[:, None] == views)).sum(dim=0)
     if frame.assignment is not None:
         frame.assignment.ranks.all_reduce(sums)
     return sums / frame.visible.clamp(min=1)

@@ -81,6 +81,7 @@ class LazyAdam:
         frame: Frame,
         v: SplatGradients,
         scale_reg: Tensor | None,
+        opacity_reg: Tensor | None,
         step: int,
         means2d_sums: Tensor | None = None,
     ) -> None:
@@ -92,6 +93,7 @@ class LazyAdam:
             v: gradients of the frame's splats, from `pipeline.backward_splats`.
             scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
                 such term.
+            opacity_reg: the same of its opacity.
             step: the visible rows stand at the step before.
             means2d_sums: [P, 2], becomes the gradient of the splats' means2d where `v` has it at ranks.
         """
@@ -112,4 +114,5 @@ class LazyAdam:
             v,
             scale_reg,
             means2d_sums,
+            opacity_reg,
         )

@@ -122,7 +122,7 @@ class Stepper:
         v_means2d, sums = gradients.means2d, None
         if v_means2d is None and keep_means2d:
             v_means2d = sums = torch.empty_like(frame.projected.means2d)
-        self._optimiser.step(table, frame, gradients, terms.scale_reg, step, sums)
+        self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step, sums)
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
         mark("optimiser")

@@ -12,19 +12,22 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.pipeline import Frame
 from blitzgs.training.batches import Batch
 from blitzgs.training.guard import check_table
-from blitzgs.training.loss import batch_psnr, photometric, scale_term
+from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term
 from blitzgs.training.state import TrainingState
 
 
 def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
-    """Return the batch's L_scale and PSNR, the visible Gaussians and all, float64 [4], without a wait."""
+    """Return the batch's L_scale, L_opacity and PSNR, the visible Gaussians and all, float64 [5]; no wait."""
     length_unit = state.space.extent * state.config.loss.scale_reference
     scale = scale_term(frame, state.table, length_unit).mean()
+    opacity = scale.new_zeros(())
+    if state.config.loss.opacity > 0:
+        opacity = opacity_term(frame, state.table).mean()
     counts = [
         state.ranks.all_reduce(torch.full((), float(count), dtype=torch.float64, device=scale.device))
         for count in (len(frame.projected.visible_ids), len(state.table))
     ]
-    return torch.stack([scale.double(), batch_psnr(frame, batch).double(), *counts])
+    return torch.stack([scale.double(), opacity.double(), batch_psnr(frame, batch).double(), *counts])
 
 
 def log_step(
@@ -45,9 +48,9 @@ def log_step(
     check_table(state.table, state.progress.step)
     loss = state.config.loss
     losses = photometric(sums.read()[: 2 * len(names)], batch.samples.cpu(), loss)
-    scale, psnr, visible, population = measured.tolist()
+    scale, opacity, psnr, visible, population = measured.tolist()
     values = {
-        "loss": losses.mean().item() + loss.scale * scale,
+        "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity,
         "l_scale": scale,
         "psnr": psnr,
         "visible": visible,

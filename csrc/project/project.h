@@ -117,6 +117,14 @@ struct ProjectGradients {
   bool dense = false;
 };
 
+// Terms of the training loss that look at no pixel, as weights per view, [B] each, or null: the loss grows by
+// scale[b] times the smallest axis (the paper's L_scale) and by opacity[b] times the opacity of each Gaussian
+// that has a splat in view b.
+template <class T>
+struct Regularisers {
+  const T *scale, *opacity;
+};
+
 // What the backward pass knows of the forward pass.
 struct SplatIndex {
   const std::int32_t *camera_ids, *visible_ids, *splat_offsets;
@@ -127,10 +135,9 @@ namespace cpu {
 template <class T>
 void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
-// scale_reg [B] or null: adds scale_reg[b] * d(min_j s_j) for each splat in view b (the paper's L_scale).
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
-                 const T* scale_reg, const ProjectGradients<T>&, Workspace&, CudaStream);
+                 const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
 // Where the splats do not fit into the capacity, the totals are right all the same; the columns then hold the
@@ -139,8 +146,8 @@ template <class T>
 void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
 template <class T>
-void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&, const T* scale_reg,
-                 const ProjectGradients<T>&, Workspace&, CudaStream);
+void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,
+                 const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -114,8 +114,8 @@ __global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks
 
 template <>
 void project_bwd<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
-                        const float* scale_reg, const ProjectGradients<float>& out, Workspace& workspace,
-                        CudaStream stream) {
+                        const Regularisers<float>& regularisers, const ProjectGradients<float>& out,
+                        Workspace& workspace, CudaStream stream) {
   const std::int64_t blocks = project_blocks(splats.n_visible);
   if (out.viewmats && in.n_views > 0) {
     const std::size_t bytes = 16 * in.n_views * sizeof(float);
@@ -123,14 +123,14 @@ void project_bwd<float>(const Inputs& in, const SplatIndex& splats, const SplatG
   }
   if (blocks == 0) return;
   const StoreGradients sink{out, 3 * in.options.sh_stride};
-  dispatch_backward(in, splats, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
+  dispatch_backward(in, splats, v, regularisers, [&](auto degree, auto quads, const auto& args) {
     launch_backward<degree.value, quads.value>(args, sink, stream);
   });
   if (!out.viewmats) return;
   auto* partial = workspace.allocate<double>(blocks * in.n_views * 12);
   std::visit(
       [&](const auto& source) {
-        const BackwardInputs<std::decay_t<decltype(source)>> args{in, splats, source, scale_reg};
+        const BackwardInputs<std::decay_t<decltype(source)>> args{in, splats, source, regularisers};
         const dim3 grid(static_cast<unsigned>(blocks), in.n_views);
         pose_kernel<<<grid, kPoseThreads, 0, stream>>>(args, partial);
       },

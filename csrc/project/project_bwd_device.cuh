@@ -14,16 +14,16 @@ struct BackwardInputs {
   Inputs in;
   SplatIndex splats;
   Source v;
-  const float* scale_reg;
+  Regularisers<float> regularisers;
 };
 
 // Calls f(degree, quads, BackwardInputs) with degree and quads as dispatch_sh has them.
 template <class F>
 void dispatch_backward(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
-                       const float* scale_reg, const F& f) {
+                       const Regularisers<float>& regularisers, const F& f) {
   std::visit(
       [&](const auto& source) {
-        const BackwardInputs<std::decay_t<decltype(source)>> args{in, splats, source, scale_reg};
+        const BackwardInputs<std::decay_t<decltype(source)>> args{in, splats, source, regularisers};
         dispatch_sh(in, [&](auto degree, auto quads) { f(degree, quads, args); });
       },
       v);
@@ -96,7 +96,8 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   reader.for_each(begin, end, [&](std::int64_t r, const auto& v) {
     if constexpr (Reader::kPulls) v_splat = v.geometry(r);
     project_splat_vjp(cameras[view], gaussian, in.options, v_splat, &gradient, no_pose);
-    if (args.scale_reg) axis_weight += args.scale_reg[view];
+    if (args.regularisers.scale) axis_weight += args.regularisers.scale[view];
+    if (args.regularisers.opacity) gradient.opacity += args.regularisers.opacity[view];
     load_splat(r + 1);
   });
 

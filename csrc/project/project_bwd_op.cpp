@@ -13,11 +13,11 @@ namespace {
 // pointers stay valid.
 struct BackwardSplats {
   Tensor camera_ids, visible_ids, splat_offsets;
-  OptionalTensor scale_reg;
+  OptionalTensor scale_reg, opacity_reg;
 
   BackwardSplats(const char* op, const ProjectArguments& p, const TensorList& splats,
-                 const OptionalTensor& scale_reg_in)
-      : scale_reg(contiguous_or_none(scale_reg_in)) {
+                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in)
+      : scale_reg(contiguous_or_none(scale_reg_in)), opacity_reg(contiguous_or_none(opacity_reg_in)) {
     check_group(op, "(camera_ids, visible_ids, splat_offsets)", splats, 3, 3);
     camera_ids = as_contiguous(splats[0]);
     visible_ids = as_contiguous(splats[1]);
@@ -26,10 +26,8 @@ struct BackwardSplats {
     check_dtype(op, "visible_ids", visible_ids, ScalarType::Int);
     check_dtype(op, "splat_offsets", splat_offsets, ScalarType::Int);
     check_shape(op, "splat_offsets", splat_offsets, {visible() + 1});
-    if (scale_reg) {
-      check_shape(op, "scale_reg", *scale_reg, {p.n_views});
-      check_dtype(op, "scale_reg", *scale_reg, p.means.scalar_type());
-    }
+    check_weights(op, p, "scale_reg", scale_reg);
+    check_weights(op, p, "opacity_reg", opacity_reg);
   }
 
   std::int64_t visible() const { return visible_ids.numel(); }
@@ -38,6 +36,18 @@ struct BackwardSplats {
     return {data<std::int32_t>(camera_ids), data<std::int32_t>(visible_ids),
             data<std::int32_t>(splat_offsets), visible()};
   }
+  template <class T>
+  Regularisers<T> regularisers() const {
+    return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg)};
+  }
+
+ private:
+  static void check_weights(const char* op, const ProjectArguments& p, const char* name,
+                            const OptionalTensor& weights) {
+    if (!weights) return;
+    check_shape(op, name, *weights, {p.n_views});
+    check_dtype(op, name, *weights, p.means.scalar_type());
+  }
 };
 
 using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
@@ -45,10 +55,10 @@ using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 BackwardTensors project_bwd(const TensorList& gaussians, const TensorList& cameras, const TensorList& splats,
                             const IntList& ints, const FloatList& floats, const TensorList& v_splats,
                             const OptionalTensor& v_depths, const OptionalTensor& scale_reg,
-                            bool need_viewmats, bool dense) {
+                            bool need_viewmats, bool dense, const OptionalTensor& opacity_reg) {
   constexpr const char* kOp = "project_bwd";
   const ProjectArguments p(kOp, gaussians, cameras, ints, floats);
-  const BackwardSplats b(kOp, p, splats, scale_reg);
+  const BackwardSplats b(kOp, p, splats, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
@@ -65,7 +75,7 @@ BackwardTensors project_bwd(const TensorList& gaussians, const TensorList& camer
   dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
     backend::project_bwd(
-        p.inputs<T>(), b.pointers(), v.source<T>(), data_or_null<T>(b.scale_reg),
+        p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
         ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
                             mutable_data<T>(v_opacities), p.sh ? mutable_data<T>(v_sh) : nullptr,
                             need_viewmats ? mutable_data<T>(v_viewmats) : nullptr, dense},
@@ -78,19 +88,20 @@ void project_bwd_step(TensorList params, TensorList exp_avgs, TensorList exp_avg
                       const TensorList& tables, const IntList& steps, const FloatList& decays,
                       const TensorList& cameras, const TensorList& splats, const IntList& ints,
                       const FloatList& floats, const TensorList& v_splats, const OptionalTensor& places,
-                      const OptionalTensor& scale_reg, const OptionalTensor& means2d_sums) {
+                      const OptionalTensor& scale_reg, const OptionalTensor& means2d_sums,
+                      const OptionalTensor& opacity_reg) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
   STD_TORCH_CHECK(state.step >= 1, "blitzgs::project_bwd_step_: steps count from 1, got ", state.step);
   const ProjectArguments p(kOp, params, cameras, ints, floats);
-  const BackwardSplats b(kOp, p, splats, scale_reg);
+  const BackwardSplats b(kOp, p, splats, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
                              means2d_sums);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
-    backend::project_bwd_step(p.inputs<T>(), b.pointers(), v.source<T>(), data_or_null<T>(b.scale_reg),
+    backend::project_bwd_step(p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
                               state.arguments<T>(data<std::int32_t>(b.visible_ids), b.visible()),
                               scope.workspace, scope.stream);
   });

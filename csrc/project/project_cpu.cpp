@@ -119,7 +119,7 @@ void write_splat(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64
 // Gradients of visible Gaussian u; poses [B] or null.
 template <class T>
 void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras, const SplatIndex& splats,
-                  const SplatGradientColumns<T>& v, const T* scale_reg, std::int64_t u,
+                  const SplatGradientColumns<T>& v, const Regularisers<T>& regularisers, std::int64_t u,
                   PoseGradient<T>* poses, const ProjectGradients<T>& out) {
   const std::int64_t id = splats.visible_ids[u];
   const std::int64_t stride = 3 * in.options.sh_stride;
@@ -136,7 +136,8 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
       splat_color_vjp(cameras[view], gaussian.mean, in.sh + stride * id, in.options.sh_degree,
                       v.colors + 3 * r, out.sh + stride * at, &gradient.mean, pose);
     }
-    if (scale_reg) axis_weight += scale_reg[view];
+    if (regularisers.scale) axis_weight += regularisers.scale[view];
+    if (regularisers.opacity) gradient.opacity += regularisers.opacity[view];
   }
   activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
                         {out.means + 3 * at, out.quats + 4 * at, out.scales + 3 * at, out.opacities + at});
@@ -228,7 +229,8 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemor
 
 template <class T>
 void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const SplatGradientColumns<T>& v,
-                 const T* scale_reg, const ProjectGradients<T>& out, Workspace&, CudaStream) {
+                 const Regularisers<T>& regularisers, const ProjectGradients<T>& out, Workspace&,
+                 CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const std::int64_t blocks = project_blocks(splats.n_visible);
   std::vector<double> pose_sums(out.viewmats ? blocks * in.n_views * 12 : 0, 0.0);
@@ -237,7 +239,7 @@ void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const Spl
       std::vector<PoseGradient<T>> poses(out.viewmats ? in.n_views : 0);
       const std::int64_t last = std::min(splats.n_visible, (block + 1) * kProjectBlock);
       for (std::int64_t u = block * kProjectBlock; u < last; ++u) {
-        gaussian_bwd(in, cameras, splats, v, scale_reg, u, poses.empty() ? nullptr : poses.data(), out);
+        gaussian_bwd(in, cameras, splats, v, regularisers, u, poses.empty() ? nullptr : poses.data(), out);
       }
       if (out.viewmats) store_poses(poses, &pose_sums[block * in.n_views * 12]);
     }
@@ -249,7 +251,7 @@ void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const Spl
   template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,      \
                            Workspace&, CudaStream);                                                        \
   template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&, \
-                               const T*, const ProjectGradients<T>&, Workspace&, CudaStream);
+                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)
 #undef BLITZGS_INSTANTIATE

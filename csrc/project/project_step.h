@@ -23,12 +23,12 @@ ProjectGradients<T> scratch_gradients(const SplatIndex& splats, AdamArgs<T>& ada
 namespace cpu {
 template <class T>
 void project_bwd_step(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
-                      const T* scale_reg, AdamArgs<T> adam, Workspace&, CudaStream);
+                      const Regularisers<T>&, AdamArgs<T> adam, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
 template <class T>
 void project_bwd_step(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,
-                      const T* scale_reg, AdamArgs<T> adam, Workspace&, CudaStream);
+                      const Regularisers<T>&, AdamArgs<T> adam, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -120,12 +120,12 @@ bool moves_by_packs(const AdamArgs<float>& adam) {
 
 template <>
 void project_bwd_step<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
-                             const float* scale_reg, AdamArgs<float> adam, Workspace& workspace,
-                             CudaStream stream) {
+                             const Regularisers<float>& regularisers, AdamArgs<float> adam,
+                             Workspace& workspace, CudaStream stream) {
   if (splats.n_visible == 0) return;
   bool done = false;
   if (moves_by_packs(adam)) {
-    dispatch_backward(in, splats, v, scale_reg, [&](auto degree, auto quads, const auto& args) {
+    dispatch_backward(in, splats, v, regularisers, [&](auto degree, auto quads, const auto& args) {
       if constexpr (quads.value) {
         launch_backward<degree.value, true>(args, StepRows{adam}, stream);
         done = true;
@@ -135,7 +135,7 @@ void project_bwd_step<float>(const Inputs& in, const SplatIndex& splats, const S
   if (done) return;
   // Rows that are no whole packs.
   const ProjectGradients<float> gradients = scratch_gradients(splats, adam, workspace);
-  project_bwd(in, splats, v, scale_reg, gradients, workspace, stream);
+  project_bwd(in, splats, v, regularisers, gradients, workspace, stream);
   lazy_adam(adam, workspace, stream);
 }
 

@@ -83,7 +83,7 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
 // A scalar of the splats: the weighted sum of everything differentiable.
 struct Weights {
   std::vector<double> means2d, conics, depths, opacities, colors;
-  std::vector<double> scale_reg{0.3, 0.0, -0.2};
+  std::vector<double> scale_reg{0.3, 0.0, -0.2}, opacity_reg{-0.1, 0.4, 0.2};
 
   explicit Weights(std::int64_t splats) {
     std::mt19937 engine(6);
@@ -108,6 +108,7 @@ struct Weights {
     for (std::size_t splat = 0; splat < p.camera_ids.size(); ++splat) {
       const double* s = &world.scales[3 * p.gaussian_ids[splat]];
       sum += scale_reg[p.camera_ids[splat]] * std::exp(std::min({s[0], s[1], s[2]}));
+      sum += opacity_reg[p.camera_ids[splat]] * sigmoid(world.opacities[p.gaussian_ids[splat]]);
     }
     return sum;
   }
@@ -204,7 +205,7 @@ TEST_CASE("the backward pass is the derivative of the splats") {
       world.inputs(), SplatIndex{p.camera_ids.data(), p.visible_ids.data(), p.splat_offsets.data(), U},
       SplatGradientColumns<double>{weights.means2d.data(), weights.conics.data(), weights.depths.data(),
                                    weights.opacities.data(), weights.colors.data()},
-      weights.scale_reg.data(),
+      Regularisers<double>{weights.scale_reg.data(), weights.opacity_reg.data()},
       ProjectGradients<double>{v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(),
                                v_sh.data(), v_viewmats.data()},
       workspace, nullptr);

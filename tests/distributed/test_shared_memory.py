@@ -114,7 +114,7 @@ def _gradients(ranks):
             copy = GaussianTable({name: table[name].clone() for name in table})
             if transport is transports[1]:
                 kept = torch.full_like(frame.projected.means2d, torch.nan)
-            optimiser.step(copy, frame, splats[-1], None, 1, kept)
+            optimiser.step(copy, frame, splats[-1], None, None, 1, kept)
             moments.append(copy.exp_avgs)
             frames.append(frame)
         assert splats[0].places is None and splats[1].means2d is None

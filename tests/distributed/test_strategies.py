@@ -34,7 +34,7 @@ SETTINGS = (
     "log.keep_checkpoints=9",
     "ranks.max_imbalance=1.02",
 )
-RELOCATION = ("population.strategy=relocation", "population.max_gaussians=450")
+RELOCATION = ("population.strategy=relocation", "loss.opacity=0.01", "population.max_gaussians=450")
 OPTIONS = {
     "relocation": RELOCATION,
     "relocate": ("population.relocate=true", "population.max_gaussians=490"),

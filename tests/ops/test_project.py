@@ -208,22 +208,25 @@ def test_dense_gradients_are_the_compact_ones_where_they_belong(backend, degree,
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, arguments, {"dense": True})
 
 
-def test_scale_regulariser_adds_the_slope_of_the_smallest_axis():
+def test_regularisers_add_the_slopes_of_smallest_axis_and_opacity():
     scene = before_activation(random_scene(n=50, cameras=2, dtype=torch.float64))
     splats = project_scene(scene, raw=True)
     P = len(splats.depths)
     zeros = torch.zeros(P, 3, dtype=torch.float64)
-    weights = torch.tensor([0.5, 2.0], dtype=torch.float64)
+    weights, others = torch.tensor([[0.5, 2.0], [-0.3, 0.7]], dtype=torch.float64)
     options = ProjectionOptions(scene.width, scene.height)
-    v_scales = torch.ops.blitzgs.project_bwd(
+    _, _, v_scales, v_opacities, _, _ = torch.ops.blitzgs.project_bwd(
         [scene.means, scene.quats, scene.scales, scene.opacities], [scene.viewmats, scene.Ks],
         [splats.camera_ids, splats.visible_ids, splats.splat_offsets], options.ints, options.floats,
-        [zeros[:, :2], zeros, zeros[:, 0]], None, weights, False,
-    )[2]  # fmt: skip
-    log_scales = scene.scales.requires_grad_()
-    smallest = log_scales.exp().amin(dim=1)[splats.gaussian_ids.long()]
-    (smallest * weights[splats.camera_ids.long()]).sum().backward()
-    assert relative_error(v_scales, log_scales.grad[splats.visible_ids.long()]) < 1e-14
+        [zeros[:, :2], zeros, zeros[:, 0]], None, weights, False, False, others,
+    )  # fmt: skip
+    log_scales, logits = scene.scales.requires_grad_(), scene.opacities.requires_grad_()
+    ids, views = splats.gaussian_ids.long(), splats.camera_ids.long()
+    terms = log_scales.exp().amin(dim=1)[ids] * weights[views] + logits.sigmoid()[ids] * others[views]
+    terms.sum().backward()
+    visible = splats.visible_ids.long()
+    assert relative_error(v_scales, log_scales.grad[visible]) < 1e-14
+    assert relative_error(v_opacities, logits.grad[visible]) < 1e-14
 
 
 def test_nothing_finite_is_lost_and_nothing_else_spreads():

@@ -40,6 +40,7 @@ class Scene:
         lazy_adam_catch_up_(*self.columns(), None, *self.stands(), self.lr_table, STEP - 1, BETA1, BETA2, EPS)
         self.degree = min(3, math.isqrt(k) - 1)
         self.scale_reg = torch.linspace(0.1, 0.2, views).to(device, dtype)
+        self.opacity_reg = torch.linspace(0.3, -0.2, views).to(device, dtype)
         self.seed = generator
 
     def columns(self):
@@ -67,7 +68,7 @@ class Scene:
     def backward_arguments(self, need_viewmats=False):
         return (
             self.params, [self.viewmats, self.Ks], self.splat_ids(), self.options.ints, self.options.floats,
-            list(self.v.parts), None, self.scale_reg, need_viewmats,
+            list(self.v.parts), None, self.scale_reg, need_viewmats, False, self.opacity_reg,
         )  # fmt: skip
 
     def backward(self, need_viewmats=False):
@@ -81,7 +82,7 @@ class Scene:
     def at_once(self, sparse, means2d_sums=None):
         project_bwd_step_(
             *self.columns(), *self.stands(), *self.optimiser, sparse, self.splats, (self.viewmats, self.Ks),
-            self.options, self.v, self.scale_reg, means2d_sums,
+            self.options, self.v, self.scale_reg, means2d_sums, self.opacity_reg,
         )  # fmt: skip
 
     def pack(self, width):
@@ -278,6 +279,6 @@ def test_opcheck():
         torch.ops.blitzgs.project_bwd_step_,
         (*scene.columns(), [*scene.stands()], tables, [STEP, explicit_steps(BETA1, BETA2, torch.float32), 0],
          [BETA1, BETA2, EPS], [scene.viewmats, scene.Ks], scene.splat_ids(), scene.options.ints,
-         scene.options.floats, list(scene.v.parts), None, scene.scale_reg),
+         scene.options.floats, list(scene.v.parts), None, scene.scale_reg, None, scene.opacity_reg),
     )  # fmt: skip
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, scene.backward_arguments(True))
