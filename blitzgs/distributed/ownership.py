@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from itertools import groupby, islice
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +25,13 @@ TILE_COST = 8
 LOSS_HALO = 10
 # Costs that `divide` first adds up together.
 _STRETCH = 128
+# So many numbers tell what the tiles of a view cost, or one a tile where it has fewer: 16 KB at most.
+_MOST_NUMBERS = 8192
+# Borders follow from what was measured this many batches ago and before. The host has read that by then for
+# the sake of the losses, so it waits for nothing, and all ranks know the same.
+_LATE = 2
+# A view not yet seen is expected to cost what this many others do on average.
+_SIMILAR = 16
 
 
 @dataclass(frozen=True)
@@ -127,27 +137,50 @@ class TileAssignment:
         return [self.ranges.composited(rank) for rank in range(self.ranks.world_size)]
 
 
-@dataclass(frozen=True)
-class _KeptSum:
-    """Costs out of a checkpoint, in the place of the sum that they were read from."""
+class _ViewCost(NamedTuple):
+    """What the tiles of a view cost: the mean of each piece of `_grain(tiles)` of them, float16."""
 
-    values: Tensor
+    key: Hashable
+    tiles: int
+    pieces: NDArray[np.float16]
 
-    def read(self) -> Tensor:
-        """Return the costs."""
-        return self.values
+    @classmethod
+    def of(cls, key: Hashable, cost: NDArray[np.float32]) -> _ViewCost:
+        """Keep the costs of a view's tiles."""
+        grain, last = _grain(len(cost)), np.finfo(np.float16).max
+        begins = np.arange(0, len(cost), grain)
+        sums = np.add.reduceat(cost, begins, dtype=np.float32)
+        means = sums / np.minimum(grain, len(cost) - begins)
+        return cls(key, len(cost), np.minimum(means, last).astype(np.float16))
+
+    def of_tiles(self) -> NDArray[np.float32]:
+        """Return the cost of each tile."""
+        return self.pieces.astype(np.float32).repeat(_grain(self.tiles))[: self.tiles]
+
+
+def _grain(tiles: int) -> int:
+    """Return how many tiles of a view one number stands for."""
+    return -(-tiles // _MOST_NUMBERS)
+
+
+def _measured(sums: HostSum, keys: Sequence[Hashable], tiles: int, first: int) -> list[_ViewCost]:
+    """Read what the views of a batch cost; those of the first begin at `first`."""
+    values = sums.read().numpy()[first:]
+    return [_ViewCost.of(key, values[tiles * view :][:tiles]) for view, key in enumerate(keys)]
 
 
 class TileOwners:
     """Divides the tiles of each batch by what they cost at the last visit of each view.
 
-    Every rank holds the same costs and so draws the same borders without asking the others.
+    Every rank holds the same costs and so draws the same borders without asking the others. A view's costs
+    take 16 KB at most, and to divide a batch the host waits for nothing.
     """
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks = ranks
-        # Where a view's tiles are in the sums.
-        self._costs: dict[Hashable, tuple[HostSum | _KeptSum, int, int]] = {}
+        self._costs: dict[Hashable, _ViewCost] = {}  # of the last visits, the latest last
+        self._late: deque[Callable[[], Sequence[_ViewCost]]] = deque()  # the newest batches
+        self._typical: dict[int, NDArray[np.float32]] = {}  # by number of tiles, of views not yet seen
         self._planned: dict[int, tuple[int, ...]] = {}
 
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
@@ -174,28 +207,43 @@ class TileOwners:
         """What a resumed run needs to draw the same borders; the same on every rank.
 
         Returns:
-            views int64 [V], tiles int64 [V] and costs float32 [sum of tiles]: what was measured;
-            steps int64 [S] and bounds int64 [S, M + 1]: what was planned. Keys must be integers.
+            views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: what was measured; ages int64
+            [V]: 0 for what borders follow from, the others by batch; steps int64 [S] and bounds int64
+            [S, M + 1]: what was planned. Keys must be integers.
         """
-        costs = [torch.from_numpy(self._read(key)) for key in self._costs]
+        batches = [list(self._costs.values()), *(measured() for measured in self._late)]
+        ages = [age for age, batch in enumerate(batches) for _ in batch]
+        costs = [cost for batch in batches for cost in batch]
+        pieces = [torch.from_numpy(cost.pieces) for cost in costs]
         return {
-            "views": torch.tensor([int(str(key)) for key in self._costs], dtype=torch.int64),
-            "tiles": torch.tensor([len(cost) for cost in costs], dtype=torch.int64),
-            "costs": torch.cat([torch.empty(0), *costs]),
+            "views": torch.tensor([int(str(cost.key)) for cost in costs], dtype=torch.int64),
+            "tiles": torch.tensor([cost.tiles for cost in costs], dtype=torch.int64),
+            "costs": torch.cat([torch.empty(0, dtype=torch.float16), *pieces]),
+            "ages": torch.tensor(ages, dtype=torch.int64),
             "steps": torch.tensor(list(self._planned), dtype=torch.int64),
             "bounds": torch.tensor(list(self._planned.values()), dtype=torch.int64),
         }
 
     def restore(self, columns: Mapping[str, Tensor]) -> None:
         """Go on from `columns`; plans for another number of ranks are left out."""
-        kept, begin = _KeptSum(columns["costs"]), 0
-        for key, tiles in zip(columns["views"].tolist(), columns["tiles"].tolist(), strict=True):
-            self._costs[key] = (kept, begin, begin + tiles)
-            begin += tiles
+        if "ages" in columns:  # checkpoints of earlier versions have costs in another form
+            self._restore_costs(columns)
         bounds = columns["bounds"]
         if bounds.dim() == 2 and bounds.shape[1] == self.ranks.world_size + 1:
             rows = [tuple(row) for row in bounds.tolist()]
             self._planned = dict(zip(columns["steps"].tolist(), rows, strict=True))
+
+    def _restore_costs(self, columns: Mapping[str, Tensor]) -> None:
+        tiles = columns["tiles"].tolist()
+        pieces = columns["costs"].split([-(-count // _grain(count)) for count in tiles])
+        costs = map(_ViewCost, columns["views"].tolist(), tiles, (piece.numpy() for piece in pieces))
+        dated = zip(columns["ages"].tolist(), costs, strict=True)
+        for age, batch in groupby(dated, key=lambda pair: pair[0]):
+            views = [cost for _, cost in batch]
+            if age == 0:
+                self._learn(views)
+            else:
+                self._late.append(partial(list, views))
 
     def divide(
         self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, halo: int = 0
@@ -225,7 +273,9 @@ class TileOwners:
         ranges: TileRanges,
         parts: Tensor | None = None,
     ) -> HostSum:
-        """Remember what the tiles of a batch cost. Collective; waits for nothing.
+        """Remember what the tiles of a batch cost, for borders from the batch after the next on. Collective.
+
+        On CUDA the host waits for no batch of which the losses were read.
 
         Args:
             keys: the B views.
@@ -237,30 +287,30 @@ class TileOwners:
             The sums; see `HostSum.read`.
         """
         sums = HostSum(self.ranks, parts, tile_work, ranges.of(self.ranks.rank))
-        tiles, first = ranges.tiles_per_view, 0 if parts is None else 2 * len(parts)
-        for view, key in enumerate(keys):
-            self._costs[key] = (sums, first + view * tiles, first + (view + 1) * tiles)
+        first = 0 if parts is None else 2 * len(parts)
+        self._late.append(partial(_measured, sums, list(keys), ranges.tiles_per_view, first))
+        if len(self._late) > _LATE:
+            self._learn(self._late.popleft()())
         return sums
+
+    def _learn(self, costs: Sequence[_ViewCost]) -> None:
+        """Let borders follow from the costs of some views."""
+        for cost in costs:
+            self._costs.pop(cost.key, None)
+            self._costs[cost.key] = cost
+        self._typical.clear()
 
     def _cost(self, key: Hashable, tiles: int) -> NDArray[np.float32]:
         """Work of each tile of a view: measured at its last visit, else the mean of the views visited."""
-        if key in self._costs and self._tiles(key) == tiles:
-            return self._read(key)
-        # What views share: the far (upper) tiles of oblique ones cost more than the near ones.
-        similar = [other for other in self._costs if self._tiles(other) == tiles][-16:]
-        if not similar:
-            return np.zeros(tiles, np.float32)
-        mean: NDArray[np.float32] = np.mean([self._read(other) for other in similar], 0)
-        return mean
-
-    def _tiles(self, key: Hashable) -> int:
-        _, begin, end = self._costs[key]
-        return end - begin
-
-    def _read(self, key: Hashable) -> NDArray[np.float32]:
-        sums, begin, end = self._costs[key]
-        values: NDArray[np.float32] = sums.read().numpy()
-        return values[begin:end]
+        known = self._costs.get(key)
+        if known is not None and known.tiles == tiles:
+            return known.of_tiles()
+        if tiles not in self._typical:
+            # What views share: the far (upper) tiles of oblique ones cost more than the near ones.
+            alike = (cost for cost in reversed(self._costs.values()) if cost.tiles == tiles)
+            latest = [cost.of_tiles() for cost in islice(alike, _SIMILAR)] or [np.zeros(tiles, np.float32)]
+            self._typical[tiles] = np.mean(latest, 0)
+        return self._typical[tiles]
 
 
 def divide(cost: NDArray[Any], parts: int) -> tuple[int, ...]:

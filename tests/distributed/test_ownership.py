@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+import pickle
+import weakref
+
 import numpy as np
 import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import (
     LOSS_HALO,
     TILE_COST,
@@ -47,32 +51,86 @@ def test_each_bound_is_the_nearest_to_its_share(n, share_of_zeros):
             assert distances[bounds[part]] == distances.min()
 
 
-def test_costs_are_those_of_the_last_visit():
-    owners = TileOwners(Ranks(world_size=1))
-    owners.ranks = type(
-        "TwoRanks",
-        (),
-        {
-            "world_size": 2,
-            "rank": 0,
-            "all_reduce": staticmethod(lambda t: t),
-            "side_stream": lambda _: None,
-            "peers": None,
-        },
-    )()
-    # 64 x 48: 4 x 3 tiles a view.
-    assert owners.divide(["a", "b"], 64, 48).bounds == (0, 12, 24)
+class TwoRanks(Ranks):
+    """Rank 0 of two, of which the other has nothing to add."""
+
+    def __init__(self):
+        super().__init__(world_size=2)
+
+    def all_reduce(self, tensor, op="sum"):
+        return tensor
+
+    def side_stream(self):
+        return None
+
+
+# 64 x 48: 4 x 3 tiles a view.
+SIZE, TILES = (64, 48), 12
+
+
+def visit(owners, costs):
+    """Record a batch: views and what each of their tiles costs."""
+    work = torch.tensor(list(costs.values()), dtype=torch.int32).repeat_interleave(TILES)
+    ranges = TileRanges((0, len(work), len(work)), len(costs), *SIZE)
+    return owners.record(list(costs), work, ranges, torch.ones(len(costs), 1, 2, dtype=torch.float64))
+
+
+def test_costs_are_those_of_the_last_visit_but_two():
+    owners = TileOwners(TwoRanks())
+    assert owners.divide(["a", "b"], *SIZE).bounds == (0, 12, 24)
     work = torch.zeros(24, dtype=torch.int32)
     work[:12] = 1000  # all in view a
     parts = torch.tensor([[[1.0, 4.0], [1.0, 1.0]]], dtype=torch.float64)
-    sums = owners.record(["a", "b"], work, TileRanges((0, 24, 24), 2, 64, 48), parts)
+    sums = owners.record(["a", "b"], work, TileRanges((0, 24, 24), 2, *SIZE), parts)
     assert sums.read()[:3].tolist() == [2, 5, 1000]
-    assert owners.divide(["a", "b"], 64, 48).bounds == (0, 6, 24)
-    assert owners.divide(["b", "a"], 64, 48).bounds == (0, 18, 24)
+    for _ in range(2):
+        assert owners.divide(["a", "b"], *SIZE).bounds == (0, 12, 24)
+        visit(owners, {"b": 0})
+    assert owners.divide(["a", "b"], *SIZE).bounds == (0, 6, 24)
+    assert owners.divide(["b", "a"], *SIZE).bounds == (0, 18, 24)
     # A view never seen is expected to cost what the others do on average.
-    assert owners.divide(["c", "a"], 64, 48).bounds[1] in (13, 14, 15, 16)
+    assert owners.divide(["c", "a"], *SIZE).bounds[1] in (13, 14, 15, 16)
     # Another resolution: nothing is known.
     assert owners.divide(["a"], 32, 32).bounds == (0, 2, 4)
+
+
+def test_no_batch_is_divided_by_what_the_host_would_wait_for(monkeypatch):
+    """Seen or not, a view's borders follow from sums that the guard of the losses has read."""
+    owners, queued, reads = TileOwners(TwoRanks()), [], []
+    read = HostSum.read
+
+    def read_if_there(sums):
+        assert sums in queued[:-1], "neither this batch nor the one before it is there yet"
+        reads.append(sums)
+        return read(sums)
+
+    monkeypatch.setattr(HostSum, "read", read_if_there)
+    for step in range(12):
+        assert owners.divide([step, "unseen", 0], *SIZE).bounds[-1] == 3 * TILES
+        queued.append(visit(owners, {step: 5}))
+    assert len(reads) == 10
+
+
+def test_what_is_kept_of_many_large_views_is_small():
+    """Sums of whole batches are let go, and 4K views keep 16 KB each; borders stay as good."""
+    owners, alive, generator = TileOwners(TwoRanks()), [], torch.Generator().manual_seed(0)
+    size, tiles = (3840, 2160), 240 * 135
+    work = torch.randint(0, 3000, (40, tiles), generator=generator, dtype=torch.int32)
+    work[:, : tiles // 2] //= 10
+    for view in range(0, 40, 2):
+        batch = work[view : view + 2].flatten()
+        sums = owners.record([view, view + 1], batch, TileRanges((0, 2 * tiles, 2 * tiles), 2, *size))
+        alive.append(weakref.ref(sums))
+        del sums
+    assert [ref() is not None for ref in alive] == [False] * 18 + [True] * 2
+    columns = owners.columns()
+    assert len(columns["views"]) == 40
+    assert columns["costs"].element_size() * len(columns["costs"]) <= 40 * 16_384
+    assert len(pickle.dumps(owners._costs)) < 36 * 17_000
+    for view in range(0, 36, 2):
+        bounds = owners.divide([view, view + 1], *size).bounds
+        cost = work[view : view + 2].flatten().double().numpy() + TILE_COST
+        assert cost_balance(cost, bounds) < 1.001
 
 
 def test_pixel_rows_and_composited_tiles():
@@ -121,28 +179,39 @@ def test_all_that_the_loss_reads_is_composited(tile_size, bounds):
 
 
 def test_what_is_saved_draws_the_same_borders():
-    ranks = Ranks(world_size=3)
-    owners, again = TileOwners(ranks), TileOwners(ranks)
-    costs = torch.rand(2, 24) * 100
-    owners.restore(
-        {
-            "views": torch.tensor([5, 2]),
-            "tiles": torch.tensor([24, 24]),
-            "costs": costs.flatten(),
-            "steps": torch.tensor([7]),
-            "bounds": torch.tensor([[0, 1, 2, 48]]),
-        }
-    )
-    assert owners.plan(7, [2, 5], 96, 64, 0).bounds == (0, 1, 2, 48)  # as planned before the save
-    ahead = owners.plan(8, [2, 5], 96, 64, 0)
-    again.restore(owners.columns())
-    for step, keys in ((7, [2, 5]), (8, [2, 5]), (9, [5, 1])):
-        assert again.plan(step, keys, 96, 64, 0) == owners.plan(step, keys, 96, 64, 0)
-    assert ahead.bounds != TileOwners(ranks).plan(8, [2, 5], 96, 64, 0).bounds
-    owners.forget_before(8)
-    assert owners.plan(7, [2, 5], 96, 64, 0).bounds != (0, 1, 2, 48)
+    """From any moment on: what was measured of late counts from the same batch on."""
+    batches = [[5, 2], [2, 1], [5, 1], [7, 2], [1, 7], [2, 5]]
+    for saved_at in range(len(batches)):
+        owners, again = TileOwners(TwoRanks()), TileOwners(TwoRanks())
+        for step, keys in enumerate(batches):
+            planned = owners.plan(step + 1, keys, *SIZE, 0)  # a batch ahead, as training does
+            if step == saved_at:
+                again.restore(owners.columns())
+            if step >= saved_at:
+                assert again.plan(step + 1, keys, *SIZE, 0) == planned
+                visit(again, {key: 10 ** (key % 5) + step for key in keys})
+            visit(owners, {key: 10 ** (key % 5) + step for key in keys})
+        saved, whole = again.columns(), owners.columns()
+        assert all(torch.equal(saved[name], whole[name]) for name in ("views", "tiles", "costs", "ages"))
+        again.forget_before(99)
+        assert again.plan(1, [5, 2], *SIZE, 0).bounds != owners.plan(1, [5, 2], *SIZE, 0).bounds
     # Plans for another number of ranks mean nothing; costs do.
     four = TileOwners(Ranks(world_size=4))
-    four.restore(again.columns())
-    assert len(four.plan(7, [2, 5], 96, 64, 0).bounds) == 5
-    assert torch.equal(four.columns()["costs"], costs.flatten())
+    four.restore(whole)
+    assert len(four.plan(1, [5, 2], *SIZE, 0).bounds) == 5
+    assert torch.equal(four.columns()["costs"], whole["costs"])
+
+
+def test_costs_of_an_earlier_version_are_left_out():
+    owners = TileOwners(TwoRanks())
+    owners.restore(
+        {
+            "views": torch.tensor([5]),
+            "tiles": torch.tensor([TILES]),
+            "costs": torch.rand(TILES),
+            "steps": torch.tensor([7]),
+            "bounds": torch.tensor([[0, 3, 24]]),
+        }
+    )
+    assert owners.plan(7, [5, 2], *SIZE, 0).bounds == (0, 3, 24)
+    assert owners.plan(8, [5, 2], *SIZE, 0).bounds == (0, 12, 24)
