@@ -74,7 +74,7 @@ def survey(
         weights, pixels = (column[: len(counts.splats.depths)] for column in (weights, pixels))
         if assignment is not None:
             returned = exchange.return_sums(torch.stack((weights, pixels.long()), 1))
-            weights, pixels = returned[:, 0], returned[:, 1].int()
+            weights, pixels = returned[:, 0].contiguous(), returned[:, 1].int()
         return Survey(counts.projected, weights, pixels), exchange.needed
 
     with torch._C._AutoDispatchBelowAutograd():

@@ -123,6 +123,17 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "contributions(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, "
       "Tensor tile_offsets, int[] grid, Tensor? n_splats=None) -> (Tensor weights, Tensor pixels)");
 
+  // Of each segment's items, the fewest that hold a share of its weight; `first_step` to `last_step` of the
+  // search, between which sums may be added up over ranks.
+  m.def(
+      "mass_cut_(Tensor weights, Tensor segments, Tensor owners, Tensor ids, Tensor(a!) searches, "
+      "Tensor(b!) sums, Tensor(c!) listed, Tensor(d!) chosen, int numerator, int denominator, "
+      "int first_step, int last_step) -> ()");
+  // What an importance sweep keeps of a batch of views.
+  m.def(
+      "view_sums_(Tensor(a!)[] sums, Tensor[] splats, Tensor weights, Tensor pixels, Tensor counts, "
+      "int[] columns, int rule, float eps, float unit) -> ()");
+
   // L1 and SSIM of the owned tiles; fwd_bwd does both at once when the weights of the sums are known.
   m.def(
       "photometric_fwd(Tensor renders, Tensor targets, Tensor? masks, int tile_size, int tile_begin, "

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.counter_random import uniform
+from blitzgs.ops.mass_cut import CHOICE_STEP, STEPS, TIES_STEP, MassCut
 
 # Digits of a threshold search, most significant first. The first digit of a score is its exponent and three
 # bits of its mantissa, so all scores of a bin share one exponent and their mantissas can be summed exactly.
@@ -22,10 +23,6 @@ _KEY_DIGITS = (11, 11, 10)
 _SCORE_DIGITS = (11, 10, 10)
 _ID_DIGITS = (13, 13, 13, 12, 12)
 _MANTISSA_BITS = 23
-# An integer weight as a key: its exponent, then all the bits behind the leading one.
-_WEIGHT_BITS = 56
-_WEIGHT_DIGITS = (12, 13, 13, 12, 12)
-_SPREAD = 256
 
 
 def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor:
@@ -126,67 +123,53 @@ def mass_prefix(
 
 
 def integer_mass_prefix(
-    weights: Tensor, ids: Tensor, fraction: float, ranks: Ranks, segments: Tensor, n_segments: int
+    weights: Tensor,
+    segments: Tensor,
+    owners: Tensor,
+    ids: Tensor,
+    fraction: float,
+    ranks: Ranks,
+    n_segments: int,
 ) -> Tensor:
-    """`mass_prefix` of integers, by descending weight, without the host: for the views of a sweep.
+    """`mass_prefix` of integers: the items of each segment by descending weight, ties by id.
+
+    One rank does not wait for its device; several wait once, and exchange one histogram of all segments a
+    round.
 
     Args:
-        weights: int64 [N_rank], in [0, 2^57); a segment's sum must be below 2^62.
-        ids: int64 [N_rank], >= 0, unique over all ranks within a segment.
+        weights: int64 [P], not negative; a segment's sum over all ranks must be below 2^62.
+        segments: int32 [P] in [0, n_segments).
+        owners: int32 [P], whose weights they are.
+        ids: int64 [N], >= 0, of the owners; unique over all ranks within a segment.
         fraction: share of the total of all ranks, in [0, 1]; its decimal value counts, of at most 9 places.
         ranks: the job.
-        segments: int64 [N_rank] in [0, n_segments).
-        n_segments: number of sets.
+        n_segments: number of segments.
 
     Returns:
-        bool [N_rank]; the same ids at every world size. The sums are exact. A set whose total is zero selects
+        bool [P]; the same ids at every world size. The sums are exact. A segment whose total is zero selects
         nothing.
 
     Raises:
-        ValueError: on every rank, when a weight of any rank is out of range, or for a fraction outside [0, 1]
-            or with more places.
+        ValueError: for a fraction outside [0, 1] or with more places.
     """
     share = Fraction(repr(float(fraction)))
     if not 0 <= share <= 1 or share.denominator > 10**9:
         raise ValueError(
             f"integer_mass_prefix: fraction must be in [0, 1] with at most 9 decimals, got {fraction}"
         )
-    # Spread over many sums for each segment, because additions to one address wait for each other.
-    lanes = segments * _SPREAD + torch.arange(len(weights), device=weights.device) % _SPREAD
-    spread = weights.new_zeros(n_segments * _SPREAD).index_add_(0, lanes, weights)
-    invalid = ((weights < 0) | (weights >> (_WEIGHT_BITS + 1) > 0)).sum()
-    totals = ranks.all_reduce(torch.cat((spread.view(n_segments, _SPREAD).sum(1), invalid[None])))
-    if n_invalid := int(totals[-1]):
-        raise ValueError(f"integer_mass_prefix: {n_invalid} weights are negative or not below 2^57")
-    totals = totals[:-1]
-    # ceil(share total), without the product, which might overflow.
-    rest, of = share.denominator - share.numerator, share.denominator
-    missing = totals - totals // of * rest - totals % of * rest // of
-    keys = _descending_keys(weights)
-    threshold, left = _kth(keys, _WEIGHT_DIGITS, missing, segments, ranks, weights)
-    # Of the rows equal to the threshold, as many as make up for what is missing.
-    each = _weight_of_key(threshold)
-    return _with_ties(keys, ids, threshold, (left + each - 1) // each.clamp(min=1), segments, ranks)
-
-
-def _descending_keys(weights: Tensor) -> Tensor:
-    """Map int64 in [0, 2^57) to int64 in [0, 2^62) in reverse order; a key's first digits have few values."""
-    exponent = weights.double().log2().clamp(min=-1).floor().long()
-    # The rounded logarithm may be one too large, or one too small.
-    exponent -= (weights < (1 << exponent.clamp(min=0))).long()
-    exponent += (weights >> (exponent + 1).clamp(min=0) > 0).long() * (weights > 0)
-    mantissa = (weights << (_WEIGHT_BITS - exponent.clamp(min=0))) & ((1 << _WEIGHT_BITS) - 1)
-    ascending = torch.where(weights > 0, (exponent + 1 << _WEIGHT_BITS) | mantissa, 0)
-    return (1 << (_WEIGHT_BITS + 6)) - 1 - ascending
-
-
-def _weight_of_key(keys: Tensor) -> Tensor:
-    """Invert `_descending_keys`; -1, no key, gives 0."""
-    ascending = (1 << (_WEIGHT_BITS + 6)) - 1 - keys.clamp(min=0)
-    exponent = (ascending >> _WEIGHT_BITS) - 1
-    mantissa = (ascending & ((1 << _WEIGHT_BITS) - 1)) | (1 << _WEIGHT_BITS)
-    weight = mantissa >> (_WEIGHT_BITS - exponent.clamp(min=0))
-    return torch.where((keys >= 0) & (exponent >= 0), weight, 0)
+    cut = MassCut.begin(weights, segments, owners, ids, n_segments)
+    ratio = share.numerator, share.denominator
+    if ranks.world_size == 1:
+        cut.take_steps(ratio, 0, STEPS)
+        return cut.chosen
+    for step in range(0, CHOICE_STEP, 2):
+        if step == TIES_STEP and not cut.has_ties():
+            break
+        cut.take_steps(ratio, step, step + 1)
+        ranks.all_reduce(cut.sums)
+        cut.take_steps(ratio, step + 1, step + 2)
+    cut.take_steps(ratio, CHOICE_STEP, STEPS)
+    return cut.chosen
 
 
 def _ordered_bits(keys: Tensor) -> Tensor:
@@ -201,9 +184,8 @@ def _kth(
     k: Tensor,
     segments: Tensor,
     ranks: Ranks,
-    weights: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Find the k-th smallest key of each segment, where a row counts as often as its weight says.
+    """Find the k-th smallest key of each segment.
 
     Args:
         keys: int64 [N_rank] >= 0, below 2^sum(digits).
@@ -211,15 +193,14 @@ def _kth(
         k: int64 [S], 1-based and at most the segment's size; 0 gives the threshold -1.
         segments: int64 [N_rank].
         ranks: the job.
-        weights: int64 [N_rank]; None: each row counts once.
 
     Returns:
-        threshold [S], and left [S]: what the rows equal to it have to contribute to the k.
+        threshold [S], and left [S]: how many of the rows equal to it are among the k.
     """
     left, prefix, shift = k.clone(), torch.zeros_like(k), sum(digits)
     for width in digits:
         shift -= width
-        counts = _histogram(keys, prefix, shift, width, segments, weights, ranks)
+        counts = _histogram(keys, prefix, shift, width, segments, None, ranks)
         ends = counts.cumsum(1)
         chosen = (ends < left[:, None]).sum(1).clamp(max=counts.shape[1] - 1)
         left = left - (ends - counts).gather(1, chosen[:, None]).squeeze(1)

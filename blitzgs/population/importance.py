@@ -30,7 +30,7 @@ from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
 from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
-from blitzgs.ops.importance import UNITS
+from blitzgs.ops.view_sums import ViewSums, view_sums_
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.survey import Survey, survey
 from blitzgs.view.gate import SceneGate
@@ -137,32 +137,29 @@ class _Sums:
         self._rule = rule
         # Terms are integers in units that let those of all views be added up in 62 bits.
         self._unit = 2.0 ** -min(48, 62 - n_views.bit_length() - _TERM_BITS[rule])
-        self._score = torch.zeros(count, dtype=torch.int64, device=device)
-        self._seen = torch.zeros(count, dtype=torch.int32, device=device)
-        self._counted = torch.zeros(count, dtype=torch.int32, device=device)
-        self._cull = _all_culled(n_views, device).repeat(count, 1)
+        self._sums = ViewSums(
+            torch.zeros(count, dtype=torch.int64, device=device),
+            torch.zeros(count, dtype=torch.int32, device=device),
+            torch.zeros(count, dtype=torch.int32, device=device),
+            _all_culled(n_views, device).repeat(count, 1),
+        )
 
     def add(self, found: Survey, columns: Sequence[int], ids: Tensor, ranks: Ranks) -> None:
         """Add the splats of a batch of views."""
-        splats, weights = found.splats, found.weights
-        gaussians, views = splats.gaussian_ids.long(), splats.camera_ids.long()
-        terms, pixels = weights.double() / UNITS, found.pixels.double() + SCORE_EPS
-        if self._rule != "weight":
-            terms = terms / (pixels if self._rule == "density" else pixels.sqrt())
-        self._score.index_add_(0, gaussians, (terms / self._unit).round().long())
-        self._seen.index_add_(0, gaussians, (splats.radii > 0).any(1).int())
-        counts = integer_mass_prefix(weights, ids[gaussians], VIEW_MASS, ranks, views, len(columns))
-        self._counted.index_add_(0, gaussians, counts.int())
-        column = torch.tensor(columns, device=views.device)[views]
-        # The bits are set, each is cleared once: a difference. Words wrap as bits do.
-        bit = (torch.ones_like(column) << column % _WORD).int()
-        words = self._cull.shape[1]
-        self._cull.view(-1).index_add_(0, gaussians * words + column // _WORD, -bit * counts)
+        splats = found.splats
+        counts = integer_mass_prefix(
+            found.weights, splats.camera_ids, splats.gaussian_ids, ids, VIEW_MASS, ranks, len(columns)
+        )
+        lists = splats.visible_ids, splats.splat_offsets, splats.camera_ids, splats.radii
+        view_sums_(
+            self._sums, lists, found.weights, found.pixels, counts, columns,
+            rule=self._rule, eps=SCORE_EPS, unit=self._unit,
+        )  # fmt: skip
 
     def result(self) -> Importance:
-        phi = self._counted.double() / (self._seen.double() + PHI_EPS)
-        score = self._score.double() * self._unit
-        return Importance(score.float(), phi.float(), self._cull)
+        phi = self._sums.counted.double() / (self._sums.seen.double() + PHI_EPS)
+        score = self._sums.score.double() * self._unit
+        return Importance(score.float(), phi.float(), self._sums.cull)
 
 
 def _all_culled(n_views: int, device: torch.device) -> Tensor:

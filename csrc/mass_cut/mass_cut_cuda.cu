@@ -1,0 +1,185 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
+#include "common/launch.cuh"
+#include "common/multiprocessors.h"
+#include "common/warp.cuh"
+#include "mass_cut/mass_cut.h"
+
+namespace blitzgs::cuda {
+namespace {
+
+constexpr int kThreads = 512;
+constexpr int kWarps = kThreads / 32;
+// Segments whose first digits a block counts in shared memory, 8 KiB each.
+constexpr int kSegmentsAtOnce = 8;
+
+// Numbers of 64 bits in two words, because shared memory adds words at once and wider numbers in a loop.
+struct WideSum {
+  std::uint32_t low, high;
+
+  __device__ void add(std::int64_t amount) {
+    const auto part = static_cast<std::uint32_t>(amount);
+    const std::uint32_t before = atomicAdd(&low, part);
+    const std::uint32_t carry = before + part < before;
+    const auto rest = static_cast<std::uint32_t>(amount >> 32) + carry;
+    if (rest > 0) atomicAdd(&high, rest);
+  }
+  __device__ std::int64_t value() const { return static_cast<std::int64_t>(high) << 32 | low; }
+};
+
+__device__ void add_to(std::int64_t* sum, std::int64_t amount) {
+  atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(amount));
+}
+
+// Round 0: every item adds. Block row y counts the segments from y * kSegmentsAtOnce on.
+__global__ void __launch_bounds__(kThreads) first_scan_kernel(const MassCutArgs args) {
+  extern __shared__ __align__(16) unsigned char shared_bytes[];
+  auto* const digits = reinterpret_cast<WideSum*>(shared_bytes);
+  const int first_segment = blockIdx.y * kSegmentsAtOnce;
+  const int n_segments = min(static_cast<int>(args.n_segments) - first_segment, kSegmentsAtOnce);
+  for (int i = threadIdx.x; i < n_segments * kFirstDigits; i += kThreads) digits[i] = {0, 0};
+  wait_for_earlier_kernels();
+  __syncthreads();
+  if (blockIdx.x == 0 && blockIdx.y == 0 && threadIdx.x == 0) args.listed[0] = 0;
+  const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
+  for (std::int64_t item = blockIdx.x * kThreads + threadIdx.x; item < args.n_items; item += stride) {
+    const int segment = args.segments[item] - first_segment;
+    const std::int64_t weight = args.weights[item];
+    if (segment < 0 || segment >= n_segments || weight == 0) continue;
+    digits[segment * kFirstDigits + first_digit(weight)].add(weight);
+  }
+  __syncthreads();
+  for (int i = threadIdx.x; i < n_segments * kFirstDigits; i += kThreads) {
+    const std::int64_t sum = digits[i].value();
+    const int segment = first_segment + i / kFirstDigits;
+    if (sum != 0) add_to(args.sums + std::int64_t{segment} * kDigits + i % kFirstDigits, sum);
+  }
+}
+
+__device__ void add_term(const MassCutArgs& args, int round, std::int64_t item) {
+  const ScanTerm term = scan_term(args, round, item);
+  if (term.adds) add_to(args.sums + std::int64_t{args.segments[item]} * kDigits + term.digit, term.amount);
+}
+
+// Round 1: lists the items under the first digit of their segment, and adds up their next one.
+__global__ void __launch_bounds__(kThreads) second_scan_kernel(const MassCutArgs args) {
+  wait_for_earlier_kernels();
+  const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
+  const int lane = threadIdx.x % 32;
+  for (std::int64_t begin = blockIdx.x * kThreads + threadIdx.x - lane; begin < args.n_items;
+       begin += stride) {
+    const std::int64_t item = begin + lane;
+    const bool lists = item < args.n_items && is_listed(args, item);
+    const unsigned lanes = __ballot_sync(kFullWarp, lists);
+    if (lanes == 0) continue;
+    int place = lane == 0 ? atomicAdd(args.listed, __popc(lanes)) : 0;
+    place = __shfl_sync(kFullWarp, place, 0) + __popc(lanes & ((1u << lane) - 1));
+    if (!lists) continue;
+    args.listed[1 + place] = static_cast<std::int32_t>(item);
+    add_term(args, 1, item);
+  }
+}
+
+// Later rounds: the listed items.
+__global__ void __launch_bounds__(kThreads) scan_kernel(const MassCutArgs args, int round) {
+  wait_for_earlier_kernels();
+  const int count = args.listed[0];
+  for (int i = blockIdx.x * kThreads + threadIdx.x; i < count; i += gridDim.x * kThreads) {
+    add_term(args, round, args.listed[1 + i]);
+  }
+}
+
+// The sum of a block's values up to and including each thread's own, and that of all.
+struct BlockScan {
+  std::int64_t until, total;
+};
+
+__device__ BlockScan scan_block(std::int64_t value) {
+  __shared__ std::int64_t warps[kWarps];
+  const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+  std::int64_t until = sum_of_lanes_until(value, lane), total = 0;
+  if (lane == 31) warps[warp] = until;
+  __syncthreads();
+  for (int i = 0; i < kWarps; ++i) {
+    if (i < warp) until += warps[i];
+    total += warps[i];
+  }
+  return {until, total};
+}
+
+// A block for each segment; a thread adds up neighbouring digits, thread 0 the largest.
+__global__ void __launch_bounds__(kThreads) descent_kernel(const MassCutArgs args, int round) {
+  constexpr int kEach = kDigits / kThreads;
+  wait_for_earlier_kernels();
+  SegmentSearch& both = args.searches[blockIdx.x];
+  const bool first = round % kRounds == 0;
+  MassSearch search = round >= kRounds ? both.id : both.weight;
+  if (round > 0 && round != kRounds - 1 && !descends(search, first)) return;  // and no scan has added
+  std::int64_t* const sums = args.sums + std::int64_t{blockIdx.x} * kDigits;
+  const int top = kDigits - 1 - static_cast<int>(threadIdx.x) * kEach;
+  std::int64_t mine[kEach], sum = 0;
+#pragma unroll
+  for (int i = 0; i < kEach; ++i) {
+    mine[i] = sums[top - i];
+    sums[top - i] = 0;
+    sum += mine[i];
+  }
+  const BlockScan scan = scan_block(sum);
+  if (round == 0) search = {kNobody, 0, share_of(scan.total, args.numerator, args.denominator), 0};
+  std::int64_t above = scan.until - sum;
+  const bool is_below = above < search.missing && search.missing <= scan.until;
+  const bool writes = descends(search, first) ? is_below : threadIdx.x == 0;
+  __syncthreads();  // everyone has read the search
+  if (!writes) return;
+  if (descends(search, first)) {
+    int i = 0;
+    while (above + mine[i] < search.missing) above += mine[i++];
+    take_digit(search, first, top - i, above, mine[i]);
+  }
+  (round >= kRounds ? both.id : both.weight) = search;
+  if (round == kRounds - 1) both.id = search_of_ids(search);
+}
+
+__global__ void __launch_bounds__(kThreads) choice_kernel(const MassCutArgs args) {
+  wait_for_earlier_kernels();
+  const std::int64_t item = static_cast<std::int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (item < args.n_items) args.chosen[item] = is_chosen(args, item);
+}
+
+void scan(const MassCutArgs& args, int round, CudaStream stream) {
+  const unsigned all = std::max(1u, blocks_for(args.n_items, kThreads));
+  const unsigned resident = static_cast<unsigned>(4 * multiprocessors());
+  if (round > 1) {
+    launch_early("mass_cut", scan_kernel, {std::min(all, resident / 4), kThreads, stream}, args, round);
+  } else if (round == 1) {
+    launch_early("mass_cut", second_scan_kernel, {std::min(all, resident), kThreads, stream}, args);
+  } else {
+    const auto groups = static_cast<unsigned>((args.n_segments + kSegmentsAtOnce - 1) / kSegmentsAtOnce);
+    const std::size_t bytes = std::min<std::int64_t>(args.n_segments, kSegmentsAtOnce) * kFirstDigits *
+                              static_cast<std::int64_t>(sizeof(WideSum));
+    check(cudaFuncSetAttribute(first_scan_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize,
+                               static_cast<int>(bytes)),
+          "mass_cut");
+    launch_early("mass_cut", first_scan_kernel,
+                 {dim3(std::min(all, resident / 2), groups), kThreads, stream, bytes}, args);
+  }
+}
+
+}  // namespace
+
+void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream stream) {
+  const auto segments = static_cast<unsigned>(args.n_segments);
+  for (int step = first_step; step < std::min(last_step, kChoiceStep); ++step) {
+    if (step % 2 == 0) {
+      scan(args, step / 2, stream);
+    } else {
+      launch_early("mass_cut", descent_kernel, {segments, kThreads, stream}, args, step / 2);
+    }
+  }
+  if (last_step == kSteps && args.n_items > 0) {
+    launch_early("mass_cut", choice_kernel, {blocks_for(args.n_items, kThreads), kThreads, stream}, args);
+  }
+}
+
+}  // namespace blitzgs::cuda

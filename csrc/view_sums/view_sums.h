@@ -1,0 +1,82 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the importance sweep keeps of a batch of at most kMostViews views: per visible Gaussian g, added up
+// over its splats i (g in the view v_i), which lie one behind the other,
+//
+//   score[g]   += round(w / (a + eps)^p / unit)   w = weights[i] / 2^32, a = pixels[i]; p is 1, 1/2 or 0; in
+//                                                 float64, to the nearest integer, ties to even
+//   seen[g]    += whether the splat has a radius
+//   counted[g] += counts[i]
+//   cull[g]     : the bit columns[v_i] is cleared where counts[i]; bit c is bit c % 32 of word c / 32
+//
+//   weights int64 [P], pixels int32 [P], radii int32 [P, 2], camera_ids int32 [P], counts bool [P],
+//   visible_ids int32 [U], splat_offsets int32 [U + 1]; score int64 [N], seen and counted int32 [N],
+//   cull int32 [N, words]
+//
+// Sums of integers, each by one thread: exact, without atomics. O(P).
+#pragma once
+#include <cmath>
+#include <cstdint>
+
+#include "common/host_device.h"
+#include "common/stream.h"
+
+namespace blitzgs {
+
+inline constexpr int kMostViews = 32;
+
+enum class ScoreRule : int { kWeight = 0, kRoot = 1, kDensity = 2 };
+
+struct ViewSumsArgs {
+  const std::int64_t* weights;
+  const std::int32_t* pixels;
+  const std::int32_t* radii;
+  const std::int32_t* camera_ids;
+  const bool* counts;
+  const std::int32_t* visible_ids;
+  const std::int32_t* splat_offsets;
+  std::int64_t n_visible, words;
+  std::int64_t* score;
+  std::int32_t* seen;
+  std::int32_t* counted;
+  std::uint32_t* cull;
+  ScoreRule rule;
+  double eps, unit;
+  std::int32_t columns[kMostViews];
+};
+
+// The term of a splat, in units of the score. `round` is the backend's, to the nearest even integer.
+template <class Round>
+BLITZGS_HD std::int64_t score_term(const ViewSumsArgs& args, std::int64_t splat, const Round& round) {
+  double term = static_cast<double>(args.weights[splat]) / 4294967296.0;
+  const double pixels = static_cast<double>(args.pixels[splat]) + args.eps;
+  if (args.rule == ScoreRule::kDensity) term = term / pixels;
+  if (args.rule == ScoreRule::kRoot) term = term / std::sqrt(pixels);
+  return round(term / args.unit);
+}
+
+template <class Round>
+BLITZGS_HD void view_sums_of(const ViewSumsArgs& args, std::int64_t u, const Round& round) {
+  const std::int32_t id = args.visible_ids[u];
+  std::int64_t score = 0;
+  std::int32_t seen = 0, counted = 0;
+  for (std::int64_t i = args.splat_offsets[u]; i < args.splat_offsets[u + 1]; ++i) {
+    score += score_term(args, i, round);
+    seen += args.radii[2 * i] > 0 || args.radii[2 * i + 1] > 0;
+    if (!args.counts[i]) continue;
+    ++counted;
+    const std::int32_t column = args.columns[args.camera_ids[i]];
+    args.cull[id * args.words + column / 32] &= ~(1u << column % 32);
+  }
+  args.score[id] += score;
+  args.seen[id] += seen;
+  args.counted[id] += counted;
+}
+
+namespace cpu {
+void view_sums(const ViewSumsArgs& args, CudaStream);
+}
+namespace cuda {
+void view_sums(const ViewSumsArgs& args, CudaStream);
+}
+
+}  // namespace blitzgs

@@ -1,0 +1,74 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "view_sums/view_sums.h"
+
+#include <algorithm>
+
+#include "common/op.h"
+
+namespace blitzgs {
+namespace {
+
+constexpr const char* kOp = "view_sums_";
+
+void check_array(const char* name, const Tensor& tensor, ScalarType dtype,
+                 std::initializer_list<std::int64_t> shape) {
+  check_dtype(kOp, name, tensor, dtype);
+  check_shape(kOp, name, tensor, shape);
+  STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", kOp, ": ", name, " must be contiguous");
+}
+
+// sums: score, seen, counted, cull. splats: visible_ids, splat_offsets, camera_ids, radii.
+void view_sums_(const std::vector<Tensor>& sums, const std::vector<Tensor>& splats, const Tensor& weights,
+                const Tensor& pixels, const Tensor& counts, const std::vector<std::int64_t>& columns,
+                std::int64_t rule, double eps, double unit) {
+  STD_TORCH_CHECK(sums.size() == 4 && splats.size() == 4, "blitzgs::", kOp,
+                  ": sums are score, seen, counted, cull; splats are visible_ids, splat_offsets, camera_ids, "
+                  "radii; got ",
+                  sums.size(), " and ", splats.size(), " tensors");
+  const std::int64_t n = sums[0].numel(), words = sums[3].dim() == 2 ? sums[3].size(1) : 0;
+  const std::int64_t visible = splats[0].numel(), count = weights.numel();
+  check_array("score", sums[0], ScalarType::Long, {n});
+  check_array("seen", sums[1], ScalarType::Int, {n});
+  check_array("counted", sums[2], ScalarType::Int, {n});
+  check_array("cull", sums[3], ScalarType::Int, {n, words});
+  check_array("visible_ids", splats[0], ScalarType::Int, {visible});
+  check_array("splat_offsets", splats[1], ScalarType::Int, {visible + 1});
+  check_array("camera_ids", splats[2], ScalarType::Int, {count});
+  check_array("radii", splats[3], ScalarType::Int, {count, 2});
+  check_array("weights", weights, ScalarType::Long, {count});
+  check_array("pixels", pixels, ScalarType::Int, {count});
+  check_array("counts", counts, ScalarType::Bool, {count});
+  STD_TORCH_CHECK(!columns.empty() && columns.size() <= kMostViews, "blitzgs::", kOp, ": 1 to ", kMostViews,
+                  " views at once, got ", columns.size());
+  for (const std::int64_t column : columns) {
+    STD_TORCH_CHECK(0 <= column && column < 32 * words, "blitzgs::", kOp, ": cull has ", 32 * words,
+                    " columns, got ", column);
+  }
+  STD_TORCH_CHECK(0 <= rule && rule <= 2, "blitzgs::", kOp, ": rule must be 0, 1 or 2, got ", rule);
+  DeviceScope scope(weights);
+  ViewSumsArgs args{data<std::int64_t>(weights),
+                    data<std::int32_t>(pixels),
+                    data<std::int32_t>(splats[3]),
+                    data<std::int32_t>(splats[2]),
+                    data<bool>(counts),
+                    data<std::int32_t>(splats[0]),
+                    data<std::int32_t>(splats[1]),
+                    visible,
+                    words,
+                    static_cast<std::int64_t*>(sums[0].mutable_data_ptr()),
+                    static_cast<std::int32_t*>(sums[1].mutable_data_ptr()),
+                    static_cast<std::int32_t*>(sums[2].mutable_data_ptr()),
+                    static_cast<std::uint32_t*>(sums[3].mutable_data_ptr()),
+                    static_cast<ScoreRule>(rule),
+                    eps,
+                    unit,
+                    {}};
+  std::transform(columns.begin(), columns.end(), args.columns,
+                 [](std::int64_t column) { return static_cast<std::int32_t>(column); });
+  backend::view_sums(args, scope.stream);
+}
+
+}  // namespace
+}  // namespace blitzgs
+
+BLITZGS_REGISTER(m) { m.impl("view_sums_", TORCH_BOX(&blitzgs::view_sums_)); }
