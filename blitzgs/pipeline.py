@@ -67,6 +67,8 @@ class RenderOptions:
         background: RGB behind everything.
         tile_size: pixels.
         deterministic: gradients repeat bit for bit on CUDA too (they always do on the CPU).
+        fade: opacities fade by octree level and distance, `blitzgs.view.gate.LodGate.fade`; empty: they do
+            not.
     """
 
     sh_degree: int
@@ -77,6 +79,7 @@ class RenderOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tile_size: int = 16
     deterministic: bool = False
+    fade: tuple[float, ...] = ()
 
     def projection(self, views: Views) -> ProjectionOptions:
         """Return the options of projecting into views."""
@@ -89,6 +92,7 @@ class RenderOptions:
             far_plane=self.far_plane,
             eps2d=self.eps2d,
             antialiased=self.antialiased,
+            fade=self.fade,
         )
 
 
@@ -249,7 +253,10 @@ def inputs_of(
 ) -> ProjectionInputs:
     """Return what is projected of a table."""
     cameras = (views.viewmats, views.Ks)
-    return ProjectionInputs(table.parameters, cameras, options.projection(views), active or (), table["id"])
+    level = table["level"] if options.fade else None
+    return ProjectionInputs(
+        table.parameters, cameras, options.projection(views), active or (), table["id"], level
+    )
 
 
 def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:

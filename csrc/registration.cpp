@@ -44,10 +44,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // blitzgs/ops/project.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras (viewmats,
   // Ks); active ([ids[, views[, count]]]); rank_tiles (begin and end of each rank); capacity ([visible,
   // splats]; none: wait for their number); splats (camera_ids, visible_ids, splat_offsets); ints (width,
-  // height, tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d, radius_clip).
+  // height, tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d, radius_clip[,
+  // fade_slope, reach of each level]). level: of the Gaussians, where opacities fade by it
+  // (csrc/project/level_fade.h).
   m.def(
       "project_fwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] active, int[] ints, float[] floats, "
-      "int[] rank_tiles, int[] capacity, Tensor? ids) -> (Tensor gaussian_ids, "
+      "int[] rank_tiles, int[] capacity, Tensor? ids, Tensor? level) -> (Tensor gaussian_ids, "
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
@@ -55,7 +57,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] splats, int[] ints, float[] floats, "
       "Tensor[] v_splats, Tensor? v_depths, Tensor? scale_reg, bool need_viewmats, bool dense=False, "
-      "Tensor? opacity_reg=None) -> ("
+      "Tensor? opacity_reg=None, Tensor? level=None) -> ("
       "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
       "Tensor v_viewmats)");
   // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the
@@ -65,7 +67,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
       "Tensor(d!)[] last_steps, Tensor[] tables, int[] steps, float[] decays, Tensor[] cameras, "
       "Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, Tensor? places=None, "
-      "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None, Tensor? opacity_reg=None) -> ()");
+      "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None, Tensor? opacity_reg=None, Tensor? level=None) "
+      "-> ()");
   // Where the parts of a splat gradient begin in its floats, and last how many these are: mean2d, conic,
   // opacity, color, mean2d_abs.
   m.def("splat_gradient_layout() -> int[]");

@@ -14,7 +14,7 @@ from blitzgs.progress import image_progress
 from blitzgs.training import run as run_folder
 from blitzgs.training.evaluation import evaluate, load_lpips
 from blitzgs.training.inputs import check_capture, open_capture
-from blitzgs.training.lod import scene_gate
+from blitzgs.training.lod import lod_gate, scene_gate
 from blitzgs.training.run_cameras import input_files
 from blitzgs.training.views import ViewSet, render_options
 
@@ -55,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
                 capture.cameras,
                 images,
                 getattr(capture, args.split),
-                render_options(config, model.space, model.progress.sh_degree),
+                render_options(
+                    config, model.space, model.progress.sh_degree, lod_gate(config, model.progress)
+                ),
                 args.out or args.folder / run_folder.EVALUATION / args.split,
                 TileOwners(ranks),
                 pictures=args.pictures,

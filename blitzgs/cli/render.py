@@ -19,7 +19,7 @@ from blitzgs.scene.pictures import encode_image
 from blitzgs.training import run as run_folder
 from blitzgs.training.evaluation import render_view
 from blitzgs.training.inputs import check_capture, open_capture
-from blitzgs.training.lod import scene_gate
+from blitzgs.training.lod import lod_gate, scene_gate
 from blitzgs.training.run_cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.training.views import CameraLike, ViewSet, render_options
 
@@ -51,7 +51,8 @@ def run(args: argparse.Namespace) -> int:
         cameras: Sequence[CameraLike] = stored.cameras
         indices = range(len(cameras)) if args.split == "all" else getattr(stored, args.split)
         views = ViewSet(list(cameras), model.space, ranks.device)
-        options = render_options(model.config, model.space, model.progress.sh_degree)
+        gate = lod_gate(model.config, model.progress)
+        options = render_options(model.config, model.space, model.progress.sh_degree, gate)
         owners, lod = TileOwners(ranks), scene_gate(model.config, model.progress, model.table, ranks)
         output = OutputFolder(args.out, stored.inputs)
         # Of all views, so that a view's file has the same name whichever split is rendered.

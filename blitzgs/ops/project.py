@@ -122,6 +122,7 @@ def differentiable_splats(
         [],
         [],
         None,
+        inputs.level,
     )
     return ProjectedSplats._make((*columns, totals.cpu()[:3]))
 
@@ -136,6 +137,7 @@ def _(
     rank_tiles: Sequence[int],
     capacity: Sequence[int],
     ids: Tensor | None,
+    level: Tensor | None,
 ) -> tuple[Tensor, ...]:
     context, means = torch.library.get_ctx(), gaussians[0]
     U, P = context.new_dynamic_size(), context.new_dynamic_size()
@@ -174,6 +176,7 @@ def _(
     need_viewmats: bool,
     dense: bool = False,
     opacity_reg: Tensor | None = None,
+    level: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
     means, (_, visible_ids, _) = gaussians[0], splats
     length = (means if dense else visible_ids).shape[0]
@@ -190,7 +193,12 @@ def _(
 def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats) -> None:
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(
-        *inputs.gaussians, *inputs.cameras, splats.camera_ids, splats.visible_ids, splats.splat_offsets
+        *inputs.gaussians,
+        *inputs.cameras,
+        splats.camera_ids,
+        splats.visible_ids,
+        splats.splat_offsets,
+        inputs.level,
     )
     ctx.options, ctx.n_gaussians = inputs.options, len(inputs.gaussians)
 
@@ -201,12 +209,13 @@ class _Saved(NamedTuple):
     gaussians: Sequence[Tensor]
     cameras: Sequence[Tensor]
     splats: Sequence[Tensor]
+    level: Tensor | None
 
     @classmethod
     def of(cls, ctx: Any) -> _Saved:
         """Read it, once: checkpointing recomputes saved tensors for each reading."""
-        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets = ctx.saved_tensors  # noqa: N806
-        return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets))
+        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level = ctx.saved_tensors  # noqa: N806
+        return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets), level)
 
 
 def _gradients(
@@ -239,7 +248,7 @@ def _first_gradients(
     dense = not any(sparse) and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         list(saved.gaussians), list(saved.cameras), list(saved.splats), options.ints, options.floats,
-        _splat_gradients(saved, v), v.depths, None, need_viewmats, dense,
+        _splat_gradients(saved, v), v.depths, None, need_viewmats, dense, None, saved.level,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if not dense:
@@ -298,12 +307,16 @@ class _Project(torch.autograd.Function):
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    gaussians, cameras, _, ints, floats, *_ = inputs
+    gaussians, cameras, _, ints, floats, *_, level = inputs
     options = ProjectionOptions.of(ints, floats)
     # Torch wants a gradient for each argument, and for each tensor of a list.
     ctx.no_gradients = [_no_gradient(argument) for argument in inputs[2:]]
     *columns, _, _ = output
-    _save(ctx, ProjectionInputs(gaussians, cameras, options), ProjectedSplats._make((*columns, None)))
+    _save(
+        ctx,
+        ProjectionInputs(gaussians, cameras, options, level=level),
+        ProjectedSplats._make((*columns, None)),
+    )
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:

@@ -34,6 +34,7 @@ def project_bwd_step_(
     scale_reg: Tensor | None = None,
     means2d_sums: Tensor | None = None,
     opacity_reg: Tensor | None = None,
+    level: Tensor | None = None,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
@@ -62,6 +63,7 @@ def project_bwd_step_(
             term.
         means2d_sums: [P, 2], becomes the gradient of `splats.means2d` where `gradients` has it at ranks.
         opacity_reg: as `scale_reg`, of the opacity (without the compensation of antialiased splats).
+        level: uint8 [N], octree levels, where opacities fade by them (`options.fade`).
 
     Raises:
         ValueError: decay rates outside their range.
@@ -84,6 +86,7 @@ def project_bwd_step_(
         scale_reg,
         means2d_sums,
         opacity_reg,
+        level,
     )
 
 

@@ -62,15 +62,16 @@ class ProjectionOptions(NamedTuple):
     radius_clip: float = 0.0
     antialiased: bool = False
     raw: bool = True
+    fade: tuple[float, ...] = ()  # `blitzgs.view.gate.LodGate.fade`; empty: opacities do not fade
 
     @classmethod
     def of(cls, ints: Sequence[int], floats: Sequence[float]) -> ProjectionOptions:
         """Return what `ints` and `floats` were of."""
         width, height, tile_size, sh_degree, antialiased, raw = ints
-        near_plane, far_plane, eps2d, radius_clip = floats
+        near_plane, far_plane, eps2d, radius_clip, *fade = floats
         return cls(
             width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip,
-            bool(antialiased), bool(raw),
+            bool(antialiased), bool(raw), tuple(fade),
         )  # fmt: skip
 
     @property
@@ -83,7 +84,7 @@ class ProjectionOptions(NamedTuple):
     @property
     def floats(self) -> list[float]:
         """As the ops take them, with `ints`."""
-        return [self.near_plane, self.far_plane, self.eps2d, self.radius_clip]
+        return [self.near_plane, self.far_plane, self.eps2d, self.radius_clip, *self.fade]
 
 
 class ProjectionInputs(NamedTuple):
@@ -96,6 +97,7 @@ class ProjectionInputs(NamedTuple):
         active: which Gaussians to consider, `ActiveRows`: ids, the views of each, how many ids there are;
             those behind the first may be left out. Empty: all Gaussians in all views.
         ids: int64 [N], persistent, of the Gaussians; None: the splats' are not wanted.
+        level: uint8 [N], octree levels, where opacities fade by them (`ProjectionOptions.fade`); else None.
     """
 
     gaussians: Sequence[Tensor]
@@ -103,6 +105,7 @@ class ProjectionInputs(NamedTuple):
     options: ProjectionOptions
     active: Sequence[Tensor] = ()
     ids: Tensor | None = None
+    level: Tensor | None = None
 
     @property
     def n_views(self) -> int:
@@ -126,6 +129,7 @@ class ProjectionInputs(NamedTuple):
             [tile for tiles in rank_tiles for tile in tiles],
             [] if capacity is None else [capacity.visible, capacity.splats],
             self.ids,
+            self.level,
         )
         return Projected(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 

@@ -257,6 +257,8 @@ class ViewConfig:
         level_ratio: the others come one by one until `schedule.levels_until`, each after a wait shorter by
             this factor than the one before.
         most_kept: views that would keep at least this share of all Gaussians are rendered with all of them.
+        smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
+            All views then have the gate, whatever `most_kept` says. Needs `lod`.
         cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
             in it at the last pass, until half of the images after the last pass are trained on. Needs
             `population.importance`.
@@ -266,6 +268,7 @@ class ViewConfig:
     first_levels: float = 0.5
     level_ratio: float = 1.5
     most_kept: float = 0.8
+    smooth: bool = False
     cull: bool = False
 
 

@@ -152,6 +152,8 @@ def problems(config: Config) -> Iterator[str]:
         )
     if population.strategy == "relocation" and population.gate is not None:
         yield "population.gate: withholds candidates of population.strategy=density; relocation has none"
+    if config.view.smooth and not config.view.lod:
+        yield "view.smooth: needs view.lod=true, whose cuts it smooths"
     if config.view.cull and not population.importance:
         yield "view.cull: needs population.importance=true, whose passes make the mask"
 

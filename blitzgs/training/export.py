@@ -71,7 +71,7 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
         gate = model.lod.gate
         comments.append(
             f"comment lod reference_distance {gate.reference_distance * space.unit!r} fork {gate.fork!r} "
-            f"levels {gate.count} finest {gate.finest}"
+            f"levels {gate.count} finest {gate.finest}" + (" smooth" if gate.smooth else "")
         )
     if centred:
         x, y, z = space.offset

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
 from blitzgs.training.config import Config
@@ -14,7 +16,13 @@ def lod_gate(config: Config, progress: Progress) -> LodGate | None:
     """Return the LOD gate of a run at some point; None: it is not open."""
     if progress.finest_level is None:
         return None
-    return LodGate(progress.reference_distance, config.lod.fork, progress.level_count, progress.finest_level)
+    return LodGate(
+        progress.reference_distance,
+        config.lod.fork,
+        progress.level_count,
+        progress.finest_level,
+        config.view.smooth,
+    )
 
 
 def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> SceneGate | None:
@@ -27,4 +35,8 @@ def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: 
         ranks: the job.
     """
     gate = lod_gate(config, progress)
-    return None if gate is None else SceneGate(gate, config.view.most_kept, table, ranks)
+    if gate is None:
+        return None
+    # A view without the gate beside one with it would be the jump that smooth levels are to avoid.
+    most_kept = math.inf if gate.smooth else config.view.most_kept
+    return SceneGate(gate, most_kept, table, ranks)

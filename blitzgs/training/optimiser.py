@@ -115,4 +115,5 @@ class LazyAdam:
             scale_reg,
             means2d_sums,
             opacity_reg,
+            table["level"] if frame.options.fade else None,
         )

@@ -28,7 +28,7 @@ from blitzgs.training.lod import scene_gate
 from blitzgs.training.run_cameras import RunCamera, RunCameras, load_cameras
 from blitzgs.training.run_log import LOG
 from blitzgs.training.views import CameraLike, Space, render_options, viewmat
-from blitzgs.view.gate import SceneGate
+from blitzgs.view.gate import SceneGate, centres_of
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,16 @@ class Model:
         return images[0]
 
     def _kept(self, camera: CameraLike) -> Model:
-        """Return the Gaussians that the LOD gate leaves for a view."""
+        """Return the Gaussians that the LOD gate leaves for a view, as opaque as it leaves them."""
         if self.lod is None:
             return self
         pose = torch.from_numpy(viewmat(camera, self.space)).float().to(self.means.device)[None]
         rows = self.lod.rows(self.means, self.level, pose)
         columns = {name: getattr(self, name)[rows] for name in (*PARAMETERS, "level")}
+        if self.lod.gate.smooth:
+            weights = self.lod.gate.weights(columns["means"], columns["level"], centres_of(pose)[0])
+            faded = columns["opacities"].double().sigmoid() * weights
+            columns["opacities"] = faded.logit().float()
         return dataclasses.replace(self, **columns)
 
     def splat(self, cameras: list[CameraLike], antialiased: bool) -> tuple[Tensor, Any]:

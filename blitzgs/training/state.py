@@ -23,6 +23,7 @@ from blitzgs.training.agreement import SaveClock
 from blitzgs.training.batches import Images
 from blitzgs.training.config import Config
 from blitzgs.training.evaluation import Lpips
+from blitzgs.training.lod import lod_gate
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_log import RunLog
@@ -98,7 +99,8 @@ class TrainingState:
     @property
     def render_options(self) -> RenderOptions:
         """How the run renders at its present spherical-harmonics degree."""
-        return render_options(self.config, self.space, self.progress.sh_degree)
+        lod = lod_gate(self.config, self.progress)
+        return render_options(self.config, self.space, self.progress.sh_degree, lod)
 
     def start_clock(self) -> None:
         """Count training time from now on, on top of what a resumed run has already taken."""

@@ -25,6 +25,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
 from blitzgs.training.events import evaluate, handle_all, save
 from blitzgs.training.guard import LossGuard, ModelLostError
+from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
@@ -136,7 +137,7 @@ class Trainer:
         degree = schedule.sh_degree(begin, config.model.sh_degree)
         view_level.follow_schedule(state, begin)
         gate = view_level.batch_gate(state, batch.indices)
-        options = render_options(config, state.space, degree)
+        options = render_options(config, state.space, degree, lod_gate(config, state.progress))
         frame, terms, sums = state.stepper.forward(step, options, batch, gate=gate)
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.table, frame)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.config import Config
-from blitzgs.view.gate import centres_of
+from blitzgs.view.gate import LodGate, centres_of
 
 
 class CameraLike(Protocol):
@@ -137,8 +137,8 @@ class ViewSet:
         return unpack_views(numbers.to(self._device), *self.size(indices))
 
 
-def render_options(config: Config, space: Space, sh_degree: int) -> RenderOptions:
-    """Return the render options of a run at a spherical-harmonics degree."""
+def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | None = None) -> RenderOptions:
+    """Return the render options of a run at a spherical-harmonics degree, with the fading of its LOD gate."""
     model = config.model
     return RenderOptions(
         sh_degree=sh_degree,
@@ -148,6 +148,7 @@ def render_options(config: Config, space: Space, sh_degree: int) -> RenderOption
         antialiased=model.antialiased,
         background=model.background,
         deterministic=model.deterministic,
+        fade=() if lod is None else lod.fade(),
     )
 
 

@@ -37,17 +37,46 @@ class LodGate:
         fork: f, ratio of neighbouring levels.
         count: number of levels K.
         finest: the finest level that is kept at all, L_max in 0..K - 1.
+        smooth: opacities fade out over half a level around these distances, a quarter to each side.
     """
 
     reference_distance: float
     fork: float
     count: int
     finest: int
+    smooth: bool = False
 
     def reach(self) -> list[float]:
         """Return the distance up to which each of the K levels is kept; -1: nowhere."""
-        kept = [farthest(level, self.reference_distance, self.fork) for level in range(self.finest + 1)]
+        longer = self.fork**0.25 if self.smooth else 1.0
+        distances = (farthest(level, self.reference_distance, self.fork) for level in range(self.finest + 1))
+        kept = [longer * distance for distance in distances]
         return kept + [-1.0] * (self.count - len(kept))
+
+    def fade(self) -> tuple[float, ...]:
+        """Return what the projection fades opacities by; empty: they do not fade.
+
+        With r the reach of its level, the opacity of a Gaussian at distance d has the weight
+        clamp((1 - d^2 / r^2) f / (f - 1), 0, 1): it is whole up to r / sqrt(f), and gone at r.
+
+        Returns:
+            f / (f - 1), then `reach`.
+        """
+        return (self.fork / (self.fork - 1), *self.reach()) if self.smooth else ()
+
+    def weights(self, means: Tensor, level: Tensor, centre: Tensor) -> Tensor:
+        """Return the weights of `fade` that a camera gives the opacities of Gaussians, float64 [N].
+
+        Args:
+            means: [N, 3].
+            level: uint8 [N].
+            centre: of the camera, float64 [3].
+        """
+        slope, *reach = self.fade()
+        reaches = torch.tensor(reach, dtype=torch.float64, device=means.device)
+        reaches = reaches[level.long().clamp(max=self.count - 1)]
+        relative = (means.double() - centre).square().sum(1) / reaches.square()
+        return torch.where(reaches > 0, slope * (1 - relative), 0.0).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,9 @@
 
 namespace blitzgs {
 
-inline constexpr int kMaxViews = 32;  // views of one launch: an int32 holds a bit for each
-inline constexpr int kMaxRanks = 63;  // ranks of a job: a non-negative int64 holds a bit for each
-inline constexpr int kMaxPeers = 16;  // ranks that write to each other's memory
+inline constexpr int kMaxViews = 32;   // views of one launch: an int32 holds a bit for each
+inline constexpr int kMaxRanks = 63;   // ranks of a job: a non-negative int64 holds a bit for each
+inline constexpr int kMaxLevels = 32;  // octree levels
+inline constexpr int kMaxPeers = 16;   // ranks that write to each other's memory
 
 }  // namespace blitzgs

@@ -30,6 +30,7 @@
 
 #include "common/stream.h"
 #include "math/rank_tiles.h"
+#include "project/level_fade.h"
 #include "project/project_splat.h"
 #include "project/splat_gradients.h"
 
@@ -38,7 +39,7 @@ namespace blitzgs {
 // means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3] or null; viewmats [B, 4, 4],
 // Ks [B, 3, 3]. Candidates: rows active_ids (ascending), or all N when null; bit v of active_views[c] allows
 // view v for candidate c (null: all views). n_active (CUDA, on the device): how many of the n_candidates
-// there are; null: all.
+// there are; null: all. fade: of smooth levels.
 template <class T>
 struct ProjectInputs {
   const T *means, *quats, *scales, *opacities, *sh, *viewmats, *Ks;
@@ -47,6 +48,7 @@ struct ProjectInputs {
   int n_views;
   ProjectOptions<T> options;
   const std::int32_t* n_active = nullptr;
+  LevelFade fade{};
 };
 
 // What project() sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P splats,

@@ -70,7 +70,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
                     scale_part = TripleStage::fetch(in.scales, id, lane);
   float quat[4];
   load_quat(in, known, quat);
-  const float opacity = in.opacities[known];
+  const float opacity = in.opacities[known], inverse_reach2 = inverse_reach2_of(in.fade, known);
   GeometryGradient<float> v_splat{};
   int view = 0;
   const auto load_splat = [&](std::int64_t r) {
@@ -87,8 +87,9 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   const Vec3<float> mean = triple.share(mean_part, lane), scale = triple.share(scale_part, lane);
 
   Vec3<float> v_mean{}, v_scale{};
-  const ActiveGaussian<float> gaussian = activate_gaussian(
-      mean, quat, activate_scale(&scale.x, in.options.raw), activate_opacity(opacity, in.options.raw));
+  const ActiveGaussian<float> gaussian =
+      activate_gaussian(mean, quat, activate_scale(&scale.x, in.options.raw),
+                        activate_opacity(opacity, in.options.raw), inverse_reach2);
   GaussianGradient<float> gradient{};
   float axis_weight = 0.f;
   PoseGradient<float>* no_pose = nullptr;

@@ -55,9 +55,10 @@ using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 BackwardTensors project_bwd(const TensorList& gaussians, const TensorList& cameras, const TensorList& splats,
                             const IntList& ints, const FloatList& floats, const TensorList& v_splats,
                             const OptionalTensor& v_depths, const OptionalTensor& scale_reg,
-                            bool need_viewmats, bool dense, const OptionalTensor& opacity_reg) {
+                            bool need_viewmats, bool dense, const OptionalTensor& opacity_reg,
+                            const OptionalTensor& level) {
   constexpr const char* kOp = "project_bwd";
-  const ProjectArguments p(kOp, gaussians, cameras, ints, floats);
+  const ProjectArguments p(kOp, gaussians, cameras, ints, floats, level);
   const BackwardSplats b(kOp, p, splats, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
@@ -89,11 +90,11 @@ void project_bwd_step(TensorList params, TensorList exp_avgs, TensorList exp_avg
                       const TensorList& cameras, const TensorList& splats, const IntList& ints,
                       const FloatList& floats, const TensorList& v_splats, const OptionalTensor& places,
                       const OptionalTensor& scale_reg, const OptionalTensor& means2d_sums,
-                      const OptionalTensor& opacity_reg) {
+                      const OptionalTensor& opacity_reg, const OptionalTensor& level) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
   STD_TORCH_CHECK(state.step >= 1, "blitzgs::project_bwd_step_: steps count from 1, got ", state.step);
-  const ProjectArguments p(kOp, params, cameras, ints, floats);
+  const ProjectArguments p(kOp, params, cameras, ints, floats, level);
   const BackwardSplats b(kOp, p, splats, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
                              means2d_sums);

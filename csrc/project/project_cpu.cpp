@@ -27,9 +27,9 @@ std::int64_t candidate_id(const ProjectInputs<T>& in, std::int64_t candidate) {
 
 template <class T>
 ActiveGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
-  return activate_gaussian(load3(in.means + 3 * id), in.quats + 4 * id,
-                           activate_scale(in.scales + 3 * id, in.options.raw),
-                           activate_opacity(in.opacities[id], in.options.raw));
+  return activate_gaussian(
+      load3(in.means + 3 * id), in.quats + 4 * id, activate_scale(in.scales + 3 * id, in.options.raw),
+      activate_opacity(in.opacities[id], in.options.raw), static_cast<T>(inverse_reach2_of(in.fade, id)));
 }
 
 // A splat as counting finds it and writing takes it back.
@@ -80,7 +80,8 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
     const int view = __builtin_ctz(rest);
     if (!may_overlap(frusta[view], point, norm, sigma)) continue;
     if (first) {
-      gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity);
+      gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity,
+                                   static_cast<T>(inverse_reach2_of(in.fade, id)));
       first = 0;
     }
     KeptSplat<T> kept{};

@@ -44,7 +44,8 @@ __device__ inline ActiveGaussian<float> make_gaussian(const Inputs& in, std::int
   float quat[4];
   load_quat(in, id, quat);
   return activate_gaussian(mean, quat, activate_scale(&scale.x, in.options.raw),
-                           activate_opacity(in.opacities[id], in.options.raw));
+                           activate_opacity(in.opacities[id], in.options.raw),
+                           inverse_reach2_of(in.fade, id));
 }
 
 __device__ inline ActiveGaussian<float> load_gaussian(const Inputs& in, std::int64_t id) {

@@ -116,9 +116,9 @@ using Projected = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Ten
 
 Projected project_fwd(const TensorList& gaussians, const TensorList& cameras, const TensorList& active,
                       const IntList& ints, const FloatList& floats, const IntList& rank_tiles,
-                      const IntList& capacity, const OptionalTensor& ids) {
+                      const IntList& capacity, const OptionalTensor& ids, const OptionalTensor& level) {
   constexpr const char* kOp = "project_fwd";
-  const ProjectArguments p(kOp, gaussians, cameras, ints, floats);
+  const ProjectArguments p(kOp, gaussians, cameras, ints, floats, level);
   const Candidates candidates(kOp, active, p.count);
   const RankTiles ranks = checked_rank_tiles(kOp, rank_tiles);
   const std::optional<ProjectSizes> sizes = checked_capacity(kOp, capacity);

@@ -2,6 +2,7 @@
 // What the ops of the projection share: groups of arguments, checked. Python's side of the groups is
 // blitzgs/ops/project.py.
 #pragma once
+#include <cfloat>
 #include <limits>
 #include <optional>
 #include <vector>
@@ -28,10 +29,11 @@ void check_group(const char* op, const char* names, const List& list, std::size_
 }
 
 // ints: width, height, tile_size, sh_degree, antialiased, raw. floats: near_plane, far_plane, eps2d,
-// radius_clip.
+// radius_clip, and with smooth levels those of set_fade.
 inline ProjectOptions<double> checked_options(const char* op, const IntList& ints, const FloatList& floats) {
   check_group(op, "(width, height, tile_size, sh_degree, antialiased, raw)", ints, 6, 6);
-  check_group(op, "(near_plane, far_plane, eps2d, radius_clip)", floats, 4, 4);
+  check_group(op, "(near_plane, far_plane, eps2d, radius_clip[, fade_slope, reach of each level])", floats, 4,
+              5 + kMaxLevels);
   const std::int64_t width = ints[0], height = ints[1], tile_size = ints[2];
   STD_TORCH_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24), "blitzgs::", op,
                   ": width and height must be in [1, 2^24), got ", width, " x ", height);
@@ -48,19 +50,37 @@ inline ProjectOptions<double> checked_options(const char* op, const IntList& int
   options.far_plane = floats[1];
   options.eps2d = floats[2];
   options.radius_clip = floats[3];
+  options.fade_slope = floats.size() > 4 ? floats[4] : 0.0;
   return options;
+}
+
+// floats from the fifth on: f / (f - 1), then for each level the distance at which it has faded away
+// (infinite: nowhere; negative: everywhere).
+inline void set_fade(const char* op, const Tensor& level, const FloatList& floats, LevelFade& fade) {
+  STD_TORCH_CHECK(floats.size() > 5 && floats[4] >= 1, "blitzgs::", op,
+                  ": levels need a fade_slope of at least 1 and a reach for each level behind the other "
+                  "floats, got ",
+                  floats.size(), " floats");
+  fade.level = data<std::uint8_t>(level);
+  fade.n_levels = static_cast<int>(floats.size()) - 5;
+  for (int i = 0; i < fade.n_levels; ++i) {
+    const double reach = floats[5 + i];
+    fade.inverse_reach2[i] = reach > 0 ? static_cast<float>(1.0 / (reach * reach)) : FLT_MAX;
+  }
 }
 
 // Gaussians (means, quats, scales, opacities and perhaps sh) and cameras (viewmats, Ks), contiguous and
 // checked. Held here so that the raw pointers stay valid.
 struct ProjectArguments {
   Tensor means, quats, scales, opacities, viewmats, Ks;
-  OptionalTensor sh;
+  OptionalTensor sh, level;
   std::int64_t count, n_views, sh_stride;
   ProjectOptions<double> options;
+  LevelFade fade{};
 
+  // level_in: octree levels of the Gaussians, where opacities fade by them.
   ProjectArguments(const char* op, const TensorList& gaussians, const TensorList& cameras,
-                   const IntList& ints, const FloatList& floats)
+                   const IntList& ints, const FloatList& floats, const OptionalTensor& level_in)
       : options(checked_options(op, ints, floats)) {
     check_group(op, "(means, quats, scales, opacities[, sh])", gaussians, 4, 5);
     check_group(op, "(viewmats, Ks)", cameras, 2, 2);
@@ -93,6 +113,11 @@ struct ProjectArguments {
     STD_TORCH_CHECK(count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
                     ": at most 2^31 - 1 Gaussians on one device, got ", count);
     if (sh) check_sh(op);
+    if (!level_in) return;
+    check_dtype(op, "level", *level_in, ScalarType::Byte);
+    check_shape(op, "level", *level_in, {count});
+    level = as_contiguous(*level_in);
+    set_fade(op, *level, floats, fade);
   }
 
   template <class T>
@@ -111,7 +136,9 @@ struct ProjectArguments {
             static_cast<int>(n_views),
             {o.width, o.height, o.tile_size, o.sh_degree, o.sh_stride, static_cast<T>(o.near_plane),
              static_cast<T>(o.far_plane), static_cast<T>(o.eps2d), static_cast<T>(o.radius_clip),
-             o.antialiased, o.raw}};
+             o.antialiased, o.raw, static_cast<T>(o.fade_slope)},
+            nullptr,
+            fade};
   }
 
  private:

@@ -20,6 +20,7 @@ struct ProjectOptions {
   int sh_degree, sh_stride;  // sh_stride: coefficients stored per Gaussian, K
   T near_plane, far_plane, eps2d, radius_clip;
   bool antialiased, raw;
+  T fade_slope = T(0);  // of level_weight
 };
 
 // A Gaussian after activation, shared by its splats.
@@ -29,6 +30,7 @@ struct ActiveGaussian {
   UnitQuaternion<T> quat;
   Columns3<T> rotation, axes;
   T opacity;
+  T inverse_reach2;  // of its level (level_fade.h); 0: it fades nowhere
 };
 
 template <class T>
@@ -76,7 +78,7 @@ BLITZGS_HD Frustum frustum_of(const Camera<T>& camera, const ProjectOptions<T>& 
 
 template <class T>
 BLITZGS_HD ActiveGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* quat, const Vec3<T>& scale,
-                                               T opacity) {
+                                               T opacity, T inverse_reach2 = T(0)) {
   ActiveGaussian<T> gaussian;
   gaussian.mean = mean;
   gaussian.scale = scale;
@@ -84,7 +86,16 @@ BLITZGS_HD ActiveGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* qua
   gaussian.rotation = rotation_columns(gaussian.quat);
   gaussian.axes = scaled_axes(gaussian.rotation, scale);
   gaussian.opacity = opacity;
+  gaussian.inverse_reach2 = inverse_reach2;
   return gaussian;
+}
+
+// The weight of a Gaussian's opacity in a view with smooth levels (level_fade.h).
+template <class T>
+BLITZGS_HD T level_weight(const Camera<T>& camera, const ActiveGaussian<T>& gaussian, T slope) {
+  if (!(gaussian.inverse_reach2 > T(0))) return T(1);
+  const Vec3<T> offset = gaussian.mean - camera.centre;
+  return smaller(larger(slope - slope * gaussian.inverse_reach2 * dot(offset, offset), T(0)), T(1));
 }
 
 // False when the splat does not exist: outside (near, far], alpha below 1/255 everywhere, no overlap with the
@@ -98,7 +109,8 @@ BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActiveGaussian<T>& 
   pixel_position(camera, p, splat->mean2d);
   const Footprint<T> footprint = make_footprint(pixel_gradients(camera, p), gaussian.axes, options.eps2d);
   store_conic(footprint, splat->conic);
-  splat->opacity = options.antialiased ? gaussian.opacity * compensation(footprint) : gaussian.opacity;
+  splat->opacity = level_weight(camera, gaussian, options.fade_slope) * gaussian.opacity;
+  if (options.antialiased) splat->opacity *= compensation(footprint);
   const T sigmas = reach(splat->opacity);
   if (sigmas < T(0) || !is_finite(footprint.conic[0] + footprint.conic[1] + footprint.conic[2])) return false;
   splat->extent[0] = sigmas * std::sqrt(footprint.cov_xx);
@@ -219,9 +231,10 @@ BLITZGS_HD void project_splat_vjp(const Camera<T>& camera, const ActiveGaussian<
   const ProjectedMean p = project_mean(camera, gaussian.mean);
   const PixelGradients<T> g = pixel_gradients(camera, p);
   const Footprint<T> footprint = make_footprint(g, gaussian.axes, options.eps2d);
-  gradient->opacity += options.antialiased ? v.opacity * compensation(footprint) : v.opacity;
+  const T v_opacity = level_weight(camera, gaussian, options.fade_slope) * v.opacity;
+  gradient->opacity += options.antialiased ? v_opacity * compensation(footprint) : v_opacity;
   Vec3<T> v_m0, v_m1, v_gx, v_gy;
-  footprint_vjp(footprint, v.conic, options.antialiased ? v.opacity * gaussian.opacity : T(0), &v_m0, &v_m1);
+  footprint_vjp(footprint, v.conic, options.antialiased ? v_opacity * gaussian.opacity : T(0), &v_m0, &v_m1);
   factor_vjp(g, gaussian.axes, v_m0, v_m1, &v_gx, &v_gy, &gradient->axes);
   const Vec3<T> v_p = pixel_gradients_vjp(camera, p, g, v_gx, v_gy, v.mean2d, v.depth, pose);
   camera_point_vjp(camera, gaussian.mean, v_p, &gradient->mean, pose);

@@ -149,9 +149,9 @@ __device__ __forceinline__ void write_splats(const Group& group, std::int64_t be
 // the tiles, and only then asks how many splats the blocks before it have. No block waits for the slowest
 // one.
 __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
-    splats_kernel(const Inputs in, const __grid_constant__ RankTiles rank_tiles, const Prefiltered kept,
-                  const ProjectSizes capacity, const ProjectIds ids, const ProjectOutputs<float> out,
-                  unsigned long long* totals, const TurnSums turns) {
+    splats_kernel(const __grid_constant__ Inputs in, const __grid_constant__ RankTiles rank_tiles,
+                  const Prefiltered kept, const ProjectSizes capacity, const ProjectIds ids,
+                  const ProjectOutputs<float> out, unsigned long long* totals, const TurnSums turns) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ TripleStage triples[kWarps];
   __shared__ Sums sums;

@@ -23,8 +23,6 @@
 
 namespace blitzgs {
 
-constexpr int kMaxLevels = 32;
-
 // What all rows of a launch are compared with.
 struct GateTable {
   float centres[kMaxViews][3];

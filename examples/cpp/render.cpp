@@ -70,7 +70,7 @@ int main(int argc, char** argv) {
   const std::vector<Tensor> everywhere;  // no list of active Gaussians: all of them
   const std::vector<std::int64_t> no_ranks, no_capacity;
   const auto rows = call<14>("blitzgs::project_fwd", gaussians, cameras, everywhere, ints, floats, no_ranks,
-                             no_capacity, std::nullopt);
+                             no_capacity, std::nullopt, std::nullopt);
   const Tensor &camera_ids = rows[1], &visible_ids = rows[2], &means2d = rows[4], &conics = rows[5],
                &depths = rows[6], &alphas = rows[7], &colors = rows[8];
 

@@ -349,7 +349,17 @@ def test_opcheck():
         inputs = inputs_of(scene.leaves() if with_gradients else scene)
         options = inputs.options
         ids = torch.arange(10)
-        arguments = (inputs.gaussians, inputs.cameras, [], options.ints, options.floats, [0, 6], [], ids)
+        arguments = (
+            inputs.gaussians,
+            inputs.cameras,
+            [],
+            options.ints,
+            options.floats,
+            [0, 6],
+            [],
+            ids,
+            None,
+        )
         # With gradients opcheck's own traced comparison cannot sum integer outputs; the next test is that
         # check.
         utilities = ("test_schema", "test_autograd_registration", "test_faketensor")

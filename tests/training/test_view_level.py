@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The LOD gate and the cull mask in a training, and in what evaluates and renders its model."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -242,6 +243,37 @@ def test_a_photograph_that_is_lost_moves_no_mask_to_another_view(tmp_path, monke
     torch.set_num_threads(1)
     again, summary = train(tmp_path, resume=True)
     assert summary is not None and len(again.state.progress.gated_views) == 7
+
+
+def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypatch):
+    stop_at(monkeypatch, 65)
+    assert train(tmp_path / "stopped", "view.smooth=true")[1] is None
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    resumed, _ = train(tmp_path / "stopped", "view.smooth=true", resume=True)
+    trainer, _ = train(tmp_path / "whole", "view.smooth=true")
+    state = trainer.state
+    assert_same_table(resumed.state.table, state.table)
+    assert set(state.progress.gated_views) == {"1"}  # whatever they keep
+    scene = scene_gate(state.config, state.progress, state.table, Ranks())
+    view, camera = state.views.pick([3]), state.capture.cameras[3]
+    weights = scene.gate.weights(state.table["means"], state.table["level"], centres_of(view.viewmats)[0])
+    assert ((weights > 0) & (weights < 1)).sum() > 10
+    faded = GaussianTable({name: state.table[name].clone() for name in state.table})
+    faded["opacities"] = (faded["opacities"].double().sigmoid() * weights).logit().float()
+    options = dataclasses.replace(state.render_options, fade=())
+    image = pipeline.forward(faded, view, options).renders[0]
+    found = pipeline.forward(state.table, view, state.render_options).renders[0]
+    torch.testing.assert_close(found, image, rtol=0, atol=1e-5)
+    psnr = image_metrics(image, tiny_scene()[1].get(3), None)["psnr"]
+    assert evaluate.measure(state, [3], None)["psnr"] == pytest.approx(psnr, abs=1e-3)
+    shown = blitzgs.open_run(tmp_path / "whole").model().render(camera)
+    torch.testing.assert_close(shown, image, rtol=0, atol=1e-5)
+    path = tmp_path / "model.ply"
+    assert main(["export", str(tmp_path / "whole"), "--ply", str(path)]) == 0
+    assert any(text.endswith(" finest 1 smooth") for text in read_ply(path).comments)
+    with pytest.raises(ConfigError, match="view.smooth: needs view.lod=true"):
+        tiny_config("view.smooth=true")
 
 
 def test_levels_are_unlocked_as_octree_gs_does():
