@@ -175,6 +175,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "position_noise_(Tensor(a!) means, Tensor quats, Tensor scales, Tensor opacities, Tensor ids, Tensor "
       "visible_ids, int seed, int step, float threshold, float strength) -> ()");
 
+  // Gradient-boosted trees: the sum of the leaves that each row of features reaches.
+  m.def("tree_sums(Tensor features, Tensor roots, Tensor nodes, Tensor leaves, int depth) -> Tensor");
+
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
 

@@ -23,13 +23,12 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.ops.counter_random import uniform
+from blitzgs.ops.tree_sums import tree_sums
 from blitzgs.population.candidates import FEATURES, Candidates
 
 FORMAT = 1
 # Leaf values enter as integers in units of 2^-32.
 _LEAF_BITS = 32
-# Candidates x trees that are walked at once.
-_CHUNK = 1 << 23
 
 
 class GateError(ValueError):
@@ -120,7 +119,8 @@ class SpawnGate:
             int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.
         """
         self._trees = self._trees.to(features.device)
-        return self._trees.sum(features)
+        trees = self._trees
+        return tree_sums(features, trees.roots, trees.nodes, trees.leaves, trees.depth)
 
 
 class RankVeto:
@@ -187,24 +187,17 @@ def _read_model(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Trees:
-    """All nodes of all trees, one after the other; a leaf's children are the leaf itself.
+    """All nodes of all trees, one after the other, as `tree_sums` takes them.
 
     Attributes:
-        roots: int32 [T], the first node of each tree.
-        features: int32 [nodes], which input is compared; 0 for leaves.
-        thresholds: float32 [nodes]; an input below goes left.
-        left, right: int32 [nodes].
-        unknown_left: bool [nodes], where NaN goes.
-        leaves: int64 [nodes], in units of 2^-32.
+        roots: int32 [T].
+        nodes: int32 [n, 4].
+        leaves: int64 [n], in units of 2^-32.
         depth: of the deepest tree.
     """
 
     roots: Tensor
-    features: Tensor
-    thresholds: Tensor
-    left: Tensor
-    right: Tensor
-    unknown_left: Tensor
+    nodes: Tensor
     leaves: Tensor
     depth: int
 
@@ -215,63 +208,46 @@ class _Trees:
         objective, count = learner["objective"]["name"], int(learner["learner_model_param"]["num_feature"])
         if objective != "binary:logistic" or count != len(FEATURES):
             raise ValueError(f"objective {objective} with {count} features")
-        columns: dict[str, list[Any]] = {name: [] for name in ("f", "t", "l", "r", "u", "v")}
-        roots, depth = [], 0
+        roots: list[int] = []
+        thresholds: list[float] = []
+        splits: list[tuple[int, int, int]] = []
+        leaves: list[int] = []
+        depth = 0
         for tree in learner["gradient_booster"]["model"]["trees"]:
-            first = len(columns["f"])
+            first = len(leaves)
             roots.append(first)
             depth = max(depth, _depth(tree["left_children"], tree["right_children"]))
             for node, left in enumerate(tree["left_children"]):
-                leaf = left < 0
                 value = tree["split_conditions"][node]
-                columns["f"].append(0 if leaf else tree["split_indices"][node])
-                columns["t"].append(0.0 if leaf else value)
-                columns["l"].append(first + (node if leaf else left))
-                columns["r"].append(first + (node if leaf else tree["right_children"][node]))
-                columns["u"].append(bool(tree["default_left"][node]))
-                columns["v"].append(round(value * 2**_LEAF_BITS) if leaf else 0)
-        ints = {name: torch.tensor(columns[name], dtype=torch.int32) for name in ("f", "l", "r")}
-        return cls(
-            torch.tensor(roots, dtype=torch.int32),
-            ints["f"],
-            torch.tensor(columns["t"], dtype=torch.float32),
-            ints["l"],
-            ints["r"],
-            torch.tensor(columns["u"]),
-            torch.tensor(columns["v"]),
-            depth,
-        )
+                if left < 0:
+                    splits.append((0, -1, -1))
+                else:
+                    feature, unknown = tree["split_indices"][node], bool(tree["default_left"][node])
+                    if not 0 <= feature < count:
+                        raise ValueError(f"a split of feature {feature}")
+                    splits.append((2 * feature + unknown, first + left, first + tree["right_children"][node]))
+                thresholds.append(0.0 if left < 0 else value)
+                leaves.append(round(value * 2**_LEAF_BITS) if left < 0 else 0)
+        bits = torch.tensor(thresholds, dtype=torch.float32).view(torch.int32)
+        nodes = torch.cat((bits[:, None], torch.tensor(splits, dtype=torch.int32).view(-1, 3)), 1)
+        return cls(torch.tensor(roots, dtype=torch.int32), nodes, torch.tensor(leaves), depth)
 
     def to(self, device: torch.device) -> _Trees:
         """Return the trees on a device."""
         if self.roots.device == device:
             return self
-        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return dataclasses.replace(self, **moved)  # type: ignore[arg-type]
-
-    def sum(self, features: Tensor) -> Tensor:
-        """Return the sum of the leaves that each row reaches, int64 [M]."""
-        length = max(1, _CHUNK // max(1, len(self.roots)))
-        parts = [self._sum(part) for part in features.split(length)]
-        return torch.cat(parts) if parts else self.leaves.new_zeros(0)
-
-    def _sum(self, features: Tensor) -> Tensor:
-        count, width = features.shape
-        flat = features.contiguous().view(-1)
-        first = torch.arange(0, count * width, width, dtype=torch.int32, device=flat.device)
-        rows = first[:, None].expand(count, len(self.roots)).reshape(-1)
-        nodes = self.roots.repeat(count)
-        for _ in range(self.depth):
-            values = flat.index_select(0, rows + self.features.index_select(0, nodes))
-            left = values < self.thresholds.index_select(0, nodes)
-            left |= values.isnan() & self.unknown_left.index_select(0, nodes)
-            nodes = torch.where(left, self.left.index_select(0, nodes), self.right.index_select(0, nodes))
-        return self.leaves.index_select(0, nodes).view(count, len(self.roots)).sum(1)
+        return _Trees(self.roots.to(device), self.nodes.to(device), self.leaves.to(device), self.depth)
 
 
 def _depth(left: list[int], right: list[int]) -> int:
-    """Return how many comparisons the longest path through a tree has."""
-    depth, level = 0, [0]
+    """Return how many comparisons the longest path through a tree has.
+
+    Raises:
+        ValueError: the children of a node lie outside the tree, or it is no tree.
+    """
+    depth, level, met = 0, [0], 1
     while level := [child for node in level for child in (left[node], right[node]) if left[node] >= 0]:
-        depth += 1
+        depth, met = depth + 1, met + len(level)
+        if met > len(left) or min(level) < 0 or max(level) >= len(left):
+            raise ValueError("the nodes of a tree do not form one")
     return depth

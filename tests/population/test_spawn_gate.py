@@ -127,6 +127,12 @@ def test_a_lone_scene_holds_parents_out(tmp_path):
         fit([spawns("a"), spawns("b", schedule={"x": 1})], tmp_path / "h.json")
 
 
+def spoil_tree(path, field, value):
+    model = json.loads(path.read_text())
+    model["learner"]["gradient_booster"]["model"]["trees"][3][field][0] = value
+    path.write_text(json.dumps(model))
+
+
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
@@ -143,6 +149,9 @@ def test_a_lone_scene_holds_parents_out(tmp_path):
             lambda path: path.write_text(path.read_text().replace("binary:logistic", "reg:squarederror")),
             "objective reg:squarederror",
         ),
+        (lambda path: spoil_tree(path, "left_children", 0), "the nodes of a tree do not form one"),
+        (lambda path: spoil_tree(path, "right_children", 1 << 20), "the nodes of a tree do not form one"),
+        (lambda path: spoil_tree(path, "split_indices", 8), "a split of feature 8"),
     ],
 )
 def test_bad_files_are_named(gate, tmp_path, break_it, message):

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gradient-boosted trees, evaluated in integers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+import blitzgs._library  # noqa: F401  (registers the ops)
+
+
+@torch.no_grad()
+def tree_sums(features: Tensor, roots: Tensor, nodes: Tensor, leaves: Tensor, depth: int) -> Tensor:
+    """Sum the leaves that each row of features reaches.
+
+    Args:
+        features: float32 [M, F], F <= 32; NaN: unknown.
+        roots: int32 [T], the first node of each tree.
+        nodes: int32 [n, 4]: the bits of the float32 threshold below which a row goes left; twice the number
+            of the feature that is compared, plus 1 where NaN goes left; the left child, -1 for a leaf; and
+            the right one. Children and features must be in range: the kernel does not check them.
+        leaves: int64 [n]; read at leaves.
+        depth: no path has more comparisons.
+
+    Returns:
+        int64 [M], the same bits on every device.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    return torch.ops.blitzgs.tree_sums(features, roots, nodes, leaves, depth)
+
+
+@torch.library.register_fake("blitzgs::tree_sums")
+def _(features: Tensor, *_rest: object) -> Tensor:
+    return features.new_empty(features.shape[0], dtype=torch.int64)

@@ -1,0 +1,59 @@
+// SPDX-License-Identifier: Apache-2.0
+// The sum of the leaves that each row of features reaches in the trees of a gradient-boosted model.
+//
+//   features float32 [M, F], roots int32 [T], nodes [n], leaves int64 [n]  ->  sums int64 [M]
+//
+// A row goes left where its feature is below the threshold, and where it is NaN and the node says so. A node
+// without children is a leaf. Leaves are integers, so the order of the trees does not matter and both
+// backends give the same bits. The caller has checked that children and features are in range and that no
+// path is longer than `depth`. O(M T depth).
+#pragma once
+#include <cstdint>
+
+#include "common/host_device.h"
+#include "common/stream.h"
+
+namespace blitzgs {
+
+struct alignas(16) TreeNode {
+  float threshold;
+  std::int32_t feature;      // twice its number, plus 1 where NaN goes left
+  std::int32_t left, right;  // -1 for a leaf
+};
+
+struct TreeSumsArgs {
+  const float* features;
+  const std::int32_t* roots;
+  const TreeNode* nodes;
+  const std::int64_t* leaves;
+  std::int64_t n_rows, n_features;
+  int n_trees, depth;
+  std::int64_t* sums;
+};
+
+// `row` gives the features of a row by their numbers.
+template <class Row>
+BLITZGS_HD std::int64_t tree_sum_of(const TreeSumsArgs& args, const Row& row) {
+  std::int64_t sum = 0;
+  for (int tree = 0; tree < args.n_trees; ++tree) {
+    std::int32_t at = args.roots[tree];
+    for (int step = 0; step < args.depth; ++step) {
+      const TreeNode node = args.nodes[at];
+      if (node.left < 0) break;
+      const float value = row[node.feature >> 1];
+      const bool goes_left = value < node.threshold || (value != value && (node.feature & 1));
+      at = goes_left ? node.left : node.right;
+    }
+    sum += args.leaves[at];
+  }
+  return sum;
+}
+
+namespace cpu {
+void tree_sums(const TreeSumsArgs& args, CudaStream);
+}
+namespace cuda {
+void tree_sums(const TreeSumsArgs& args, CudaStream);
+}
+
+}  // namespace blitzgs
