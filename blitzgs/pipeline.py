@@ -28,6 +28,8 @@ from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, Projection
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
 
 Mark = Callable[[str], None]
+# Finds the active rows, caught up, with room for the rows of so many blocks (None: of as many as there are).
+FindActive = Callable[[int | None], ActiveRows]
 
 
 def unmarked(stage: str) -> None:
@@ -144,7 +146,7 @@ def forward(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
-    active: ActiveRows | None = None,
+    active: ActiveRows | FindActive | None = None,
     assignment: TileAssignment | None = None,
     transport: Transport | None = None,
     mark: Mark = unmarked,
@@ -156,7 +158,8 @@ def forward(
         table: the Gaussians.
         views: at most 32 views.
         options: how to render.
-        active: rows to consider, and the views of each; None: all.
+        active: rows to consider, and the views of each, or what finds them: it is called again where it had
+            too little room. None: all.
         assignment: who composites which tiles; every rank of the job calls this with its table. None: render
             all of the views from this table alone.
         transport: brings the splats to the ranks that composite them. A transport that is kept estimates the
@@ -171,9 +174,7 @@ def forward(
     """
     if transport is None:
         transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
-    render = _Render(
-        inputs_of(table, views, options, active), views, options, assignment, mark, backward_follows
-    )
+    render = _Render(table, views, options, active, assignment, mark, backward_follows)
     # Past autograd's Python: an op that is differentiable elsewhere spends 20 us of the host's time there.
     with torch._C._AutoDispatchBelowAutograd():
         return transport.capacity.run(lambda capacity: render.attempt(transport, capacity))
@@ -183,9 +184,10 @@ def forward(
 class _Render:
     """One call of `forward`."""
 
-    inputs: ProjectionInputs
+    table: GaussianTable
     views: Views
     options: RenderOptions
+    active: ActiveRows | FindActive | None
     assignment: TileAssignment | None
     mark: Mark
     backward_follows: bool
@@ -193,7 +195,13 @@ class _Render:
     def attempt(self, transport: Transport, capacity: Sizes | None) -> tuple[Frame | None, Sizes]:
         """Queue all of it, then wait for the numbers; the frame is None if the capacity was too small."""
         views, grid = self.views, tile_grid(self.views, self.options, self.assignment)
-        with transport.start(self.inputs, self.assignment, capacity) as exchange:
+        active = self.active
+        if callable(active) and self.table.device.type == "cpu":
+            active = active(None)._replace(blocks=None)  # complete, as the number is there at once
+        elif callable(active):
+            active = active(None if capacity is None else capacity.blocks)
+        inputs = inputs_of(self.table, views, self.options, active)
+        with transport.start(inputs, self.assignment, capacity) as exchange:
             self.mark("project")
             arrived = exchange.receive()
             self.mark("exchange")

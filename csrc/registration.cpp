@@ -33,8 +33,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
       "Tensor? moment_step, Tensor? table, Tensor[] cameras, int[] size, float[] limits, "
       "Tensor? level_ranges=None, Tensor? level=None, float[] reach=[], int lod_views=0, Tensor? cull=None, "
-      "int[] columns=[]) "
-      "-> (Tensor active_ids, Tensor active_views, Tensor count)");
+      "int[] columns=[], int? room=None) "
+      "-> (Tensor active_ids, Tensor active_views, Tensor count, Tensor n_blocks)");
   // Clears the bits of pairs that a view leaves out, by level and distance or by the columns of a cull mask.
   m.def(
       "gate_views_(Tensor ids, Tensor(a!) views, Tensor? count, Tensor means, Tensor level, Tensor viewmats, "
@@ -42,10 +42,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
 
   // Projection: parameters to screen-space splats, ordered by (Gaussian, view). Groups of arguments, as
   // blitzgs/ops/project.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras (viewmats,
-  // Ks); active ([ids[, views[, count]]]); rank_tiles (begin and end of each rank); capacity ([visible,
-  // splats]; none: wait for their number); splats (camera_ids, visible_ids, splat_offsets); ints (width,
-  // height, tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d, radius_clip[,
-  // fade_slope, reach of each level]). level: of the Gaussians, where opacities fade by it
+  // Ks); active ([ids[, views[, count[, n_blocks]]]]); rank_tiles (begin and end of each rank); capacity
+  // ([visible, splats]; none: wait for their number); splats (camera_ids, visible_ids, splat_offsets); ints
+  // (width, height, tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d,
+  // radius_clip[, fade_slope, reach of each level]). level: of the Gaussians, where opacities fade by it
   // (csrc/project/level_fade.h).
   m.def(
       "project_fwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] active, int[] ints, float[] floats, "

@@ -58,19 +58,22 @@ class GateRules(NamedTuple):
 
 
 class ActiveRows(NamedTuple):
-    """The rows that some view may see: the first `length` entries of lists with room for all N.
+    """The rows that some view may see: the first `length` entries of lists with room for R rows.
 
     The length stays on the device, so that the host need not wait; ops that take the lists take it too.
 
     Attributes:
-        ids: int32 [N], ascending.
-        views: int32 [N], bit v set when view v may see the row.
+        ids: int32 [R], ascending.
+        views: int32 [R], bit v set when view v may see the row.
         length: int32 [1], on the device of the others.
+        blocks: int32 [1], likewise: of how many blocks some view may see a part. Where there is room for
+            fewer, the lists are incomplete and `length` is 0. None: the lists are complete.
     """
 
     ids: Tensor
     views: Tensor
     length: Tensor
+    blocks: Tensor | None = None
 
     def listed(self) -> tuple[Tensor, Tensor]:
         """Return the active rows and their views, int32 [A] each; waits for the device."""
@@ -127,6 +130,7 @@ def cull_blocks(
     pending: PendingSteps | None = None,
     level_ranges: Tensor | None = None,
     rules: GateRules | None = None,
+    room: int | None = None,
 ) -> ActiveRows:
     """Return the rows that at least one of B views may see, without reading the rows of blocks outside.
 
@@ -149,22 +153,24 @@ def cull_blocks(
         level_ranges: uint8 [ceil(N / 256), 2], coarsest and finest level of each block; needed for `rules`.
         rules: rows that the views certainly leave out, wherever their pending steps take them, are dropped
             too; `blitzgs.ops.view_gate.gate_views_` decides about the rest. None: none are.
+        room: for the rows of how many blocks the lists have room, at least 1. None: as many as some view may
+            see; the host waits for their number.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, more than 32 views, or as `gate_views_` says.
     """
-    return ActiveRows._make(
-        torch.ops.blitzgs.cull_blocks(
-            bounds,
-            means,
-            scales,
-            *_pending_arguments(pending),
-            [viewmats, Ks],
-            [width, height],
-            [near_plane, far_plane, eps2d],
-            *(() if rules is None else (level_ranges, *rules)),
-        )
+    ids, views, length, blocks = torch.ops.blitzgs.cull_blocks(
+        bounds,
+        means,
+        scales,
+        *_pending_arguments(pending),
+        [viewmats, Ks],
+        [width, height],
+        [near_plane, far_plane, eps2d],
+        *(() if rules is None else (level_ranges, *rules)),
+        room=room,
     )
+    return ActiveRows(ids, views, length, blocks)
 
 
 def _pending_arguments(
@@ -184,6 +190,8 @@ def _(*_args: object) -> None:
 
 
 @torch.library.register_fake("blitzgs::cull_blocks")
-def _(bounds: Tensor, means: Tensor, *_args: object) -> tuple[Tensor, Tensor, Tensor]:
-    ids, views, count = (bounds.new_empty(n, dtype=torch.int32) for n in (len(means), len(means), 1))
-    return ids, views, count
+def _(bounds: Tensor, *_args: object, room: int | None = None) -> tuple[Tensor, ...]:
+    blocks = torch.library.get_ctx().new_dynamic_size() if room is None else min(room, len(bounds))
+    return tuple(
+        bounds.new_empty(n, dtype=torch.int32) for n in (blocks * BLOCK_ROWS, blocks * BLOCK_ROWS, 1, 1)
+    )

@@ -25,6 +25,7 @@ class Sizes(NamedTuple):
     visible: int  # Gaussians seen by at least one view
     splats: int  # pairs of a Gaussian and a view that sees it
     isects: int  # entries of the tiles' lists
+    blocks: int = 0  # of rows of the table, of which some view may see a part
 
     def holds(self, needed: Sequence[int]) -> bool:
         """Tell whether there is room for so many of the first of these."""
@@ -50,7 +51,7 @@ class CapacityEstimate:
             before = self._sizes or Sizes(0, 0, 0)
             # Views differ, so some more than the largest; and a large one is forgotten slowly.
             self._sizes = Sizes._make(
-                max(1, n * 9 // 8, size - size // 256) for n, size in zip(needed, before, strict=True)
+                max(1, n * 9 // 8, size - size // 256) for n, size in zip(Sizes(*needed), before, strict=True)
             )
 
     def run(self, attempt: Callable[[Sizes | None], tuple[T | None, Sequence[int]]]) -> T:

@@ -10,7 +10,13 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, project_splats
+from blitzgs.ops.projection import (
+    VIEW_TOTALS,
+    ProjectedSplats,
+    ProjectionInputs,
+    ProjectionOptions,
+    project_splats,
+)
 from blitzgs.ops.sparse_rows import sparse_rows
 from blitzgs.ops.splat_gradients import packed_table
 
@@ -159,7 +165,7 @@ def _(
         ints_of(P),
         means.new_empty(P if rank_tiles else 0, dtype=torch.int64),
         means.new_empty(0 if ids is None else P, dtype=torch.int64),
-        means.new_empty(3 + cameras[0].shape[0] + len(rank_tiles), dtype=torch.int64),
+        means.new_empty(VIEW_TOTALS + cameras[0].shape[0] + len(rank_tiles), dtype=torch.int64),
     )
 
 

@@ -14,6 +14,9 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
 
+# Where the splats of the views begin in `Projected.totals` (kTotalViews of csrc/project/project.h).
+VIEW_TOTALS = 4
+
 
 class ProjectedSplats(NamedTuple):
     """What the views see, ordered by (Gaussian, view): P splats of U different Gaussians."""
@@ -94,8 +97,8 @@ class ProjectionInputs(NamedTuple):
         gaussians: means, quats, scales, opacities and, unless there are none, sh.
         cameras: viewmats, Ks.
         options: the rest.
-        active: which Gaussians to consider, `ActiveRows`: ids, the views of each, how many ids there are;
-            those behind the first may be left out. Empty: all Gaussians in all views.
+        active: which Gaussians to consider, `ActiveRows`: ids, the views of each, how many ids there are,
+            of how many blocks; those behind the first may be left out. Empty: all Gaussians in all views.
         ids: int64 [N], persistent, of the Gaussians; None: the splats' are not wanted.
         level: uint8 [N], octree levels, where opacities fade by them (`ProjectionOptions.fade`); else None.
     """
@@ -103,7 +106,7 @@ class ProjectionInputs(NamedTuple):
     gaussians: Sequence[Tensor]
     cameras: Sequence[Tensor]
     options: ProjectionOptions
-    active: Sequence[Tensor] = ()
+    active: Sequence[Tensor | None] = ()
     ids: Tensor | None = None
     level: Tensor | None = None
 
@@ -123,7 +126,7 @@ class ProjectionInputs(NamedTuple):
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
             list(self.gaussians),
             list(self.cameras),
-            list(self.active),
+            [tensor for tensor in self.active if tensor is not None],
             self.options.ints,
             self.options.floats,
             [tile for tiles in rank_tiles for tile in tiles],
@@ -141,8 +144,9 @@ class Projected(NamedTuple):
         splats: with room behind them where a capacity was given; counts are None. Where the capacity was too
             small they mean nothing.
         ids: int64 [P], persistent, of the splats' Gaussians; [0] where none were given.
-        totals: int64 [3 + B + 2 M], on the device, right in any case: U, P and the sum of tiles_touched; the
-            splats of each view; and for each rank its splats and the tiles that these touch there.
+        totals: int64 [VIEW_TOTALS + B + 2 M], on the device, right in any case: `Sizes` (an upper bound of
+            the entries); the splats of each view; and for each rank its splats and the tiles that these touch
+            there.
     """
 
     splats: ProjectedSplats
@@ -153,11 +157,11 @@ class Projected(NamedTuple):
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
     """`project` of grouped arguments, without gradients."""
 
-    def attempt(capacity: Sizes | None) -> tuple[ProjectedSplats | None, list[int]]:
+    def attempt(capacity: Sizes | None) -> tuple[ProjectedSplats | None, Sizes]:
         projected = inputs.run(capacity)
         with HostCopy(projected.totals) as copy:
             counts = copy.read()[:3]
-        needed = counts.tolist()
+        needed = Sizes._make((*counts.tolist(), 0))
         if capacity is not None and not capacity.holds(needed[:2]):
             return None, needed
         return splats_of(projected.splats[:12], counts), needed

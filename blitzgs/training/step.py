@@ -11,6 +11,7 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
+from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
 from blitzgs.population.exploration import PositionNoise
@@ -79,18 +80,22 @@ class Stepper:
         """
         table, ranks, views = self._table, self._owners.ranks, batch.views
         rules = None if gate is None else gate.rules(table, table.columns.get(CULL))
-        active = self._blocks.active(
-            table, views.viewmats, views.Ks, views.width, views.height, options.near_plane, options.far_plane,
-            options.eps2d, rules,
-        )  # fmt: skip
-        mark("other")
-        self._optimiser.catch_up(table, active.ids, step - 1, active.length)
-        mark("optimiser")
-        if rules is not None:
-            gate_views_(active, table["means"], views.viewmats, rules)
+
+        def find_active(room: int | None) -> ActiveRows:
+            active = self._blocks.active(
+                table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
+                options.far_plane, options.eps2d, rules, room,
+            )  # fmt: skip
+            mark("other")
+            self._optimiser.catch_up(table, active.ids, step - 1, active.length)
+            mark("optimiser")
+            if rules is not None:
+                gate_views_(active, table["means"], views.viewmats, rules)
+            return active
+
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         frame = pipeline.forward(
-            table, views, options, active, assignment, self._transport, mark, backward_follows=True
+            table, views, options, find_active, assignment, self._transport, mark, backward_follows=True
         )
         terms = loss_terms(frame, batch, self._loss, self._length_unit)
         mark("loss")

@@ -61,6 +61,7 @@ class BlockIndex:
         far_plane: float,
         eps2d: float = 0.3,
         rules: GateRules | None = None,
+        room: int | None = None,
     ) -> ActiveRows:
         """Return the rows that the views may see, and the views of each.
 
@@ -69,7 +70,7 @@ class BlockIndex:
         """
         return cull_blocks(
             self._bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
-            eps2d, self._pending(table), self._level_ranges, rules,
+            eps2d, self._pending(table), self._level_ranges, rules, room,
         )  # fmt: skip
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:

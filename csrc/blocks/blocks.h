@@ -20,6 +20,8 @@
 //
 // The test is conservative: every row that projection would project is in the set
 // (tests/view/test_blocks.py). O(N / 256 + rows of the blocks across a border + active rows) per view.
+// Memory: O(rows of the blocks that some view may see). The caller says for how many blocks there is room;
+// where there are more, the lists are left empty and the number of blocks tells what is needed.
 #pragma once
 #include <cfloat>
 #include <cmath>
@@ -275,24 +277,41 @@ BLITZGS_HD std::uint32_t views_of_row(const BlockRows& rows, const Frustum* view
   return mask;
 }
 
-// What the first kernels find, before rows are listed: the views of each block, the views of the rows of
-// mixed blocks, and how many rows of each block are active.
-struct CullPlan {
-  BlockViews* blocks;    // [blocks_of(n)]
-  std::uint32_t* masks;  // [n]
-  std::int32_t* active;  // [blocks_of(n)]
-  std::int64_t n;
-
-  CullPlan(std::int64_t rows, Workspace& workspace)
-      : blocks(workspace.allocate<BlockViews>(blocks_of(rows))),
-        masks(workspace.allocate<std::uint32_t>(rows)),
-        active(workspace.allocate<std::int32_t>(blocks_of(rows))),
-        n(rows) {}
+// A block that some view may see.
+struct alignas(16) ActiveBlock {
+  std::int32_t block;
+  BlockViews seen;
 };
 
-// Lists with room for n rows; the active rows and their views come first.
+// What the first kernels find, before rows are listed: the blocks that some view may see, in order, the views
+// of the rows of those that are mixed, and how many rows of each are active.
+struct CullPlan {
+  ActiveBlock* blocks;   // [room]
+  std::uint32_t* masks;  // [room, kBlockRows]
+  std::int32_t* active;  // [room]
+  std::int64_t room;
+
+  CullPlan(std::int64_t n_blocks, Workspace& workspace)
+      : blocks(workspace.allocate<ActiveBlock>(n_blocks)),
+        masks(workspace.allocate<std::uint32_t>(n_blocks * kBlockRows)),
+        active(workspace.allocate<std::int32_t>(n_blocks)),
+        room(n_blocks) {}
+};
+
+// Lists with room for the rows of `room` blocks; the active rows and their views come first. n_blocks is how
+// many blocks some view may see: where these are more than there is room for, count is 0.
 struct ActiveList {
-  std::int32_t *ids, *views, *count;  // [n], [n], [1]
+  std::int32_t *ids, *views, *count, *n_blocks;  // [room * kBlockRows] twice, [1] twice
+  std::int64_t room;
+};
+
+// What decides which rows are active.
+struct CullInputs {
+  BlockRows rows;
+  const float* bounds;
+  CullCamera camera;
+  int views;
+  BlockGate gate;
 };
 
 namespace cpu {
@@ -300,15 +319,17 @@ void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Worksp
 // ids null: every block. Otherwise the blocks of these rows.
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);
-void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                 const BlockGate&, const ActiveList&, Workspace&, CudaStream);
+// Waits for the number of blocks that some view may see.
+std::int64_t count_active_blocks(const CullInputs&, Workspace&, CudaStream);
+void cull_blocks(const CullInputs&, const ActiveList&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);
-void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                 const BlockGate&, const ActiveList&, Workspace&, CudaStream);
+// Waits for the number of blocks that some view may see.
+std::int64_t count_active_blocks(const CullInputs&, Workspace&, CudaStream);
+void cull_blocks(const CullInputs&, const ActiveList&, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

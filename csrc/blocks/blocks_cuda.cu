@@ -4,6 +4,7 @@
 #include "blocks/blocks.h"
 #include "common/launch.cuh"
 #include "common/multiprocessors.h"
+#include "common/running_sum.cuh"
 #include "common/warp.cuh"
 #include "common/zeros.cuh"
 #include "math/morton_cuda.cuh"
@@ -85,105 +86,133 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
   }
 }
 
-// One thread for each block, one CUDA block for each group of blocks. Lists the mixed blocks, in any order,
-// counts the active rows of the others, and writes the planes of the views for test_rows.
+// Counters of a call, zero at its start.
+struct CullCounters {
+  RunningSum earlier;     // over the groups of blocks
+  std::int32_t* groups;   // active rows of each kGroup blocks of the plan
+  std::int32_t* n_mixed;  // entries of `mixed`
+};
+
+// One thread for each block, one CUDA block for each group of blocks, in turn. Lists the blocks that some
+// view may see behind those of earlier groups, as far as there is room, lists which of these are mixed, in
+// any order, counts the active rows of the others, and writes the planes of the views for test_rows.
 template <bool kGated>
-__global__ void test_blocks(const float* bounds, CullCamera camera, int views, const BlockGate gate,
-                            const CullPlan plan, std::int32_t* list, std::int32_t* length,
-                            std::int32_t* groups, Frustum* planes_out) {
+__global__ void __launch_bounds__(kGroup)
+    test_blocks(const __grid_constant__ CullInputs in, const CullPlan plan, const CullCounters counters,
+                std::int32_t* mixed, std::int32_t* n_blocks, Frustum* planes_out) {
   __shared__ Frustum planes[kMaxViews];
   __shared__ GateTable table;
+  __shared__ int of_warps[kWarps];
   wait_for_earlier_kernels();
-  if (kGated) fill_gate_table(gate.rules, camera.viewmats, table);
-  const int thread = threadIdx.x;
-  if (thread < views) {
-    planes[thread] = make_frustum(camera, thread);
+  const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
+  if (kGated) fill_gate_table(in.gate.rules, in.camera.viewmats, table);
+  if (thread < in.views) {
+    planes[thread] = make_frustum(in.camera, thread);
     if (blockIdx.x == 0) planes_out[thread] = planes[thread];
   }
-  __syncthreads();
-  const std::int64_t blocks = blocks_of(plan.n), block = blockIdx.x * std::int64_t{blockDim.x} + thread;
+  const int group = counters.earlier.take_turn();
+  const std::int64_t blocks = blocks_of(in.rows.n), block = group * std::int64_t{kGroup} + thread;
   BlockViews seen{0, 0, 0};
-  int active = 0;
-  if (block < blocks) {
-    plan.blocks[block] = seen = views_of_block<kGated>(planes, views, bounds, block, gate, table);
-    if (!is_mixed(seen)) plan.active[block] = active = seen.all ? rows_in_block(plan.n, block) : 0;
+  if (block < blocks) seen = views_of_block<kGated>(planes, in.views, in.bounds, block, in.gate, table);
+  const unsigned ballot = __ballot_sync(kFullWarp, seen.some != 0);
+  if (lane == 0) of_warps[warp] = __popc(ballot);
+  __syncthreads();
+  int at = __popc(ballot & ((1u << lane) - 1)), count = 0;
+#pragma unroll
+  for (int other = 0; other < kWarps; ++other) {
+    if (other < warp) at += of_warps[other];
+    count += of_warps[other];
   }
-  active = __reduce_add_sync(kFullWarp, active);
-  if (thread % 32 == 0 && active > 0) atomicAdd(groups + blockIdx.x, active);
-  append(is_mixed(seen), static_cast<std::int32_t>(block), list, length);
+  const std::int64_t before = counters.earlier.sum_before<kGroup>(group, count), place = before + at;
+  if (thread == 0 && (group + 1) * std::int64_t{kGroup} >= blocks) {
+    *n_blocks = static_cast<std::int32_t>(before + count);
+  }
+  const bool listed = seen.some && place < plan.room;
+  if (listed) {
+    plan.blocks[place] = {static_cast<std::int32_t>(block), seen};
+    if (!is_mixed(seen)) {
+      const int rows = rows_in_block(in.rows.n, block);
+      plan.active[place] = rows;
+      atomicAdd(counters.groups + place / kGroup, rows);
+    }
+  }
+  append(listed && is_mixed(seen), static_cast<std::int32_t>(place), mixed, counters.n_mixed);
 }
 
-// Each CUDA block tests blocks of the list in turn, one thread for each row.
+// Each CUDA block tests mixed blocks in turn, one thread for each row.
 template <bool kGated>
 __global__ void __launch_bounds__(kBlockRows, kResident)
-    test_rows(const BlockRows rows, const float* bounds, const Frustum* planes, const float* viewmats,
-              int views, const BlockGate gate, const CullPlan plan, const std::int32_t* list,
-              const std::int32_t* length, std::int32_t* groups) {
+    test_rows(const __grid_constant__ CullInputs in, const CullPlan plan, const CullCounters counters,
+              const std::int32_t* mixed, const std::int32_t* n_blocks, const Frustum* planes) {
   __shared__ Frustum shared[kMaxViews];
   __shared__ GateTable table;
   wait_for_earlier_kernels();
-  const std::int32_t count = *length;
+  const std::int32_t count = *n_blocks > plan.room ? 0 : *counters.n_mixed;
   if (static_cast<std::int32_t>(blockIdx.x) >= count) return;
-  if (threadIdx.x < views) shared[threadIdx.x] = planes[threadIdx.x];
-  if (kGated) fill_gate_table(gate.rules, viewmats, table);
+  if (threadIdx.x < in.views) shared[threadIdx.x] = planes[threadIdx.x];
+  if (kGated) fill_gate_table(in.gate.rules, in.camera.viewmats, table);
   __syncthreads();
   for (std::int32_t i = blockIdx.x; i < count; i += gridDim.x) {
-    const std::int64_t block = list[i], row = block * kBlockRows + threadIdx.x;
+    const std::int32_t place = mixed[i];
+    const auto [block, seen] = plan.blocks[place];
+    const std::int64_t row = std::int64_t{block} * kBlockRows + threadIdx.x;
     std::uint32_t mask = 0;
-    if (row < rows.n) {
-      mask = views_of_row<kGated>(rows, shared, views, bounds, plan.blocks[block], row, gate, table);
-      plan.masks[row] = mask;
+    if (row < in.rows.n) {
+      mask = views_of_row<kGated>(in.rows, shared, in.views, in.bounds, seen, row, in.gate, table);
+      plan.masks[std::int64_t{place} * kBlockRows + threadIdx.x] = mask;
     }
     const int total = __syncthreads_count(mask != 0);
     if (threadIdx.x == 0) {
-      plan.active[block] = total;
-      atomicAdd(groups + block / kGroup, total);
+      plan.active[place] = total;
+      atomicAdd(counters.groups + place / kGroup, total);
     }
   }
 }
 
-// Returns the number of active rows before a block: those of earlier groups, and those of earlier blocks of
-// its own group. All threads call this.
-__device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* groups, std::int64_t block) {
+// Returns the number of active rows before a place of the plan: those of earlier groups, and those of earlier
+// blocks of its own group. All threads call this.
+__device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* groups, std::int32_t place) {
   __shared__ std::int32_t parts[kWarps];
-  const std::int64_t group = block / kGroup, near = group * kGroup + threadIdx.x;
+  const std::int32_t group = place / kGroup, near = group * kGroup + static_cast<std::int32_t>(threadIdx.x);
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  std::int32_t sum = near < block ? plan.active[near] : 0;
-  for (std::int64_t i = threadIdx.x; i < group; i += kGroup) sum += groups[i];
+  std::int32_t sum = near < place ? plan.active[near] : 0;
+  for (std::int32_t i = threadIdx.x; i < group; i += kGroup) sum += groups[i];
   sum = __reduce_add_sync(kFullWarp, sum);
   if (lane == 0) parts[warp] = sum;
   __syncthreads();
   return __reduce_add_sync(kFullWarp, lane < kWarps ? parts[lane] : 0);
 }
 
-// One warp for each block.
+// One warp for each block of the plan.
 __global__ void __launch_bounds__(kBlockRows)
-    emit_rows(const CullPlan plan, const std::int32_t* groups, const ActiveList out) {
+    emit_rows(std::int64_t n, const CullPlan plan, const std::int32_t* groups, const ActiveList out) {
   wait_for_earlier_kernels();
-  const std::int64_t blocks = blocks_of(plan.n), first = blockIdx.x * std::int64_t{kWarps};
+  const std::int32_t n_blocks = *out.n_blocks > plan.room ? 0 : *out.n_blocks;
+  const std::int32_t first = static_cast<std::int32_t>(blockIdx.x) * kWarps;
+  if (blockIdx.x == 0 && threadIdx.x == 0 && n_blocks == 0) *out.count = 0;
+  if (first >= n_blocks) return;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-  const std::int64_t block = first + warp;
-  const std::int32_t before = rows_before(plan, groups, first);
-  const std::int32_t here = lane < kWarps && first + lane < blocks ? plan.active[first + lane] : 0;
-  if (blockIdx.x == gridDim.x - 1 && warp == 0) {
+  const std::int32_t place = first + warp, before = rows_before(plan, groups, first);
+  const std::int32_t here = lane < kWarps && first + lane < n_blocks ? plan.active[first + lane] : 0;
+  if (first + kWarps >= n_blocks && warp == 0) {
     const std::int32_t all = before + __reduce_add_sync(kFullWarp, here);
     if (lane == 0) *out.count = all;
   }
   std::int32_t at = before + __reduce_add_sync(kFullWarp, lane < warp ? here : 0);
-  if (block >= blocks) return;
-  const BlockViews seen = plan.blocks[block];
-  if (!seen.some) return;
+  if (place >= n_blocks) return;
+  const auto [block, seen] = plan.blocks[place];
   const bool mixed = is_mixed(seen);
-  const int count = rows_in_block(plan.n, block);
+  const int count = rows_in_block(n, block);
 #pragma unroll
   for (int local = lane; local < kBlockRows; local += 32) {
-    const std::int64_t row = block * kBlockRows + local;
-    const std::uint32_t mask = local >= count ? 0 : mixed ? plan.masks[row] : seen.all;
+    const std::uint32_t mask = local >= count ? 0
+                               : mixed        ? plan.masks[std::int64_t{place} * kBlockRows + local]
+                                              : seen.all;
     const std::uint32_t ballot = __ballot_sync(kFullWarp, mask != 0);
-    const std::int32_t place = at + __popc(ballot & ((1u << lane) - 1));
+    const std::int32_t to = at + __popc(ballot & ((1u << lane) - 1));
     if (mask) {
-      out.ids[place] = static_cast<std::int32_t>(row);
-      out.views[place] = static_cast<std::int32_t>(mask);
+      out.ids[to] = block * kBlockRows + local;
+      out.views[to] = static_cast<std::int32_t>(mask);
     }
     at += __popc(ballot);
   }
@@ -219,26 +248,47 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
                list, length, bounds);
 }
 
-void cull_blocks(const BlockRows& rows, const float* bounds, const CullCamera& camera, int views,
-                 const BlockGate& gate, const ActiveList& out, Workspace& workspace, CudaStream stream) {
-  const std::int64_t blocks = blocks_of(rows.n);
-  if (blocks == 0) {
-    check(cudaMemsetAsync(out.count, 0, sizeof(*out.count), stream), "cull_blocks");
-    return;
-  }
-  const CullPlan plan(rows.n, workspace);
-  std::int32_t* list = workspace.allocate<std::int32_t>(blocks);
-  Frustum* planes = workspace.allocate<Frustum>(views);
-  const unsigned n_groups = blocks_for(blocks, kGroup);
-  std::int32_t *groups = workspace.allocate<std::int32_t>(n_groups + 1), *length = groups + n_groups;
-  zero("cull_blocks", groups, n_groups + 1, stream);
-  const bool gated = leaves_out_any(gate.rules);
-  launch_early("cull_blocks", gated ? test_blocks<true> : test_blocks<false>, {n_groups, kGroup, stream},
-               bounds, camera, views, gate, plan, list, length, groups, planes);
+namespace {
+
+// Finds the blocks that some view may see, and lists their rows where there is room for any.
+void cull(const CullInputs& in, const ActiveList& out, Workspace& workspace, CudaStream stream) {
+  const CullPlan plan(out.room, workspace);
+  std::int32_t* mixed = workspace.allocate<std::int32_t>(out.room);
+  Frustum* planes = workspace.allocate<Frustum>(in.views);
+  const unsigned turns = blocks_for(blocks_of(in.rows.n), kGroup), n_groups = blocks_for(out.room, kGroup);
+  auto* sums = workspace.allocate<std::uint64_t>(turns + 1 + (n_groups + 2) / 2);
+  auto* groups = reinterpret_cast<std::int32_t*>(sums + turns + 1);
+  const CullCounters counters{RunningSum(sums), groups, groups + n_groups};
+  zero("cull_blocks", reinterpret_cast<std::int32_t*>(sums), 2 * (turns + 1) + n_groups + 1, stream);
+  const bool gated = leaves_out_any(in.gate.rules);
+  launch_early("cull_blocks", gated ? test_blocks<true> : test_blocks<false>, {turns, kGroup, stream}, in,
+               plan, counters, mixed, out.n_blocks, planes);
+  if (out.room == 0) return;
   launch_early("cull_blocks", gated ? test_rows<true> : test_rows<false>,
-               {persistent_blocks(blocks), kBlockRows, stream}, rows, bounds, planes, camera.viewmats, views,
-               gate, plan, list, length, groups);
-  launch_early("cull_blocks", emit_rows, {blocks_for(blocks, kWarps), kBlockRows, stream}, plan, groups, out);
+               {persistent_blocks(out.room), kBlockRows, stream}, in, plan, counters, mixed, out.n_blocks,
+               planes);
+  launch_early("cull_blocks", emit_rows, {blocks_for(out.room, kWarps), kBlockRows, stream}, in.rows.n, plan,
+               groups, out);
+}
+
+}  // namespace
+
+std::int64_t count_active_blocks(const CullInputs& in, Workspace& workspace, CudaStream stream) {
+  if (in.rows.n == 0) return 0;
+  auto* n_blocks = workspace.allocate<std::int32_t>(1);
+  cull(in, {nullptr, nullptr, nullptr, n_blocks, 0}, workspace, stream);
+  std::int32_t count = 0;
+  check(cudaMemcpyAsync(&count, n_blocks, sizeof(count), cudaMemcpyDeviceToHost, stream), "cull_blocks");
+  check(cudaStreamSynchronize(stream), "cull_blocks");
+  return count;
+}
+
+void cull_blocks(const CullInputs& in, const ActiveList& out, Workspace& workspace, CudaStream stream) {
+  if (in.rows.n == 0 || out.room == 0) {
+    check(cudaMemsetAsync(out.count, 0, sizeof(*out.count), stream), "cull_blocks");
+    check(cudaMemsetAsync(out.n_blocks, 0, sizeof(*out.n_blocks), stream), "cull_blocks");
+  }
+  if (in.rows.n > 0) cull(in, out, workspace, stream);
 }
 
 }  // namespace blitzgs::cuda

@@ -39,7 +39,8 @@ namespace blitzgs {
 // means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3] or null; viewmats [B, 4, 4],
 // Ks [B, 3, 3]. Candidates: rows active_ids (ascending), or all N when null; bit v of active_views[c] allows
 // view v for candidate c (null: all views). n_active (CUDA, on the device): how many of the n_candidates
-// there are; null: all. fade: of smooth levels.
+// there are; null: all. n_blocks (where the inputs are): a number that is passed on to the totals; null: 0.
+// fade: of smooth levels.
 template <class T>
 struct ProjectInputs {
   const T *means, *quats, *scales, *opacities, *sh, *viewmats, *Ks;
@@ -48,13 +49,15 @@ struct ProjectInputs {
   int n_views;
   ProjectOptions<T> options;
   const std::int32_t* n_active = nullptr;
+  const std::int32_t* n_blocks = nullptr;
   LevelFade fade{};
 };
 
 // What project() sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P splats,
-// the tiles they touch (an upper bound: hidden splats count), the splats of each view [B], and for each rank
-// its splats and the tiles they touch there [M, 2].
-inline constexpr int kTotalVisible = 0, kTotalSplats = 1, kTotalTiles = 2, kTotalViews = 3;
+// the tiles they touch (an upper bound: hidden splats count), the blocks of the table that some view may see
+// (blocks.h), the splats of each view [B], and for each rank its splats and the tiles they touch there [M,
+// 2].
+inline constexpr int kTotalVisible = 0, kTotalSplats = 1, kTotalTiles = 2, kTotalBlocks = 3, kTotalViews = 4;
 
 BLITZGS_HD std::int64_t project_totals(std::int64_t n_views, std::int64_t n_ranks) {
   return kTotalViews + n_views + 2 * n_ranks;

@@ -191,6 +191,7 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemor
   const std::int64_t n_totals = project_totals(in.n_views, rank_tiles.n_ranks);
   std::vector<CountedBlock<T>> blocks(project_blocks(in.n_candidates));
   std::fill_n(totals, n_totals, 0);
+  if (in.n_blocks) totals[kTotalBlocks] = *in.n_blocks;
   std::mutex adding;
   for_each_block(blocks, in.n_candidates, [&](CountedBlock<T>& block, std::int64_t first, std::int64_t last) {
     std::vector<std::int64_t> sums(n_totals, 0);

@@ -7,14 +7,14 @@
 namespace blitzgs {
 namespace {
 
-// The candidates of a projection: ids, which views may see each, and how many of the ids are there; all
-// Gaussians and views where nothing is given.
+// The candidates of a projection: ids, which views may see each, how many of the ids are there, and how many
+// blocks of the table they are of; all Gaussians and views where nothing is given.
 struct Candidates {
-  OptionalTensor ids, views, listed;
+  OptionalTensor ids, views, listed, blocks;
   std::int64_t count;
 
   Candidates(const char* op, const TensorList& active, std::int64_t n_gaussians) : count(n_gaussians) {
-    check_group(op, "(ids, views, count), each left out with those behind it", active, 0, 3);
+    check_group(op, "(ids, views, count, n_blocks), each left out with those behind it", active, 0, 4);
     if (active.empty()) return;
     ids = as_contiguous(active[0]);
     check_shape(op, "active_ids", *ids, {-1});
@@ -25,6 +25,11 @@ struct Candidates {
       check_dtype(op, "active_views", *views, ScalarType::Int);
     }
     if (active.size() > 2) listed = active[2];
+    if (active.size() > 3) {
+      blocks = active[3];
+      check_shape(op, "n_blocks", *blocks, {1});
+      check_dtype(op, "n_blocks", *blocks, ScalarType::Int);
+    }
     count = most_listed(op, listed, ids->numel());
   }
 };
@@ -137,6 +142,7 @@ Projected project_fwd(const TensorList& gaussians, const TensorList& cameras, co
     in.active_views = data_or_null<std::int32_t>(candidates.views);
     in.n_candidates = candidates.count;
     in.n_active = data_or_null<std::int32_t>(candidates.listed);
+    in.n_blocks = data_or_null<std::int32_t>(candidates.blocks);
     TorchSplats<T> splats(p.means, p.sh.has_value(), ranks.n_ranks > 0, persistent, sizes, &t);
     backend::project(in, ranks, splats, mutable_data<std::int64_t>(totals), scope.workspace, scope.stream);
   });

@@ -161,7 +161,10 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
   const std::int64_t n_gaussians = *kept.count;
   const int at_once = projected_at_once(in.n_views);
   const int n_turns = static_cast<int>((n_gaussians + at_once - 1) / at_once);
-  if (blockIdx.x == 0 && thread == 0 && n_turns == 0) end_splats(0, capacity, ids);
+  if (blockIdx.x == 0 && thread == 0) {
+    if (n_turns == 0) end_splats(0, capacity, ids);
+    if (totals && in.n_blocks) totals[kTotalBlocks] = *in.n_blocks;
+  }
   if (static_cast<int>(blockIdx.x) > n_turns) return;
   const bool writes = capacity.splats > 0;
   for (int i = thread; i < static_cast<int>(sizeof(Sums) / 4); i += kSplatThreads) {

@@ -12,6 +12,7 @@ from blitzgs.distributed.transport import LocalTransport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.splat_gradients import gradient_columns
+from blitzgs.view.blocks import BlockIndex, morton_order
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import parameter_gradients
 from tests.training.tiny import random_gaussians
@@ -91,6 +92,35 @@ def test_frames_do_not_depend_on_the_room_that_was_guessed():
             assert torch.equal(getattr(frame, name), getattr(plain, name)), name
         for x, y in zip(parameter_gradients(table, frame, v_renders), expected, strict=True):
             assert torch.equal(x, y)
+
+
+def test_an_active_set_that_did_not_fit_is_found_again():
+    small = random_gaussians(5000)
+    table = GaussianTable({name: small[name].cuda() for name in small})
+    table.permute(morton_order(table["means"]))
+    views, index, asked = cameras(3, device="cuda"), BlockIndex(table), []
+    expected = pipeline.forward(table, views, OPTIONS)
+
+    def find(room):
+        asked.append(room)
+        return index.active(
+            table, views.viewmats, views.Ks, views.width, views.height, OPTIONS.near_plane,
+            OPTIONS.far_plane, room=room,
+        )  # fmt: skip
+
+    blocks = int(find(None).blocks)
+    assert blocks > 2
+    for sizes in (None, Sizes(1, 1, 1, 1), Sizes(10**5, 10**5, 10**6, blocks - 1), Sizes(1, 1, 1, blocks)):
+        transport = LocalTransport(CapacityEstimate(sizes))
+        asked.clear()
+        frame = pipeline.forward(table, views, OPTIONS, find, transport=transport)
+        assert torch.equal(frame.renders, expected.renders)
+        assert asked[0] == (None if sizes is None else sizes.blocks)
+        assert asked[-1] is None or asked[-1] >= blocks
+        assert len(asked) == 1 + (sizes is not None and (sizes.blocks < blocks) + (sizes.visible == 1))
+        asked.clear()
+        pipeline.forward(table, views, OPTIONS, find, transport=transport)
+        assert len(asked) == 1 and asked[0] >= blocks
 
 
 def test_a_frame_without_splats_takes_no_room_and_any():

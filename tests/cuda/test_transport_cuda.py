@@ -10,7 +10,7 @@ from blitzgs.distributed.transport.base import Splats
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerBuffers
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection import splats_of
+from blitzgs.ops.projection import VIEW_TOTALS, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.helpers import sum_of_ranks
@@ -39,7 +39,7 @@ class Rank:
         places, plan = ops.send_splats_(
             list(Splats.of(splats, ids)), splats.rank_masks, everyone, self.number, buffers, capacity
         )
-        counts, rest = totals[:3].cpu(), everyone[:, 3 + VIEWS :]
+        counts, rest = totals[:3].cpu(), everyone[:, VIEW_TOTALS + VIEWS :]
         most = max(everyone[:, 1].max(), rest[:, ::2].sum(0).max(), rest[:, ::2].sum(1).max())
         assert plan[0] == (rest[:, 2 * self.number].sum() if most <= capacity else 0)
         return [*splats_of(splats[:12], counts)[:12], places[: runs_of(int(counts[1]))]]

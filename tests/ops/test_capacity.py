@@ -10,9 +10,9 @@ def test_an_estimate_follows_the_largest_of_late():
     estimate = CapacityEstimate()
     assert estimate.sizes is None
     estimate.learn((800, 1600, 0))
-    assert estimate.sizes == (900, 1800, 1)  # some more, and never nothing
+    assert estimate.sizes == (900, 1800, 1, 1)  # some more, and never nothing
     estimate.learn((80, 3200, 16))
-    assert estimate.sizes == (900 - 900 // 256, 3600, 18)
+    assert estimate.sizes == (900 - 900 // 256, 3600, 18, 1)
     assert estimate.sizes.holds((897, 3600, 18)) and not estimate.sizes.holds((898,))
     for _ in range(3000):  # forgotten slowly
         estimate.learn((80, 80, 16))
@@ -39,7 +39,7 @@ def test_a_need_that_grows_for_ever_is_an_error():
         calls.append(capacity)
         return None, Sizes(1, 10 ** len(calls), 1)
 
-    with pytest.raises(RuntimeError, match=f"{MOST_ATTEMPTS} attempts .* needs \\(1, 10000, 1\\)"):
+    with pytest.raises(RuntimeError, match=f"{MOST_ATTEMPTS} attempts .* needs \\(1, 10000, 1, 0\\)"):
         CapacityEstimate().run(attempt)
     assert len(calls) == MOST_ATTEMPTS
 
@@ -52,7 +52,7 @@ def test_an_attempt_that_fails_leaves_the_estimate():
 
     with pytest.raises(MemoryError):
         estimate.run(attempt)
-    assert estimate.sizes == (1, 2, 3)
+    assert estimate.sizes == (1, 2, 3, 1)
 
 
 def test_threads_may_share_an_estimate():

@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, ProjectionOptions
 from tests.helpers import BACKENDS, PARAMETERS, orbit_camera, random_scene, reference_images, relative_error
 
 FLOATS = ("means2d", "conics", "depths", "opacities", "colors")
@@ -270,9 +270,9 @@ def test_each_splat_knows_the_ranks_that_composite_its_tiles():
             width=70, height=40, tile_begin=begin, tile_end=end,
         )  # fmt: skip
         masks[listed.long().unique()] |= 1 << rank
-        assert totals[5 + 2 * rank :][:2].tolist() == [len(listed.unique()), len(listed)]
+        assert totals[VIEW_TOTALS + 2 + 2 * rank :][:2].tolist() == [len(listed.unique()), len(listed)]
     assert torch.equal(splats.rank_masks, masks) and masks.unique().numel() > 2
-    assert torch.equal(totals[3:5], torch.bincount(splats.camera_ids, minlength=2))
+    assert torch.equal(totals[VIEW_TOTALS:][:2], torch.bincount(splats.camera_ids, minlength=2))
     assert totals[:3].tolist() == [len(splats.visible_ids), len(splats.depths), splats.tiles_touched.sum()]
 
 
@@ -373,7 +373,7 @@ def test_groups_of_arguments_are_checked():
     for change, text in (
         ({"gaussians": inputs.gaussians[:3]}, r"\(means, quats, scales, opacities\[, sh\]\), got 3 entries"),
         ({"cameras": inputs.cameras[:1]}, r"\(viewmats, Ks\), got 1 entries"),
-        ({"active": [torch.arange(2, dtype=torch.int32)] * 4}, "got 4 entries"),
+        ({"active": [torch.arange(2, dtype=torch.int32)] * 5}, "got 5 entries"),
         ({"ids": torch.arange(3)}, r"ids must have shape \[4\], got \[3\]"),
     ):
         with pytest.raises(RuntimeError, match=text):

@@ -191,13 +191,33 @@ def test_whoever_takes_the_set_needs_its_count_on_the_device_alone(device, n, ah
         viewmats[:, 2, 3] = -1e5
     active = BlockIndex(table).active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
     listed = active.listed()
-    assert len(active.ids) == n
+    assert len(active.ids) == 256 * int(active.blocks) < n + 256
     assert (len(listed[0]) > 0) == ahead or n < 300
     active.ids[len(listed[0]) :] = 2**31 - 1  # nobody may look there
-    got = caught_up_and_projected(table, *active, viewmats, Ks)
+    got = caught_up_and_projected(table, *active[:3], viewmats, Ks)
     expected = caught_up_and_projected(table, *listed, None, viewmats, Ks)
     for a, b in zip(got, expected, strict=True):
         assert torch.equal(a.view(torch.uint8), b.view(torch.uint8))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("n", [1, 5000, 150_000])
+def test_too_little_room_leaves_the_lists_empty_and_tells_how_much_is_needed(device, n):
+    table = make_table(max(n, 300), device)
+    table.keep(torch.arange(len(table), device=device) < n)
+    viewmats, Ks = make_views(device=device)
+    index, views = BlockIndex(table), (viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
+    exact = index.active(table, *views)
+    needed = int(exact.blocks)
+    assert len((exact.listed()[0] // 256).unique()) <= needed <= -(-n // 256)
+    for room in {1, max(1, needed - 1), max(1, needed), needed + 1, 10**6}:
+        active = index.active(table, *views, room=room)
+        assert int(active.blocks) == needed
+        assert len(active.ids) == len(active.views) == 256 * min(room, -(-n // 256))
+        if room < needed:
+            assert int(active.length) == 0
+        else:
+            assert all(torch.equal(a, b) for a, b in zip(active.listed(), exact.listed(), strict=True))
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -291,6 +311,8 @@ def test_errors_name_the_value():
     viewmats, Ks = make_views(33)
     with pytest.raises(RuntimeError, match="at most 32 views at once, got 33"):
         active_of(index, table, viewmats, Ks)
+    with pytest.raises(RuntimeError, match="room must be for 1 block or more, got 0"):
+        index.active(table, *make_views(1), WIDTH, HEIGHT, NEAR, FAR, room=0)
     table.keep(torch.arange(len(table)) < 100)
     with pytest.raises(RuntimeError, match=r"bounds must have shape \[1, 8\], got \[12, 8\]"):
         active_of(index, table, *make_views(1))

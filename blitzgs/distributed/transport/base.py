@@ -29,7 +29,7 @@ from torch import Tensor
 
 from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs
+from blitzgs.ops.projection import VIEW_TOTALS, ProjectedSplats, ProjectionInputs
 from blitzgs.ops.splat_gradients import SplatGradients
 
 
@@ -83,6 +83,7 @@ class Traffic:
         most: most splats that any rank has, sends or gets.
         n_isects: tile entries of the splats received, or a few more.
         most_isects: the most that any rank has of these.
+        most_blocks: the most blocks of which some view may see a part that any rank has.
     """
 
     counts: Tensor
@@ -91,15 +92,17 @@ class Traffic:
     most: int
     n_isects: int
     most_isects: int
+    most_blocks: int
 
     @classmethod
     def of(cls, totals: Sequence[Sequence[int]], n_views: int, rank: int) -> Traffic:
         """Read it from every rank's `Projected.totals`."""
-        first = 3 + n_views
+        first = VIEW_TOTALS + n_views
         splats = [list(numbers[first::2]) for numbers in totals]
         most = max(*(n[1] for n in totals), *map(sum, splats), *map(sum, zip(*splats, strict=True)))
         isects = [sum(column) for column in zip(*(n[first + 1 :: 2] for n in totals), strict=True)]
-        return cls(torch.tensor(totals[rank][:3]), splats, rank, most, isects[rank], max(isects))
+        blocks = max(numbers[VIEW_TOTALS - 1] for numbers in totals)
+        return cls(torch.tensor(totals[rank][:3]), splats, rank, most, isects[rank], max(isects), blocks)
 
     @property
     def sent(self) -> list[int]:

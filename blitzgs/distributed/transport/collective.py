@@ -14,7 +14,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Traffic, Transport
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import Projected, ProjectionInputs, splats_of
+from blitzgs.ops.projection import VIEW_TOTALS, Projected, ProjectionInputs, splats_of
 from blitzgs.ops.scatter import (
     RUN,
     as_column,
@@ -51,11 +51,13 @@ class CollectiveTransport(Transport):
         # Waiting may mean to wait for other ranks, whose collectives are queued before.
         projected = ranks.reading(partial(inputs.run, capacity, tiles))
         everyone = ranks.share(projected.totals)
-        visible = everyone[:, 3 : 3 + inputs.n_views].sum(0)
+        visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + inputs.n_views].sum(0)
         traffic = Traffic.of(ranks.read(everyone), inputs.n_views, ranks.rank)
         if capacity is not None and not capacity.holds(traffic.counts[:2].tolist()):
             projected = ranks.reading(partial(inputs.run, None, tiles))
-        return _CollectiveExchange(ranks, self._codec, projected, traffic, visible)
+        # All ranks find the same, as they have estimated the same number of blocks.
+        complete = capacity is None or traffic.most_blocks <= capacity.blocks
+        return _CollectiveExchange(ranks, self._codec, projected, traffic, visible if complete else None)
 
 
 def carry_sums(sums: Tensor, places: Tensor, traffic: Traffic, splats: int, ranks: Ranks) -> Tensor:
@@ -108,13 +110,19 @@ class HalfCodec:
 
 class _CollectiveExchange(Exchange):
     def __init__(
-        self, ranks: Ranks, codec: HalfCodec | None, projected: Projected, traffic: Traffic, visible: Tensor
+        self,
+        ranks: Ranks,
+        codec: HalfCodec | None,
+        projected: Projected,
+        traffic: Traffic,
+        visible: Tensor | None,
     ) -> None:
+        """Begin; `visible` None: some rank's active set is incomplete."""
         super().__init__()
         self._ranks, self._codec, self._traffic, self._visible = ranks, codec, traffic, visible
         self._projected = splats_of(projected.splats[:12], traffic.counts)
         self._own = Splats.of(self._projected, projected.ids[: len(self._projected.camera_ids)])
-        self.needed = Sizes._make(traffic.counts.tolist())
+        self.needed = Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
 
     def _receive(self) -> Arrived:
         own, codec, traffic = self._own, self._codec, self._traffic
@@ -131,7 +139,9 @@ class _CollectiveExchange(Exchange):
         # Rounding may let splats touch some tiles more.
         return Arrived(self._splats, None, traffic.n_isects if codec is None else -1)
 
-    def _finish(self) -> HostCounts:
+    def _finish(self) -> HostCounts | None:
+        if self._visible is None:
+            return None
         return HostCounts(self._projected, self._splats, self._visible, self._traffic)
 
     def _return_gradients(self, parts: Sequence[Tensor]) -> SplatGradients:

@@ -11,7 +11,7 @@ from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Transport
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection import ProjectionInputs, splats_of
+from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, splats_of
 from blitzgs.ops.splat_gradients import SplatGradients
 
 
@@ -34,7 +34,7 @@ class _LocalExchange(Exchange):
         self._capacity = capacity
         self._projected = inputs.run(capacity)
         self._copy = HostCopy(self._projected.totals)
-        self._visible = self._projected.totals[3 : 3 + inputs.n_views]
+        self._visible = self._projected.totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views]
 
     def _receive(self) -> Arrived:
         splats = Splats.of(self._projected.splats, self._projected.ids)
@@ -43,8 +43,8 @@ class _LocalExchange(Exchange):
         return Arrived(splats, self._projected.totals[1:2], self._capacity.isects)
 
     def _finish(self) -> HostCounts | None:
-        counts = self._copy.read()[:3]
-        self.needed = Sizes._make(counts.tolist())
+        totals = self._copy.read()
+        counts, self.needed = totals[:3], Sizes._make(totals[:VIEW_TOTALS].tolist())
         if self._capacity is not None and not self._capacity.holds(self.needed):
             return None
         splats = Splats.of(self._projected.splats, self._projected.ids).first(self.needed.splats)

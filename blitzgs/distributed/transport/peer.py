@@ -38,7 +38,7 @@ from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Traffic, Transport
 from blitzgs.distributed.transport.collective import carry_sums
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.projection import ProjectionInputs, splats_of
+from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
 
@@ -108,8 +108,7 @@ class PeerTransport(Transport):
                 self._ranks.reading(partial(self._memory.reserve, splats * WORDS_PER_SPLAT))
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
-        n_isects = None if capacity is None else capacity.isects
-        return _PeerExchange(self._ranks, self._memory, self._buffers, inputs, assignment, n_isects)
+        return _PeerExchange(self._ranks, self._memory, self._buffers, inputs, assignment, capacity)
 
 
 class _PeerExchange(Exchange):
@@ -120,10 +119,10 @@ class _PeerExchange(Exchange):
         buffers: PeerBuffers,
         inputs: ProjectionInputs,
         assignment: TileAssignment,
-        n_isects: int | None,
+        capacity: Sizes | None,
     ) -> None:
         super().__init__()
-        self._ranks, self._memory, self._buffers, self._n_isects = ranks, memory, buffers, n_isects
+        self._ranks, self._memory, self._buffers, self._capacity = ranks, memory, buffers, capacity
         self._n_views = inputs.n_views
         self._traffic: Traffic | None = None
         room = Sizes(buffers.length, buffers.length, 0)
@@ -142,7 +141,7 @@ class _PeerExchange(Exchange):
         self._generation = memory.generation
 
     def _receive(self) -> Arrived:
-        n_isects = self._read().n_isects if self._n_isects is None else self._n_isects
+        n_isects = self._read().n_isects if self._capacity is None else self._capacity.isects
         return Arrived(self._buffers.splats, self._plan[:1], n_isects)
 
     def _gradient_table(self) -> Tensor:
@@ -150,14 +149,15 @@ class _PeerExchange(Exchange):
 
     def _finish(self) -> HostCounts | None:
         traffic = self._read()
-        self.needed = Sizes(traffic.most, traffic.most, traffic.most_isects)
+        self.needed = Sizes(traffic.most, traffic.most, traffic.most_isects, traffic.most_blocks)
         if traffic.most > self._buffers.length:
             return None
-        if self._n_isects is not None and traffic.most_isects > self._n_isects:
+        room = self._capacity
+        if room is not None and (traffic.most_isects > room.isects or traffic.most_blocks > room.blocks):
             return None
         projected = splats_of(self._projected[:12], traffic.counts)
         self._places = self._places[: runs_of(len(projected.camera_ids))]
-        visible = self._shared.sums[3 : 3 + self._n_views]
+        visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
         return HostCounts(projected, self._buffers.splats.first(sum(traffic.received)), visible, traffic)
 
     def _read(self) -> Traffic:
