@@ -5,6 +5,10 @@ import argparse
 import hashlib
 import json
 import os
+import signal
+import subprocess
+import sys
+from concurrent.futures.process import BrokenProcessPool
 
 import cv2
 import numpy as np
@@ -14,6 +18,7 @@ pytest.importorskip("embreex")
 
 from blitzgs.scene.colmap import quats_to_rotations, read_model
 from blitzgs.scene.synth import PRESETS, add_arguments, generate_city, run
+from blitzgs.scene.synth.processes import each
 
 SMALL = {"extent": 100.0, "views": 9, "width": 192, "height": 128, "points_per_view": 150}
 
@@ -28,8 +33,8 @@ def digests(folder):
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
-def test_the_same_bytes_by_seed_for_any_number_of_threads(city, tmp_path):
-    assert digests(generate_city(tmp_path / "again", **SMALL, threads=1)) == digests(city)
+def test_the_same_bytes_by_seed_for_any_number_of_processes(city, tmp_path):
+    assert digests(generate_city(tmp_path / "again", **SMALL, processes=1)) == digests(city)
     other = digests(generate_city(tmp_path / "other", **SMALL, seed=1))
     images = [name for name in other if name.endswith(".jpg")]
     assert len(images) == 9
@@ -152,3 +157,64 @@ def test_command(city, capsys):
     assert "9 images of 192 x 128" in capsys.readouterr().out
     with pytest.raises(FileExistsError, match=f"another city .*extent 100.0, not {PRESETS['town'].extent}"):
         run(parser.parse_args([str(city), "--preset", "town"]))
+
+
+def test_a_killed_generation_continues_and_redoes_torn_photographs(city, tmp_path):
+    """A generation is killed by the system, one of its pictures is torn, one of its records is lost."""
+    out = tmp_path / "city"
+    script = (
+        "import os, sys, signal\nfrom blitzgs.scene.synth import generate_city\n"
+        "stop = lambda done, total: done == 5 and os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"generate_city(sys.argv[1], **{SMALL!r}, processes=2, progress=stop)\n"
+    )
+    killed = subprocess.run([sys.executable, "-c", script, str(out)], timeout=120, capture_output=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    partial = tmp_path / ".city.partial"
+    assert not out.exists()
+    pictures = sorted((partial / "images").glob("*.jpg"))
+    assert len(pictures) >= 5
+    torn = pictures[0].read_bytes()
+    pictures[0].write_bytes(torn[: len(torn) // 2])
+    (partial / "corners" / "00001.npz").write_bytes(b"PK")
+    untouched = pictures[2].stat().st_mtime_ns
+    generate_city(out, **SMALL)
+    assert digests(out) == digests(city)
+    assert (out / "images" / pictures[2].name).stat().st_mtime_ns == untouched
+    assert os.listdir(tmp_path) == ["city"]
+
+
+def test_the_beginning_of_another_city_is_not_continued(city, tmp_path):
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    out = tmp_path / "city"
+    with pytest.raises(KeyboardInterrupt):
+        generate_city(out, **SMALL | {"seed": 3}, progress=interrupt)
+    assert digests(generate_city(out, **SMALL)) == digests(city)
+
+
+def test_what_is_no_unfinished_city_stays(tmp_path):
+    partial = tmp_path / ".city.partial"
+    partial.mkdir()
+    (partial / "precious.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="holds no unfinished city"):
+        generate_city(tmp_path / "city", **SMALL)
+    assert (partial / "precious.txt").read_text() == "mine"
+
+
+def test_two_processes_do_not_make_the_same_city(tmp_path):
+    tiny = {"extent": 60.0, "views": 3, "width": 48, "height": 32, "points_per_view": 20}
+
+    def again(done, total):
+        with pytest.raises(FileExistsError, match="another process is making this city"):
+            generate_city(tmp_path / "city", **tiny)
+
+    generate_city(tmp_path / "city", **tiny, progress=again)
+
+
+def test_a_process_that_the_system_ends_is_an_error(tmp_path):
+    def die(index):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    with pytest.raises(BrokenProcessPool):
+        list(each(die, 4, 2))

@@ -14,3 +14,9 @@ Doubles = NDArray[np.float64]
 Ints = NDArray[np.integer[Any]]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
+
+
+def dot(a: Floats, b: Floats) -> Floats:
+    """Return the inner products [R] of rows [R, 3]."""
+    product: Floats = np.einsum("ij,ij->i", a, b)
+    return product

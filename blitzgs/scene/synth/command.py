@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="N" if isinstance(field.default, int) else "X",
             help=_HELP[field.name],
         )
-    parser.add_argument("--threads", type=int, metavar="N", help="to render with (all cores)")
+    parser.add_argument("--processes", type=int, metavar="N", help="to render with (one a core)")
     parser.add_argument(
         "--overwrite", action="store_true", help="replace a generated city with other parameters"
     )
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         out = generate_city(
             args.out,
             **chosen,
-            threads=args.threads,
+            processes=args.processes,
             overwrite=args.overwrite,
             progress=report,
         )

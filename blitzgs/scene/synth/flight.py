@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blitzgs.scene.synth.arrays import Doubles
+from blitzgs.scene.synth.arrays import Doubles, Floats, dot
 from blitzgs.scene.synth.options import CityOptions
 
 FIELD_OF_VIEW = math.radians(62)  # horizontal
@@ -42,12 +42,12 @@ class View:
         pixels = camera[:, :2] / safe[:, None] * self.focal + np.array([self.width, self.height]) / 2
         return pixels, depth
 
-    def directions(self, pixels: Doubles) -> Doubles:
-        """Return unit world directions [N, 3] through pixel positions [N, 2]."""
-        camera = np.ones((len(pixels), 3))
-        camera[:, :2] = (pixels - np.array([self.width, self.height]) / 2) / self.focal
-        camera /= np.linalg.norm(camera, axis=1, keepdims=True)
-        world: Doubles = camera @ self.rotation
+    def directions(self, pixels: Floats) -> Floats:
+        """Return unit world directions [N, 3] through pixel positions [N, 2], in the precision of these."""
+        camera = np.ones((len(pixels), 3), pixels.dtype)
+        camera[:, :2] = (pixels - np.array([self.width, self.height], pixels.dtype) / 2) / self.focal
+        camera /= np.sqrt(dot(camera, camera))[:, None]
+        world: Floats = camera @ self.rotation.astype(pixels.dtype)
         return world
 
 

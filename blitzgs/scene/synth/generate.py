@@ -3,30 +3,28 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import shutil
-import tempfile
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
-
+from blitzgs.output import write_file
 from blitzgs.scene.colmap import write_model
-from blitzgs.scene.synth.arrays import Bytes
 from blitzgs.scene.synth.dataset import colmap_model
 from blitzgs.scene.synth.flight import plan_flight
 from blitzgs.scene.synth.options import CityOptions
+from blitzgs.scene.synth.photographs import CORNERS, Progress, take_photographs
 from blitzgs.scene.synth.plan import Plan
+from blitzgs.scene.synth.processes import each
 from blitzgs.scene.synth.render import City
-from blitzgs.scene.synth.tracks import Corners, find_corners, track
+from blitzgs.scene.synth.tracks import track
 
 MANIFEST = "city.json"
-_JPEG_QUALITY = 95
-
-# Called with the images finished so far and their number.
-Progress = Callable[[int, int], None]
+_STARTED = "started.json"  # the manifest of a city that is not finished
+_LOCK = ".lock"
 
 
 def generate_city(
@@ -39,16 +37,17 @@ def generate_city(
     points_per_view: int = CityOptions.points_per_view,
     oblique: float = CityOptions.oblique,
     seed: int = CityOptions.seed,
-    threads: int | None = None,
+    processes: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
     """Generate a city and photograph it from the air, unless `out` already holds the same one.
 
     Writes `images/*.jpg`, `sparse/0/*.bin` (a COLMAP model: PINHOLE camera, poses, points with tracks; in
-    metres, z up) and `city.json` (the parameters). The folder appears only when complete. The files depend
-    on the parameters alone, not on the number of threads; on another processor or with other library versions
-    single pixels may differ in rounding.
+    metres, z up) and `city.json` (the parameters). The folder appears only when complete. Until then the
+    files are in `.NAME.partial` beside it, where the same call continues after an interruption, however it
+    came. The files depend on the parameters alone, not on processes or interruptions; on another
+    processor or with other library versions single pixels may differ in rounding.
 
     Args:
         out: folder to create.
@@ -59,7 +58,7 @@ def generate_city(
         points_per_view: feature points looked for per image.
         oblique: fraction of oblique views, 0 to 1.
         seed: of everything random.
-        threads: to render with; all of this process's cores if None.
+        processes: to render with; one for each core that this process may use if None.
         overwrite: replace a city with other parameters instead of raising.
         progress: called after each image.
 
@@ -68,26 +67,48 @@ def generate_city(
 
     Raises:
         ValueError: a parameter is out of range.
-        FileExistsError: `out` holds something else.
+        FileExistsError: `out` holds something else, or another process is making it.
+        BrokenProcessPool: the system ended one of the processes, as for want of memory.
         ModuleNotFoundError: `embreex` is not installed.
     """
     options = CityOptions(extent, views, width, height, points_per_view, oblique, seed)
     out = Path(out)
     if _reusable(out, options, overwrite):
         return out
-    out.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    try:
-        _write(scratch, options, threads or len(os.sched_getaffinity(0)), progress)
-        scratch.chmod(0o755)
+    partial = out.with_name(f".{out.name}.partial")
+    with _begun(partial, options):
+        _write(partial, options, processes or len(os.sched_getaffinity(0)), progress)
+        for name in (_STARTED, _LOCK):
+            (partial / name).unlink()
         if out.exists() and any(out.iterdir()):
-            _replace(out, scratch)
+            _replace(out, partial)
         else:
-            scratch.rename(out)
-    except BaseException:
-        shutil.rmtree(scratch, ignore_errors=True)
-        raise
+            partial.rename(out)
     return out
+
+
+@contextlib.contextmanager
+def _begun(partial: Path, options: CityOptions) -> Iterator[None]:
+    """Hold the folder in which a city is made, emptied where it holds the beginning of another one."""
+    partial.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(partial / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        started = partial / _STARTED
+        wanted = json.dumps(options.manifest(), indent=2) + "\n"
+        found = started.read_text() if started.exists() else ""
+        leftovers = [path for path in partial.iterdir() if path.name != _LOCK]
+        if leftovers and not found:
+            raise FileExistsError(f"{partial} holds no unfinished city: move it, or choose another folder")
+        if found != wanted:
+            for path in leftovers:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            write_file(started, wanted)
+        yield
+    except BlockingIOError as error:
+        raise FileExistsError(f"{partial}: another process is making this city; wait for it") from error
+    finally:
+        os.close(descriptor)
 
 
 def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
@@ -117,50 +138,21 @@ def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
     return not different
 
 
-def _write(folder: Path, options: CityOptions, threads: int, progress: Progress | None) -> None:
-    images = folder / "images"
-    images.mkdir()
+def _write(folder: Path, options: CityOptions, processes: int, progress: Progress | None) -> None:
     city = City(Plan(options))
     views = plan_flight(options)
-
-    def photograph(index: int) -> Corners:
-        view = views[index]
-        image = city.render(view)
-        _write_jpeg(images / view.name, image)
-        return find_corners(city, view, image, options.points_per_view, options.seed)
-
-    cv_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # every core has a view of its own
-    try:
-        with ThreadPoolExecutor(threads) as pool:
-            try:
-                corners = []
-                for found in pool.map(photograph, range(len(views))):
-                    corners.append(found)
-                    if progress:
-                        progress(len(corners), len(views))
-                cloud = track(city, views, corners, options.seed, pool.map)
-            except BaseException:
-                pool.shutdown(cancel_futures=True)  # or leaving the pool would first take every photograph
-                raise
-    finally:
-        cv2.setNumThreads(cv_threads)
+    corners = take_photographs(folder, city, views, processes, progress)
+    cloud = track(city, views, corners, options.seed, lambda seen, count: each(seen, count, processes))
     write_model(folder / "sparse" / "0", colmap_model(views, cloud))
-    (folder / MANIFEST).write_text(json.dumps(options.manifest(), indent=2) + "\n")
+    shutil.rmtree(folder / CORNERS)
+    write_file(folder / MANIFEST, json.dumps(options.manifest(), indent=2) + "\n")
 
 
-def _replace(out: Path, scratch: Path) -> None:
+def _replace(out: Path, made: Path) -> None:
     """Put a new city in place of the one in `out`, leaving alone whatever else is there."""
     (out / MANIFEST).unlink()
     for name in ("images", "sparse"):
         shutil.rmtree(out / name, ignore_errors=True)
-        (scratch / name).rename(out / name)
-    (scratch / MANIFEST).rename(out / MANIFEST)
-    scratch.rmdir()
-
-
-def _write_jpeg(path: Path, image: Bytes) -> None:
-    done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    if not done:
-        raise OSError(f"{path}: the image could not be encoded as JPEG")
-    path.write_bytes(encoded.tobytes())
+        (made / name).rename(out / name)
+    (made / MANIFEST).rename(out / MANIFEST)
+    made.rmdir()

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 # Raised whenever the same parameters would give other files, so that cached cities are made anew.
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class CityOptions:
 PRESETS = {
     # Made in well under a minute on two cores: the default scene of `make demo`.
     "demo": CityOptions(),
-    # A district: minutes.
-    "town": CityOptions(extent=420.0, views=240, width=960, height=640, points_per_view=800),
-    # More than two square kilometres: hours on two cores, well under one on a server.
-    "city": CityOptions(extent=1600.0, views=2400, width=1600, height=1064, points_per_view=1200),
+    # A quarter of a square kilometre in as many views as a survey of it has.
+    "town": CityOptions(extent=500.0, views=400, width=1368, height=912, points_per_view=1000),
+    # More than two square kilometres, with the views and the image size of the usual large captures.
+    "city": CityOptions(extent=1600.0, views=2048, width=1368, height=912, points_per_view=1200),
 }

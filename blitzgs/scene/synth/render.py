@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from blitzgs.scene.synth import materials, mesh
-from blitzgs.scene.synth.arrays import Bytes, Doubles, Floats, Ints
+from blitzgs.scene.synth.arrays import Bytes, Doubles, Floats, Ints, dot
 from blitzgs.scene.synth.city import build_city
 from blitzgs.scene.synth.flight import View
 from blitzgs.scene.synth.ground import ground_color
@@ -19,8 +19,8 @@ from blitzgs.scene.synth.plan import Plan
 from blitzgs.scene.synth.raycast import Hits, RayCaster
 
 # Four samples per pixel on a rotated grid: every row and column of the 4 x 4 subpixels is met once.
-_SAMPLES: Final = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]])
-_RAYS_AT_ONCE: Final = 600_000
+_SAMPLES: Final = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]], np.float32)
+_RAYS_AT_ONCE: Final = 400_000
 _OFFSET: Final = 0.02  # metres a shadow ray starts off its surface
 
 _SUN: Final = np.array([-0.52, -0.42, 0.74], np.float32) / np.float32(np.linalg.norm([-0.52, -0.42, 0.74]))
@@ -43,7 +43,7 @@ _PAINTERS: Final = {
 
 
 class City:
-    """The city ready to be photographed; its methods may be called from several threads at once."""
+    """The city ready to be photographed; its methods may be called from several processes at once."""
 
     def __init__(self, plan: Plan) -> None:
         """Build the geometry and the skylight of `plan`: seconds for a square kilometre."""
@@ -56,17 +56,15 @@ class City:
 
     def render(self, view: View) -> Bytes:
         """Return the photograph of a view: sRGB uint8 [height, width, 3]."""
-        image = np.empty((view.height, view.width, 3), np.float32)
+        image = np.empty((view.height, view.width, 3), np.uint8)
         rows = max(1, _RAYS_AT_ONCE // (view.width * len(_SAMPLES)))
         for top in range(0, view.height, rows):
             bottom = min(top + rows, view.height)
-            y, x = np.mgrid[top:bottom, 0 : view.width]
+            y, x = np.mgrid[top:bottom, 0 : view.width].astype(np.float32)
             corners = np.stack([x, y], -1).reshape(-1, 1, 2)
-            pixels = (corners + _SAMPLES).reshape(-1, 2)
-            # Tone mapping each sample keeps edges against bright surfaces smooth.
-            colors = _tone(self._shade(view, pixels))
-            image[top:bottom] = colors.reshape(bottom - top, view.width, len(_SAMPLES), 3).mean(2)
-        return np.clip(image * 255 + 0.5, 0, 255).astype(np.uint8)
+            display = self._shade(view, (corners + _SAMPLES).reshape(-1, 2))
+            image[top:bottom] = (display * 255 + 0.5).reshape(bottom - top, view.width, 3)
+        return image
 
     def hit(self, view: View, pixels: Doubles) -> Hits:
         """Return what the view sees at pixel positions [R, 2]."""
@@ -74,36 +72,84 @@ class City:
         origins = np.broadcast_to(view.centre.astype(np.float32), directions.shape)
         return self.caster.hit(np.ascontiguousarray(origins), directions)
 
-    def _shade(self, view: View, pixels: Doubles) -> Floats:
-        """Return scene-linear RGB [R, 3] of rays through pixel positions [R, 2]."""
-        directions = view.directions(pixels).astype(np.float32)
+    def _shade(self, view: View, pixels: Floats) -> Floats:
+        """Return display values [P, 3] of P pixels from the positions of their samples [4 P, 2].
+
+        Samples of a pixel that meet the same surface are shaded once, at their mean and for the area they
+        stand for: materials filter themselves. Shadows have edges within a surface: every sample casts a ray.
+        """
+        directions = view.directions(pixels)
         origins = np.ascontiguousarray(np.broadcast_to(view.centre.astype(np.float32), directions.shape))
         hits = self.caster.hit(origins, directions)
-        color = self._sky(directions)
-        seen = np.flatnonzero(hits.triangle >= 0)
-        if len(seen) == 0:
-            return color
-        direction, distance = directions[seen], hits.distance[seen]
-        position = origins[seen] + distance[:, None] * direction
-        surface = self.mesh.surface[hits.triangle[seen]]
+        seen, missed = np.flatnonzero(hits.triangle >= 0), np.flatnonzero(hits.triangle < 0)
+        display = np.empty_like(directions)
+        # Tone mapping each sample keeps edges against bright surfaces smooth.
+        display[missed] = _tone(self._sky(directions[missed]))
+        if len(seen):
+            position = origins[seen] + hits.distance[seen, None] * directions[seen]
+            surface = np.full(len(pixels), -1, np.int32)
+            surface[seen] = self.mesh.surface[hits.triangle[seen]]
+            first, group = self._share(surface, seen)
+            display[seen] = _tone(self._color(view, surface[first], position, group))[group]
+        samples = display.reshape(-1, len(_SAMPLES), 3)
+        mean: Floats = (samples[:, 0] + samples[:, 1] + samples[:, 2] + samples[:, 3]) / np.float32(4)
+        return mean
+
+    def _share(self, surface: Ints, seen: Ints) -> tuple[Ints, Ints]:
+        """Return the samples [G] that stand for groups, and the group of each seen sample [S].
+
+        A group has the samples of a pixel that see the same surface; surfaces [4 P], -1 for none. The ground
+        is one surface with hard edges between its parts, so its upper and lower two samples stay apart.
+        """
+        keys = surface.reshape(-1, len(_SAMPLES)).copy()
+        lower = keys[:, 2:]
+        lower[(lower >= 0) & (self.mesh.material[lower] == mesh.GROUND)] = -2
+        leader = np.arange(keys.size, dtype=np.int32).reshape(keys.shape)
+        for k in range(1, len(_SAMPLES)):
+            for earlier in reversed(range(k)):
+                np.copyto(leader[:, k], leader[:, earlier], where=keys[:, k] == keys[:, earlier])
+        leaders = leader.ravel()[seen]
+        is_first = leaders == seen
+        number = np.empty(keys.size, np.int32)
+        first = seen[is_first]
+        number[first] = np.arange(len(first), dtype=np.int32)
+        return first, number[leaders]
+
+    def _color(self, view: View, surface: Ints, samples: Floats, group: Ints) -> Floats:
+        """Return scene-linear RGB [G, 3] of what a view sees.
+
+        Args:
+            view: the camera.
+            surface: of each of G groups.
+            samples: positions [S, 3] of the samples.
+            group: of each sample [S].
+        """
+        count = np.bincount(group).astype(np.float32)
+        sums = np.stack([np.bincount(group, samples[:, k]) for k in range(3)], 1)
+        position = (sums / count[:, None]).astype(np.float32)
+        direction = position - view.centre.astype(np.float32)
+        distance = np.sqrt(dot(direction, direction))
+        direction /= distance[:, None]
+        pixel = distance * np.float32(0.5 / view.focal) * np.sqrt(count)  # a sample stands for half a pixel
         material = self.mesh.material[surface]
         normal = self.mesh.normal[surface]
         round_ = np.flatnonzero(material == mesh.LEAVES)
         outward = position[round_] - self.mesh.origin[surface[round_]]
         outward /= np.square(self.mesh.size[surface[round_]][:, [0, 0, 1]])
-        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-        outward += self._ruffle(position[round_], distance[round_] * np.float32(0.5 / view.focal))
-        normal[round_] = outward / np.linalg.norm(outward, axis=1, keepdims=True)
-        slant = (normal * direction).sum(1)
+        outward /= np.sqrt(dot(outward, outward))[:, None]
+        outward += self._ruffle(position[round_], pixel[round_])
+        normal[round_] = outward / np.sqrt(dot(outward, outward))[:, None]
+        slant = dot(normal, direction)
         normal[slant > 0] *= -1
-        # A sample stands for half a pixel; on a slanted surface that is more, taken as the mean of both axes.
-        footprint = distance * np.float32(0.5 / view.focal) / np.sqrt(np.maximum(np.abs(slant), 0.15))
+        # On a slanted surface the footprint is longer one way, taken as the mean of both axes.
+        footprint = pixel / np.sqrt(np.maximum(np.abs(slant), 0.15))
 
         albedo = self._albedo(surface, material, position, normal, footprint)
-        lit = self._light(position, normal, material) * albedo
+        sunny = self._sunny(samples, group, count, normal, material)
+        lit = self._light(position, normal, sunny) * albedo
         lit = self._reflect(lit, albedo, material, direction, normal)
         haze = np.exp(-distance / np.float32(self._haze_length))[:, None]
-        color[seen] = lit * haze + _HAZE * (1 - haze)
+        color: Floats = lit * haze + _HAZE * (1 - haze)
         return color
 
     def _ruffle(self, position: Floats, footprint: Floats) -> Floats:
@@ -135,8 +181,8 @@ class City:
             s = surface[index]
             offset = position[index] - self.mesh.origin[s]
             points = Points(
-                u=(offset * self.mesh.axis_u[s]).sum(1),
-                v=(offset * self.mesh.axis_v[s]).sum(1),
+                u=dot(offset, self.mesh.axis_u[s]),
+                v=dot(offset, self.mesh.axis_v[s]),
                 size=self.mesh.size[s],
                 position=position[index],
                 normal=normal[index],
@@ -147,18 +193,23 @@ class City:
             albedo[index] = painter(points, self.noise)
         return np.clip(albedo, 0.005, 0.92)
 
-    def _light(self, position: Floats, normal: Floats, material: Ints) -> Floats:
-        """Return the irradiance [R, 3]: sun where no shadow falls, sky by openness, light from the ground."""
+    def _sunny(self, samples: Floats, group: Ints, count: Floats, normal: Floats, material: Ints) -> Floats:
+        """Return the cosine at which the sun shines on each group, times its samples without shadow, [G]."""
         facing = normal @ _SUN
         # Light passes through leaves, so crowns are lit a little past their terminator.
         facing = np.where(material == mesh.LEAVES, 0.75 * facing + 0.25, facing)
-        sunny = np.clip(facing, 0, 1).astype(np.float32)
-        towards = np.flatnonzero(sunny > 0)
+        towards = np.flatnonzero((facing > 0)[group])
+        lit = group[towards]
         # Foliage is coarser than its mesh: its rays start further out, or each crown would shade itself.
-        lift = np.where(material[towards] == mesh.LEAVES, np.float32(0.35), np.float32(_OFFSET))
-        origins = position[towards] + lift[:, None] * normal[towards]
+        lift = np.where(material == mesh.LEAVES, np.float32(0.35), np.float32(_OFFSET))[:, None] * normal
+        origins = samples[towards] + lift[lit]
         rays = np.ascontiguousarray(np.broadcast_to(_SUN, origins.shape))
-        sunny[towards[self.caster.occluded(origins, rays)]] = 0
+        dark = np.bincount(lit, self.caster.occluded(origins, rays), len(count))
+        sunny: Floats = (np.clip(facing, 0, 1) * (1 - dark / count)).astype(np.float32)
+        return sunny
+
+    def _light(self, position: Floats, normal: Floats, sunny: Floats) -> Floats:
+        """Return the irradiance [G, 3]: sun where no shadow falls, sky by openness, light from the ground."""
         openness = self._openness(position + np.float32(1.5) * normal)
         sky = openness * (0.55 + 0.45 * normal[:, 2])
         bounce = (0.5 - 0.5 * normal[:, 2]) * (0.4 + 0.6 * openness)
@@ -173,7 +224,7 @@ class City:
         if len(index) == 0:
             return lit
         d, n = direction[index], normal[index]
-        cosine = np.clip(-(d * n).sum(1), 0, 1)
+        cosine = np.clip(-dot(d, n), 0, 1)
         fresnel = 0.08 + 0.92 * (1 - cosine) ** 5
         mirrored = d + 2 * cosine[:, None] * n
         # A mirrored ray that goes down meets other buildings, not sky.
@@ -216,9 +267,10 @@ class City:
         side = len(self._open_sky)
         scale = np.float32(side / 2) / self._map_half
         i = ((position[:, :2] + self._map_half) * scale).astype(np.int32)
-        inside = ((i >= 0) & (i < side)).all(1)
-        i = np.clip(i, 0, side - 1)
-        low = np.where(inside, self._open_sky[i[:, 1], i[:, 0]], np.float32(1))
+        x, y = i[:, 0], i[:, 1]
+        inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
+        low = np.ones(len(i), np.float32)
+        low[inside] = self._open_sky[y[inside], x[inside]]
         raised = np.clip(position[:, 2] / 16, 0, 1)
         openness: Floats = np.maximum(low, 0.35) * (1 - raised) + raised
         return openness

@@ -78,10 +78,11 @@ def find_corners(city: City, view: View, image: Bytes, count: int, seed: int) ->
     )
 
 
-Mapper = Callable[[Callable[[int], Ints], Iterable[int]], Iterable[Ints]]
+# Returns a function's values at 0, 1, ..., count - 1.
+Mapper = Callable[[Callable[[int], Ints], int], Iterable[Ints]]
 
 
-def track(city: City, views: list[View], corners: list[Corners], seed: int, run: Mapper = map) -> Cloud:
+def track(city: City, views: list[View], corners: list[Corners], seed: int, run: Mapper) -> Cloud:
     """Return the cloud of all corners seen in three views or more.
 
     Args:
@@ -89,7 +90,7 @@ def track(city: City, views: list[View], corners: list[Corners], seed: int, run:
         views: V cameras.
         corners: those found in each of them.
         seed: of the noise.
-        run: applies a function of a view index to many; may do so concurrently, in order.
+        run: applies a function of a view index to all of them; may do so concurrently, in order.
     """
     positions = np.concatenate([c.positions for c in corners])
     directions = np.concatenate([c.directions for c in corners])
@@ -106,7 +107,7 @@ def track(city: City, views: list[View], corners: list[Corners], seed: int, run:
         found = _observed(city, views[index], positions[rows], directions[rows], own, [seed, 7, index])
         return rows[found]
 
-    lists = list(run(seen, range(len(views))))
+    lists = list(run(seen, len(views)))
     view_ids = np.repeat(np.arange(len(views)), [len(x) for x in lists])
     point_ids = np.concatenate(lists)
     long_enough = np.bincount(point_ids, minlength=len(positions)) >= _MIN_TRACK

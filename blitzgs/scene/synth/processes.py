@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Spreads work on the city over processes that share it without copying it."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, TypeVar
+
+import cv2
+
+T = TypeVar("T")
+_PR_SET_PDEATHSIG = 1  # of prctl(2)
+_task: Callable[[int], Any]  # what the forked processes do; they find it in the memory they share
+
+
+def each(task: Callable[[int], T], count: int, processes: int) -> Iterator[T]:
+    """Yield task(0), task(1), ..., task(count - 1), in this order.
+
+    The processes are forked, so that `task` may hold gigabytes, as a closure does; only indices and results
+    are sent. They end with this process, however it ends.
+
+    Args:
+        task: called in another process, unless there is one alone.
+        count: of the calls.
+        processes: to share the calls among.
+
+    Raises:
+        BrokenProcessPool: a process was killed, as for want of memory.
+    """
+    cv_threads = cv2.getNumThreads()
+    # Every core has a call of its own; and a forked process could not end OpenCV's threads, nor use them.
+    cv2.setNumThreads(1)
+    try:
+        if processes == 1:
+            yield from map(task, range(count))
+        else:
+            yield from _forked(task, count, processes)
+    finally:
+        cv2.setNumThreads(cv_threads)
+
+
+def _forked(task: Callable[[int], T], count: int, processes: int) -> Iterator[T]:
+    global _task
+    _task = task
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(min(processes, count), context, _prepare) as pool:
+        try:
+            yield from pool.map(_call, range(count))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # or leaving the pool would first make every call
+            raise
+
+
+def _call(index: int) -> Any:
+    return _task(index)
+
+
+def _prepare() -> None:
+    """Make a forked process leave interrupts to its parent, and end with it."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
