@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the levels of a model make jump along a descending flight: with the LOD gate's cuts, and smoothed.
+
+    python benchmarks/bm_popping.py RUN [--frames 240] [--out FOLDER] [--device cuda] [--json FILE]
+
+The flight goes down the viewing axis of one of the run's cameras towards what it looks at, by the same ratio
+of distances from frame to frame, so that levels come at an even pace. Each frame is rendered with all
+Gaussians ("full"), with the LOD gate ("gated") and with smooth levels ("smooth"), of the same model.
+
+Two things are measured, as means of |difference| over the pixels in 1/255. The change of a frame is its
+difference from the frame before, most of which is the flight itself: "full" says how much. The popping of a
+frame is its difference from the same view with the levels and weights that the frame before had, so that
+nothing but the levels has changed. Of both the mean and the largest over the frames count, and of the popping
+also what one pixel in 1,000 exceeds in the worst frame. More frames make smaller steps.
+
+Into the folder go a chart of the popping (popping.svg) and the clip (popping.mp4: full, gated, smooth).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from harness import report
+from torch import Tensor
+
+from blitzgs import pipeline
+from blitzgs.charts import line_chart
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import GaussianTable
+from blitzgs.ops.blocks import ActiveRows
+from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.scene.pictures import to_uint8
+from blitzgs.training import run as run_folder
+from blitzgs.training.run import TrainedModel
+from blitzgs.training.run_cameras import load_cameras
+from blitzgs.training.views import CameraLike, ViewSet, render_options
+from blitzgs.view.gate import LodGate, SceneGate, centres_of
+
+MODES = ("full", "gated", "smooth")
+FRAMES_PER_SECOND = 30.0
+# The flight begins and ends at these multiples of the distance between the camera and what it looks at.
+FARTHEST, NEAREST = 4.0, 0.5
+
+
+@torch.no_grad()
+def popping(
+    run: Path,
+    out: Path | None = None,
+    device: str = "cpu",
+    frames: int = 240,
+    width: int = 640,
+    camera: str | None = None,
+) -> dict[str, Any]:
+    """Measure the popping of a run's model.
+
+    Args:
+        run: folder of the run.
+        out: gets popping.svg and popping.mp4; None: nothing is written.
+        device: that renders.
+        frames: of the flight, at least 2.
+        width: of the frames in pixels, at most that of the camera.
+        camera: name of the view whose axis is flown along; None: the one closest to the mean axis of all.
+
+    Returns:
+        "frames", "levels" (K), and for each of "full", "gated" and "smooth" a dictionary: "mean_change" and
+        "largest_change", and but for "full" "mean", "largest" and "pixel" of the popping, as above, and
+        "kept", the mean share of the Gaussians that a frame keeps.
+
+    Raises:
+        ValueError: there are fewer than 2 frames, no view of that name, or nothing in front of the camera.
+        OSError: the clip cannot be written.
+    """
+    if frames < 2:
+        raise ValueError(f"a flight has at least 2 frames, got {frames}")
+    ranks = Ranks(device=torch.device(device))
+    model = run_folder.open_model(run, ranks)
+    viewmats, K, size = _flight(model, load_cameras(run).cameras, frames, width, camera)
+    gates: dict[str, SceneGate | None] = {"full": None}
+    gates |= {mode: _gate(model, mode == "smooth", ranks) for mode in MODES[1:]}
+    clip = None if out is None else _Clip(out / "popping.mp4", 3 * size[0], size[1])
+    flights = {mode: _Flight(model, K, size, gate) for mode, gate in gates.items()}
+    for viewmat in viewmats.to(ranks.device):
+        images = [flight.next(viewmat[None]) for flight in flights.values()]
+        if clip is not None:
+            clip.add(torch.cat(images, dim=1))
+    found: dict[str, Any] = {"frames": frames, "levels": model.progress.level_count}
+    found |= {mode: flight.figures() for mode, flight in flights.items()}
+    if out is not None and clip is not None:
+        clip.close()
+        lines = {mode: list(enumerate(flights[mode].popping, 1)) for mode in MODES[1:]}
+        chart = line_chart(lines, "frame", "popping, mean over pixels, 1/255")
+        (out / "popping.svg").write_text(chart)
+    return found
+
+
+class _Flight:
+    """Renders one frame after the other in one way, and notes what changes."""
+
+    def __init__(
+        self, model: TrainedModel, K: Tensor, size: tuple[int, int], scene: SceneGate | None
+    ) -> None:
+        self._model, self._K, self._size, self._scene = model, K, size, scene
+        lod = None if scene is None else scene.gate
+        self._options = render_options(model.config, model.space, model.progress.sh_degree, lod)
+        self._before: tuple[Tensor, Tensor] | None = None
+        self._changes: list[float] = []
+        self._kept: list[float] = []
+        self._worst = torch.zeros(1)
+        self.popping: list[float] = []
+
+    def next(self, viewmats: Tensor) -> Tensor:
+        """Return the image [H, W, 3] in [0, 1] from a pose, [1, 4, 4]."""
+        table, active = self._model.table, self._active(viewmats)
+        image = self._render(table, viewmats, self._options, active)
+        self._kept.append(1.0 if active is None else float((active.views != 0).double().mean()))
+        if self._before is not None:
+            last_pose, last_image = self._before
+            self._changes.append(float((image - last_image).abs().mean()) * 255)
+            if self._scene is not None:
+                popped = (image - self._with_levels_of(last_pose, viewmats)).abs().mean(2).flatten() * 255
+                self.popping.append(float(popped.mean()))
+                if self.popping[-1] == max(self.popping):
+                    self._worst = popped
+        self._before = viewmats, image
+        return image
+
+    def figures(self) -> dict[str, float]:
+        """Return what `popping` says of this way to render."""
+        found = {"mean_change": _mean(self._changes), "largest_change": max(self._changes)}
+        if self._scene is None:
+            return found
+        pixel = float(self._worst.topk(max(1, len(self._worst) // 1000)).values[-1])
+        popped = {"mean": _mean(self.popping), "largest": max(self.popping), "pixel": pixel}
+        return found | popped | {"kept": _mean(self._kept)}
+
+    def _active(self, viewmats: Tensor) -> ActiveRows | None:
+        return None if self._scene is None else self._scene.active(self._model.table, viewmats)
+
+    def _with_levels_of(self, other: Tensor, viewmats: Tensor) -> Tensor:
+        """Return the image from a pose, with the Gaussians and weights of the pose `other`."""
+        assert self._scene is not None
+        table, gate = self._model.table, self._scene.gate
+        if gate.smooth:
+            weights = gate.weights(table["means"], table["level"], centres_of(other)[0])
+            opacities = (table["opacities"].double().sigmoid() * weights).logit().float()
+            table = GaussianTable(table.columns | {"opacities": opacities})
+        return self._render(table, viewmats, replace(self._options, fade=()), self._active(other))
+
+    def _render(
+        self, table: GaussianTable, viewmats: Tensor, options: RenderOptions, active: ActiveRows | None
+    ) -> Tensor:
+        views = Views(viewmats, self._K.to(viewmats.device)[None], *self._size)
+        return pipeline.forward(table, views, options, active).renders[0].clamp(0, 1)
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _gate(model: TrainedModel, smooth: bool, ranks: Ranks) -> SceneGate:
+    """Return the gate that the run has or would have at its end."""
+    progress, config = model.progress, model.config
+    count = progress.level_count
+    finest = count - 1 if progress.finest_level is None else progress.finest_level
+    gate = LodGate(progress.reference_distance, config.lod.fork, count, finest, smooth)
+    return SceneGate(gate, math.inf if smooth else config.view.most_kept, model.table, ranks)
+
+
+def _flight(
+    model: TrainedModel, cameras: Any, frames: int, width: int, name: str | None
+) -> tuple[Tensor, Tensor, tuple[int, int]]:
+    """Return the poses [frames, 4, 4], the intrinsics [3, 3] and the size in pixels of the frames."""
+    chosen = _camera(cameras, name)
+    view = ViewSet([chosen], model.space, torch.device("cpu")).pick([0])
+    pose, K = view.viewmats[0].double(), view.Ks[0].clone()
+    scale = min(1.0, width / chosen.width)
+    size = round(chosen.width * scale), round(chosen.height * scale)
+    K[0] *= size[0] / chosen.width
+    K[1] *= size[1] / chosen.height
+    points = model.table["means"].cpu().double() @ pose[:3, :3].T + pose[:3, 3]
+    slopes = points[:, :2] / points[:, 2:]
+    # What is around the middle of the picture says how far away it is.
+    seen = (points[:, 2] > 0) & (slopes.abs() < 0.1 * chosen.width / float(view.Ks[0, 0, 0])).all(1)
+    if not bool(seen.any()):
+        raise ValueError(
+            f"there is no Gaussian in front of the middle of {chosen.name}: choose another --camera"
+        )
+    distance = float(points[seen, 2].median())
+    share = torch.linspace(0, 1, frames, dtype=torch.float64)
+    poses = pose.repeat(frames, 1, 1)
+    poses[:, 2, 3] += distance * (FARTHEST * (NEAREST / FARTHEST) ** share - 1)
+    return poses.float(), K, size
+
+
+def _camera(cameras: Any, name: str | None) -> CameraLike:
+    if name is None:
+        axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
+        chosen: CameraLike = cameras[int((axes @ axes.mean(0)).argmax())]
+        return chosen
+    for camera in cameras:
+        if camera.name == name:
+            found: CameraLike = camera
+            return found
+    raise ValueError(f"the run has no view '{name}'; it has for example {cameras[0].name}")
+
+
+class _Clip:
+    """A video file that grows frame by frame."""
+
+    def __init__(self, path: Path, width: int, height: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # The codec wants even edges.
+        self._size = width // 2 * 2, height // 2 * 2
+        self._writer = cv2.VideoWriter(
+            str(path), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_SECOND, self._size
+        )
+        if not self._writer.isOpened():
+            raise OSError(f"{path}: OpenCV cannot write MP4 files here; call without an output folder")
+
+    def add(self, image: Tensor) -> None:
+        width, height = self._size
+        self._writer.write(np.ascontiguousarray(to_uint8(image)[:height, :width, ::-1]))
+
+    def close(self) -> None:
+        self._writer.release()
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path, help="folder of the run")
+    parser.add_argument("--out", type=Path, help="folder for the chart and the clip (RUN/popping)")
+    parser.add_argument("--frames", type=int, default=240)
+    parser.add_argument("--width", type=int, default=640, help="of the frames in pixels")
+    parser.add_argument("--camera", help="name of the view whose axis is flown along")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    out = options.out or options.run / "popping"
+    found = popping(options.run, out, options.device, options.frames, options.width, options.camera)
+    rows = [
+        {
+            "levels": mode,
+            "largest change": found[mode]["largest_change"],
+            "mean change": found[mode]["mean_change"],
+            "largest popping": found[mode].get("largest", 0.0),
+            "mean popping": found[mode].get("mean", 0.0),
+            "worst pixels": found[mode].get("pixel", 0.0),
+            "kept": found[mode].get("kept", 1.0),
+        }
+        for mode in MODES
+    ]
+    title = f"Popping of {options.run.name} over {found['frames']} frames, {found['levels']} levels"
+    report(title, rows, options.json, options.device)
+
+
+if __name__ == "__main__":
+    main()

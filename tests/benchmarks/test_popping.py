@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The measure of popping: levels that are cut off jump, levels that fade do less, one level does not."""
+
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training import run as run_folder
+from blitzgs.training.trainer import Trainer
+from tests.helpers import DEVICES
+from tests.training.tiny import tiny_config, tiny_scene
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+import bm_popping  # noqa: E402
+
+FLAGS = (
+    "schedule.iterations=60",
+    "view.lod=true",
+    "schedule.densify_until=40",
+    "lod.fork=1.3",
+    "log.pictures=0",
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("popping") / "run"
+    Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, Ranks()).train()
+    return folder
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_smooth_levels_pop_less(trained, tmp_path, device, capsys):
+    arguments = [str(trained), "--frames", "200", "--device", device, "--out", str(tmp_path / "shown")]
+    bm_popping.main([*arguments, "--json", str(tmp_path / "found.json")])
+    assert "Popping of run over 200 frames" in capsys.readouterr().out
+    found = bm_popping.popping(trained, None, device, frames=200)
+    gated, smooth = found["gated"], found["smooth"]
+    assert found["levels"] > 2 and gated["kept"] < 1 and smooth["kept"] < 1
+    assert 0 < smooth["largest"] < 0.7 * gated["largest"]
+    assert smooth["pixel"] < 0.7 * gated["pixel"]
+    assert gated["largest_change"] > smooth["largest_change"]
+    assert 0 < gated["mean"] < gated["largest"] < 255
+    assert "<svg" in (tmp_path / "shown" / "popping.svg").read_text()
+    clip = cv2.VideoCapture(str(tmp_path / "shown" / "popping.mp4"))
+    assert clip.get(cv2.CAP_PROP_FRAME_COUNT) == 200
+    assert clip.get(cv2.CAP_PROP_FRAME_WIDTH) == 3 * 48
+
+
+def test_a_model_of_one_level_does_not_pop(trained, monkeypatch):
+    opened = run_folder.open_model
+
+    def flat(*arguments):
+        model = opened(*arguments)
+        model.table["level"].zero_()
+        return model
+
+    monkeypatch.setattr(run_folder, "open_model", flat)
+    found = bm_popping.popping(trained, None, frames=4)
+    assert found["gated"]["largest"] == 0 < found["full"]["mean_change"]
+    assert found["smooth"]["largest"] < 1e-3  # opacities that went through a logit and back
+    assert torch.tensor([found["gated"]["kept"], found["smooth"]["kept"]]).eq(1).all()
+
+
+def test_errors_name_the_remedy(trained):
+    with pytest.raises(ValueError, match="at least 2 frames, got 1"):
+        bm_popping.popping(trained, frames=1)
+    with pytest.raises(ValueError, match="no view 'x.jpg'; it has for example 00.png"):
+        bm_popping.popping(trained, camera="x.jpg")
