@@ -23,7 +23,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,8 +36,15 @@ from blitzgs.population.candidates import FEATURES
 # What was trained: the capture's name and fingerprint, and the schedule under which its Gaussians lived.
 ABOUT = "about.json"
 _PART = re.compile(r"(births|deaths)_(\d{8})_(\d{4})_(\d{4})\.parquet")
-# Rows that are kept in memory before they are written.
-_MOST_PENDING = 1 << 20
+# Rows that stay in the memory of the device before they are written: a row takes some 60 bytes.
+_MOST_PENDING = 1 << 19
+# The columns of each table, in order: those that are kept as int64, with their types in the log, and those of
+# float32.
+_INTS: dict[str, dict[str, torch.dtype]] = {
+    "births": {"id": torch.int64, "parent": torch.int64},
+    "deaths": {"id": torch.int64, "time": torch.int32, "cause": torch.uint8},
+}
+_FLOATS: dict[str, tuple[str, ...]] = {"births": ("x", "y", "z", *FEATURES), "deaths": ()}
 
 
 class Cause(enum.IntEnum):
@@ -117,18 +124,17 @@ class Lineage:
             write_file(folder / ABOUT, json.dumps(about or {}, indent=1) + "\n")
         ranks.barrier()
         self._sums = torch.zeros(3, dtype=torch.int64, device=ranks.device)
-        self._pending: dict[str, list[dict[str, Tensor]]] = {"births": [], "deaths": []}
+        self._pending: dict[str, list[_Block]] = {name: [] for name in _INTS}
         self._rows, self._parts = 0, 0
         self._writer = ThreadPoolExecutor(1, "lineage")
         self._writing: list[Future[None]] = []
-        self._unwritten: list[tuple[str, list[dict[str, Tensor]], OSError]] = []
+        self._unwritten: list[tuple[str, dict[str, Tensor], OSError]] = []
 
     def born(self, births: Births, step: int) -> None:
         """Log births at the end of an optimiser step."""
         self._count(births.ids, births=True)
-        columns = {"id": births.ids, "parent": births.parents}
-        columns |= dict(zip("xyz", births.means.unbind(1), strict=True))
-        self._log("births", columns | dict(zip(FEATURES, births.features.unbind(1), strict=True)), step)
+        floats = torch.cat((births.means, births.features), 1)
+        self._log("births", (births.ids, births.parents), floats, step)
 
     def died(self, ids: Tensor, causes: Tensor, time: int, step: int) -> None:
         """Log deaths.
@@ -140,8 +146,8 @@ class Lineage:
             step: optimiser step.
         """
         self._count(ids, births=False)
-        times = torch.full_like(ids, time, dtype=torch.int32)
-        self._log("deaths", {"id": ids, "time": times, "cause": causes.to(torch.uint8)}, step)
+        columns = ids, torch.full_like(ids, time), causes.long()
+        self._log("deaths", columns, torch.empty(len(ids), 0, device=ids.device), step)
 
     def settle(self, ids: Tensor, step: int) -> Ledger:
         """Write what is pending and check the books, before a checkpoint is written. Collective.
@@ -160,8 +166,8 @@ class Lineage:
         self._flush(step)
         self._wait()
         unwritten, self._unwritten = self._unwritten, []
-        for name, pieces, _ in unwritten:
-            self._write(name, pieces)
+        for name, columns, _ in unwritten:
+            self._write(name, columns)
         texts = [str(error) for _, _, error in self._unwritten]
         problems = [text for part in self._ranks.all_gather_object(texts) for text in part]
         if problems:
@@ -197,32 +203,48 @@ class Lineage:
         self._sums[0 if births else 1] += len(ids)
         self._sums[2] += sign * hash_keys(ids).sum()
 
-    def _log(self, table: str, columns: dict[str, Tensor], step: int) -> None:
-        self._pending[table].append({name: column.cpu() for name, column in columns.items()})
-        self._rows += len(columns["id"])
+    def _log(self, table: str, ints: tuple[Tensor, ...], floats: Tensor, step: int) -> None:
+        # Copies, on the device: the host waits once for very many rows, not at every event.
+        self._pending[table].append(_Block(torch.stack(ints, 1), floats))
+        self._rows += len(floats)
         if self._rows > _MOST_PENDING:
             self._flush(step)
 
     def _flush(self, step: int) -> None:
         """Have the pending rows written by another thread."""
-        for table, pieces in self._pending.items():
-            if not pieces:
+        for table, blocks in self._pending.items():
+            if not blocks:
                 continue
             name = f"{table}_{step:08d}_{self._ranks.rank:04d}_{self._parts:04d}.parquet"
             self._parts += 1
-            self._writing.append(self._writer.submit(self._write, name, list(pieces)))
-            pieces.clear()
+            self._writing.append(self._writer.submit(self._write, name, _columns(table, blocks)))
+            blocks.clear()
         self._rows = 0
 
-    def _write(self, name: str, pieces: list[dict[str, Tensor]]) -> None:
-        columns = {key: torch.cat([piece[key] for piece in pieces]).numpy() for key in pieces[0]}
+    def _write(self, name: str, columns: dict[str, Tensor]) -> None:
         arrow, parquet = self._parquet
         try:
             # On the disk when `settle` returns: the checkpoint that follows counts on it.
             with new_file(self._folder / name) as partial:
-                parquet.write_table(arrow.table(columns), partial, compression="zstd")
+                table = arrow.table({key: column.numpy() for key, column in columns.items()})
+                parquet.write_table(table, partial, compression="zstd")
         except OSError as error:
-            self._unwritten.append((name, pieces, error))
+            self._unwritten.append((name, columns, error))
+
+
+class _Block(NamedTuple):
+    """Rows of a table: int64 [M, ...] and float32 [M, ...], see `_INTS` and `_FLOATS`."""
+
+    ints: Tensor
+    floats: Tensor
+
+
+def _columns(table: str, blocks: list[_Block]) -> dict[str, Tensor]:
+    """Bring rows to the CPU, as the columns of the log."""
+    ints = torch.cat([block.ints for block in blocks]).t().contiguous().cpu()
+    floats = torch.cat([block.floats for block in blocks]).t().contiguous().cpu()
+    typed = {name: column.to(dtype) for (name, dtype), column in zip(_INTS[table].items(), ints, strict=True)}
+    return typed | dict(zip(_FLOATS[table], floats, strict=True))
 
 
 def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
