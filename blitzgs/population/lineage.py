@@ -36,8 +36,9 @@ from blitzgs.population.candidates import FEATURES
 # What was trained: the capture's name and fingerprint, and the schedule under which its Gaussians lived.
 ABOUT = "about.json"
 _PART = re.compile(r"(births|deaths)_(\d{8})_(\d{4})_(\d{4})\.parquet")
-# Rows that stay in the memory of the device before they are written: a row takes some 60 bytes.
-_MOST_PENDING = 1 << 19
+# Rows that stay in the memory of the device, some 60 bytes each, before they are written behind the training;
+# what is left at a checkpoint holds it up.
+_MOST_PENDING = 1 << 17
 # The columns of each table, in order: those that are kept as int64, with their types in the log, and those of
 # float32.
 _INTS: dict[str, dict[str, torch.dtype]] = {
@@ -227,7 +228,8 @@ class Lineage:
             # On the disk when `settle` returns: the checkpoint that follows counts on it.
             with new_file(self._folder / name) as partial:
                 table = arrow.table({key: column.numpy() for key, column in columns.items()})
-                parquet.write_table(table, partial, compression="zstd")
+                # Ids and floats hardly repeat: a dictionary would take longer and save nothing.
+                parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
         except OSError as error:
             self._unwritten.append((name, columns, error))
 

@@ -56,7 +56,7 @@ def write_sample(run: Spawns, path: Path, most: int = MOST_ROWS) -> float:
     table = arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
     with new_file(path) as partial:
         table = table.replace_schema_metadata({_ABOUT: json.dumps(about)})
-        parquet.write_table(table, partial, compression="zstd")
+        parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
     return rate
 
 

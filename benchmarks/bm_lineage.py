@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the log of births and deaths costs: density events with and without it, and a checkpoint's books.
+
+    python benchmarks/bm_lineage.py [--gaussians 2000000] [--candidates 0.02] [--json FILE]
+
+Every event clones or splits a share of the Gaussians and prunes about as many. Times are medians of wall time
+with the device idle before and after; "books" brings the rows of all events to the disk and compares births
+less deaths with the population. A run has an event each 100 images and the books at each checkpoint.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+from bm_importance import table_of
+from harness import report
+from scenes import aerial
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import GaussianTable
+from blitzgs.population.density import DensityRules, densify
+from blitzgs.population.lineage import Ledger, Lineage, initial_births
+
+RULES = DensityRules(grad_threshold=0.5, clone_scale=1.0, min_opacity=0.005)
+
+
+def shake(table: GaussianTable, share: float, event: int) -> None:
+    """Give a share of the rows gradients above the threshold, and another opacities that are pruned."""
+    generator = torch.Generator(table.device).manual_seed(event)
+    draws = torch.rand(len(table), generator=generator, device=table.device)
+    table["grad_count"].fill_(1)
+    table["grad_sum"].copy_((draws < share).float())
+    table["opacities"].masked_fill_(draws > 1 - share, -9.0)
+
+
+def events(table: GaussianTable, share: float, count: int, lineage: Lineage | None) -> list[float]:
+    """Return the seconds of each of several density events."""
+    ranks, seconds = Ranks(device=table.device), []
+    for event in range(count):
+        shake(table, share, event)
+        begin = now(table.device)
+        densify(
+            table, RULES, time=100 * event, step=event, seed=0, level_count=4, ranks=ranks, lineage=lineage
+        )
+        seconds.append(now(table.device) - begin)
+    return seconds
+
+
+def now(device: torch.device) -> float:
+    """Return the time at which the device has nothing left to do."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gaussians", type=int, default=2_000_000)
+    parser.add_argument("--candidates", type=float, default=0.02, help="share that grows at an event")
+    parser.add_argument("--events", type=int, default=20)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    scene = aerial(options.gaussians, options.device)
+    with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
+        plain = events(table_of(scene), options.candidates, options.events, None)
+        table = table_of(scene)
+        lineage = Lineage(Path(folder), Ranks(device=table.device), 0, Ledger())
+        lineage.born(initial_births(table["id"], table["parent"], table["means"]), 0)
+        logged = events(table, options.candidates, options.events, lineage)
+        begin = now(table.device)
+        lineage.settle(table["id"], options.events)
+        books = now(table.device) - begin
+        lineage.close()
+        megabytes = sum(path.stat().st_size for path in Path(folder).iterdir()) / 1e6
+    times = {"event": plain, "event, logged": logged, "books": [books]}
+    rows = [{"work": name, "ms": 1e3 * statistics.median(values)} for name, values in times.items()]
+    title = (
+        f"Lineage: {options.events} events on {scene.name}, {options.candidates:.0%} grow; {megabytes:.0f} MB"
+    )
+    report(title, rows, options.json, options.device)
+
+
+if __name__ == "__main__":
+    main()
