@@ -49,8 +49,8 @@ struct ProjectInputs {
   int n_views;
   ProjectOptions<T> options;
   const std::int32_t* n_active = nullptr;
-  const std::int32_t* n_blocks = nullptr;
   LevelFade fade{};
+  const std::int32_t* n_blocks = nullptr;
 };
 
 // What project() sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P splats,
