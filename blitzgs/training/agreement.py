@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What interrupts the loop between two steps: a signal that asks to stop, and the clock that asks to save.
+"""What interrupts the loop between two steps: a signal, the clock that asks to save, a lost photograph.
 
-Ranks may only act on either after the same step, so they agree on it: by one small reduction every few steps.
+Ranks may only act on these after the same step, so they agree on it: by one small reduction every few steps.
 torchrun kills a process 30 seconds after SIGTERM, so the number of steps follows from how long they take.
 """
 
@@ -78,10 +78,12 @@ class Decision:
     Attributes:
         signal: name of the signal that ends the run, or None.
         save: whether a checkpoint is due.
+        lost: whether a rank goes on without a photograph that it could not read.
     """
 
     signal: str | None
     save: bool
+    lost: bool = False
 
 
 class Agreement:
@@ -92,30 +94,37 @@ class Agreement:
         self._ranks, self._stop, self._clock = ranks, stop, clock
         self._next = 0
         self._last: tuple[int, float] | None = None
+        self._agreed_to_stop = False
 
-    def after(self, step: int) -> Decision:
-        """Return what happens after `step`; every rank calls this after every step."""
-        if self._ranks.world_size == 1:
-            return self._decision(self._stop.number, self._clock.is_due)
-        if step < self._next:
+    def after(self, step: int, lost: bool = False) -> Decision:
+        """Return what happens after `step`; every rank calls this after every step.
+
+        `lost`: whether this rank goes on without a photograph.
+        """
+        if self._ranks.world_size > 1 and step < self._next and not self._agreed_to_stop:
             return Decision(None, False)
-        return self.now(step)
+        return self.now(step, lost)
 
-    def now(self, step: int) -> Decision:
+    def now(self, step: int, lost: bool = False) -> Decision:
         """Agree at once, whatever the step; every rank calls this."""
+        if self._ranks.world_size == 1:
+            return self._decision(self._stop.number, self._clock.is_due, lost)
         now = time.monotonic()
         # Unknown at first: the ranks agree again after the next step.
         seconds = MOST_SECONDS
         if self._last is not None and step > self._last[0]:
             seconds = (now - self._last[1]) / (step - self._last[0])
         values = torch.tensor(
-            [self._stop.number, self._clock.is_due, seconds], dtype=torch.float64, device=self._ranks.device
+            [self._stop.number, self._clock.is_due, seconds, lost],
+            dtype=torch.float64,
+            device=self._ranks.device,
         )
-        number, due, slowest = self._ranks.read(self._ranks.all_reduce(values, "max"))
+        number, due, slowest, any_lost = self._ranks.read(self._ranks.all_reduce(values, "max"))
         interval = max(1, min(MOST_STEPS, int(MOST_SECONDS / max(slowest, 1e-9))))
         self._next, self._last = (step // interval + 1) * interval, (step, time.monotonic())
-        return self._decision(int(number), due > 0)
+        self._agreed_to_stop = number > 0
+        return self._decision(int(number), due > 0, any_lost > 0)
 
     @staticmethod
-    def _decision(number: int, due: bool) -> Decision:
-        return Decision(signal.Signals(number).name if number else None, due)
+    def _decision(number: int, due: bool, lost: bool) -> Decision:
+        return Decision(signal.Signals(number).name if number else None, due, lost)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -54,6 +54,14 @@ class Batch:
     masks: Tensor | None
     samples: Tensor
     ranges: TileRanges | None
+
+
+class _Photograph(NamedTuple):
+    """What a batch takes of a view's photograph."""
+
+    strip: np.ndarray | None  # the pixel rows that this rank needs
+    mask: Tensor | None
+    samples: float
 
 
 class _Memory:
@@ -139,6 +147,11 @@ class BatchLoader:
 
     On CUDA, images go through pinned memory and a stream of their own, so that uploads overlap the kernels. A
     batch is overwritten some steps later: it is valid until the next one is asked for.
+
+    Attributes:
+        lost: on several ranks, why this one could not read the first of the photographs that it goes on
+            without: all their pixels count as masked. The others are in the middle of a step, so that it
+            cannot stop alone. None: it has read all.
     """
 
     def __init__(
@@ -167,6 +180,7 @@ class BatchLoader:
         self._views = views
         self._owners = owners
         self._counts: dict[int, float] = {}
+        self.lost: str | None = None
         self._train = train
         self._sampler = sampler
         self._device = device
@@ -228,17 +242,26 @@ class BatchLoader:
         self, indices: list[int], ranges: TileRanges | None, rows: list[tuple[int, int]]
     ) -> tuple[Batch, _Slot]:
         # Images that cannot be read must not keep a slot.
-        masks = [self._images.mask(index) for index in indices]
-        strips = [
-            self._images.get(index).numpy()[y0:y1] if y0 < y1 else None
-            for index, (y0, y1) in zip(indices, rows, strict=True)
-        ]
+        photographs = [self._read(index, *needed) for index, needed in zip(indices, rows, strict=True)]
         slot = self._free.popleft()
         try:
-            return self._fill(slot, indices, ranges, rows, strips, masks), slot
+            return self._fill(slot, indices, ranges, rows, photographs), slot
         except BaseException:  # one that is not given back would be missing from then on
             self._free.append(slot)
             raise
+
+    def _read(self, index: int, y0: int, y1: int) -> _Photograph:
+        """Return what a batch needs of a view."""
+        try:
+            mask = self._images.mask(index)
+            strip = self._images.get(index).numpy()[y0:y1] if y0 < y1 else None
+        except (OSError, ValueError) as error:
+            if self._owners is None:
+                raise
+            self.lost = self.lost or str(error)
+            width, height = self._views.size([index])
+            return _Photograph(None, torch.zeros(height, width, dtype=torch.uint8), 3.0 * width * height)
+        return _Photograph(strip, mask, self._samples(index, mask))
 
     def _fill(
         self,
@@ -246,12 +269,11 @@ class BatchLoader:
         indices: list[int],
         ranges: TileRanges | None,
         rows: list[tuple[int, int]],
-        strips: list[np.ndarray | None],
-        masks: list[Tensor | None],
+        photographs: list[_Photograph],
     ) -> Batch:
         """Put a batch together in a slot and start to upload it."""
         count, (width, height) = len(indices), self._views.size(indices)
-        samples = [self._samples(index, mask) for index, mask in zip(indices, masks, strict=True)]
+        strips, masks, samples = zip(*photographs, strict=True)
         if self._stream is not None:
             slot.uploaded.synchronize()  # the pinned memory is free, long since
             self._stream.wait_event(slot.read)

@@ -27,7 +27,12 @@ from blitzgs.training.views import CameraLike, ViewSet
 from blitzgs.view.gate import SceneGate
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
+Stops = Callable[[], bool]
 METRICS = ("psnr", "ssim", "psnr_corrected", "lpips")
+
+
+class EvaluationStoppedError(Exception):
+    """An evaluation was given up because the run has to stop."""
 
 
 def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
@@ -152,6 +157,7 @@ def evaluate(
     inputs: Iterable[Path] = (),
     optional_files: bool = False,
     lod: SceneGate | None = None,
+    stops: Stops | None = None,
 ) -> dict[str, Any]:
     """Render views and compare them with their photographs; the ranks take turns at comparing.
 
@@ -170,6 +176,8 @@ def evaluate(
         inputs: files that must stay as they are, wherever `folder` is.
         optional_files: warn instead of failing when a file cannot be written, as while training.
         lod: as for `render_view`.
+        stops: whether to give up, asked whenever each rank has compared one view more; the same answer on
+            every rank. None: never.
 
     Returns:
         {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}; the
@@ -178,16 +186,20 @@ def evaluate(
 
     Raises:
         OSError: a file cannot be written, and `optional_files` is not set.
-        PhotographError: a photograph cannot be read.
+        PhotographError: a photograph cannot be read; on every rank, once the others are measured.
+        EvaluationStoppedError: `stops` said so.
     """
     ranks = owners.ranks
     files = None if folder is None else _Files(folder, inputs, optional_files)
     chosen = files.plan(indices, cameras, pictures) if files is not None else {}
     per_view: dict[str, dict[str, float]] = {}
+    lost: str | None = None
     own = list(indices[ranks.rank :: ranks.world_size])
     for position, index in enumerate(indices):
         turn, destination = divmod(position, ranks.world_size)
         if destination == 0:
+            if stops is not None and position > 0 and stops():
+                raise EvaluationStoppedError
             images.prefetch(own[turn : turn + 4])
         render = render_view(table, views, index, options, owners, destination, lod)
         if report is not None:
@@ -195,15 +207,21 @@ def evaluate(
         if render is None:
             continue
         with ranks.working(f"comparing view {cameras[index].name}"):
-            target, mask = _photograph(images, index)
-            target = target.to(table.device)
+            try:
+                target, mask = images.get(index).to(table.device), images.mask(index)
+            except (OSError, ValueError) as error:
+                lost = lost or str(error)  # the other ranks go on: they learn of it at the end
+                continue
             if mask is not None and not bool(mask.any()):
                 continue  # nothing to compare
             per_view[cameras[index].name] = _compare(render, target, mask, lpips)
             if files is not None and index in chosen:
                 picture = comparison(render, target, mask)
                 files.write(chosen[index], encode_image(picture, ".jpg"))
-    found = {name: view for part in ranks.all_gather_object(per_view) for name, view in part.items()}
+    parts = ranks.all_gather_object((per_view, lost))
+    if reasons := [reason for _, reason in parts if reason is not None]:
+        raise PhotographError("; ".join(reasons))
+    found = {name: view for part, _ in parts for name, view in part.items()}
     names = [cameras[index].name for index in indices]
     masked = [name for name in names if name not in found]
     if masked and ranks.rank == 0:
@@ -219,14 +237,6 @@ def evaluate(
     if files is not None and ranks.rank == 0:
         files.write(files.output.root / "metrics.json", json.dumps(result, indent=1).encode())
     return result
-
-
-def _photograph(images: Images, index: int) -> tuple[Tensor, Tensor | None]:
-    """Return a photograph and its mask, with an error that a run knows to save before."""
-    try:
-        return images.get(index), images.mask(index)
-    except (OSError, ValueError) as error:
-        raise PhotographError(str(error)) from error
 
 
 class _Files:

@@ -33,6 +33,11 @@ from blitzgs.training.views import Space, ViewSet, render_options
 from blitzgs.view.blocks import morton_order
 
 
+def never() -> bool:
+    """Say that nothing asks the run to stop."""
+    return False
+
+
 @dataclass
 class TrainingState:
     """One run on one rank; an event is a function `run(state, event)` that may change it.
@@ -59,6 +64,8 @@ class TrainingState:
         lineage: logs births and deaths, or None.
         growth_was_limited: whether the log has said already that a limit holds growth back.
         log: where the run reports; silent until the loop opens the run's own.
+        stops: whether the run has to stop soon, which long events ask every few seconds; the same answer on
+            every rank. The loop that runs the events sets it.
         clock: monotonic seconds, that training time is counted by.
     """
 
@@ -83,6 +90,7 @@ class TrainingState:
     lineage: Lineage | None
     log: RunLog
     growth_was_limited: bool = False
+    stops: Callable[[], bool] = never
     clock: Callable[[], float] = time.monotonic
     _started: float = field(default_factory=time.monotonic)
 

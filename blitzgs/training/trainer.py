@@ -18,7 +18,7 @@ from blitzgs.pipeline import Frame
 from blitzgs.population.importance import PHI
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run, view_level
-from blitzgs.training.agreement import Agreement, StopRequest
+from blitzgs.training.agreement import MOST_STEPS, Agreement, StopRequest
 from blitzgs.training.batches import BatchLoader, Images, PhotographError
 from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config
@@ -30,6 +30,7 @@ from blitzgs.training.population_report import MemoryMeter, describe, population
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.setup import set_up
+from blitzgs.training.state import never
 from blitzgs.training.step_report import log_step, measure_step
 from blitzgs.training.views import render_options
 
@@ -88,6 +89,7 @@ class Trainer:
         try:
             with StopRequest() as stop:
                 agreement = Agreement(state.ranks, stop, state.save_clock)
+                state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 self._announce()
                 budget = Budget(state)
                 # The budget changes how many steps there are.
@@ -97,22 +99,31 @@ class Trainer:
                     budget.after(step)
                     if step == state.schedule.steps:
                         break
-                    decision = agreement.after(step)
+                    decision = agreement.after(step, self._loader.lost is not None)
                     if decision.signal is not None:
                         self._stop(f"stopped by {decision.signal}; continue with --resume")
                         return None
+                    if decision.lost:
+                        break
                     if decision.save:
                         save.run(state)
+            state.stops = never
+            self._check_photographs()
             return self._finish()
-        except PhotographError as error:
-            if state.ranks.world_size > 1:
-                raise  # the other ranks are in the middle of the step and cannot save
+        except PhotographError as error:  # on every rank
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
             raise PhotographError(
                 f"{error}. The model so far is saved: put the photograph back and continue with --resume"
             ) from error
         finally:
             self.close()
+
+    def _check_photographs(self) -> None:
+        """Fail on all ranks where one of them went on without a photograph (`BatchLoader.lost`)."""
+        reasons = self.state.ranks.all_gather_object(self._loader.lost)
+        lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
+        if lost:
+            raise PhotographError(f"{'; '.join(lost)}. The last steps, {MOST_STEPS} at most, went without it")
 
     def _stop(self, text: str) -> None:
         """Save where the run is, and say why it stops here."""

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import run
+from blitzgs.training import evaluation, run
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
@@ -158,13 +158,99 @@ def _lose_a_photograph(ranks, folder):
     trainer.train()
 
 
-def test_a_photograph_lost_on_one_rank_is_named_by_all_and_costs_a_checkpoint_interval(tmp_path):
+def require_named_by_all(failure, photograph):
+    assert len(failure.value.messages) == 2
+    for message in failure.value.messages.values():
+        assert "PhotographError" in message and photograph in message
+        assert "put the photograph back and continue with --resume" in message
+
+
+def test_a_photograph_lost_on_one_rank_is_named_by_all_and_costs_nothing(tmp_path):
     with pytest.raises(RankError) as failure:
         run_ranks(_lose_a_photograph, 2, tmp_path)
-    for message in failure.value.messages.values():
-        assert "PhotographError" in message and "/photos/0" in message
-    # The other rank is in the middle of the step: what counts is the last checkpoint, after 19 images.
-    assert run.restore(tmp_path, Ranks()).progress.step == 10
+    require_named_by_all(failure, "rank 1: ")
+    require_named_by_all(failure, "/photos/0")
+    # The other rank is in the middle of the step: they save where they next agree. The last checkpoint of the
+    # schedule is that after 19 images.
+    assert run.restore(tmp_path, Ranks()).progress.step == 16
+    for summary, _ in run_ranks(_train, 2, tmp_path):
+        assert summary["images"] == 60
+
+
+def _lose_the_last_photographs(ranks, folder):
+    torch.set_num_threads(1)
+    capture, images = tiny_scene()
+    trainer = Trainer(tiny_config(*SETTINGS, "data.prefetch=0"), capture, images, folder, ranks)
+    step, get = trainer.step, images.get
+
+    def losing(number):
+        images.get = gone if number == 30 and ranks.rank == 0 else get
+        step(number)
+
+    def gone(index):
+        raise ValueError(f"/photos/{index:02}.png is damaged")
+
+    trainer.step = losing
+    trainer.train()
+
+
+def test_a_photograph_lost_in_the_last_step_is_named_by_all(tmp_path):
+    with pytest.raises(RankError) as failure:
+        run_ranks(_lose_the_last_photographs, 2, tmp_path)
+    require_named_by_all(failure, "rank 0: /photos/0")
+    assert run.restore(tmp_path, Ranks()).progress.step == 30
+
+
+def _lose_a_held_out_photograph(ranks, folder, resume):
+    torch.set_num_threads(1)
+    capture, images = tiny_scene()
+    capture.train, capture.test, get = [0, 2, 4, 6], [1, 3, 5, 7], images.get
+
+    def gone(index):
+        if index == 5:
+            raise FileNotFoundError(2, "No such file or directory", "/photos/05.png")
+        return get(index)
+
+    if not resume:
+        images.get = gone
+    config = tiny_config(*SETTINGS, "schedule.evaluate_every=30")
+    return Trainer(config, capture, images, folder, ranks, resume).train()
+
+
+def test_a_held_out_photograph_lost_on_several_ranks_is_named_by_all_and_costs_nothing(tmp_path):
+    with pytest.raises(RankError) as failure:
+        run_ranks(_lose_a_held_out_photograph, 2, tmp_path, False)
+    require_named_by_all(failure, "/photos/05.png")
+    assert run.restore(tmp_path, Ranks()).progress.step == 16  # the evaluation is due after 30 images
+    assert all(run_ranks(_lose_a_held_out_photograph, 2, tmp_path, True))
+
+
+def _stop_in_an_evaluation(ranks, folder):
+    """Ask rank 1 to stop when it has compared its first view of many; count what each compares."""
+    torch.set_num_threads(1)
+    capture, images = tiny_scene()
+    capture.test = capture.train * 6
+    trainer = Trainer(tiny_config(*SETTINGS, "schedule.evaluate_every=22"), capture, images, folder, ranks)
+    compare, compared = evaluation._compare, []
+
+    def stopping(*arguments):
+        compared.append(trainer.state.progress.step)
+        if ranks.rank == ranks.world_size - 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return compare(*arguments)
+
+    evaluation._compare = stopping
+    return compared, trainer.train()
+
+
+@pytest.mark.parametrize("world_size", [1, 2])
+def test_a_signal_within_an_evaluation_does_not_wait_for_its_end(tmp_path, world_size):
+    """torchrun ends a process 30 seconds after it was asked to stop; an evaluation may take longer."""
+    for compared, summary in run_ranks(_stop_in_an_evaluation, world_size, tmp_path):
+        assert compared == [12] and summary is None  # images 22 and 23
+    assert run.restore(tmp_path, Ranks()).progress.step == 12
+    events = [json.loads(line).get("event") for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert "evaluation stopped" in events and "evaluation" not in events
 
 
 def _resume_with_fewer_views(ranks, folder):

@@ -9,7 +9,7 @@ from typing import Any
 
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.training import run as run_folder
-from blitzgs.training.evaluation import evaluate
+from blitzgs.training.evaluation import EvaluationStoppedError, evaluate
 from blitzgs.training.lod import scene_gate
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
@@ -19,12 +19,18 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
     """Evaluate the held-out views (the training views when there are none), while the clock stands still.
 
     Returns:
-        The mean of each metric, and under "split" whether they are those of held-out or of training views.
+        The mean of each metric, and under "split" whether they are those of held-out or of training views;
+        nothing where the run has to stop meanwhile.
     """
     with state.paused_clock():
         folder = state.folder / run_folder.EVALUATION / f"{state.images_seen:06d}"
         capture = state.capture
-        metrics = measure(state, capture.test or capture.train, folder)
+        try:
+            metrics = measure(state, capture.test or capture.train, folder)
+        except EvaluationStoppedError:
+            text = "evaluation given up: the run has to stop"
+            state.log.event(state.images_seen, "evaluation stopped", {}, text)
+            return {}
         means = {name: value for name, value in metrics.items() if name != "views"}
         what = "evaluation" if capture.test else "evaluation of TRAINING views (none is held out)"
         text = f"{what}: " + "  ".join(f"{name} {value:.4f}" for name, value in means.items())
@@ -55,4 +61,5 @@ def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -
         lpips=state.lpips,
         optional_files=True,
         lod=scene_gate(state.config, state.progress, state.table, state.ranks),
+        stops=state.stops,
     )
