@@ -25,7 +25,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions
-from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
+from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients, absolute_column
 
 Mark = Callable[[str], None]
 # Finds the active rows, caught up, with room for the rows of so many blocks (None: of as many as there are).
@@ -289,13 +289,16 @@ def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.d
     return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
 
 
-def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> SplatGradients:
+def backward_splats(
+    frame: Frame, v_renders: Tensor, mark: Mark = unmarked, absolute: bool = False
+) -> SplatGradients:
     """Carry image gradients back to this rank's projected splats.
 
     Args:
         frame: from `forward`.
         v_renders: gradient of the loss by the images, [B, H, W, 3]; this rank's tiles matter.
         mark: called at the end of each stage: "raster back", "exchange back".
+        absolute: also add up the absolute values of the pixels' gradients of means2d.
 
     Raises:
         RuntimeError: the ranks share memory, and a later frame has taken the place of this one's splats.
@@ -311,10 +314,13 @@ def backward_splats(frame: Frame, v_renders: Tensor, mark: Mark = unmarked) -> S
     frame.exchange.expect_gradients()
     if v_renders.is_cuda:
         packed = frame.gradients.take(splats.means2d)
-        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, grid, options.deterministic, packed)
-        parts = [packed]
+        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, grid, options.deterministic, packed, absolute)
+        parts = [packed, absolute_column(packed)] if absolute else [packed]
     else:
-        *parts, _ = torch.ops.blitzgs.rasterize_bwd(*arguments, None, grid, False, options.deterministic)
+        *parts, v_abs = torch.ops.blitzgs.rasterize_bwd(
+            *arguments, None, grid, absolute, options.deterministic
+        )
+        parts += [v_abs] if absolute else []
     mark("raster back")
     gradients = frame.exchange.return_gradients(parts)
     mark("exchange back")

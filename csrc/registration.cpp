@@ -67,8 +67,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
       "Tensor(d!)[] last_steps, Tensor[] tables, int[] steps, float[] decays, Tensor[] cameras, "
       "Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, Tensor? places=None, "
-      "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None, Tensor? opacity_reg=None, Tensor? level=None) "
-      "-> ()");
+      "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None, Tensor? opacity_reg=None, "
+      "Tensor? level=None, bool absolute_sums=False) -> ()");
   // Where the parts of a splat gradient begin in its floats, and last how many these are: mean2d, conic,
   // opacity, color, mean2d_abs.
   m.def("splat_gradient_layout() -> int[]");
@@ -119,7 +119,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "rasterize_bwd_packed_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
       "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
-      "int[] grid, bool deterministic, Tensor(a!) packed) -> ()");
+      "int[] grid, bool deterministic, Tensor(a!) packed, bool absgrad=False) -> ()");
 
   // What each splat contributes to the pixels, without colours.
   m.def(

@@ -35,6 +35,7 @@ def project_bwd_step_(
     means2d_sums: Tensor | None = None,
     opacity_reg: Tensor | None = None,
     level: Tensor | None = None,
+    absolute_sums: bool = False,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
@@ -64,6 +65,7 @@ def project_bwd_step_(
         means2d_sums: [P, 2], becomes the gradient of `splats.means2d` where `gradients` has it at ranks.
         opacity_reg: as `scale_reg`, of the opacity (without the compensation of antialiased splats).
         level: uint8 [N], octree levels, where opacities fade by them (`options.fade`).
+        absolute_sums: `means2d_sums` becomes the sum over pixels of its absolute values instead.
 
     Raises:
         ValueError: decay rates outside their range.
@@ -81,12 +83,13 @@ def project_bwd_step_(
         [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
         options.ints,
         options.floats,
-        list(gradients.parts),
+        gradients.projected,
         gradients.places,
         scale_reg,
         means2d_sums,
         opacity_reg,
         level,
+        absolute_sums,
     )
 
 

@@ -33,6 +33,11 @@ def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     )
 
 
+def absolute_column(packed: Tensor) -> Tensor:
+    """View the sums over pixels of the absolute gradients of means2d, [P, 2], in a table that has them."""
+    return packed[:, _MEAN2D_ABS : _MEAN2D_ABS + 2]
+
+
 def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
     """Return the table that columns are `gradient_columns` of; None: they are not of one table."""
     table = None if columns[0] is None else columns[0]._base
@@ -51,9 +56,10 @@ class SplatGradients(NamedTuple):
 
     Attributes:
         parts: columns (v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]); or (CUDA) one
-            table [P, 12]; or, with `places`, this rank's part of such a table at each of the M ranks that
-            composited splats, in memory that they share. A splat's gradient is then the sum over the ranks,
-            in their order.
+            table [P, 12]; both followed by the sums over pixels of the absolute gradients of means2d, [P, 2],
+            where these were asked for; or, with `places`, this rank's part of such a table at each of the M
+            ranks that composited splats, in memory that they share. A splat's gradient is then the sum over
+            the ranks, in their order.
         places: int64 [ceil(P / 32), M], where each splat is among those that a rank had of this one, as
             `scatter_splats` returns it. Such gradients are valid until the next frame, or the next backward
             pass of this one.
@@ -67,7 +73,28 @@ class SplatGradients(NamedTuple):
         """The gradient of means2d, [P, 2] per pixel; None: it is at several ranks."""
         if self.places is not None:
             return None
-        return gradient_columns(self.parts[0])[0] if len(self.parts) == 1 else self.parts[0]
+        return columns_of(self.parts)[0]
+
+    @property
+    def means2d_abs(self) -> Tensor | None:
+        """The sums over pixels of its absolute values, [P, 2]; None: they are at several ranks."""
+        return None if self.places is not None else self.parts[-1]
+
+    @property
+    def projected(self) -> list[Tensor]:
+        """What the projection's backward pass reads of the parts."""
+        if self.places is not None:
+            return list(self.parts)
+        return list(self.parts[: 1 if _begins_with_table(self.parts) else 4])
+
+
+def columns_of(parts: Sequence[Tensor]) -> list[Tensor]:
+    """Return the columns of a rank's own gradients, `SplatGradients.parts` without `places`: four or five."""
+    return [*gradient_columns(parts[0]), *parts[1:]] if _begins_with_table(parts) else list(parts)
+
+
+def _begins_with_table(parts: Sequence[Tensor]) -> bool:
+    return len(parts) <= 2
 
 
 class GradientBuffer:

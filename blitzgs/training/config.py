@@ -194,6 +194,9 @@ class PopulationConfig:
         growth: share of the population that "relocation" adds at each event.
         grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
             densified.
+        absolute_gradients: take the sum over pixels of the absolute gradients in its place (AbsGS), in which
+            those of a Gaussian's two halves do not cancel.
+        absolute_threshold: in the place of `grad_threshold` with `absolute_gradients`.
         clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split.
         min_opacity: Gaussians below are pruned.
         reset_opacity: what `schedule.reset_every` caps the opacities at.
@@ -226,6 +229,8 @@ class PopulationConfig:
     relocate: bool = False
     growth: float = 0.05
     grad_threshold: float = 2e-4
+    absolute_gradients: bool = False
+    absolute_threshold: float = 8e-4
     clone_scale: float = 0.01
     min_opacity: float = 0.005
     reset_opacity: float = 0.01

@@ -84,6 +84,7 @@ class LazyAdam:
         opacity_reg: Tensor | None,
         step: int,
         means2d_sums: Tensor | None = None,
+        absolute_sums: bool = False,
     ) -> None:
         """Take step number `step` (from 1) for the Gaussians that a frame shows.
 
@@ -96,6 +97,7 @@ class LazyAdam:
             opacity_reg: the same of its opacity.
             step: the visible rows stand at the step before.
             means2d_sums: [P, 2], becomes the gradient of the splats' means2d where `v` has it at ranks.
+            absolute_sums: the sum over pixels of its absolute values instead.
         """
         project_bwd_step_(
             table.parameters,
@@ -116,4 +118,5 @@ class LazyAdam:
             means2d_sums,
             opacity_reg,
             table["level"] if frame.options.fade else None,
+            absolute_sums,
         )

@@ -108,7 +108,13 @@ class Stepper:
         return frame, terms, sums
 
     def backward(
-        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
+        self,
+        step: int,
+        frame: Frame,
+        terms: LossTerms,
+        mark: Mark = unmarked,
+        keep_means2d: bool = False,
+        absolute: bool = False,
     ) -> Tensor | None:
         """Carry the gradients of `forward`'s loss back to the splats, and move the Gaussians by them.
 
@@ -118,16 +124,20 @@ class Stepper:
             terms: from `forward`.
             mark: called with its name at the end of each stage.
             keep_means2d: whether the caller wants the gradient of the splats' means2d.
+            absolute: as the sum over pixels of its absolute values (AbsGS, Ye et al. 2024).
 
         Returns:
             That gradient, [P, 2] per pixel, or None.
         """
         table = self._table
-        gradients = pipeline.backward_splats(frame, terms.v_renders, mark)
-        v_means2d, sums = gradients.means2d, None
+        absolute &= keep_means2d
+        gradients = pipeline.backward_splats(frame, terms.v_renders, mark, absolute)
+        v_means2d, sums = gradients.means2d_abs if absolute else gradients.means2d, None
         if v_means2d is None and keep_means2d:
             v_means2d = sums = torch.empty_like(frame.projected.means2d)
-        self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step, sums)
+        self._optimiser.step(
+            table, frame, gradients, terms.scale_reg, terms.opacity_reg, step, sums, absolute
+        )
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
         mark("optimiser")

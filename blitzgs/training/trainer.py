@@ -155,7 +155,11 @@ class Trainer:
         is_logged = end // config.log.every > begin // config.log.every
         measured = measure_step(state, frame, batch) if is_logged else None
         v_means2d = state.stepper.backward(
-            step, frame, terms, keep_means2d=schedule.gathers_statistics(begin)
+            step,
+            frame,
+            terms,
+            keep_means2d=schedule.gathers_statistics(begin),
+            absolute=config.population.absolute_gradients,
         )
         if v_means2d is not None:
             self._gather(frame, v_means2d)

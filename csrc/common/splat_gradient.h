@@ -20,6 +20,7 @@ struct alignas(16) SplatGradient {
     for (int i = 0; i < 3; ++i) conic[i] += v.conic[i];
     opacity += v.opacity;
     for (int i = 0; i < 3; ++i) color[i] += v.color[i];
+    for (int i = 0; i < 2; ++i) mean2d_abs[i] += v.mean2d_abs[i];
   }
 };
 

@@ -90,14 +90,14 @@ void project_bwd_step(TensorList params, TensorList exp_avgs, TensorList exp_avg
                       const TensorList& cameras, const TensorList& splats, const IntList& ints,
                       const FloatList& floats, const TensorList& v_splats, const OptionalTensor& places,
                       const OptionalTensor& scale_reg, const OptionalTensor& means2d_sums,
-                      const OptionalTensor& opacity_reg, const OptionalTensor& level) {
+                      const OptionalTensor& opacity_reg, const OptionalTensor& level, bool absolute_sums) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
   STD_TORCH_CHECK(state.step >= 1, "blitzgs::project_bwd_step_: steps count from 1, got ", state.step);
   const ProjectArguments p(kOp, params, cameras, ints, floats, level);
   const BackwardSplats b(kOp, p, splats, scale_reg, opacity_reg);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
-                             means2d_sums);
+                             means2d_sums, absolute_sums);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {

@@ -139,10 +139,9 @@ class SplatGradientReader<RankSplatGradients> {
           }
         }
         index()[r - first] = static_cast<std::uint8_t>(found);
-        mean2d = {stage()[found].mean2d[0], stage()[found].mean2d[1]};
+        mean2d = kept_of(stage()[found]);
       } else if (source_.means2d) {
-        const GeometryGradient<float> v = source_.geometry(r);
-        mean2d = {v.mean2d[0], v.mean2d[1]};
+        mean2d = kept_of(source_.sum(r));
       }
       if (source_.means2d) reinterpret_cast<float2*>(source_.means2d)[r] = mean2d;
     }
@@ -169,6 +168,10 @@ class SplatGradientReader<RankSplatGradients> {
     }
   };
 
+  __device__ __forceinline__ float2 kept_of(const SplatGradient& v) const {
+    const float* kept = source_.absolute ? v.mean2d_abs : v.mean2d;
+    return {kept[0], kept[1]};
+  }
   static __device__ __forceinline__ int lane() { return static_cast<int>(threadIdx.x) % 32; }
   // The runs that splats [begin, end) touch, by ranks.
   __device__ __forceinline__ int n_segments(std::int32_t begin, std::int32_t end) const {

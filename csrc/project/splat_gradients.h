@@ -49,6 +49,7 @@ struct RankSplatGradients {
   const SplatGradient* tables[kMaxPeers];
   std::int32_t sizes[kMaxPeers];  // this rank's splats in each
   float* means2d;                 // null, or [P, 2]: where the projection's backward pass leaves these sums
+  bool absolute;                  // those of mean2d_abs instead
 
   BLITZGS_HD bool colored() const { return true; }
   BLITZGS_HD GeometryGradient<float> geometry(std::int64_t r) const {

@@ -22,10 +22,12 @@ class HeldSplatGradients {
   using Source = SplatGradientColumns<T>;
 #endif
 
-  // splats: P. sums: none, or [P, 2], for the sums of the gradients of means2d from the ranks.
+  // splats: P. sums: none, or [P, 2], for the sums of the gradients of means2d from the ranks, or (absolute)
+  // of their absolute values over pixels.
   HeldSplatGradients(const char* op, ScalarType dtype, std::int64_t splats,
                      const std::vector<Tensor>& v_splats, const std::optional<Tensor>& v_depths,
-                     const std::optional<Tensor>& places, const std::optional<Tensor>& sums)
+                     const std::optional<Tensor>& places, const std::optional<Tensor>& sums,
+                     bool absolute = false)
       : held_(v_splats), depths_(v_depths), in_tables_(places || v_splats.size() == 1) {
 #ifndef BLITZGS_BACKEND_CUDA
     STD_TORCH_CHECK(!in_tables_, "blitzgs::", op, ": tables of gradients need CUDA; give columns");
@@ -36,6 +38,7 @@ class HeldSplatGradients {
       for (const Tensor& table : held_) check_table(op, table);
       if (!places) check_shape(op, "v_splats[0]", held_[0], {splats, kSplatGradient});
       if (places) hold_ranks(op, splats, *places, sums);
+      ranks_.absolute = absolute;
       return;
     }
     STD_TORCH_CHECK(v_splats.size() == 3 || v_splats.size() == 4, "blitzgs::", op,

@@ -122,8 +122,8 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
                    const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
                    Workspace&, CudaStream);
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, float* packed,
-                          Workspace&, CudaStream);
+                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
+                          float* packed, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -328,11 +328,11 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
 }
 
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, float* packed,
-                          Workspace& workspace, CudaStream stream) {
+                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
+                          float* packed, Workspace& workspace, CudaStream stream) {
   if (in.n_splats == 0) return;
   const SplatGradientSums splats(in, saved, n_isects, aux, deterministic, workspace, stream);
-  splats.add(splats.chunk(0), false, reinterpret_cast<PackedGradient*>(packed));
+  splats.add(splats.chunk(0), absolute, reinterpret_cast<PackedGradient*>(packed));
 }
 
 }  // namespace blitzgs::cuda

@@ -245,7 +245,8 @@ void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Ten
                           const Tensor& colors, const std::optional<Tensor>& backgrounds,
                           const Tensor& isect_splats, const Tensor& tile_offsets,
                           const std::vector<Tensor>& composited_in, const Tensor& v_renders,
-                          const std::vector<std::int64_t>& grid_numbers, bool deterministic, Tensor packed) {
+                          const std::vector<std::int64_t>& grid_numbers, bool deterministic, Tensor packed,
+                          bool absgrad) {
   constexpr const char* kOp = "rasterize_bwd_packed_";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
@@ -254,8 +255,8 @@ void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Ten
   const Composited composited(kOp, splats, composited_in, v_renders, std::nullopt);
   DeviceScope scope(splats.means2d);
   cuda::rasterize_bwd_packed(splats.input<float>(), composited.saved<float>(), splats.isect_splats.size(0),
-                             composited.aux(), deterministic, mutable_data<float>(packed), scope.workspace,
-                             scope.stream);
+                             composited.aux(), deterministic, absgrad, mutable_data<float>(packed),
+                             scope.workspace, scope.stream);
 }
 #endif
 

@@ -5,6 +5,8 @@ import pytest
 import torch
 from cuda_scenes import Scene, ops, relative_error
 
+from blitzgs.ops.splat_gradients import absolute_column
+
 # Where rounding decides whether a splat takes part, the images differ by up to about alpha = 1/255.
 CUT_SHARE = 2e-3
 
@@ -78,17 +80,20 @@ def test_gradients_match_float64(scene, channels, deterministic, absgrad):
         assert relative_error(value, target) < 1e-4, name
 
 
+@pytest.mark.parametrize("absgrad", [False, True])
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_packed_gradients_are_the_same(scene, channels):
+def test_packed_gradients_are_the_same(scene, channels, absgrad):
     job = Job(scene, channels)
     renders, rest, *_, room = saved = job.forward("cuda", backward_follows=True)
     assert room.shape == (len(job.splats[0]), 12) and not room.any()
     v_renders = torch.randn(renders.shape, generator=torch.Generator().manual_seed(7)).cuda()
     none = torch.zeros_like(rest)
-    *columns, _ = job.backward("cuda", torch.float32, saved, v_renders, none, False, True)
+    *columns, absolute = job.backward("cuda", torch.float32, saved, v_renders, none, absgrad, True)
     arguments = *job.inputs("cuda", torch.float32), kept_by(saved), v_renders, job.grid
-    ops.rasterize_bwd_packed_(*arguments, True, room)
+    ops.rasterize_bwd_packed_(*arguments, True, room, absgrad)
     assert torch.equal(room[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
+    if absgrad:
+        assert absolute.any() and torch.equal(absolute_column(room), absolute)
 
 
 @pytest.mark.parametrize("n_splats", [0, 1, 1000, 300_000])

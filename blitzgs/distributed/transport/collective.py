@@ -24,7 +24,7 @@ from blitzgs.ops.scatter import (
     words_of,
     words_per_splat,
 )
-from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
+from blitzgs.ops.splat_gradients import SplatGradients, columns_of
 
 
 class CollectiveTransport(Transport):
@@ -145,7 +145,7 @@ class _CollectiveExchange(Exchange):
         return HostCounts(self._projected, self._splats, self._visible, self._traffic)
 
     def _return_gradients(self, parts: Sequence[Tensor]) -> SplatGradients:
-        columns = gradient_columns(parts[0]) if len(parts) == 1 else parts
+        columns = columns_of(parts)
         flat = [g.reshape(len(g), math.prod(g.shape[1:])) for g in columns]
         widths, dtype = [g.shape[1] for g in flat], flat[0].dtype
         sent, received = self._traffic.sent, self._traffic.received

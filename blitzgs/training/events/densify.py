@@ -101,8 +101,9 @@ def density_rules(state: TrainingState, time: int, limit: GrowthLimit | None) ->
     """Return the rules of a density event at `time`, with lengths in the unit of the means."""
     population, extent = state.config.population, state.space.extent
     by_size = state.schedule.prunes_by_size(time)
+    absolute, threshold = population.absolute_threshold, population.grad_threshold
     return DensityRules(
-        grad_threshold=population.grad_threshold,
+        grad_threshold=absolute if population.absolute_gradients else threshold,
         clone_scale=population.clone_scale * extent,
         min_opacity=population.min_opacity,
         max_screen_radius=(population.prune_screen_radius or None) if by_size else None,
