@@ -97,7 +97,7 @@ RANGES: Mapping[str, Range] = {
     "loss.scale_reference": Range(1e-6, 1e6),
     "population.growth": Range(0, 10),
     "population.grad_threshold": Range(0, 1e30),
-    "population.absolute_threshold": Range(0, 1e30),
+    "population.absolute_threshold": Range(0, 1e6),
     "population.clone_scale": _LENGTH,
     "population.min_opacity": Range(0, 1, high_open=True),
     "population.reset_opacity": Range(0, 1, low_open=True, high_open=True),
