@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A training step that sees the same in ever larger tables: its time, and the memory it needs for a while.
+
+    python benchmarks/bm_scratch.py [--millions 4 16 64] [--views 1] [--repeats 20] [--json FILE]
+
+The first 4 M Gaussians are `bm_step.py`'s aerial scene; the others are copies of it, 5 km apart behind the
+cameras. The step is that of `bm_step.py`: every row is 0 to 39 steps behind. Time is the median over steps of
+the sum of their stages by CUDA events; scratch is the most memory in use during a step, beyond the table and
+what stays from step to step.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from bm_step import OurStep, measure
+from harness import report
+from scenes import BenchmarkScene, aerial
+
+from blitzgs.view.blocks import morton_order
+
+SEEN, APART = 4_000_000, 5000.0
+COLUMNS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def make_scene(gaussians: int, views: int) -> BenchmarkScene:
+    """Return the aerial scene with copies of it behind the cameras, in Morton order."""
+    scene = aerial(SEEN, "cuda", views=views)
+    copies = -(-gaussians // SEEN)
+    columns = {name: torch.cat([getattr(scene, name)] * copies)[:gaussians] for name in COLUMNS if copies > 1}
+    if columns:
+        columns["means"][:, 1] -= APART * (torch.arange(gaussians, device="cuda") // SEEN)
+        scene = replace(scene, **columns)
+    order = morton_order(scene.means)
+    for name in COLUMNS:
+        scene = replace(scene, **{name: getattr(scene, name)[order]})
+    return scene
+
+
+def scratch_of(step: OurStep) -> int:
+    """Return the bytes that a step needs beyond what is allocated before it."""
+    step.prepare()
+    torch.cuda.synchronize()
+    before = torch.cuda.memory_allocated()
+    torch.cuda.reset_peak_memory_stats()
+    step.take(lambda _: None)
+    torch.cuda.synchronize()
+    return torch.cuda.max_memory_allocated() - before
+
+
+def run(millions: float, views: int, repeats: int) -> dict[str, Any]:
+    """Measure one table."""
+    gaussians = round(1e6 * millions)
+    step = OurStep(make_scene(gaussians, views))
+    torch.cuda.empty_cache()
+    stages = measure(step, repeats)
+    scratch = sorted(scratch_of(step) for _ in range(5))[2]
+    return {
+        "gaussians": gaussians,
+        "views": views,
+        "visible": step.visible,
+        "ms": stages[-1][1],
+        "scratch MB": scratch / 1e6,
+        "scratch B a Gaussian": scratch / gaussians,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--millions", nargs="+", type=float, default=[4, 16, 64], help="Gaussians, 1e6")
+    parser.add_argument("--views", type=int, default=1, help="views in a batch")
+    parser.add_argument("--repeats", type=int, default=20, help="timed steps, of which the median counts")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
+    args = parser.parse_args()
+    rows = []
+    for millions in args.millions:
+        rows.append(run(millions, args.views, args.repeats))
+        torch.cuda.empty_cache()
+    for row in rows:
+        row["ms to the first"] = row["ms"] / rows[0]["ms"]
+        row["scratch to the first"] = row["scratch MB"] / rows[0]["scratch MB"]
+    report("A step that sees the same in larger tables", rows, args.json, "cuda")
+
+
+if __name__ == "__main__":
+    main()
