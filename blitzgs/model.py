@@ -128,6 +128,10 @@ class GaussianTable:
             raise ValueError(
                 f"GaussianTable: column '{name}' must have {len(self)} rows, got {list(tensor.shape)}"
             )
+        self._store(name, tensor)
+
+    def _store(self, name: str, tensor: Tensor) -> None:
+        """Make a tensor the column of a name. Every operation puts its new columns here, one by one."""
         self.columns[name] = tensor
 
     def __iter__(self) -> Iterator[str]:
@@ -166,7 +170,7 @@ class GaussianTable:
         count = self._check_new(rows)
         for name, column in self.columns.items():
             new = rows[name] if name in rows else column.new_zeros((count, *column.shape[1:]))
-            self.columns[name] = torch.cat((column, new))
+            self._store(name, torch.cat((column, new)))
 
     def _check_new(self, rows: Mapping[str, Tensor]) -> int:
         """Check rows that are to be added; return how many."""
@@ -212,7 +216,7 @@ class GaussianTable:
         self._check_new(new)
         # One after the other, so that no more than one column is there twice.
         for name, column in self.columns.items():
-            self.columns[name] = take_rows(column, rows, new.get(name))
+            self._store(name, take_rows(column, rows, new.get(name)))
 
     def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
         """Move every row to a rank. Collective: every rank calls it; rows arrive by source rank, in order.
@@ -227,8 +231,8 @@ class GaussianTable:
         received = ranks.exchange_counts(counts).tolist()
         for name in list(self.columns):
             column = self.columns.pop(name)
-            self.columns[name] = ranks.all_to_all(take_rows(column, order), sent, received)
+            self._store(name, ranks.all_to_all(take_rows(column, order), sent, received))
 
     def _select(self, rows: Tensor) -> None:
         for name, column in self.columns.items():
-            self.columns[name] = take_rows(column, rows)
+            self._store(name, take_rows(column, rows))

@@ -55,6 +55,10 @@ class Views:
     def __len__(self) -> int:
         return self.viewmats.shape[0]
 
+    def as_arguments(self) -> tuple[Tensor, Tensor, int, int]:
+        """Return viewmats, Ks, width and height, as functions take them that know no views."""
+        return self.viewmats, self.Ks, self.width, self.height
+
 
 @dataclass(frozen=True)
 class RenderOptions:
@@ -82,6 +86,11 @@ class RenderOptions:
     tile_size: int = 16
     deterministic: bool = False
     fade: tuple[float, ...] = ()
+
+    @property
+    def limits(self) -> tuple[float, float, float]:
+        """What tells whether a view may see a Gaussian at all: near plane, far plane and eps2d."""
+        return self.near_plane, self.far_plane, self.eps2d
 
     def projection(self, views: Views) -> ProjectionOptions:
         """Return the options of projecting into views."""

@@ -20,6 +20,8 @@ from blitzgs.training.batches import PhotographError
 from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.folder_checks import FolderError
 from blitzgs.training.guard import ModelLostError, NonFiniteError
+from blitzgs.view.host_table import HostMemoryError
+from blitzgs.view.residence import ResidenceError
 
 # What a user can cause and mend: reported as a message. Anything else is ours and keeps its traceback.
 USER_ERRORS = (
@@ -28,10 +30,12 @@ USER_ERRORS = (
     ImportError,
     CheckpointError,
     FolderError,
+    HostMemoryError,
     MismatchError,
     ModelLostError,
     NonFiniteError,
     PhotographError,
+    ResidenceError,
 )
 
 

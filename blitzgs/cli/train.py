@@ -73,7 +73,11 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error("the following arguments are required: --out")
     job = config.ranks
     with Ranks.from_environment(
-        args.device, job.timeout_seconds, cast(Transport, job.transport), job.share_gpus
+        args.device,
+        job.timeout_seconds,
+        cast(Transport, job.transport),
+        job.share_gpus,
+        tables_on_host=config.memory.resident_gb > 0,
     ) as ranks:
         with locked(args.out, ranks):
             capture, images = open_capture(config, ranks)

@@ -70,6 +70,7 @@ class Ranks:
         timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS,
         transport: Transport = "auto",
         share_gpus: bool = False,
+        tables_on_host: bool = False,
     ) -> Ranks:
         """Join the job that torchrun's environment describes: Gloo on the CPU, NCCL on CUDA.
 
@@ -82,6 +83,8 @@ class Ranks:
                 lets NCCL or Gloo carry them, "auto" prefers the former where it works.
             share_gpus: where a host has fewer GPUs than ranks, deal them out in turn, so that ranks share
                 them: for development, as each then waits for the others' turns on the GPU.
+            tables_on_host: whether collectives will carry tensors that are on the CPU although the ranks
+                compute on CUDA.
 
         Returns:
             The ranks; the trivial object when torchrun started a single process or none.
@@ -116,16 +119,16 @@ class Ranks:
         if place.type == "cuda":
             torch.cuda.set_device(place)
         if world_size > 1:
-            ranks._join(transport)
+            ranks._join(transport, tables_on_host)
         return ranks
 
-    def _join(self, transport: Transport) -> None:
+    def _join(self, transport: Transport, tables_on_host: bool) -> None:
         if self.shares_gpu:
             # Read at every mapping of shared memory.
             os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
         nccl = self.device.type == "cuda" and not self.shares_gpu
         dist.init_process_group(
-            backend="nccl" if nccl else "gloo",
+            backend="gloo" if not nccl else "cpu:gloo,cuda:nccl" if tables_on_host else "nccl",
             store=open_store("group", self.rank == 0, STARTUP_TIMEOUT_SECONDS),
             rank=self.rank,
             world_size=self.world_size,

@@ -9,6 +9,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
+from blitzgs.view.host_table import available_bytes
 
 # Share of the memory that growth may fill; the rest is for what a step needs at its worst.
 MEMORY_SHARE = 0.9
@@ -51,18 +52,25 @@ def growth_limit(
 
 
 def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
-    """Predict how many Gaussians all ranks together can hold on their GPUs; None on the CPU.
+    """Predict how many Gaussians all ranks together can hold; None where the CPU computes.
 
-    A density event makes a second copy of one column at a time, and a step needs scratch memory that grows
-    with the population: the most that was seen beyond the table so far, per Gaussian. Every rank calls this.
+    What counts is the memory of the GPUs or, where the tables are there, of the hosts. A density event makes
+    a second copy of one column at a time, and a step needs scratch memory on the GPU that grows with the
+    population: the most that was seen beyond the table so far, per Gaussian. Every rank calls this.
     """
     if ranks.device.type != "cuda":
         return None
-    allocated = torch.cuda.memory_allocated(ranks.device)
-    free, _ = torch.cuda.mem_get_info(ranks.device)
-    available = free + torch.cuda.memory_reserved(ranks.device)
-    scratch = torch.cuda.max_memory_allocated(ranks.device) - allocated
-    count = rows_that_fit(len(table), *_row_bytes(table), available, scratch)
+    row_bytes, widest = _row_bytes(table)
+    if table.device.type == "cpu":
+        free = available_bytes()
+        if free is None:
+            return None
+        available, scratch = free // ranks.local_world_size + len(table) * row_bytes, 0
+    else:
+        allocated = torch.cuda.memory_allocated(ranks.device)
+        available = torch.cuda.mem_get_info(ranks.device)[0] + torch.cuda.memory_reserved(ranks.device)
+        scratch = torch.cuda.max_memory_allocated(ranks.device) - allocated
+    count = rows_that_fit(len(table), row_bytes, widest, available, scratch)
     # The ranks' shards stay equal to within `ranks.max_imbalance`, so the fullest GPU decides for all.
     fewest = ranks.all_reduce(torch.tensor([-count], device=ranks.device), "max")
     return -int(fewest.item()) * ranks.world_size

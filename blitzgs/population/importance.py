@@ -34,6 +34,7 @@ from blitzgs.ops.view_sums import ViewSums, view_sums_
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.survey import Survey, survey
 from blitzgs.view.gate import SceneGate
+from blitzgs.view.seen import Scene, Seen, seen, table_of
 
 SCORE_EPS = 1e-6
 PHI_EPS = 0.1
@@ -83,7 +84,7 @@ class Importance:
 
 
 def sweep(
-    table: GaussianTable,
+    scene: Scene,
     batches: Iterable[ViewBatch],
     n_views: int,
     options: RenderOptions,
@@ -95,7 +96,7 @@ def sweep(
     """Score the Gaussians by what they contribute to V views. Collective: every rank calls it.
 
     Args:
-        table: this rank's Gaussians, caught up.
+        scene: this rank's Gaussians, caught up.
         batches: the views, each once, in the same batches on every rank.
         n_views: V, columns of the cull matrix.
         options: how the views are rendered.
@@ -105,14 +106,15 @@ def sweep(
         lod: leaves Gaussians out of views as rendering does: they contribute nothing there and hide nothing;
             None: none are left out.
     """
+    table = table_of(scene)
     sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
     transport = open_transport(ranks)
     for batch in batches:
         assignment = _assign(batch, options, owners)
-        active = None if lod is None else lod.active(table, batch.views.viewmats)
-        surveyed = survey(table, batch.views, options, assignment, transport, active)
-        sums.add(surveyed, batch.columns, table["id"], ranks)
+        visible = seen(scene, *batch.views.as_arguments(), options.limits, lod)
+        surveyed = survey(visible.table, batch.views, options, assignment, transport, visible.active)
+        sums.add(surveyed, batch.columns, visible, ranks)
     return sums.result()
 
 
@@ -144,15 +146,21 @@ class _Sums:
             _all_culled(n_views, device).repeat(count, 1),
         )
 
-    def add(self, found: Survey, columns: Sequence[int], ids: Tensor, ranks: Ranks) -> None:
+    def add(self, found: Survey, columns: Sequence[int], surveyed: Seen, ranks: Ranks) -> None:
         """Add the splats of a batch of views."""
-        splats = found.splats
+        splats, ids = found.splats, surveyed.table["id"]
         counts = integer_mass_prefix(
             found.weights, splats.camera_ids, splats.gaussian_ids, ids, VIEW_MASS, ranks, len(columns)
         )
-        lists = splats.visible_ids, splats.splat_offsets, splats.camera_ids, splats.radii
+        home = self._sums.score.device  # where the whole table is
+        lists = (
+            surveyed.rows_of(splats.visible_ids).to(home),
+            splats.splat_offsets.to(home),
+            splats.camera_ids.to(home),
+            splats.radii.to(home),
+        )
         view_sums_(
-            self._sums, lists, found.weights, found.pixels, counts, columns,
+            self._sums, lists, found.weights.to(home), found.pixels.to(home), counts.to(home), columns,
             rule=self._rule, eps=SCORE_EPS, unit=self._unit,
         )  # fmt: skip
 

@@ -174,7 +174,7 @@ class Lineage:
         if problems:
             raise OSError(f"the lineage could not be written: {problems[0]}")
         live = torch.stack((torch.tensor(len(ids), device=ids.device), hash_keys(ids).sum()))
-        totals = self._ranks.all_reduce(torch.cat((self._sums, live))).tolist()
+        totals = self._ranks.all_reduce(torch.cat((self._sums, live.to(self._sums.device)))).tolist()
         self._sums.zero_()
         ledger = Ledger(
             self.ledger.births + totals[0],

@@ -278,6 +278,18 @@ class ViewConfig:
 
 
 @dataclass(frozen=True)
+class MemoryConfig:
+    """Where the Gaussians are while they train; nothing here changes the result beyond rounding.
+
+    Attributes:
+        resident_gb: gigabytes of each rank's device for Gaussians. The others wait in the memory of the host
+            and come when the views of a step are about to need them. 0: all are on the device.
+    """
+
+    resident_gb: float = 0.0
+
+
+@dataclass(frozen=True)
 class RanksConfig:
     """How several processes share a run; nothing here changes its result beyond rounding.
 
@@ -338,6 +350,7 @@ class Config:
     loss: LossConfig = field(default_factory=LossConfig)
     population: PopulationConfig = field(default_factory=PopulationConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
+    memory: MemoryConfig = field(default_factory=MemoryConfig)
     ranks: RanksConfig = field(default_factory=RanksConfig)
     log: LogConfig = field(default_factory=LogConfig)
     seed: int = 0

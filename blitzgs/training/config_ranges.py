@@ -114,6 +114,7 @@ RANGES: Mapping[str, Range] = {
     "view.first_levels": Range(0, 1),
     "view.level_ratio": Range(1.001, 100),
     "view.most_kept": Range(0, 1),
+    "memory.resident_gb": Range(0, 1e6),
     "ranks.timeout_seconds": Range(1, 1e6),
     "ranks.max_imbalance": Range(1, 1e6),
     "log.every": _EVERY,

@@ -16,7 +16,6 @@ from torch import Tensor
 from blitzgs import pipeline
 from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.pixels import collect_images
-from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import ssim
 from blitzgs.output import OutputFolder
 from blitzgs.pipeline import RenderOptions
@@ -25,6 +24,7 @@ from blitzgs.scene.pictures import comparison, encode_image
 from blitzgs.training.batches import Images, PhotographError
 from blitzgs.training.views import CameraLike, ViewSet
 from blitzgs.view.gate import SceneGate
+from blitzgs.view.seen import Scene, seen
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
 Stops = Callable[[], bool]
@@ -97,7 +97,7 @@ def load_lpips(path: str | None) -> Lpips | None:
 
 
 def render_view(
-    table: GaussianTable,
+    scene: Scene,
     views: ViewSet,
     index: int,
     options: RenderOptions,
@@ -108,7 +108,7 @@ def render_view(
     """Render camera `index` with the Gaussians of all ranks; every rank calls this.
 
     Args:
-        table: this rank's Gaussians, caught up.
+        scene: this rank's Gaussians, caught up.
         views: all cameras.
         index: of the camera.
         options: how to render.
@@ -120,7 +120,7 @@ def render_view(
         float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
     """
     picked, ranks = views.pick([index]), owners.ranks
-    active = None if lod is None else lod.active(table, picked.viewmats)
+    table, active, _ = seen(scene, *picked.as_arguments(), options.limits, lod)
     if ranks.world_size == 1:
         return pipeline.forward(table, picked, options, active).renders[0]
     ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
@@ -142,7 +142,7 @@ def _compare(render: Tensor, target: Tensor, mask: Tensor | None, lpips: Lpips |
 
 
 def evaluate(
-    table: GaussianTable,
+    scene: Scene,
     views: ViewSet,
     cameras: Sequence[CameraLike],
     images: Images,
@@ -162,7 +162,7 @@ def evaluate(
     """Render views and compare them with their photographs; the ranks take turns at comparing.
 
     Args:
-        table: this rank's Gaussians, caught up.
+        scene: this rank's Gaussians, caught up.
         views: all cameras on the device.
         cameras: the same, for their names.
         images: photographs.
@@ -201,14 +201,14 @@ def evaluate(
             if stops is not None and position > 0 and stops():
                 raise EvaluationStoppedError
             images.prefetch(own[turn : turn + 4])
-        render = render_view(table, views, index, options, owners, destination, lod)
+        render = render_view(scene, views, index, options, owners, destination, lod)
         if report is not None:
             report(position + 1, len(indices))
         if render is None:
             continue
         with ranks.working(f"comparing view {cameras[index].name}"):
             try:
-                target, mask = images.get(index).to(table.device), images.mask(index)
+                target, mask = images.get(index).to(render.device), images.mask(index)
             except (OSError, ValueError) as error:
                 lost = lost or str(error)  # the other ranks go on: they learn of it at the end
                 continue

@@ -34,6 +34,7 @@ LINEAGE = "lineage"
 # for `data.allow_missing`, without which a run whose photograph is lost could not go on.
 FREE_FIELDS = (
     "log",
+    "memory",
     "ranks",
     "data.path",
     "data.allow_missing",
@@ -149,13 +150,18 @@ class Restored:
     shared: dict[str, torch.Tensor]
 
 
-def restore(folder: Path, ranks: Ranks) -> Restored | None:
+def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> Restored | None:
     """Read the newest sound checkpoint of a run; None when there is none.
+
+    Args:
+        folder: of the run.
+        ranks: the job.
+        device: where the Gaussians go; None: that of `ranks`.
 
     Raises:
         CheckpointError: there are checkpoints, but none is sound.
     """
-    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, ranks.device, _problem_of_columns)
+    loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns)
     if loaded is None:
         return None
     state = loaded.state

@@ -18,6 +18,9 @@ class BatchSampler:
     and gives B consecutive ones per batch, so that every view is drawn equally often. Rounds mix the groups
     in proportion to their sizes. What a call returns depends on no other call: a resumed run, and every rank,
     sees the same batches.
+
+    Attributes:
+        batch_size: views per batch, B.
     """
 
     def __init__(self, sizes: Sequence[Hashable], batch_size: int, seed: int) -> None:
@@ -37,7 +40,7 @@ class BatchSampler:
         for view, size in enumerate(sizes):
             groups.setdefault(size, []).append(view)
         self._groups = [torch.tensor(views) for views in groups.values()]
-        self._batch_size = batch_size
+        self.batch_size = batch_size
         self._seed = seed
         # Only the newest are asked for: consecutive steps share them.
         self._round = lru_cache(maxsize=2)(self._make_round)
@@ -47,11 +50,11 @@ class BatchSampler:
         """Return the B views of a step (0-based); a view repeats only where its group's epochs meet."""
         index = self._round_of(step)
         group, batch = self._round(index)[step - self._batches_before(index)]
-        begin = batch * self._batch_size
-        return [self._view(group, position) for position in range(begin, begin + self._batch_size)]
+        begin = batch * self.batch_size
+        return [self._view(group, position) for position in range(begin, begin + self.batch_size)]
 
     def _group_batches(self, size: int, rounds: int) -> int:
-        return rounds * size // self._batch_size
+        return rounds * size // self.batch_size
 
     def _batches_before(self, rounds: int) -> int:
         return sum(self._group_batches(len(views), rounds) for views in self._groups)

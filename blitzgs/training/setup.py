@@ -24,17 +24,21 @@ from blitzgs.training.evaluation import load_lpips
 from blitzgs.training.folder_checks import check_room, check_writable
 from blitzgs.training.gate import life_fields, open_gate
 from blitzgs.training.inputs import capture_fingerprint, check_alike, check_capture
+from blitzgs.training.offload import Course, OffloadingStepper
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_cameras import CAMERAS, save_cameras
 from blitzgs.training.run_log import RunLog
+from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import keep_to_views
 from blitzgs.training.views import Space, ViewSet, camera_centres
 from blitzgs.view.blocks import morton_order
+from blitzgs.view.host_table import HostTable
 from blitzgs.view.levels import measure_levels
+from blitzgs.view.residence import Residence
 
 
 def set_up(
@@ -64,11 +68,12 @@ def set_up(
         raise FileExistsError(
             f"{folder} already holds a run: add --resume to continue it, or choose another --out"
         )
-    restored = run.restore(folder, ranks) if resume else None
+    home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
+    restored = run.restore(folder, ranks, home) if resume else None
     config = run.with_pace_of(config, None if restored is None else restored.config)
     schedule = Schedule(config.schedule)
     if restored is None:
-        table, progress = first_gaussians(config, capture, space, ranks)
+        table, progress = first_gaussians(config, capture, space, ranks, home)
     else:
         table, progress = restored.table, restored.progress
         run.check_resumable(restored.config, config)
@@ -86,7 +91,11 @@ def set_up(
     has_same_views = restored is None or restored.progress.train_views in ("", progress.train_views)
     if restored is not None and restored.shared and has_same_views and ranks.world_size > 1:
         owners.restore(restored.shared)
-    length_unit = space.extent * config.loss.scale_reference
+    views = ViewSet(list(capture.cameras), space, ranks.device)
+    sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
+    sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed)
+    if config.memory.resident_gb > 0:
+        table = HostTable(table.columns, pinned=ranks.device.type == "cuda")
     return TrainingState(
         config=config,
         capture=capture,
@@ -97,16 +106,11 @@ def set_up(
         space=space,
         table=table,
         progress=progress,
-        views=ViewSet(list(capture.cameras), space, ranks.device),
+        views=views,
+        sampler=sampler,
         optimiser=optimiser,
-        stepper=Stepper(
-            table,
-            optimiser,
-            owners,
-            config.loss,
-            length_unit,
-            config.ranks.half_exchange,
-            _position_noise(config, space.extent),
+        stepper=_stepper(
+            config, table, optimiser, owners, space.extent, Course(sampler, capture.train, views)
         ),
         owners=owners,
         lpips=lpips,
@@ -117,6 +121,30 @@ def set_up(
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
+
+
+def _stepper(
+    config: Config,
+    table: GaussianTable,
+    optimiser: LazyAdam,
+    owners: TileOwners,
+    extent: float,
+    course: Course,
+) -> Stepper:
+    """Return what takes steps with a table, wherever that is."""
+    shared = (
+        optimiser,
+        owners,
+        config.loss,
+        extent * config.loss.scale_reference,
+        config.ranks.half_exchange,
+        _position_noise(config, extent),
+    )
+    if not isinstance(table, HostTable):
+        return Stepper(table, *shared)
+    budget = int(config.memory.resident_gb * 1e9)
+    residence = Residence(table, owners.ranks.device, budget, optimiser.pending_table)
+    return OffloadingStepper(residence, course, *shared)
 
 
 def _position_noise(config: Config, extent: float) -> PositionNoise | None:
@@ -152,9 +180,9 @@ def _origin(restored: run.Restored | None, resume: bool, folder: Path) -> str:
 
 
 def first_gaussians(
-    config: Config, capture: Capture, space: Space, ranks: Ranks
+    config: Config, capture: Capture, space: Space, ranks: Ranks, home: torch.device
 ) -> tuple[GaussianTable, Progress]:
-    """Make the first Gaussians from the capture's points; each rank keeps its share of them."""
+    """Make the first Gaussians from the capture's points; each rank keeps its share of them at `home`."""
     lod, device = config.lod, ranks.device
     points = torch.from_numpy(capture.points) / space.unit
     centres = camera_centres([capture.cameras[i] for i in capture.train], space).to(device)
@@ -170,7 +198,7 @@ def first_gaussians(
     )
     count = len(table)
     table.keep(torch.arange(count) % ranks.world_size == ranks.rank)
-    table = GaussianTable({name: table[name].to(device) for name in table})
+    table = GaussianTable({name: table[name].to(home) for name in table})
     table.permute(morton_order(table["means"]))
     return table, Progress(
         step=0,

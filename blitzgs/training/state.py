@@ -27,6 +27,7 @@ from blitzgs.training.lod import lod_gate
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_log import RunLog
+from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
 from blitzgs.training.views import Space, ViewSet, render_options
@@ -53,6 +54,7 @@ class TrainingState:
         table: this rank's Gaussians.
         progress: where the run stands.
         views: all cameras of the capture, on the device.
+        sampler: chooses the views of each step.
         optimiser: of the table.
         stepper: takes the optimiser steps.
         owners: knows what tiles cost, and divides them.
@@ -79,6 +81,7 @@ class TrainingState:
     table: GaussianTable
     progress: Progress
     views: ViewSet
+    sampler: BatchSampler
     optimiser: LazyAdam
     stepper: Stepper
     owners: TileOwners
@@ -140,7 +143,7 @@ class TrainingState:
 
     def catch_up(self) -> None:
         """Apply every pending optimiser step, so that all rows of the table can be read."""
-        self.optimiser.catch_up(self.table, None, self.progress.step)
+        self.stepper.catch_up(self.progress.step)
 
     def sort(self) -> None:
         """Put neighbours in space next to each other, so that blocks of rows are small."""

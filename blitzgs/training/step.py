@@ -22,10 +22,19 @@ from blitzgs.training.loss import LossTerms, loss_terms
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.gate import ViewGate
+from blitzgs.view.seen import Scene
 
 
 class Stepper:
-    """Takes training steps with one table: `forward`, then `backward`. Neither waits for a loss."""
+    """Takes training steps with one table: `forward`, then `backward`. Neither waits for a loss.
+
+    Attributes:
+        table: whose rows frames speak of: this rank's Gaussians, all or those that a step may need.
+        scene: what views are rendered from between steps, after `catch_up`: all of this rank's Gaussians.
+    """
+
+    table: GaussianTable
+    scene: Scene
 
     def __init__(
         self,
@@ -48,14 +57,27 @@ class Stepper:
             half_exchange: send splats in half precision, see `open_transport`.
             noise: of the means, after each step; None: none.
         """
-        self._table, self._optimiser, self._owners = table, optimiser, owners
+        self.table = self.scene = table
+        self._optimiser, self._owners = optimiser, owners
         self._loss, self._length_unit, self._noise = loss, length_unit, noise
         self._transport = open_transport(owners.ranks, half_exchange)
         self.reindex()
 
     def reindex(self) -> None:
         """Take note that rows of the table were added, removed or reordered, or that the schedule changed."""
-        self._blocks = BlockIndex(self._table, self._optimiser.pending_table)
+        self._blocks = BlockIndex(self.table, self._optimiser.pending_table)
+
+    def catch_up(self, step: int) -> None:
+        """Apply every optimiser step that rows owe up to `step`, which was the last one."""
+        self._optimiser.catch_up(self.table, None, step)
+
+    def settle(self) -> None:
+        """Have this rank's whole table hold what the steps have changed. Here it always does."""
+        return None
+
+    def report(self) -> dict[str, float]:
+        """Return figures about the steps since the last call, for the log."""
+        return {}
 
     def forward(
         self,
@@ -78,7 +100,7 @@ class Stepper:
             The frame, the loss's terms, and the sums of its `LossTerms.parts` over all ranks, which
             begin with [2 B].
         """
-        table, ranks, views = self._table, self._owners.ranks, batch.views
+        table, ranks, views = self.table, self._owners.ranks, batch.views
         rules = None if gate is None else gate.rules(table, table.columns.get(CULL))
 
         def find_active(room: int | None) -> ActiveRows:
@@ -129,7 +151,7 @@ class Stepper:
         Returns:
             That gradient, [P, 2] per pixel, or None.
         """
-        table = self._table
+        table = self.table
         absolute &= keep_means2d
         gradients = pipeline.backward_splats(frame, terms.v_renders, mark, absolute)
         v_means2d, sums = gradients.means2d_abs if absolute else gradients.means2d, None

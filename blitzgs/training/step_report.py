@@ -19,10 +19,10 @@ from blitzgs.training.state import TrainingState
 def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
     """Return the batch's L_scale, L_opacity and PSNR, the visible Gaussians and all, float64 [5]; no wait."""
     length_unit = state.space.extent * state.config.loss.scale_reference
-    scale = scale_term(frame, state.table, length_unit).mean()
+    scale = scale_term(frame, state.stepper.table, length_unit).mean()
     opacity = scale.new_zeros(())
     if state.config.loss.opacity > 0:
-        opacity = opacity_term(frame, state.table).mean()
+        opacity = opacity_term(frame, state.stepper.table).mean()
     counts = [
         state.ranks.all_reduce(torch.full((), float(count), dtype=torch.float64, device=scale.device))
         for count in (len(frame.projected.visible_ids), len(state.table))
@@ -45,7 +45,7 @@ def log_step(
     Raises:
         NonFiniteError: a parameter is not finite.
     """
-    check_table(state.table, state.progress.step)
+    check_table(state.stepper.table, state.progress.step)
     loss = state.config.loss
     losses = photometric(sums.read()[: 2 * len(names)], batch.samples.cpu(), loss)
     scale, opacity, psnr, visible, population = measured.tolist()
@@ -56,5 +56,5 @@ def log_step(
         "visible": visible,
         "gaussians": int(population),
         "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
-    }
+    } | state.stepper.report()
     state.log.scalars(state.images_seen, values)

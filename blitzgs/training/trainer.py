@@ -28,7 +28,6 @@ from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
-from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
 from blitzgs.training.step_report import log_step, measure_step
@@ -53,13 +52,11 @@ class Trainer:
     ) -> None:
         """Set a run up; arguments and errors are those of `blitzgs.training.setup.set_up`."""
         self.state = state = set_up(config, capture, images, folder, ranks, resume)
-        sizes = [(camera.width, camera.height) for camera in capture.cameras]
-        sampler = BatchSampler([sizes[i] for i in capture.train], config.schedule.batch_size, config.seed)
         self._loader = BatchLoader(
             images,
             state.views,
             capture.train,
-            sampler,
+            state.sampler,
             ranks.device,
             config.data.prefetch,
             state.owners if ranks.world_size > 1 else None,
@@ -151,7 +148,7 @@ class Trainer:
         options = render_options(config, state.space, degree, lod_gate(config, state.progress))
         frame, terms, sums = state.stepper.forward(step, options, batch, gate=gate)
         names = [state.capture.cameras[i].name for i in batch.indices]
-        self._guard.check(step, names, sums, state.table, frame)
+        self._guard.check(step, names, sums, state.stepper.table, frame)
         is_logged = end // config.log.every > begin // config.log.every
         measured = measure_step(state, frame, batch) if is_logged else None
         v_means2d = state.stepper.backward(
@@ -170,7 +167,7 @@ class Trainer:
 
     def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
         """Add a step's screen-space gradients to the statistics that density control reads."""
-        splats, views, table = frame.projected, frame.views, self.state.table
+        splats, views, table = frame.projected, frame.views, self.state.stepper.table
         density_stats_(
             table["grad_sum"],
             table["grad_count"],

@@ -122,6 +122,12 @@ class ViewSet:
         numbers[:count] = self._viewmats[indices].ravel()
         numbers[count:] = self._Ks[indices].ravel()
 
+    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return viewmats [V, 4, 4], Ks [V, 3, 3] and sizes (int32 [V, 2]) of all cameras, on the device."""
+        columns = self._viewmats, self._Ks, np.array(self._sizes, dtype=np.int32)
+        viewmats, Ks, sizes = (torch.from_numpy(column).to(self._device) for column in columns)  # noqa: N806
+        return viewmats, Ks, sizes
+
     def centres(self, indices: list[int]) -> Tensor:
         """Return the positions of cameras in the trained world, float64 [V, 3], on the CPU."""
         return centres_of(torch.from_numpy(self._viewmats[indices]))

@@ -50,6 +50,23 @@ class BlockIndex:
         self._level_ranges = _level_ranges(table["level"], count)
         self.update(table, None)
 
+    @classmethod
+    def of_bounds(cls, bounds: Tensor, level_ranges: Tensor, schedule: Tensor | None) -> BlockIndex:
+        """Return an index of blocks whose `bounds` and `level_ranges` are known."""
+        index = cls.__new__(cls)
+        index._schedule, index._bounds, index._level_ranges = schedule, bounds, level_ranges
+        return index
+
+    @property
+    def bounds(self) -> Tensor:
+        """What holds all places and sizes of each block's rows, float32 [blocks, 8]; see `cull_blocks`."""
+        return self._bounds
+
+    @property
+    def level_ranges(self) -> Tensor:
+        """The coarsest and the finest level of each block, uint8 [blocks, 2]."""
+        return self._level_ranges
+
     def active(
         self,
         table: GaussianTable,

@@ -160,13 +160,18 @@ class SceneGate:
         active = self._gated(means, level, viewmat)
         return torch.ones_like(level, dtype=torch.bool) if active is None else active.views != 0
 
-    def _gated(self, means: Tensor, level: Tensor, viewmats: Tensor) -> ActiveRows | None:
+    def rules(self, level: Tensor, viewmats: Tensor) -> GateRules | None:
+        """Return what some views leave out of rows with these levels; None: nothing. Collective."""
         shares = self.kept(centres_of(viewmats))
         lod_views = lod_bits([share < self.most_kept for share in shares])
-        if lod_views == 0:
+        return None if lod_views == 0 else GateRules(level, self.gate.reach(), lod_views)
+
+    def _gated(self, means: Tensor, level: Tensor, viewmats: Tensor) -> ActiveRows | None:
+        rules = self.rules(level, viewmats)
+        if rules is None:
             return None
         active = _all_rows(len(means), len(viewmats), means.device)
-        gate_views_(active, means, viewmats, GateRules(level, self.gate.reach(), lod_views))
+        gate_views_(active, means, viewmats, rules)
         return active
 
 

@@ -12,5 +12,7 @@ def run(state: TrainingState, event: Event) -> None:
     """Drop the mask, and the memory it takes, from a run that used it."""
     if not state.config.view.cull or CULL not in state.table:
         return
+    state.stepper.settle()
     del state.table.columns[CULL]
+    state.stepper.reindex()
     state.log.event(event.time, "clear_cull", {}, "the cull mask is cleared")

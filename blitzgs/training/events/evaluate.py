@@ -49,7 +49,7 @@ def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -
     """
     state.catch_up()
     return evaluate(
-        state.table,
+        state.stepper.scene,
         state.views,
         state.capture.cameras,
         state.images,

@@ -36,7 +36,7 @@ def run(state: TrainingState, event: Event) -> None:
     state.catch_up()
     check_table(state.table, state.progress.step)
     found = sweep(
-        state.table,
+        state.stepper.scene,
         view_batches(state),
         len(state.capture.train),
         state.render_options,
@@ -69,7 +69,9 @@ def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
     by_size: dict[tuple[int, int], list[int]] = {}
     for column, index in enumerate(state.capture.train):
         by_size.setdefault(state.views.size([index]), []).append(column)
-    length = max(state.schedule.batch_size, LEAST_VIEWS)
+    # A pool is sure to have room for as many views as a step has.
+    least = 1 if state.config.memory.resident_gb > 0 else LEAST_VIEWS
+    length = max(state.schedule.batch_size, least)
     for columns in by_size.values():
         for begin in range(0, len(columns), length):
             some = columns[begin : begin + length]

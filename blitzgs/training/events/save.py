@@ -72,6 +72,7 @@ def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[
 
 def _write(state: TrainingState) -> None:
     """Write a checkpoint, after the lineage has been written and found to add up."""
+    state.stepper.settle()
     if state.lineage is not None:
         try:
             ledger = state.lineage.settle(state.table["id"], state.progress.step)

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training beyond the memory of a GPU: the Gaussians of a step come from the memory of the host in time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.host_sum import HostSum
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
+from blitzgs.population.exploration import PositionNoise
+from blitzgs.training.batches import Batch
+from blitzgs.training.config import LossConfig
+from blitzgs.training.loss import LossTerms
+from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.sampler import BatchSampler
+from blitzgs.training.step import Stepper
+from blitzgs.training.views import ViewSet
+from blitzgs.view.gate import ViewGate
+from blitzgs.view.residence import Cameras, Residence
+
+# Views that are looked ahead at, as many as fit into the bits of a number.
+_HORIZON = 32
+
+
+class Course:
+    """The cameras of the steps to come.
+
+    Attributes:
+        batch_size: views of a step.
+    """
+
+    def __init__(self, sampler: BatchSampler, train: Sequence[int], views: ViewSet) -> None:
+        """Prepare to look ahead.
+
+        Args:
+            sampler: chooses the views of each step.
+            train: camera of each of the sampler's views.
+            views: all cameras.
+        """
+        self.batch_size = sampler.batch_size
+        self._sampler, self._train, self._views = sampler, train, views
+
+    @cached_property
+    def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self._views.columns()
+
+    def cameras(self, step: int, limits: tuple[float, float, float]) -> Cameras:
+        """Return the views of a step (from 1) and of those that follow, as far as one looks ahead."""
+        batches = [self._sampler.batch(step - 1 + ahead) for ahead in range(_HORIZON // self.batch_size)]
+        indices = torch.tensor([self._train[view] for batch in batches for view in batch])
+        device = self._columns[0].device
+        if device.type == "cuda":
+            indices = indices.pin_memory().to(device, non_blocking=True)
+        viewmats, Ks, sizes = (column[indices] for column in self._columns)  # noqa: N806
+        return Cameras(viewmats, Ks, sizes, limits)
+
+
+class OffloadingStepper(Stepper):
+    """Takes the same steps as `Stepper` with a table in the memory of the host.
+
+    A step sees the pool of `Residence` as its table. The blocks of the next step come while it runs.
+    """
+
+    scene: Residence
+
+    def __init__(
+        self,
+        residence: Residence,
+        course: Course,
+        optimiser: LazyAdam,
+        owners: TileOwners,
+        loss: LossConfig,
+        length_unit: float,
+        half_exchange: bool = False,
+        noise: PositionNoise | None = None,
+    ) -> None:
+        """Prepare to step.
+
+        Args:
+            residence: of this rank's Gaussians.
+            course: looks ahead.
+            optimiser: as for `Stepper`, like the rest.
+            owners: learns what the tiles cost.
+            loss: weights of the loss.
+            length_unit: L_scale's unit of length.
+            half_exchange: send splats in half precision.
+            noise: of the means.
+        """
+        self._residence, self._course = residence, course
+        self._reported = residence.traffic
+        self._stands_at: int | None = None
+        super().__init__(residence.pool, optimiser, owners, loss, length_unit, half_exchange, noise)
+        self.scene = residence
+
+    def reindex(self) -> None:
+        """See `Stepper.reindex`."""
+        self._residence.reindex(self._optimiser.pending_table)
+        self.table = self._residence.pool
+
+    def catch_up(self, step: int) -> None:
+        """See `Stepper.catch_up`; the table on the host is up to date then."""
+        self.settle()
+        if self._stands_at != step:
+            self._residence.catch_up(lambda pool: self._optimiser.catch_up(pool, None, step))
+            self._stands_at = step
+
+    def settle(self) -> None:
+        """See `Stepper.settle`: write changes back to the host, and empty the pool."""
+        self._residence.collect()
+
+    def report(self) -> dict[str, float]:
+        """See `Stepper.report`: how many blocks were there already, and megabytes moved in a step."""
+        traffic = self._residence.traffic.since(self._reported)
+        self._reported = self._residence.traffic
+        return traffic.values()
+
+    def forward(
+        self,
+        step: int,
+        options: RenderOptions,
+        batch: Batch,
+        mark: Mark = unmarked,
+        gate: ViewGate | None = None,
+    ) -> tuple[Frame, LossTerms, HostSum]:
+        """See `Stepper.forward`."""
+        self._stands_at = None
+        cameras = self._course.cameras(step, options.limits)
+        self._blocks = self._residence.bring(step, cameras, self._course.batch_size)
+        mark("other")
+        rendered = super().forward(step, options, batch, mark, gate)
+        self._residence.prefetch(step + 1)
+        return rendered
+
+    def backward(
+        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
+    ) -> Tensor | None:
+        """See `Stepper.backward`."""
+        v_means2d = super().backward(step, frame, terms, mark, keep_means2d)
+        self._residence.note(self._blocks)
+        return v_means2d

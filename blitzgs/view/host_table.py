@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A table in the memory of the host, where a GPU can reach its columns."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import mmap
+import weakref
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from blitzgs.model import GaussianTable
+
+# Room for so many times the rows that there are, so that a growing table is not moved each time.
+_ROOM = 1.25
+_MEMORY = Path("/proc/meminfo")
+
+
+class HostMemoryError(RuntimeError):
+    """The host has too little memory for the table; names the sizes and what to do."""
+
+
+class HostTable(GaussianTable):
+    """Columns in memory that stays where it is while rows come and go, pinned where a GPU reads it.
+
+    To pin memory takes longer than to fill it, so new columns are copied into the room of the old ones.
+    """
+
+    def __init__(self, columns: dict[str, Tensor], pinned: bool) -> None:
+        """Move the given columns into memory of the table's own, one by one.
+
+        Args:
+            columns: as for `GaussianTable`, on the CPU; left empty.
+            pinned: whether a GPU will read and write them.
+
+        Raises:
+            HostMemoryError: they do not fit.
+        """
+        super().__init__(columns)
+        self._pinned = pinned
+        self._rooms: dict[str, Tensor] = {}
+        for name in list(columns):
+            self._store(name, columns.pop(name))
+
+    def _store(self, name: str, tensor: Tensor) -> None:
+        for lost in self._rooms.keys() - self.columns.keys():
+            del self._rooms[lost]
+        room = self._rooms.get(name)
+        if not (
+            room is not None
+            and room.dtype == tensor.dtype
+            and room.shape[1:] == tensor.shape[1:]
+            and len(room) >= len(tensor)
+        ):
+            # The old room goes first: the host need not have space for both.
+            self._rooms.pop(name, None)
+            self.columns[name] = tensor
+            del room
+            room = self._rooms[name] = _new_room(tensor, self._pinned)
+        self.columns[name] = room[: len(tensor)].copy_(tensor)
+
+
+def available_bytes() -> int | None:
+    """Return how much memory the host can still give without swapping; None: it does not say."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in _MEMORY.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    return None
+
+
+def _new_room(like: Tensor, pinned: bool) -> Tensor:
+    """Return memory for `_ROOM` times the rows of a tensor, on pages of its own."""
+    rows = max(1, int(_ROOM * len(like)))
+    size = rows * like.element_size() * math.prod(like.shape[1:])
+    available = available_bytes()
+    if available is not None and size > available:
+        raise HostMemoryError(
+            f"a column of {len(like):,} Gaussians needs {size / 1e9:.2f} GB in the memory of the host, which "
+            f"has {available / 1e9:.2f} GB left: use more memory or hosts, or cap population.max_gaussians"
+        )
+    pages = mmap.mmap(-1, max(1, size), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    for advice in ("MADV_HUGEPAGE", "MADV_DONTFORK"):  # fewer pages to pin, none of which a fork takes away
+        with contextlib.suppress(AttributeError, OSError):
+            pages.madvise(getattr(mmap, advice))
+    room = torch.frombuffer(pages, dtype=torch.uint8, count=max(1, size))[:size]
+    if pinned:
+        address, runtime = room.data_ptr(), torch.cuda.cudart()
+        error = int(runtime.cudaHostRegister(address, size, 0)) if size else 0
+        if error:
+            raise HostMemoryError(
+                f"{size / 1e9:.2f} GB of the host's memory cannot be pinned (CUDA error {error}): use a host "
+                "with more memory, or cap population.max_gaussians"
+            )
+        weakref.finalize(pages, runtime.cudaHostUnregister, address)
+    return room.view(like.dtype).view(rows, *like.shape[1:])

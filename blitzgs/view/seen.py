@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What views see of a model, wherever its table is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from blitzgs.model import GaussianTable
+from blitzgs.ops.blocks import ActiveRows
+from blitzgs.ops.view_gate import gate_views_
+from blitzgs.view.gate import SceneGate
+from blitzgs.view.residence import Cameras, Residence
+
+# What views are rendered from: a table on their device, or one on the host with its pool.
+Scene = GaussianTable | Residence
+
+
+class Seen(NamedTuple):
+    """What some views see.
+
+    Attributes:
+        table: on the device of the views.
+        active: its rows to render, and the views of each; None: all.
+        rows_of: tells which rows of the model some rows of `table` are, both int32.
+    """
+
+    table: GaussianTable
+    active: ActiveRows | None
+    rows_of: Callable[[Tensor], Tensor]
+
+
+def table_of(scene: Scene) -> GaussianTable:
+    """Return all Gaussians of a scene on this rank."""
+    return scene.table if isinstance(scene, Residence) else scene
+
+
+def seen(
+    scene: Scene,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    limits: tuple[float, float, float],
+    lod: SceneGate | None,
+) -> Seen:
+    """Find what views are rendered from; collective with `lod`.
+
+    Args:
+        scene: all rows caught up.
+        viewmats: float32 [B, 4, 4], world to camera, B <= 32.
+        Ks: float32 [B, 3, 3], pixels.
+        width: pixels.
+        height: pixels.
+        limits: near plane, far plane and eps2d.
+        lod: leaves out rows that are too fine for their distance; None: none are left out.
+
+    Raises:
+        ResidenceError: the pool is too small for the views.
+    """
+    if not isinstance(scene, Residence):
+        active = None if lod is None else lod.active(scene, viewmats)
+        return Seen(scene, active, lambda rows: rows)
+    sizes = torch.tensor([[width, height]] * len(viewmats), dtype=torch.int32).to(viewmats.device)
+    index = scene.visit(Cameras(viewmats, Ks, sizes, limits))
+    pool = scene.pool
+    rules = None if lod is None else lod.rules(pool["level"], viewmats)
+    active = index.active(pool, viewmats, Ks, width, height, *limits, rules)
+    if rules is not None:
+        gate_views_(active, pool["means"], viewmats, rules)
+    return Seen(pool, active, scene.rows_of)

@@ -1,0 +1,97 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
+#include "common/cuda_check.h"
+#include "copy_to_host/copy_to_host.h"
+#include "residence/residence.h"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kThreads = 256, kWarps = kThreads / 32;
+// A warp moves kWords words of 16 bytes a lane at a time, so that enough of them are on the bus at once. The
+// grid is kept small: the kernel waits for the bus, and a step's kernels run beside it.
+constexpr int kWords = 4, kUnit = 32 * kWords, kBlocks = 96;
+
+__global__ void __launch_bounds__(kThreads) see_blocks(const SeenBlocks of) {
+  __shared__ Frustum planes[kMaxViews];
+  if (threadIdx.x < of.views) planes[threadIdx.x] = frustum_of(of, threadIdx.x);
+  __syncthreads();
+  const std::int64_t block = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
+  if (block < of.n) of.seen[block] = views_that_see(of, planes, block);
+}
+
+// Moves `count` words, the lane's share of up to kUnit, between a slot and blocks of the table.
+__device__ __forceinline__ void move(uint4* slot, uint4* leaving, const uint4* coming, int lane, int count) {
+  uint4 old[kWords], fresh[kWords];
+#pragma unroll
+  for (int k = 0; k < kWords; ++k) {
+    const int at = lane + 32 * k;
+    if (at >= count) break;
+    if (coming) fresh[k] = coming[at];
+    if (leaving) old[k] = slot[at];
+  }
+#pragma unroll
+  for (int k = 0; k < kWords; ++k) {
+    const int at = lane + 32 * k;
+    if (at >= count) break;
+    if (leaving) leaving[at] = old[k];
+    if (coming) slot[at] = fresh[k];
+  }
+}
+
+// The warps take the units of a move's columns in turn, one move after the other.
+__global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, int units) {
+  const int lane = threadIdx.x % 32;
+  const std::int64_t warps = std::int64_t{gridDim.x} * kWarps;
+  for (std::int64_t i = blockIdx.x * std::int64_t{kWarps} + threadIdx.x / 32; i < swap.n * units; i += warps) {
+    const std::int64_t move_index = i / units;
+    int unit = static_cast<int>(i - move_index * units), c = 0;
+    int words = static_cast<int>(swap.columns[0].bytes / sizeof(uint4));
+    while (unit * kUnit >= words) {
+      unit -= (words + kUnit - 1) / kUnit;
+      words = static_cast<int>(swap.columns[++c].bytes / sizeof(uint4));
+    }
+    const SwapColumn& column = swap.columns[c];
+    const std::int32_t leaving = swap.leaving[move_index], coming = swap.coming[move_index];
+    const std::int64_t first = std::int64_t{unit} * kUnit;
+    const auto at = [&](std::byte* base, std::int64_t block) {
+      return reinterpret_cast<uint4*>(base) + block * words + first;
+    };
+    move(at(column.pool, swap.slots[move_index]),
+         leaving >= 0 && column.is_written ? at(column.table, leaving) : nullptr,
+         coming >= 0 ? at(column.table, coming) : nullptr, lane, words - static_cast<int>(first));
+  }
+}
+
+}  // namespace
+
+void seen_blocks(const SeenBlocks& of, Workspace&, CudaStream stream) {
+  if (of.n == 0) return;
+  see_blocks<<<blocks_for(of.n, kThreads), kThreads, 0, stream>>>(of);
+  check_launch("seen_blocks");
+}
+
+void swap_blocks(const SwapBlocks& given, Workspace&, CudaStream stream) {
+  if (given.n == 0 || given.n_columns == 0) return;
+  SwapBlocks swap = given;
+  std::int64_t units = 0;
+  for (int c = 0; c < swap.n_columns; ++c) {
+    SwapColumn& column = swap.columns[c];
+    column.table = reinterpret_cast<std::byte*>(device_address(reinterpret_cast<std::int64_t*>(column.table)));
+    const auto places = reinterpret_cast<std::uintptr_t>(column.pool) |
+                        reinterpret_cast<std::uintptr_t>(column.table);
+    if (places % sizeof(uint4) != 0) {
+      throw std::runtime_error("blitzgs: columns that blocks move between must begin at multiples of 16 bytes");
+    }
+    const std::int64_t words = column.bytes / static_cast<std::int64_t>(sizeof(uint4));
+    units += (words + kUnit - 1) / kUnit;
+  }
+  const std::int64_t wanted = (swap.n * units + kWarps - 1) / kWarps;
+  move_blocks<<<static_cast<unsigned>(std::min<std::int64_t>(wanted, kBlocks)), kThreads, 0, stream>>>(
+      swap, static_cast<int>(units));
+  check_launch("swap_blocks");
+}
+
+}  // namespace blitzgs::cuda

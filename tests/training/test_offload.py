@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
+from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.training.trainer import Trainer
+from blitzgs.view.residence import ResidenceError
+from tests.distributed.rank_harness import run_ranks
+from tests.helpers import DEVICES
+from tests.training.tiny import HEIGHT, WIDTH, Camera, Capture, Images, random_gaussians, tiny_config
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+COUNT, VIEWS = 8000, 12
+RESIDENT = "memory.resident_gb=0.0078"
+SETTINGS = ("lod.visible_threshold=0", "schedule.iterations=60", "population.max_gaussians=40000")
+
+
+def street(count=COUNT):
+    """Gaussians along a street, and cameras above it that each see a piece."""
+    truth = random_gaussians(count)
+    truth["means"][:, 0] *= 20
+    K = np.array([[40.0, 0.0, 24.5], [0.0, 41.0, 15.0], [0.0, 0.0, 1.0]])
+    down = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]])
+    cameras, images = [], []
+    for i, x in enumerate(np.linspace(-22, 22, VIEWS)):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = down, -down @ np.array([x, 0.1 * (i % 3), 4.0])
+        cameras.append(Camera(f"{i:02}.png", WIDTH, HEIGHT, K, pose))
+        views = Views(torch.from_numpy(pose).float()[None], torch.from_numpy(K).float()[None], WIDTH, HEIGHT)
+        render = pipeline.forward(truth, views, RenderOptions(0, 0.01, 1e6)).renders[0]
+        images.append((render.clamp(0, 1) * 255 + 0.5).byte())
+    colors = (0.5 + 0.28209479 * truth["sh"][:, 0]).clamp(0, 1).mul(255).byte().numpy()
+    points = truth["means"].double().numpy()
+    train = [i for i in range(VIEWS) if i != 5]
+    return Capture(cameras, points, colors, train, [5], extent=24.0), Images(images)
+
+
+def train(folder, *overrides, device="cpu", resume=False):
+    config = tiny_config(*SETTINGS, *overrides)
+    trainer = Trainer(config, *street(), folder, Ranks(device=torch.device(device)), resume)
+    return trainer, trainer.train()
+
+
+def assert_same_run(one, other):
+    assert len(one.state.table) == len(other.state.table)
+    for name in one.state.table:
+        assert torch.equal(one.state.table[name].cpu(), other.state.table[name].cpu()), name
+    assert one.state.progress.peak_gaussians == other.state.progress.peak_gaussians
+
+
+VARIANTS = {
+    "plain": (),
+    "batches": ("schedule.batch_size=2", "memory.resident_gb=0.0118"),
+    "passes": (
+        "population.importance=true",
+        "schedule.t1=30",
+        "schedule.t2=48",
+        "view.cull=true",
+        "view.lod=true",
+        "view.most_kept=1",
+        "schedule.densify_until=40",
+        "schedule.evaluate_every=25",
+        "schedule.checkpoint_every=35",
+    ),
+    "resets": (
+        "schedule.reset_every=15",
+        "population.opacity_decay=0.01",
+        "optimiser.position_noise=1000",
+        "optimiser.sparse=true",
+        "model.antialiased=true",
+    ),
+}
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_run_with_a_quarter_of_its_blocks_on_the_device_is_the_same_run(tmp_path, variant, device):
+    options = (*VARIANTS[variant], "model.deterministic=true")
+    resident = [option for option in options if not option.startswith("memory")]
+    whole, expected = train(tmp_path / "whole", *resident, device=device)
+    pooled, summary = train(tmp_path / "pooled", RESIDENT, *options, device=device)
+    assert len(pooled.state.stepper.table) < 0.42 * len(pooled.state.table)
+    assert_same_run(pooled, whole)
+    for name in ("psnr", "ssim", "gaussians"):
+        assert summary[name] == expected[name]
+    records = [json.loads(line) for line in (tmp_path / "pooled" / "log.jsonl").read_text().splitlines()]
+    shares = [record["resident_hits"] for record in records if "loss" in record]
+    assert len(shares) == 3 and all(0 <= share < 1 for share in shares)
+    assert all(record["moved_mb_per_step"] > 0 for record in records if "loss" in record)
+
+
+def test_a_run_goes_on_with_and_without_a_pool(tmp_path, monkeypatch):
+    whole, _ = train(tmp_path / "whole")
+    stop = Trainer.step
+    for at, overrides in ((17, [RESIDENT]), (41, [])):
+        monkeypatch.setattr(Trainer, "step", stopping_at(stop, at))
+        assert train(tmp_path / "cut", *overrides, resume=at > 17)[1] is None
+    monkeypatch.setattr(Trainer, "step", stop)
+    resumed, _ = train(tmp_path / "cut", RESIDENT, resume=True)
+    assert_same_run(resumed, whole)
+
+
+def stopping_at(step, at):
+    def stopping(self, number):
+        step(self, number)
+        if number == at:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    return stopping
+
+
+def _train(ranks, folder, overrides):
+    torch.set_num_threads(1)
+    trainer = Trainer(tiny_config(*SETTINGS, *overrides), *street(), folder, ranks)
+    trainer.train()
+    table = trainer.state.table
+    return {name: table[name].clone() for name in table}
+
+
+def test_two_ranks_share_a_run_beyond_their_memory(tmp_path):
+    options = ("population.importance=true", "schedule.t1=30", "schedule.t2=0", "schedule.iterations=45")
+    whole = run_ranks(_train, 2, tmp_path / "whole", options)
+    pooled = run_ranks(_train, 2, tmp_path / "pooled", (*options, "memory.resident_gb=0.006"))
+    for expected, got in zip(whole, pooled, strict=True):
+        for name in expected:
+            assert torch.equal(got[name], expected[name]), name
+
+
+def test_a_batch_that_does_not_fit_is_named(tmp_path):
+    with pytest.raises(ResidenceError, match=r"see \d+ blocks of 256 Gaussians, .* lower schedule"):
+        train(tmp_path, "memory.resident_gb=0.002")

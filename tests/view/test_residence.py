@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from blitzgs.model import GaussianTable
+from blitzgs.ops.blocks import BLOCK_ROWS
+from blitzgs.ops.residence import seen_blocks
+from blitzgs.view import host_table
+from blitzgs.view.blocks import BlockIndex
+from blitzgs.view.host_table import HostMemoryError, HostTable
+from blitzgs.view.residence import Cameras, Residence, ResidenceError, Traffic
+from tests.helpers import DEVICES
+from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
+
+LIMITS = (NEAR, FAR, 0.3)
+BLOCK_BYTES = BLOCK_ROWS * (3 * 14 * 4 + 2 * 4 + 2 * 8 + 4 + 1 + 3 * 4)
+
+
+def host_copy(table, device="cpu"):
+    return HostTable({name: table[name].clone() for name in table}, pinned=device == "cuda")
+
+
+def make_residence(n=20_000, slots=30, device="cpu", seed=0):
+    table = make_table(n, seed=seed)
+    table["means"].nan_to_num_(0, 0, 0)  # so that tables can be compared
+    return table, Residence(host_copy(table, device), torch.device(device), (slots + 1) * BLOCK_BYTES, None)
+
+
+def cameras(views, device="cpu", seed=1):
+    """Narrow views, each of which sees few blocks."""
+    viewmats, Ks = make_views(views, device, seed)
+    Ks[:, 0, 0], Ks[:, 1, 1] = 500.0, 450.0
+    sizes = torch.tensor([[WIDTH, HEIGHT]] * views, dtype=torch.int32, device=device)
+    return Cameras(viewmats, Ks, sizes, LIMITS)
+
+
+def first(course, begin, count=None):
+    return Cameras(
+        *(column[begin:] if count is None else column[begin : begin + count] for column in course[:3]), LIMITS
+    )
+
+
+def assert_same(table, other):
+    for name in table:
+        assert torch.equal(table[name].cpu(), other[name].cpu()), name
+
+
+def active_rows(index, table, camera):
+    found = index.active(table, *(column[:1] for column in camera[:2]), WIDTH, HEIGHT, *LIMITS)
+    return found.listed()[0]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("slots", [40, 50, 65])
+def test_steps_change_the_rows_that_they_would_change_in_the_whole_table(device, slots):
+    """Steps that move all rows of their views, through a pool and in the table itself."""
+    table, residence = make_residence(slots=slots, device=device)
+    table = GaussianTable({name: table[name].to(device) for name in table})
+    course, steps = cameras(16, device), 12
+    whole = BlockIndex(table)
+    for step in range(steps):
+        index = residence.bring(step, first(course, step), 1)
+        rows = active_rows(index, residence.pool, first(course, step))
+        expected = active_rows(whole, table, first(course, step))
+        assert torch.equal(residence.rows_of(rows).sort().values, expected)
+        assert len(expected) > 0
+        residence.prefetch(step + 1)
+        for at, side, view in ((rows, residence.pool, index), (expected, table, whole)):
+            side["means"][at.long(), 0] += 0.5
+            side["grad_count"][at.long()] += 1
+            view.update(side, at)
+        residence.note(index)
+    residence.collect()
+    assert_same(residence.table, table)
+    traffic = residence.traffic
+    assert traffic.steps == steps and 0 < traffic.loaded <= traffic.needed
+    residence.collect()  # nothing is left to write back
+    assert residence.traffic == traffic
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("n", [20_000, 20_480, 100])
+def test_all_rows_pass_through_the_pool(device, n):
+    table, residence = make_residence(n, slots=9, device=device)
+
+    def set_step(pool):
+        pool["last_step"].fill_(7)
+
+    residence.catch_up(set_step)
+    assert (residence.table["last_step"] == 7).all() and len(residence.table) == n
+    table["last_step"].fill_(7)
+    assert_same(residence.table, table)
+
+
+def test_the_blocks_that_are_needed_last_go_first():
+    _, residence = make_residence(slots=40)
+    course = cameras(8)
+    seen = [set(np.flatnonzero(_blocks(residence, course, view))) for view in range(8)]
+    residence.bring(0, course, 1)
+    residence.prefetch(1)
+    residence.bring(1, first(course, 1), 1)
+    residence.prefetch(2)
+    here = set(residence._block_in[residence._block_in >= 0])
+    assert seen[1] | seen[2] <= here
+    gone = seen[0] - here
+    # What went is not needed sooner than what stayed without being needed now.
+    next_use = {b: min((v for v in range(1, 8) if b in seen[v]), default=99) for b in range(78)}
+    idle = here - seen[1] - seen[2]
+    assert gone
+    if idle:
+        assert min(next_use[b] for b in gone) >= max(next_use[b] for b in idle)
+
+
+def _blocks(residence, course, view):
+    one = first(course, view, 1)
+    return seen_blocks(residence._bounds[: residence._blocks], *one[:3], *LIMITS).numpy()
+
+
+def test_a_step_waits_for_what_did_not_come_ahead():
+    """The pool has room for each step alone: nothing of the next one replaces what the present one needs."""
+    _, residence = make_residence(slots=60)
+    course = cameras(4)
+    counts = [int((_blocks(residence, course, v) != 0).sum()) for v in range(4)]
+    _, residence = make_residence(slots=max(counts))
+    for step in range(4):
+        index = residence.bring(step, first(course, step), 1)
+        assert len(active_rows(index, residence.pool, first(course, step))) > 0
+        residence.prefetch(step + 1)
+    _, residence = make_residence(slots=max(counts) - 1)
+    with pytest.raises(
+        ResidenceError,
+        match=rf"see {max(counts)} blocks .* room for {max(counts) - 1},.*raise memory.resident_gb",
+    ):
+        for step in range(4):
+            residence.bring(step, first(course, step), 1)
+            residence.prefetch(step + 1)
+
+
+def test_a_budget_below_two_blocks_is_refused():
+    with pytest.raises(ResidenceError, match="less than two blocks"):
+        make_residence(slots=0)
+
+
+def test_a_table_that_fits_is_loaded_once():
+    table, residence = make_residence(5000, slots=100)
+    course = cameras(12)
+    for step in range(12):
+        residence.bring(step, first(course, step), 1)
+        residence.prefetch(step + 1)
+    assert residence.traffic.loaded <= 5000 // BLOCK_ROWS
+    assert residence.traffic.bytes_out == 0
+    assert len(residence.pool) == 5000
+
+
+def test_changes_of_the_table_reach_the_pool():
+    table, residence = make_residence(slots=40)
+    course = cameras(2)
+    residence.bring(0, course, 1)
+    residence.prefetch(1)
+    residence.collect()
+    kept = torch.arange(len(table)) % 3 > 0
+    residence.table.keep(kept)
+    residence.table["phi"] = torch.rand(len(residence.table))
+    residence.reindex(None)
+    index = residence.visit(first(course, 0, 1))
+    rows = active_rows(index, residence.pool, course).long()
+    places = residence.rows_of(rows).long()
+    assert len(rows) > 0
+    for name in residence.pool:
+        assert torch.equal(residence.pool[name][rows], residence.table[name][places]), name
+    table.keep(kept)
+    residence.collect()
+    for name in table:
+        assert torch.equal(residence.table[name], table[name])
+
+
+def test_traffic_of_a_time():
+    later, earlier = Traffic(10, 100, 25, 3_000_000, 2_000_000), Traffic(5, 50, 20, 1_000_000, 0)
+    assert later.since(earlier).values() == {"resident_hits": 0.9, "moved_mb_per_step": 0.8}
+
+
+def test_columns_stay_in_their_room_while_rows_come_and_go():
+    plain = make_table(1000)
+    table = host_copy(plain)
+    places = {name: table[name].data_ptr() for name in table}
+    order = torch.randperm(1000, generator=torch.Generator().manual_seed(0))
+    for each in (plain, table):
+        each.permute(order)
+        each.keep(order < 900)
+        each.append({name: each[name][:200].clone() for name in each})
+    assert {name: table[name].data_ptr() for name in table} == places
+    assert_same_bits(table, plain)
+    for each in (plain, table):
+        each.append({name: each[name][:400].clone() for name in each})
+        each["phi"] = each["scales"][:, 0].clone()
+        del each.columns["phi"]
+        each.renew(torch.arange(10), {name: each[name][:0] for name in each})
+    assert table["means"].data_ptr() != places["means"]
+    assert_same_bits(table, plain)
+
+
+def assert_same_bits(table, other):
+    assert list(table) == list(other)
+    for name in table:
+        assert torch.equal(table[name].nan_to_num(0), other[name].nan_to_num(0)), name
+
+
+def test_a_host_without_room_is_named(monkeypatch, tmp_path):
+    (tmp_path / "meminfo").write_text("MemTotal: 100 kB\nMemAvailable:       40 kB\n")
+    monkeypatch.setattr(host_table, "_MEMORY", tmp_path / "meminfo")
+    with pytest.raises(HostMemoryError, match=r"10,000 Gaussians needs 0.00 GB .*max_gaussians"):
+        host_copy(make_table(10_000))
+    monkeypatch.setattr(host_table, "_MEMORY", tmp_path / "nothing")
+    assert host_table.available_bytes() is None
+    assert len(host_copy(make_table(1000))) == 1000
+
+
+def test_the_given_columns_are_moved():
+    table = make_table(300)
+    expected = copy.deepcopy(table)
+    moved = HostTable(table.columns, pinned=False)
+    assert not table.columns
+    assert_same_bits(moved, expected)
