@@ -85,22 +85,30 @@ class Clock:
                 for (_, begin), (name, end) in zip(self.marks, self.marks[1:], strict=False)]  # fmt: skip
 
 
+def make_table(scene: BenchmarkScene) -> GaussianTable:
+    """Return the scene in the midst of a training: with moments, at step 0."""
+    raw, device = scene.raw(), scene.means.device
+    n = len(scene.means)
+    nothing = torch.zeros(n, dtype=torch.int32, device=device)
+    table = GaussianTable.create(
+        {name: raw[name] for name in PARAMETERS}
+        | {"last_step": nothing, "birth": nothing, "level": nothing.to(torch.uint8)}
+        | {"id": torch.arange(n, device=device), "parent": torch.full((n,), -1, device=device)}
+    )
+    # Gradients of this loss are around 1e-7; their sizes spread over some orders of magnitude.
+    for first, second in zip(EXP_AVGS, EXP_AVG_SQS, strict=True):
+        size = 1e-7 * torch.exp(2 * torch.randn_like(table[first]))
+        table[first].copy_(torch.randn_like(size)).mul_(size)
+        table[second].copy_(size).square_()
+    return table
+
+
 class OurStep:
     """The trainer's step."""
 
     def __init__(self, scene: BenchmarkScene) -> None:
-        n, raw = len(scene.means), scene.raw()
-        nothing = torch.zeros(n, dtype=torch.int32, device="cuda")
-        self.table = GaussianTable.create(
-            {name: raw[name] for name in PARAMETERS}
-            | {"last_step": nothing, "birth": nothing, "level": nothing.to(torch.uint8)}
-            | {"id": torch.arange(n, device="cuda"), "parent": torch.full((n,), -1, device="cuda")}
-        )
-        # Gradients of this loss are around 1e-7; their sizes spread over some orders of magnitude.
-        for first, second in zip(EXP_AVGS, EXP_AVG_SQS, strict=True):
-            size = 1e-7 * torch.exp(2 * torch.randn_like(self.table[first]))
-            self.table[first].copy_(torch.randn_like(size)).mul_(size)
-            self.table[second].copy_(size).square_()
+        n = len(scene.means)
+        self.table = make_table(scene)
         self.batch = random_photographs(scene)
         schedule = Schedule(ScheduleConfig(batch_size=len(self.batch.views)))
         optimiser = LazyAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, "cuda")

@@ -112,7 +112,7 @@ def aerial(
         sh=_spherical_harmonics(colors, generator),
         viewmats=torch.stack(
             [
-                _look_at((20.0 * (b - (views - 1) / 2), -180.0, 150.0), (20.0 * (b - (views - 1) / 2), 0, 0))
+                look_at((20.0 * (b - (views - 1) / 2), -180.0, 150.0), (20.0 * (b - (views - 1) / 2), 0, 0))
                 for b in range(views)
             ]
         ).to(device),
@@ -159,7 +159,7 @@ def garden_like(
         opacities=opacities.clamp_(1e-6, 1 - 1e-6),
         sh=_spherical_harmonics(colors, generator),
         viewmats=torch.stack(
-            [_look_at((3 * math.sin(a), -3 * math.cos(a), 1.4), (0.0, 0.0, 0.2)) for a in angles]
+            [look_at((3 * math.sin(a), -3 * math.cos(a), 1.4), (0.0, 0.0, 0.2)) for a in angles]
         ).to(device),
         Ks=_pinhole(width, height, 65.0, views).to(device),
         width=width,
@@ -271,7 +271,7 @@ def _spherical_harmonics(colors: Tensor, generator: torch.Generator) -> Tensor:
     return sh
 
 
-def _look_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> Tensor:
+def look_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> Tensor:
     """Return the world-to-camera matrix [4, 4] of an upright camera (world z is up)."""
     centre = torch.tensor(position, dtype=torch.float64)
     forward = torch.nn.functional.normalize(torch.tensor(target, dtype=torch.float64) - centre, dim=0)

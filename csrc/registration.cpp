@@ -181,8 +181,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
 
-  // A table in the memory of the host, of which blocks visit a pool on the device: which blocks views may see,
-  // and blocks that leave and come. The first n_written columns are written back.
+  // A table in the memory of the host, of which blocks visit a pool on the device: which blocks views may
+  // see, and blocks that leave and come. The first n_written columns are written back.
   m.def(
       "seen_blocks(Tensor bounds, Tensor viewmats, Tensor Ks, Tensor sizes, float near_plane, "
       "float far_plane, float eps2d) -> Tensor seen");

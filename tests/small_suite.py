@@ -75,6 +75,8 @@ TESTS = [
         "position_noise.py::test_matches_the_formula[cuda]",
         "knn_distances.py::test_matches_a_kd_tree[uniform-3-cuda]",
         "knn_distances.py::test_small_clouds[cuda]",
+        "residence_ops.py::test_blocks_leave_and_come[cuda]",
+        "residence_ops.py::test_views_have_sizes_of_their_own[cuda]",
         "take_rows.py::test_bits_and_unaligned_columns[cuda]",
         "voxel_keys.py::test_matches_the_formula[cuda-dtype2]",
     )),

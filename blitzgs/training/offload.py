@@ -137,9 +137,15 @@ class OffloadingStepper(Stepper):
         return rendered
 
     def backward(
-        self, step: int, frame: Frame, terms: LossTerms, mark: Mark = unmarked, keep_means2d: bool = False
+        self,
+        step: int,
+        frame: Frame,
+        terms: LossTerms,
+        mark: Mark = unmarked,
+        keep_means2d: bool = False,
+        absolute: bool = False,
     ) -> Tensor | None:
         """See `Stepper.backward`."""
-        v_means2d = super().backward(step, frame, terms, mark, keep_means2d)
+        v_means2d = super().backward(step, frame, terms, mark, keep_means2d, absolute)
         self._residence.note(self._blocks)
         return v_means2d

@@ -2,8 +2,8 @@
 // What keeps a table larger than a GPU's memory in the memory of its host: which blocks some views may see,
 // and blocks on their way between the host's table and a pool on the device.
 //
-// A block is 256 consecutive rows (blocks/blocks.h). The pool has a place for some of the table's blocks, each
-// called a slot.
+// A block is 256 consecutive rows (blocks/blocks.h). The pool has a place for some of the table's blocks,
+// each called a slot.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -17,9 +17,9 @@ constexpr int kMaxSwapColumns = 48;
 // Twice that of cull_blocks, whose test is compiled elsewhere and may round differently.
 constexpr float kSeenSlack = 2 * kBlockSlack;
 
-// bounds [n, kBlockBounds], of each block; seen [n]: bit v is set when view v may see a part of the block. The
-// test is that of cull_blocks with more slack, so cull_blocks reads no row of a block without the bit of any of
-// its views. Views differ in size here.
+// bounds [n, kBlockBounds], of each block; seen [n]: bit v is set when view v may see a part of the block.
+// The test is that of cull_blocks with more slack, so cull_blocks reads no row of a block without the bit of
+// any of its views. Views differ in size here.
 struct SeenBlocks {
   const float* bounds;
   std::int64_t n;
@@ -61,9 +61,9 @@ BLITZGS_HD std::int32_t views_that_see(const SeenBlocks& of, const Frustum* plan
 }
 
 BLITZGS_HD Frustum frustum_of(const SeenBlocks& of, int view) {
-  return make_frustum({of.viewmats, of.Ks, of.sizes[2 * view], of.sizes[2 * view + 1], of.near_plane,
-                       of.far_plane, of.eps2d},
-                      view);
+  return make_frustum(
+      {of.viewmats, of.Ks, of.sizes[2 * view], of.sizes[2 * view + 1], of.near_plane, of.far_plane, of.eps2d},
+      view);
 }
 
 namespace cpu {

@@ -45,7 +45,8 @@ __device__ __forceinline__ void move(uint4* slot, uint4* leaving, const uint4* c
 __global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, int units) {
   const int lane = threadIdx.x % 32;
   const std::int64_t warps = std::int64_t{gridDim.x} * kWarps;
-  for (std::int64_t i = blockIdx.x * std::int64_t{kWarps} + threadIdx.x / 32; i < swap.n * units; i += warps) {
+  for (std::int64_t i = blockIdx.x * std::int64_t{kWarps} + threadIdx.x / 32; i < swap.n * units;
+       i += warps) {
     const std::int64_t move_index = i / units;
     int unit = static_cast<int>(i - move_index * units), c = 0;
     int words = static_cast<int>(swap.columns[0].bytes / sizeof(uint4));
@@ -79,11 +80,13 @@ void swap_blocks(const SwapBlocks& given, Workspace&, CudaStream stream) {
   std::int64_t units = 0;
   for (int c = 0; c < swap.n_columns; ++c) {
     SwapColumn& column = swap.columns[c];
-    column.table = reinterpret_cast<std::byte*>(device_address(reinterpret_cast<std::int64_t*>(column.table)));
-    const auto places = reinterpret_cast<std::uintptr_t>(column.pool) |
-                        reinterpret_cast<std::uintptr_t>(column.table);
+    column.table =
+        reinterpret_cast<std::byte*>(device_address(reinterpret_cast<std::int64_t*>(column.table)));
+    const auto places =
+        reinterpret_cast<std::uintptr_t>(column.pool) | reinterpret_cast<std::uintptr_t>(column.table);
     if (places % sizeof(uint4) != 0) {
-      throw std::runtime_error("blitzgs: columns that blocks move between must begin at multiples of 16 bytes");
+      throw std::runtime_error(
+          "blitzgs: columns that blocks move between must begin at multiples of 16 bytes");
     }
     const std::int64_t words = column.bytes / static_cast<std::int64_t>(sizeof(uint4));
     units += (words + kUnit - 1) / kUnit;

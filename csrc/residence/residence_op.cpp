@@ -24,11 +24,11 @@ Tensor seen_blocks(const Tensor& bounds, const Tensor& viewmats_in, const Tensor
   const Tensor Ks = as_contiguous(Ks_in), sizes = as_contiguous(sizes_in);
   Tensor seen = make_empty(boxes, {boxes.size(0)}, ScalarType::Int);
   DeviceScope scope(boxes);
-  backend::seen_blocks({data<float>(boxes), boxes.size(0), data<float>(viewmats), data<float>(Ks),
-                        data<std::int32_t>(sizes), static_cast<int>(views), static_cast<float>(near_plane),
-                        static_cast<float>(far_plane), static_cast<float>(eps2d),
-                        mutable_data<std::int32_t>(seen)},
-                       scope.workspace, scope.stream);
+  backend::seen_blocks(
+      {data<float>(boxes), boxes.size(0), data<float>(viewmats), data<float>(Ks), data<std::int32_t>(sizes),
+       static_cast<int>(views), static_cast<float>(near_plane), static_cast<float>(far_plane),
+       static_cast<float>(eps2d), mutable_data<std::int32_t>(seen)},
+      scope.workspace, scope.stream);
   return seen;
 }
 

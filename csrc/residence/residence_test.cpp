@@ -41,12 +41,13 @@ TEST_CASE("views of their own sizes see blocks", "[residence]") {
   }
   const std::vector<std::int32_t> sizes{100, 80, 1000, 80};
   // In front, to the right, behind, and empty.
-  const std::vector<float> bounds{0, 0, 5, 0.1f, 0.1f, 5.1f, 0.01f, 1,  20, 0, 5, 20.1f, 0.1f, 5.1f, 0.01f, 1,
-                                  0, 0, -5, 0,   0,    -4,   0.01f, 1,  1,  1, 5, -1,    -1,   5,    0.01f, 1};
+  const std::vector<float> bounds{0,     0,    5,    0.1f,  0.1f, 5.1f, 0.01f, 1,  20,    0, 5,
+                                  20.1f, 0.1f, 5.1f, 0.01f, 1,    0,    0,     -5, 0,     0, -4,
+                                  0.01f, 1,    1,    1,     5,    -1,   -1,    5,  0.01f, 1};
   std::vector<std::int32_t> seen(4, -1);
   TestWorkspace workspace;
-  cpu::seen_blocks({bounds.data(), 4, viewmats.data(), Ks.data(), sizes.data(), 2, 0.5f, 50.0f, 0.3f,
-                    seen.data()},
-                   workspace, nullptr);
+  cpu::seen_blocks(
+      {bounds.data(), 4, viewmats.data(), Ks.data(), sizes.data(), 2, 0.5f, 50.0f, 0.3f, seen.data()},
+      workspace, nullptr);
   REQUIRE(seen == std::vector<std::int32_t>{3, 0, 0, 0});
 }

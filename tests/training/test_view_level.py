@@ -71,7 +71,7 @@ def whole_run(tmp_path_factory):
 
     def watched(self, step, options, batch, mark=None, gate=None):
         frame, *rest = forward(self, step, options, batch, gate=gate)
-        table = {name: self._table[name].clone() for name in self._table}
+        table = {name: self.table[name].clone() for name in self.table}
         steps[step] = (gate, frame.projected, batch.indices, table)
         return frame, *rest
 

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What training beyond the memory of a GPU costs: steps with all Gaussians on the device, and with a pool.
+
+    python benchmarks/bm_offload.py [--gaussians 16000000] [--ratios 1 2 4] [--steps 40] [--json FILE]
+
+The scene is `scenes.aerial` with SH degree 3 under a survey: cameras on parallel lines over the whole square
+kilometre, 150 m high, which look 60 degrees down, each at a few percent of the Gaussians. The trainer's own
+steps run with all Gaussians on the device ("resident"), then with a pool for 1 / ratio of them ("4x": a
+quarter; `blitzgs.training.offload`). The views come in the sampler's random order, as in a training, or
+along the flight lines. Measured: wall time of a step over all of them, after as many steps to warm up; what
+moved between host and device in a step; the share of the blocks in view that were on the device when they
+were looked for, a step ahead; "sweep", the time to bring the whole table through the pool and back, as events
+of the schedule do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from bm_step import LOSS, OPTIONS, RATE, make_table
+from harness import markdown_table, write_json
+from scenes import BenchmarkScene, aerial, look_at
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.model import GaussianTable
+from blitzgs.training.batches import Batch
+from blitzgs.training.config import OptimiserConfig, ScheduleConfig
+from blitzgs.training.offload import Course, OffloadingStepper
+from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.sampler import BatchSampler
+from blitzgs.training.schedule import Schedule
+from blitzgs.training.step import Stepper
+from blitzgs.training.views import Space, ViewSet
+from blitzgs.view.blocks import morton_order
+from blitzgs.view.host_table import HostTable
+from blitzgs.view.residence import Residence, ResidenceError
+
+LINES, VIEWS_A_LINE = 12, 20
+HEIGHT, LOOKS_DOWN = 150.0, math.radians(60)
+REACH = 400.0  # metres from the middle to the outermost places that cameras look at
+
+
+@dataclass(frozen=True)
+class Camera:
+    """As training reads it."""
+
+    name: str
+    width: int
+    height: int
+    K: np.ndarray
+    world_to_camera: np.ndarray
+
+
+def survey(scene: BenchmarkScene) -> list[Camera]:
+    """Return cameras with the scene's intrinsics at all places of the survey, line by line."""
+    K = scene.Ks[0].double().cpu().numpy()
+    cameras = []
+    for line, x in enumerate(np.linspace(-REACH, REACH, LINES)):
+        places = np.linspace(-REACH, REACH, VIEWS_A_LINE)
+        for y in places if line % 2 == 0 else places[::-1]:
+            pose = look_at((x, y - HEIGHT / math.tan(LOOKS_DOWN), HEIGHT), (x, y, 0.0)).double().numpy()
+            cameras.append(Camera(f"{len(cameras):03}", scene.width, scene.height, K, pose))
+    return cameras
+
+
+class FlightOrder(BatchSampler):
+    """Views in the order of the flight."""
+
+    def batch(self, step: int) -> list[int]:
+        """Return consecutive views."""
+        return [(step * self.batch_size + view) % (LINES * VIEWS_A_LINE) for view in range(self.batch_size)]
+
+
+class Survey:
+    """What the steps of all arms share."""
+
+    def __init__(self, scene: BenchmarkScene, batch_size: int, device: torch.device) -> None:
+        cameras = survey(scene)
+        self.ranks, self.batch_size = Ranks(device=device), batch_size
+        self.views = ViewSet(list(cameras), Space((0.0, 0.0, 0.0), 1.0, 1.0), device)
+        self.orders = {
+            "random": BatchSampler([0] * len(cameras), batch_size, seed=0),
+            "flight": FlightOrder([0] * len(cameras), batch_size, seed=0),
+        }
+        shape = (batch_size, scene.height, scene.width, 3)
+        self.targets = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
+        self.samples = torch.full((batch_size,), float(self.targets[0].numel()), device=device)
+        schedule = Schedule(ScheduleConfig(batch_size=batch_size))
+        self.optimiser = LazyAdam(OptimiserConfig(*[RATE] * 7), schedule, 1.0, device)
+
+    def batch(self, indices: list[int]) -> Batch:
+        """Return views with photographs."""
+        return Batch(indices, self.views.pick(indices), self.targets, None, self.samples, None)
+
+    def steps(self, stepper: Stepper, order: BatchSampler, first: int, count: int) -> float:
+        """Take steps; return the seconds of one."""
+        self._synchronise()
+        begin = time.perf_counter()
+        for step in range(first, first + count):
+            frame, terms, _ = stepper.forward(step, OPTIONS, self.batch(order.batch(step - 1)))
+            stepper.backward(step, frame, terms)
+        self._synchronise()
+        return (time.perf_counter() - begin) / count
+
+    def timed(self, call: Callable[[], object]) -> float:
+        """Return the seconds of a call."""
+        self._synchronise()
+        begin = time.perf_counter()
+        call()
+        self._synchronise()
+        return time.perf_counter() - begin
+
+    def _synchronise(self) -> None:
+        if self.ranks.device.type == "cuda":
+            torch.cuda.synchronize(self.ranks.device)
+
+
+def table_bytes(table: GaussianTable) -> int:
+    """Return the bytes of all columns."""
+    return sum(table[name].nbytes for name in table)
+
+
+def measure_resident(
+    table: GaussianTable, over: Survey, orders: list[str], steps: int
+) -> list[dict[str, Any]]:
+    """Measure steps with all Gaussians on the device."""
+    results, at = [], 1
+    stepper = Stepper(table, over.optimiser, TileOwners(over.ranks), LOSS, 1.0)
+    for name in orders:
+        over.steps(stepper, over.orders[name], at, steps)
+        seconds = over.steps(stepper, over.orders[name], at + steps, steps)
+        at += 2 * steps
+        results.append({"arm": "resident", "order": name, "step_ms": 1e3 * seconds})
+    stepper.catch_up(at - 1)
+    return results
+
+
+def measure_pool(
+    table: HostTable, ratio: float, over: Survey, orders: list[str], steps: int, at: int
+) -> list[dict[str, Any]]:
+    """Measure steps with a pool; `at` is the first step."""
+    results = []
+    budget = int(table_bytes(table) / ratio)
+    residence = Residence(table, over.ranks.device, budget, over.optimiser.pending_table)
+    for name in orders:
+        order = over.orders[name]
+        course = Course(order, list(range(LINES * VIEWS_A_LINE)), over.views)
+        stepper = OffloadingStepper(residence, course, over.optimiser, TileOwners(over.ranks), LOSS, 1.0)
+        result: dict[str, Any] = {"arm": f"{ratio:g}x", "order": name, "pool_gb": budget / 1e9}
+        results.append(result)
+        try:
+            over.steps(stepper, order, at, steps)
+        except ResidenceError as error:
+            result["failed"] = str(error)
+            continue
+        before = residence.traffic
+        seconds = over.steps(stepper, order, at + steps, steps)
+        moved = residence.traffic.since(before)
+        at += 2 * steps
+        result |= {"step_ms": 1e3 * seconds} | moved.values()
+        result |= {
+            "in_gb_per_s": moved.bytes_in / 1e9 / (seconds * steps),
+            "out_gb_per_s": moved.bytes_out / 1e9 / (seconds * steps),
+            "blocks_in_view": moved.needed / steps,
+        }
+        result["sweep_s"] = over.timed(lambda stepper=stepper, last=at - 1: stepper.catch_up(last))
+    return results
+
+
+def run(
+    gaussians: int, ratios: list[float], orders: list[str], batch_size: int, steps: int, device: torch.device
+) -> dict[str, Any]:
+    """Measure all arms on one scene."""
+    scene = aerial(gaussians, device)
+    rows = morton_order(scene.means)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    scene = replace(scene, **{name: getattr(scene, name)[rows] for name in names})
+    over = Survey(scene, batch_size, device)
+    table = make_table(scene)
+    about = {"scene": scene.name, "batch_size": batch_size, "table_gb": table_bytes(table) / 1e9}
+    del scene
+    results = measure_resident(table, over, orders, steps)
+    at = 1 + 2 * steps * len(orders)
+    host = {}
+    for name in list(table.columns):
+        host[name] = table.columns.pop(name).cpu()
+    begin = time.perf_counter()
+    home = HostTable(host, pinned=device.type == "cuda")
+    about["pin_s"] = time.perf_counter() - begin
+    for ratio in ratios:
+        results += measure_pool(home, ratio, over, orders, steps, at)
+        at += 2 * steps * len(orders)
+    by_order = {result["order"]: result["step_ms"] for result in results if result["arm"] == "resident"}
+    for result in results:
+        if "step_ms" in result:
+            result["cost"] = result["step_ms"] / by_order[result["order"]]
+    return about | {"results": results}
+
+
+def main() -> None:
+    """Measure, print a table, and write it as JSON when a file is named."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gaussians", type=int, default=16_000_000)
+    parser.add_argument("--ratios", type=float, nargs="+", default=[1, 2, 4])
+    parser.add_argument("--orders", nargs="+", default=["random", "flight"], choices=["random", "flight"])
+    parser.add_argument("--batch-size", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
+    args = parser.parse_args()
+    with torch.no_grad():
+        found = run(
+            args.gaussians, args.ratios, args.orders, args.batch_size, args.steps, torch.device(args.device)
+        )
+    print(f"{found['scene']}, B = {args.batch_size}, table {found['table_gb']:.2f} GB")
+    columns = (
+        "arm",
+        "order",
+        "step_ms",
+        "cost",
+        "resident_hits",
+        "moved_mb_per_step",
+        "in_gb_per_s",
+        "sweep_s",
+    )
+    print(markdown_table([{name: row.get(name, "") for name in columns} for row in found["results"]]))
+    for row in found["results"]:
+        if "failed" in row:
+            print(f"{row['arm']}, {row['order']}: {row['failed']}")
+    if args.json:
+        write_json(args.json, args.device, **found)
+
+
+if __name__ == "__main__":
+    main()
