@@ -45,6 +45,7 @@ class BoundedCache(Generic[K, V]):
         """Hold at most `budget` bytes."""
         self.budget = budget
         self.bytes = 0
+        self.most_bytes = 0  # ever held
         self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -67,6 +68,34 @@ class BoundedCache(Generic[K, V]):
                 self.bytes -= self._entries.popitem(last=False)[1][1]
             self._entries[key] = (value, size)
             self.bytes += size
+            self.most_bytes = max(self.most_bytes, self.bytes)
+
+
+@dataclass(frozen=True)
+class ImageMemory:
+    """Host memory that images took at most so far, its bounds, and the work done for it.
+
+    Attributes:
+        compressed_bytes: of compressed images.
+        compressed_budget: its bound.
+        decoded_bytes: of decoded images and masks; those being handed over come on top.
+        decoded_budget: its bound.
+        decoded: images and masks that were decoded, as often as they were.
+    """
+
+    compressed_bytes: int
+    compressed_budget: int
+    decoded_bytes: int
+    decoded_budget: int
+    decoded: int
+
+    def __str__(self) -> str:
+        """Say it in gigabytes."""
+        return (
+            f"host memory of images: at most {self.compressed_bytes / 1e9:.2f} GB compressed (budget "
+            f"{self.compressed_budget / 1e9:.2f}) and {self.decoded_bytes / 1e9:.2f} GB decoded (budget "
+            f"{self.decoded_budget / 1e9:.2f}); decoded {self.decoded:,} times"
+        )
 
 
 @dataclass(frozen=True)
@@ -106,6 +135,7 @@ class ImageStore:
         self._maps_lock = threading.Lock()
         self._pending: dict[tuple[str, int], Future[UInt8]] = {}
         self._pending_lock = threading.Lock()
+        self._times_decoded = 0
         self._pool = ThreadPoolExecutor(max(1, threads), thread_name_prefix="blitzgs-images")
 
     def get(self, index: int) -> Tensor:
@@ -154,6 +184,13 @@ class ImageStore:
         """Memory now held by decoded images and masks."""
         return self._decoded.bytes
 
+    def memory(self) -> ImageMemory:
+        """Return what images have taken so far."""
+        packed, decoded = self._packed, self._decoded
+        return ImageMemory(
+            packed.most_bytes, packed.budget, decoded.most_bytes, decoded.budget, self._times_decoded
+        )
+
     def close(self) -> None:
         """Stop the threads; decoding that has not begun is dropped."""
         self._pool.shutdown(wait=True, cancel_futures=True)
@@ -185,6 +222,7 @@ class ImageStore:
         finally:
             with self._pending_lock:
                 del self._pending[(kind, index)]
+                self._times_decoded += 1
 
     def _read(self, path: Path) -> bytes:
         data = self._packed.get(path)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from blitzgs.distributed.ownership import LOSS_HALO, TileOwners, TileRanges
 from blitzgs.pipeline import Views
+from blitzgs.scene.images import ImageMemory
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.views import VIEW_NUMBERS, ViewSet, unpack_views
 
@@ -23,7 +24,7 @@ class PhotographError(RuntimeError):
 
 
 class Images(Protocol):
-    """What training reads of an image store (`blitzgs.scene.image_store.ImageStore`)."""
+    """What training reads of an image store (`blitzgs.scene.images.ImageStore`)."""
 
     def get(self, index: int) -> Tensor:
         """Return an image, uint8 [H, W, 3]."""
@@ -33,6 +34,9 @@ class Images(Protocol):
 
     def prefetch(self, indices: list[int]) -> None:
         """Decode images in the background."""
+
+    def memory(self) -> ImageMemory:
+        """Return what images have taken of the host's memory."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ class DataConfig:
         undistort: where a distorted image does not fill its pinhole image: "crop" or "mask".
         exif: "auto" turns an image by its EXIF tag where only that fits its camera; or "apply", "ignore".
         allow_missing: drop views whose image is missing instead of failing.
-        cache_bytes: budget for the compressed images held in memory.
+        cache_bytes: budget for the compressed images held in memory, of all ranks of a host together; decoded
+            ones take a quarter of it beside.
         threads: decoder threads.
         prefetch: batches decoded and uploaded ahead.
     """

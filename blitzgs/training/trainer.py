@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import warnings
 from pathlib import Path
@@ -210,6 +211,8 @@ class Trainer:
             save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
         population = population_report(state, self._memory)
         state.log.event(state.images_seen, "population", population, describe(population))
+        images = state.images.memory()
+        state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
         summary = evaluate.run(state) | {
             "images": state.images_seen,
             "seconds": state.progress.seconds,

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+import dataclasses
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -91,6 +93,34 @@ def test_prefetch_decodes_ahead_as_far_as_the_budget_goes(capture, monkeypatch):
     store.close()
     with pytest.raises(RuntimeError):
         store.get(5)
+
+
+def test_two_thousand_images_stay_within_small_budgets(tmp_path):
+    """Two rounds over a capture of 2,000 images in a shuffled order, decoded ahead as training does."""
+    names = [f"v{i:04d}.jpg" for i in range(2000)]
+    write_capture(tmp_path, names[:8])
+    few = load_capture(tmp_path)
+    capture = dataclasses.replace(few, cameras=[few.cameras[i % 8] for i in range(2000)])
+    for i in range(2000):  # every image has a file of its own
+        path = tmp_path / "images" / names[i]
+        if i >= 8:
+            os.link(few.cameras[i % 8].image_path, path)
+        capture.cameras[i] = dataclasses.replace(few.cameras[i % 8], image_path=path)
+    expected = [ImageStore(few).get(i) for i in range(8)]
+    packed = 100 * (tmp_path / "images" / names[0]).stat().st_size
+    store = ImageStore(capture, budget_bytes=packed, threads=3, decoded_bytes=20 * IMAGE_BYTES)
+    order = [i for r in range(2) for i in np.random.default_rng(r).permutation(2000).tolist()]
+    for begin in range(0, len(order), 4):
+        store.prefetch(order[begin : begin + 12])
+        for index in order[begin : begin + 4]:
+            assert torch.equal(store.get(index), expected[index % 8])
+        assert store.compressed_bytes <= packed and store.decoded_bytes <= 20 * IMAGE_BYTES
+    memory = store.memory()
+    assert 0.9 * packed < memory.compressed_bytes <= packed
+    assert memory.decoded_bytes == memory.decoded_budget == 20 * IMAGE_BYTES
+    # What is decoded ahead is not dropped before its use; a few images of the first round are still there.
+    assert 3900 <= memory.decoded <= 4000
+    assert "decoded 3,9" in str(memory) or "decoded 4,000" in str(memory)
 
 
 def test_an_image_wanted_by_many_threads_is_decoded_once(capture, monkeypatch):

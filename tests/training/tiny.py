@@ -12,6 +12,7 @@ import torch
 from blitzgs import pipeline
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.scene.images import ImageMemory
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import load_config
 
@@ -67,6 +68,9 @@ class Images:
 
     def prefetch(self, indices):
         pass
+
+    def memory(self):
+        return ImageMemory(0, 0, 0, 0, 0)
 
 
 def tiny_config(*overrides: str) -> Config:
