@@ -46,9 +46,9 @@ from blitzgs.distributed.ownership import (
     cost_balance,
 )
 from blitzgs.distributed.pixels import collect_images
-from blitzgs.distributed.transport import Traffic, open_transport
+from blitzgs.distributed.transport import Mark, Traffic, open_transport, unmarked
 from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views, unmarked
+from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.scene.capture import load_capture
 from blitzgs.training.batches import Batch
@@ -185,7 +185,7 @@ class Workload:
         samples, targets = self.samples[: len(keys)], self.targets[: len(keys)]
         return Batch(keys, views, targets, None, samples, self.divide(keys, views))
 
-    def step(self, batch: Batch, mark: pipeline.Mark = unmarked) -> dict[str, Any]:
+    def step(self, batch: Batch, mark: Mark = unmarked) -> dict[str, Any]:
         """Take one training step."""
         self.steps += 1
         frame, terms, sums = self.stepper.forward(self.steps, self.options, batch, mark)

@@ -10,7 +10,6 @@ gradients.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -19,21 +18,20 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.ownership import TileAssignment
-from blitzgs.distributed.transport import Arrived, Exchange, Splats, Traffic, Transport, open_transport
-from blitzgs.distributed.transport.local import LocalTransport
+from blitzgs.distributed.transport import (
+    LocalTransport,
+    Mark,
+    Traffic,
+    Transport,
+    WayBack,
+    open_transport,
+    unmarked,
+)
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.capacity import Attempt
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, Splats
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients, absolute_column
-
-Mark = Callable[[str], None]
-# Finds the active rows, caught up, with room for the rows of so many blocks (None: of as many as there are).
-FindActive = Callable[[int | None], ActiveRows]
-
-
-def unmarked(stage: str) -> None:
-    """Take no note of the end of a stage."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +114,7 @@ class Frame(NamedTuple):
         projected: this rank's splats, of the Gaussians that it owns; P of them.
         splats: what was composited: these, or those that the exchange brought here.
         assignment: who composites which tiles; None: one rank does all.
-        exchange: returns the gradients of the splats.
+        way_back: of the gradients of the splats, to their owners; None: one rank owns all.
         traffic: which splats went where; None: they stayed.
         visible: int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
         backgrounds: [B, 3]; None: black.
@@ -136,7 +134,7 @@ class Frame(NamedTuple):
     projected: ProjectedSplats
     splats: Splats
     assignment: TileAssignment | None
-    exchange: Exchange
+    way_back: WayBack | None
     traffic: Traffic | None
     visible: Tensor
     backgrounds: Tensor | None
@@ -155,7 +153,7 @@ def forward(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
-    active: ActiveRows | FindActive | None = None,
+    active: ActiveRows | None = None,
     assignment: TileAssignment | None = None,
     transport: Transport | None = None,
     mark: Mark = unmarked,
@@ -167,8 +165,7 @@ def forward(
         table: the Gaussians.
         views: at most 32 views.
         options: how to render.
-        active: rows to consider, and the views of each, or what finds them: it is called again where it had
-            too little room. None: all.
+        active: rows to consider, and the views of each; None: all.
         assignment: who composites which tiles; every rank of the job calls this with its table. None: render
             all of the views from this table alone.
         transport: brings the splats to the ranks that composite them. A transport that is kept estimates the
@@ -183,86 +180,72 @@ def forward(
     """
     if transport is None:
         transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
-    render = _Render(table, views, options, active, assignment, mark, backward_follows)
+    for attempt in transport.capacity.attempts():
+        frame = render(table, views, options, active, assignment, transport, attempt, mark, backward_follows)
+    assert frame is not None  # or there would be another attempt
+    return frame
+
+
+def render(
+    table: GaussianTable,
+    views: Views,
+    options: RenderOptions,
+    active: ActiveRows | None,
+    assignment: TileAssignment | None,
+    transport: Transport,
+    attempt: Attempt,
+    mark: Mark = unmarked,
+    backward_follows: bool = False,
+) -> Frame | None:
+    """Do what `forward` does, once: queue all of it, then wait for the numbers.
+
+    Returns:
+        The frame; None if there was too little room, for the active rows or in `attempt`.
+    """
+    inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
+    backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
     # Past autograd's Python: an op that is differentiable elsewhere spends 20 us of the host's time there.
     with torch._C._AutoDispatchBelowAutograd():
-        return transport.capacity.run(lambda capacity: render.attempt(transport, capacity))
-
-
-@dataclass
-class _Render:
-    """One call of `forward`."""
-
-    table: GaussianTable
-    views: Views
-    options: RenderOptions
-    active: ActiveRows | FindActive | None
-    assignment: TileAssignment | None
-    mark: Mark
-    backward_follows: bool
-
-    def attempt(self, transport: Transport, capacity: Sizes | None) -> tuple[Frame | None, Sizes]:
-        """Queue all of it, then wait for the numbers; the frame is None if the capacity was too small."""
-        views, grid = self.views, tile_grid(self.views, self.options, self.assignment)
-        active = self.active
-        if callable(active) and self.table.device.type == "cpu":
-            active = active(None)._replace(blocks=None)  # complete, as the number is there at once
-        elif callable(active):
-            active = active(None if capacity is None else capacity.blocks)
-        inputs = inputs_of(self.table, views, self.options, active)
-        with transport.start(inputs, self.assignment, capacity) as exchange:
-            self.mark("project")
-            arrived = exchange.receive()
-            self.mark("exchange")
-            lists = list_splats(arrived, grid)
-            self.mark("sort")
-            splats = arrived.splats
-            backgrounds = _backgrounds(self.options.background, len(views), splats.means2d.device)
-            arguments = (
-                splats.means2d, splats.conics, splats.opacities, splats.colors, backgrounds, *lists, grid
-            )  # fmt: skip
-            composited, gradients = self._composite(exchange, arguments, arrived.n_splats)
-            self.mark("raster")
-            counts = exchange.finish()
-        if counts is None:
-            return None, exchange.needed
-        renders, transmittances, last_ids, tile_work, packed_splats, tile_order = composited
-        frame = Frame(
-            views=views,
-            options=self.options,
-            projected=counts.projected,
-            splats=counts.splats,
-            assignment=self.assignment,
-            exchange=exchange,
-            traffic=counts.traffic,
-            visible=counts.visible,
-            backgrounds=backgrounds,
-            isect_splats=lists[0],
-            tile_offsets=lists[1],
-            renders=renders,
-            transmittances=transmittances,
-            last_ids=last_ids,
-            tile_work=tile_work,
-            packed_splats=packed_splats,
-            tile_order=tile_order,
-            gradients=gradients,
+        exchange = transport.start(inputs, assignment, attempt, mark)
+        splats, n_splats, n_isects = exchange.arrived
+        geometry = (splats.means2d, splats.conics, splats.opacities)
+        lists = torch.ops.blitzgs.intersect(
+            *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
         )
-        return frame, exchange.needed
-
-    def _composite(
-        self, exchange: Exchange, arguments: Sequence[object], n_splats: Tensor | None
-    ) -> tuple[Sequence[Tensor], GradientBuffer]:
-        table = exchange.gradient_table()
-        if table is None:
-            *composited, zeros = torch.ops.blitzgs.rasterize_fwd(
-                *arguments, None, False, self.backward_follows, n_splats
+        mark("sort")
+        arguments, zeros = (*geometry, splats.colors, backgrounds, *lists, grid), exchange.gradient_table
+        if zeros is not None and backward_follows:
+            composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, zeros, n_splats)
+        else:
+            *composited, allocated = torch.ops.blitzgs.rasterize_fwd(
+                *arguments, None, False, backward_follows, n_splats
             )
-            return composited, GradientBuffer(zeros)
-        if self.backward_follows:
-            composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, table, n_splats)
-            return composited, GradientBuffer(table, exchange.cleared_table)
-        *composited, _ = torch.ops.blitzgs.rasterize_fwd(*arguments, None, False, False, n_splats)
-        return composited, GradientBuffer(None, exchange.cleared_table)
+            zeros = allocated if zeros is None else None
+        mark("raster")
+        counts = exchange.finish()
+    if counts is None:
+        return None
+    renders, transmittances, last_ids, tile_work, packed_splats, tile_order = composited
+    return Frame(
+        views=views,
+        options=options,
+        projected=counts.projected,
+        splats=counts.splats,
+        assignment=assignment,
+        way_back=counts.way_back,
+        traffic=counts.traffic,
+        visible=counts.visible,
+        backgrounds=backgrounds,
+        isect_splats=lists[0],
+        tile_offsets=lists[1],
+        renders=renders,
+        transmittances=transmittances,
+        last_ids=last_ids,
+        tile_work=tile_work,
+        packed_splats=packed_splats,
+        tile_order=tile_order,
+        gradients=GradientBuffer(zeros, None if counts.way_back is None else counts.way_back.cleared_table),
+    )
 
 
 def inputs_of(
@@ -280,16 +263,6 @@ def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment |
     """Return the tiles that this rank composites, as the ops take them."""
     tiles = (0, -1) if assignment is None else assignment.composited
     return [len(views), views.width, views.height, options.tile_size, *tiles]
-
-
-def list_splats(arrived: Arrived, grid: list[int]) -> tuple[Tensor, Tensor]:
-    """Return the lists of the tiles of `tile_grid`: isect_splats and tile_offsets, as `Frame` has them."""
-    splats = arrived.splats
-    isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
-        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
-        grid, arrived.n_isects, arrived.n_splats, True,
-    )  # fmt: skip
-    return isect_splats, tile_offsets
 
 
 @lru_cache(maxsize=16)
@@ -312,7 +285,7 @@ def backward_splats(
     Raises:
         RuntimeError: the ranks share memory, and a later frame has taken the place of this one's splats.
     """
-    views, options, splats = frame.views, frame.options, frame.splats
+    views, options, splats, way_back = frame.views, frame.options, frame.splats, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.tiles
     arguments = (
         splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_splats,
@@ -320,17 +293,19 @@ def backward_splats(
         [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order], v_renders,
     )  # fmt: skip
     grid = [len(views), views.width, views.height, options.tile_size, *tiles]
-    frame.exchange.expect_gradients()
+    if way_back is not None:
+        way_back.expect_gradients()
     if v_renders.is_cuda:
         packed = frame.gradients.take(splats.means2d)
         torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, grid, options.deterministic, packed, absolute)
-        parts = [packed, absolute_column(packed)] if absolute else [packed]
+        gradients = SplatGradients([packed], None, absolute_column(packed) if absolute else None)
     else:
         *parts, v_abs = torch.ops.blitzgs.rasterize_bwd(
             *arguments, None, grid, absolute, options.deterministic
         )
-        parts += [v_abs] if absolute else []
+        gradients = SplatGradients(parts, None, v_abs if absolute else None)
     mark("raster back")
-    gradients = frame.exchange.return_gradients(parts)
+    if way_back is not None:
+        gradients = way_back.return_gradients(gradients)
     mark("exchange back")
     return gradients

@@ -13,9 +13,8 @@ from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.transport import LocalTransport, Transport, open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection import ProjectedSplats
-from blitzgs.pipeline import RenderOptions, Views, inputs_of, list_splats, tile_grid
+from blitzgs.pipeline import RenderOptions, Views, inputs_of, tile_grid
 
 
 class Survey(NamedTuple):
@@ -60,22 +59,19 @@ def survey(
     options = replace(options, sh_degree=0)
     inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
 
-    def attempt(capacity: Sizes | None) -> tuple[Survey | None, Sizes]:
-        with transport.start(inputs, assignment, capacity) as exchange:
-            arrived = exchange.receive()
-            splats = arrived.splats
-            weights, pixels = torch.ops.blitzgs.contributions(
-                splats.means2d, splats.conics, splats.opacities, *list_splats(arrived, grid), grid,
-                arrived.n_splats,
-            )  # fmt: skip
-            counts = exchange.finish()
-        if counts is None:
-            return None, exchange.needed
-        weights, pixels = (column[: len(counts.splats.depths)] for column in (weights, pixels))
-        if assignment is not None:
-            returned = exchange.return_sums(torch.stack((weights, pixels.long()), 1))
-            weights, pixels = returned[:, 0].contiguous(), returned[:, 1].int()
-        return Survey(counts.projected, weights, pixels), exchange.needed
-
     with torch._C._AutoDispatchBelowAutograd():
-        return transport.capacity.run(attempt)
+        for attempt in transport.capacity.attempts():
+            exchange = transport.start(inputs, assignment, attempt)
+            splats, n_splats, n_isects = exchange.arrived
+            geometry = (splats.means2d, splats.conics, splats.opacities)
+            lists = torch.ops.blitzgs.intersect(
+                *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
+            )
+            sums = torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats)
+            counts = exchange.finish()
+    assert counts is not None  # or there would be another attempt
+    weights, pixels = (column[: len(counts.splats.depths)] for column in sums)
+    if counts.way_back is not None:
+        returned = counts.way_back.return_sums(torch.stack((weights, pixels.long()), 1))
+        weights, pixels = returned[:, 0].contiguous(), returned[:, 1].int()
+    return Survey(counts.projected, weights, pixels)

@@ -9,10 +9,8 @@ Where the estimate was too small, the work is queued once more.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
-
-T = TypeVar("T")
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 # An attempt that failed tells what it needs, so the next has it: more attempts than this are an error in the
 # program.
@@ -30,6 +28,27 @@ class Sizes(NamedTuple):
     def holds(self, needed: Sequence[int]) -> bool:
         """Tell whether there is room for so many of the first of these."""
         return all(n <= size for n, size in zip(needed, self, strict=False))
+
+
+class Attempt:
+    """One call with room of some sizes.
+
+    Attributes:
+        sizes: to make room for; None: nothing is known yet, so the call has to wait for its sizes.
+        needed: the sizes that turned out to be needed.
+        fits: whether there was room for them.
+    """
+
+    def __init__(self, sizes: Sizes | None, estimate: CapacityEstimate | None = None) -> None:
+        """Begin; `estimate` learns how it ends."""
+        self.sizes, self.fits, self._estimate = sizes, False, estimate
+        self.needed: Sequence[int] = ()
+
+    def end(self, needed: Sequence[int], fits: bool) -> None:
+        """Say what was needed, and whether there was room for it."""
+        self.needed, self.fits = needed, fits
+        if self._estimate is not None:
+            self._estimate.learn(needed)
 
 
 class CapacityEstimate:
@@ -54,24 +73,18 @@ class CapacityEstimate:
                 max(1, n * 9 // 8, size - size // 256) for n, size in zip(Sizes(*needed), before, strict=True)
             )
 
-    def run(self, attempt: Callable[[Sizes | None], tuple[T | None, Sequence[int]]]) -> T:
-        """Call `attempt` with the estimate, and again where that was too small.
-
-        Args:
-            attempt: is given the estimate, and returns its result and what it needed. The result is None
-                where the estimate was too small.
+    def attempts(self) -> Iterator[Attempt]:
+        """Yield attempts with the estimate until one of them fits; whoever makes one calls its `end`.
 
         Raises:
             RuntimeError: the sizes that an attempt asked for were too small for the next one, several times.
         """
-        given = needed = None
         for _ in range(MOST_ATTEMPTS):
-            given = self.sizes
-            result, needed = attempt(given)
-            self.learn(needed)
-            if result is not None:
-                return result
+            attempt = Attempt(self._sizes, self)
+            yield attempt
+            if attempt.fits:
+                return
         raise RuntimeError(
             f"{MOST_ATTEMPTS} attempts have each needed more than the one before had asked for: the last had "
-            f"{given} and needs {tuple(needed or ())}. The inputs must not change during a call"
+            f"{attempt.sizes} and needs {tuple(attempt.needed)}. The inputs must not change during a call"
         )

@@ -13,14 +13,13 @@ class HostCopy:
     """A few numbers on their way to the host. What is queued before `read` runs meanwhile.
 
     On CUDA a kernel writes the numbers into the host's memory: a copy would make the stream wait for the
-    copying engine, 15 us. That memory has to live until then, so this is a context manager, and leaving it
-    waits too.
+    copying engine, 15 us. That memory has to live until then, so whoever drops a copy unread waits too.
     """
 
     def __init__(self, values: Tensor) -> None:
         """Start to bring `values`, int64 [n], to the host."""
-        self._host = values
         self._written: torch.cuda.Event | None = None
+        self._host = values
         if values.is_cuda:
             self._host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
             torch.ops.blitzgs.copy_to_host_(self._host, values)
@@ -31,12 +30,10 @@ class HostCopy:
         """Wait for the numbers and return them, on the CPU."""
         if self._written is not None:
             self._written.synchronize()
+            self._written = None
         return self._host
 
-    def __enter__(self) -> HostCopy:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def __del__(self) -> None:
         self.read()
 
 

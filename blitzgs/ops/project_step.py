@@ -83,7 +83,7 @@ def project_bwd_step_(
         [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
         options.ints,
         options.floats,
-        gradients.projected,
+        list(gradients.parts),
         gradients.places,
         scale_reg,
         means2d_sums,

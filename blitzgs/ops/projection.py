@@ -52,6 +52,32 @@ def splats_of(columns: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
         return ProjectedSplats._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
 
 
+class Splats(NamedTuple):
+    """Splats as compositing sees them; P of them.
+
+    Attributes:
+        means2d: [P, 2] pixels.
+        conics: [P, 3], inverse 2D covariance (a, b, c).
+        opacities: [P].
+        colors: [P, D].
+        depths: [P].
+        camera_ids: int32 [P].
+        ids: int64 [P], persistent: what breaks ties of depth.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    opacities: Tensor
+    colors: Tensor
+    depths: Tensor
+    camera_ids: Tensor
+    ids: Tensor
+
+    def first(self, count: int) -> Splats:
+        """Return the first `count` of them."""
+        return Splats(*(column[:count] for column in self))
+
+
 class ProjectionOptions(NamedTuple):
     """How Gaussians are projected; the arguments of `project` of these names."""
 
@@ -153,21 +179,22 @@ class Projected(NamedTuple):
     ids: Tensor
     totals: Tensor
 
+    @property
+    def composited(self) -> Splats:
+        """What is composited of the splats."""
+        s = self.splats
+        return Splats(s.means2d, s.conics, s.opacities, s.colors, s.depths, s.camera_ids, self.ids)
+
 
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
     """`project` of grouped arguments, without gradients."""
-
-    def attempt(capacity: Sizes | None) -> tuple[ProjectedSplats | None, Sizes]:
-        projected = inputs.run(capacity)
-        with HostCopy(projected.totals) as copy:
-            counts = copy.read()[:3]
-        needed = Sizes._make((*counts.tolist(), 0))
-        if capacity is not None and not capacity.holds(needed[:2]):
-            return None, needed
-        return splats_of(projected.splats[:12], counts), needed
-
     with torch._C._AutoDispatchBelowAutograd():
-        return capacity_for(inputs).run(attempt)
+        for attempt in capacity_for(inputs).attempts():
+            projected = inputs.run(attempt.sizes)
+            counts = HostCopy(projected.totals).read()[:3]
+            needed = Sizes(*counts.tolist())
+            attempt.end(needed, attempt.sizes is None or attempt.sizes.holds(needed[:2]))
+        return splats_of(projected.splats[:12], counts)
 
 
 def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:

@@ -45,10 +45,12 @@ def render_queued(
     options = inputs.options
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
 
-    def attempt(capacity: Sizes | None) -> tuple[Rendered | None, list[int]]:
-        projected = inputs.run(capacity)
-        splats, n_splats = projected.splats, None if capacity is None else projected.totals[1:2]
-        with HostCopy(projected.totals) as copy:
+    estimate = capacity_for(inputs) if sizes is None else CapacityEstimate(sizes)
+    with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
+        for attempt in estimate.attempts():
+            projected, capacity = inputs.run(attempt.sizes), attempt.sizes
+            splats, n_splats = projected.splats, None if capacity is None else projected.totals[1:2]
+            copy = HostCopy(projected.totals)
             n_isects = int(copy.read()[2]) if capacity is None else capacity.isects
             geometry = splats.means2d, splats.conics, splats.opacities
             isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
@@ -59,12 +61,7 @@ def render_queued(
                 backward_follows, n_splats,
             )  # fmt: skip
             counts = copy.read()[:3]
-        needed = counts.tolist()
-        if capacity is not None and not capacity.holds(needed):
-            return None, needed
+            needed = counts.tolist()
+            attempt.end(needed, capacity is None or capacity.holds(needed))
         listed = isect_splats[: needed[2]]
-        return Rendered(splats_of(splats[:12], counts), listed, tile_offsets, composited), needed
-
-    with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
-        estimate = capacity_for(inputs) if sizes is None else CapacityEstimate(sizes)
-        return estimate.run(attempt)
+        return Rendered(splats_of(splats[:12], counts), listed, tile_offsets, composited)

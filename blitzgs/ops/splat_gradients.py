@@ -52,49 +52,33 @@ def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
 
 
 class SplatGradients(NamedTuple):
-    """Gradients of a rank's P splats in one of three forms.
+    """Gradients of P splats in one of three forms.
 
     Attributes:
         parts: columns (v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]); or (CUDA) one
-            table [P, 12]; both followed by the sums over pixels of the absolute gradients of means2d, [P, 2],
-            where these were asked for; or, with `places`, this rank's part of such a table at each of the M
-            ranks that composited splats, in memory that they share. A splat's gradient is then the sum over
-            the ranks, in their order.
+            table [P, 12]; or, with `places`, this rank's part of such a table at each of the M ranks that
+            composited splats, in memory that they share. A splat's gradient is then the sum over the ranks,
+            in their order.
         places: int64 [ceil(P / 32), M], where each splat is among those that a rank had of this one, as
             `scatter_splats` returns it. Such gradients are valid until the next frame, or the next backward
             pass of this one.
+        means2d_abs: sums over pixels of the absolute gradients of means2d, [P, 2]; None: they were not asked
+            for, or are at several ranks.
     """
 
     parts: Sequence[Tensor]
     places: Tensor | None = None
+    means2d_abs: Tensor | None = None
 
     @property
     def means2d(self) -> Tensor | None:
         """The gradient of means2d, [P, 2] per pixel; None: it is at several ranks."""
-        if self.places is not None:
-            return None
-        return columns_of(self.parts)[0]
-
-    @property
-    def means2d_abs(self) -> Tensor | None:
-        """The sums over pixels of its absolute values, [P, 2]; None: they are at several ranks."""
-        return None if self.places is not None else self.parts[-1]
-
-    @property
-    def projected(self) -> list[Tensor]:
-        """What the projection's backward pass reads of the parts."""
-        if self.places is not None:
-            return list(self.parts)
-        return list(self.parts[: 1 if _begins_with_table(self.parts) else 4])
+        return None if self.places is not None else columns_of(self.parts)[0]
 
 
-def columns_of(parts: Sequence[Tensor]) -> list[Tensor]:
-    """Return the columns of a rank's own gradients, `SplatGradients.parts` without `places`: four or five."""
-    return [*gradient_columns(parts[0]), *parts[1:]] if _begins_with_table(parts) else list(parts)
-
-
-def _begins_with_table(parts: Sequence[Tensor]) -> bool:
-    return len(parts) <= 2
+def columns_of(parts: Sequence[Tensor]) -> Sequence[Tensor]:
+    """Return the four columns of `SplatGradients.parts` without `places`."""
+    return gradient_columns(parts[0]) if len(parts) == 1 else parts
 
 
 class GradientBuffer:
@@ -103,12 +87,12 @@ class GradientBuffer:
     They are good for one backward pass; later ones get others.
     """
 
-    def __init__(self, zeros: Tensor | None, others: Callable[[], Tensor] | None = None) -> None:
+    def __init__(self, zeros: Tensor | None, others: Callable[[], Tensor | None] | None = None) -> None:
         """Keep the zeros.
 
         Args:
             zeros: [P or more, 12], the last output of `rasterize_fwd`, or none, [0, 12] or None.
-            others: makes others; None: they are allocated.
+            others: makes others; None, or where it returns None: they are allocated.
         """
         self._zeros, self._others = zeros, others
 
@@ -117,7 +101,8 @@ class GradientBuffer:
         zeros, self._zeros = self._zeros, None
         if zeros is not None and len(zeros) >= len(means2d):
             return zeros if len(zeros) == len(means2d) else zeros[: len(means2d)]
-        return means2d.new_zeros(len(means2d), SPLAT_GRADIENT) if self._others is None else self._others()
+        others = None if self._others is None else self._others()
+        return means2d.new_zeros(len(means2d), SPLAT_GRADIENT) if others is None else others
 
 
 @torch.library.register_fake("blitzgs::splat_gradient_layout")

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileOwners
-from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
+from blitzgs.distributed.transport import Mark, unmarked
+from blitzgs.pipeline import Frame, RenderOptions
 from blitzgs.population.exploration import PositionNoise
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig

@@ -9,11 +9,10 @@ from torch import Tensor
 from blitzgs import pipeline
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileAssignment, TileOwners
-from blitzgs.distributed.transport import open_transport
+from blitzgs.distributed.transport import Mark, open_transport, unmarked
 from blitzgs.model import GaussianTable
-from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.view_gate import gate_views_
-from blitzgs.pipeline import Frame, Mark, RenderOptions, unmarked
+from blitzgs.pipeline import Frame, RenderOptions
 from blitzgs.population.exploration import PositionNoise
 from blitzgs.population.importance import CULL
 from blitzgs.training.batches import Batch
@@ -103,7 +102,10 @@ class Stepper:
         table, ranks, views = self.table, self._owners.ranks, batch.views
         rules = None if gate is None else gate.rules(table, table.columns.get(CULL))
 
-        def find_active(room: int | None) -> ActiveRows:
+        assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
+        for attempt in self._transport.capacity.attempts():
+            # On the CPU the number of blocks is there at once, so there is always room for them.
+            room = attempt.sizes.blocks if attempt.sizes is not None and views.viewmats.is_cuda else None
             active = self._blocks.active(
                 table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
                 options.far_plane, options.eps2d, rules, room,
@@ -113,12 +115,11 @@ class Stepper:
             mark("optimiser")
             if rules is not None:
                 gate_views_(active, table["means"], views.viewmats, rules)
-            return active
-
-        assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
-        frame = pipeline.forward(
-            table, views, options, find_active, assignment, self._transport, mark, backward_follows=True
-        )
+            frame = pipeline.render(
+                table, views, options, active if views.viewmats.is_cuda else active._replace(blocks=None),
+                assignment, self._transport, attempt, mark, backward_follows=True,
+            )  # fmt: skip
+        assert frame is not None  # or there would be another attempt
         terms = loss_terms(frame, batch, self._loss, self._length_unit)
         mark("loss")
         if batch.ranges is None:

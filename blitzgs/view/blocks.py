@@ -85,9 +85,10 @@ class BlockIndex:
         The result depends on each row's own state alone, neither on the order of the rows nor on how they are
         divided among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
         """
+        pending = self._pending(table)
         return cull_blocks(
             self._bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
-            eps2d, self._pending(table), self._level_ranges, rules, room,
+            eps2d, pending, self._level_ranges, rules, room,
         )  # fmt: skip
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:

@@ -17,7 +17,7 @@ from blitzgs.distributed.shared_memory import MAX_VALUES, SharedMemory, control_
 from blitzgs.distributed.transport import CollectiveTransport, PeerTransport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.capacity import CapacityEstimate
-from blitzgs.ops.splat_gradients import gradient_columns
+from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
@@ -51,14 +51,16 @@ def _exchange(table, ranks, transport):
     gradients = [got.means2d * 2, got.conics + 1, got.opacities, got.colors**2]
     if isinstance(transport, PeerTransport):
         columns = [g[:, None] if g.dim() == 1 else g for g in gradients]
-        packed = frame.exchange.cleared_table()
+        packed = frame.way_back.cleared_table()
         packed.copy_(torch.cat((*columns, torch.ones_like(got.conics)), 1))
-        returned = sum_of_ranks(frame.exchange.return_gradients([packed]), len(frame.projected.means2d))
+        returned = sum_of_ranks(
+            frame.way_back.return_gradients(SplatGradients([packed])), len(frame.projected.means2d)
+        )
         sums = [column.contiguous() for column in gradient_columns(returned)]
     else:
-        sums = frame.exchange.return_gradients(gradients).parts
+        sums = frame.way_back.return_gradients(SplatGradients(gradients)).parts
     own = assignment.ranges.pixel_mask(ranks.rank, ranks.device)
-    return [*arrived, *sums, frame.renders[own], frame.visible.clone()], frame.exchange.needed
+    return [*arrived, *sums, frame.renders[own], frame.visible.clone()], frame.traffic.needed
 
 
 def _both_ways(ranks):

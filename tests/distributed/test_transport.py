@@ -7,13 +7,14 @@ import torch
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.distributed.transport import LocalTransport, PeerTransport, open_transport
+from blitzgs.distributed.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
 from blitzgs.distributed.transport.testing import LoneMemory, RecordingTransport
-from blitzgs.ops.capacity import CapacityEstimate, Sizes
+from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
 from blitzgs.ops.scatter import scatter_splats
+from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
 from tests.helpers import parameter_gradients, sum_of_ranks
@@ -72,14 +73,16 @@ def _round_trip(ranks, half, capacity):
     inputs = owned_by(scene(dtype=torch.float32 if half else torch.float64), ranks.rank, ranks.world_size)
     transport = open_transport(ranks, half)
     assignment = TileAssignment(ranks, ranges_for(ranks.world_size))
-    with transport.start(inputs, assignment, capacity) as exchange:
-        got = exchange.receive().splats
-        assert exchange.gradient_table() is None
-        projected, splats, visible, traffic = exchange.finish()
+    attempt = Attempt(capacity)
+    exchange = transport.start(inputs, assignment, attempt)
+    got = exchange.arrived.splats
+    assert exchange.gradient_table is None
+    projected, splats, visible, traffic, way_back = exchange.finish()
+    assert attempt.fits and list(attempt.needed[:3]) == projected.counts.tolist()
     assert splats is got and sum(traffic.received) == len(got.ids)
     for _ in range(2):
-        exchange.expect_gradients()
-        returned = exchange.return_gradients(gradients_of(got, ranks.rank))
+        way_back.expect_gradients()
+        returned = way_back.return_gradients(SplatGradients(gradients_of(got, ranks.rank)))
     assert returned.places is None
     ids = (inputs.ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
     return ids, returned.parts, got._asdict(), visible
@@ -201,34 +204,36 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
     assignment, inputs = TileAssignment(alone, ranges), scene()
     transport = PeerTransport(alone)
 
-    def attempt(capacity):
-        with transport.start(inputs, assignment, capacity) as exchange:
-            arrived = exchange.receive()
-            assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(exchange.gradient_table())
+    def finished():
+        for attempt in transport.capacity.attempts():
+            exchange = transport.start(inputs, assignment, attempt)
+            arrived, table = exchange.arrived, exchange.gradient_table
+            assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
             counts = exchange.finish()
-        return (exchange, counts) if counts is not None else None, exchange.needed
+            assert (counts is None) != attempt.fits
+        return counts, attempt.needed
 
-    exchange, counts = transport.capacity.run(attempt)
+    counts, needed = finished()
     assert alone.memory.generation == 2  # the first had no room
     assert len(alone.memory.buffers[0]) >= len(counts.projected.depths) * WORDS_PER_SPLAT
     projected = project_splats(inputs)
     assert all(torch.equal(a, b) for a, b in zip(counts.projected[:11], projected[:11], strict=True))
     masks = masks_by_lists(projected, 1)
     assert torch.equal(counts.splats.means2d, projected.means2d[masks == 1])
-    table = exchange.cleared_table()
+    table = counts.way_back.cleared_table()
     table.copy_(torch.arange(table.numel()).view_as(table))
-    returned = exchange.return_gradients([table])
+    returned = counts.way_back.return_gradients(SplatGradients([table]))
     sums = sum_of_ranks(returned, len(projected.depths))
     assert torch.equal(sums[masks == 1], table) and not sums[masks == 0].any()
-    later, _ = transport.capacity.run(attempt)
-    later.expect_gradients()
+    later, _ = finished()
+    later.way_back.expect_gradients()
     with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
-        exchange.expect_gradients()
+        counts.way_back.expect_gradients()
     # One entry more than there is room for: once more, with room.
-    short = CapacityEstimate(Sizes(1, 1, exchange.needed.isects - 1))
+    short = CapacityEstimate(Sizes(1, 1, needed[2] - 1))
     again = PeerTransport(alone, short)
     transport, before = again, alone.memory.generation
-    transport.capacity.run(attempt)
+    finished()
     assert alone.memory.generation == before + 2
 
 
@@ -246,22 +251,19 @@ def test_a_frame_by_shared_memory_is_the_local_one(alone):
         assert torch.equal(frame.visible, expected.visible)
 
 
-def test_calls_out_of_order_are_refused():
-    exchange = LocalTransport().start(scene(), None, None)
-    with pytest.raises(RuntimeError, match="finish\\(\\) needs an exchange that is RECEIVED, .* STARTED"):
-        exchange.finish()
-    with exchange:
-        exchange.receive()
-        with pytest.raises(RuntimeError, match="receive\\(\\) needs an exchange that is STARTED"):
-            exchange.receive()
-        with pytest.raises(RuntimeError, match="return_gradients\\(\\) needs an exchange that is FINISHED"):
-            exchange.return_gradients([])
-    with pytest.raises(RuntimeError, match="this one is CLOSED"):
-        exchange.finish()
+def test_a_transport_that_does_not_serve_the_job_says_so():
+    assignment = TileAssignment(Ranks(), ranges_for(1))
     with pytest.raises(ValueError, match="serves one rank"):
-        LocalTransport().start(scene(), TileAssignment(Ranks(), ranges_for(1)), None)
+        LocalTransport().start(scene(), assignment, Attempt(None))
+    with pytest.raises(ValueError, match="need an assignment"):
+        CollectiveTransport(Ranks()).start(scene(), None, Attempt(None))
     with pytest.raises(ValueError, match="share no memory"):
         PeerTransport(Ranks())
+
+
+def test_one_rank_has_its_gradients_where_they_belong():
+    counts = LocalTransport().start(scene(), None, Attempt(None)).finish()
+    assert counts.way_back is None and counts.traffic is None
 
 
 def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
@@ -270,7 +272,7 @@ def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
     transport = RecordingTransport(LocalTransport(), too_small=2)
     frame = pipeline.forward(table, views, OPTIONS, transport=transport)
     names = [name for name, _ in transport.calls]
-    assert names == ["start", "receive", "finish"] * 3
+    assert names == ["start", "finish"] * 3
     capacities = [capacity for name, capacity in transport.calls if name == "start"]
     assert capacities[0] is None and capacities[1].holds(expected.projected.counts)
     assert torch.equal(frame.renders, expected.renders)
@@ -278,7 +280,6 @@ def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
     gradients = parameter_gradients(table, frame, v_renders)
     for got, want in zip(gradients, parameter_gradients(table, expected, v_renders), strict=True):
         assert torch.equal(got, want)
-    assert transport.calls[-1][0] == "return_gradients"
     transport.too_small = 10
     with pytest.raises(RuntimeError, match="4 attempts have each needed more .* needs \\("):
         pipeline.forward(table, views, OPTIONS, transport=transport)

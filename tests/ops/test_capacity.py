@@ -20,38 +20,28 @@ def test_an_estimate_follows_the_largest_of_late():
 
 
 def test_attempts_are_given_what_the_last_one_needed():
-    given = []
-
-    def attempt(capacity):
-        given.append(capacity)
-        needed = Sizes(10, 100, 1000)
-        return ("done" if capacity is not None and capacity.holds(needed) else None), needed
-
-    estimate = CapacityEstimate(Sizes(10, 99, 2000))
-    assert estimate.run(attempt) == "done" and len(given) == 2
+    given, needed = [], Sizes(10, 100, 1000)
+    for attempt in CapacityEstimate(Sizes(10, 99, 2000)).attempts():
+        given.append(attempt.sizes)
+        attempt.end(needed, attempt.sizes.holds(needed))
+    assert len(given) == 2 and attempt.fits
     assert given[1].holds((10, 100, 1000))
 
 
 def test_a_need_that_grows_for_ever_is_an_error():
-    calls = []
-
-    def attempt(capacity):
-        calls.append(capacity)
-        return None, Sizes(1, 10 ** len(calls), 1)
-
+    count = 0
     with pytest.raises(RuntimeError, match=f"{MOST_ATTEMPTS} attempts .* needs \\(1, 10000, 1, 0\\)"):
-        CapacityEstimate().run(attempt)
-    assert len(calls) == MOST_ATTEMPTS
+        for attempt in CapacityEstimate().attempts():
+            count += 1
+            attempt.end(Sizes(1, 10**count, 1), False)
+    assert count == MOST_ATTEMPTS
 
 
 def test_an_attempt_that_fails_leaves_the_estimate():
     estimate = CapacityEstimate(Sizes(1, 2, 3))
-
-    def attempt(capacity):
-        raise MemoryError
-
     with pytest.raises(MemoryError):
-        estimate.run(attempt)
+        for _ in estimate.attempts():
+            raise MemoryError
     assert estimate.sizes == (1, 2, 3, 1)
 
 

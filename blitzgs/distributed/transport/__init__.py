@@ -4,10 +4,19 @@
 from __future__ import annotations
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Traffic, Transport
 from blitzgs.distributed.transport.collective import CollectiveTransport
 from blitzgs.distributed.transport.local import LocalTransport
 from blitzgs.distributed.transport.peer import PeerTransport
+from blitzgs.distributed.transport.protocol import (
+    Arrived,
+    Exchange,
+    HostCounts,
+    Mark,
+    Traffic,
+    Transport,
+    WayBack,
+    unmarked,
+)
 
 __all__ = [
     "Arrived",
@@ -15,11 +24,13 @@ __all__ = [
     "Exchange",
     "HostCounts",
     "LocalTransport",
+    "Mark",
     "PeerTransport",
-    "Splats",
     "Traffic",
     "Transport",
+    "WayBack",
     "open_transport",
+    "unmarked",
 ]
 
 

@@ -35,10 +35,10 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.shared_memory import SharedMemory
-from blitzgs.distributed.transport.base import Arrived, Exchange, HostCounts, Splats, Traffic, Transport
 from blitzgs.distributed.transport.collective import carry_sums
-from blitzgs.ops.capacity import CapacityEstimate, Sizes
-from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, splats_of
+from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
+from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
+from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
 
@@ -85,33 +85,39 @@ class PeerBuffers:
         ]
 
 
-class PeerTransport(Transport):
+class PeerTransport:
     """For ranks of one host whose GPUs reach each other's memory."""
 
     def __init__(self, ranks: Ranks, capacity: CapacityEstimate | None = None) -> None:
         """Serve `ranks`, which have shared memory; the estimate must be the same on all of them."""
-        super().__init__(capacity)
         if ranks.memory is None:
             raise ValueError(f"the ranks share no memory; their transport is {ranks.transport}")
+        self.capacity = capacity or CapacityEstimate()
         self._ranks, self._memory = ranks, ranks.memory
         self._buffers: PeerBuffers | None = None
 
     def start(
-        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
-    ) -> Exchange:
+        self,
+        inputs: ProjectionInputs,
+        assignment: TileAssignment | None,
+        attempt: Attempt,
+        mark: Mark = unmarked,
+    ) -> PeerExchange:
         """See `Transport.start`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
-        if capacity is not None:
-            splats = -(-capacity.splats // _ALIGNMENT) * _ALIGNMENT
+        if attempt.sizes is not None:
+            splats = -(-attempt.sizes.splats // _ALIGNMENT) * _ALIGNMENT
             if len(self._memory.buffers[0]) < splats * WORDS_PER_SPLAT:
                 self._ranks.reading(partial(self._memory.reserve, splats * WORDS_PER_SPLAT))
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
-        return _PeerExchange(self._ranks, self._memory, self._buffers, inputs, assignment, capacity)
+        return PeerExchange(self._ranks, self._memory, self._buffers, inputs, assignment, attempt, mark)
 
 
-class _PeerExchange(Exchange):
+class PeerExchange:
+    """See `Exchange` and `WayBack`."""
+
     def __init__(
         self,
         ranks: Ranks,
@@ -119,46 +125,49 @@ class _PeerExchange(Exchange):
         buffers: PeerBuffers,
         inputs: ProjectionInputs,
         assignment: TileAssignment,
-        capacity: Sizes | None,
+        attempt: Attempt,
+        mark: Mark,
     ) -> None:
-        super().__init__()
-        self._ranks, self._memory, self._buffers, self._capacity = ranks, memory, buffers, capacity
-        self._n_views = inputs.n_views
+        """Queue the writing of the splats."""
+        self._ranks, self._memory, self._buffers, self._attempt = ranks, memory, buffers, attempt
+        self._n_views, self._n_isects = (
+            inputs.n_views,
+            None if attempt.sizes is None else attempt.sizes.isects,
+        )
         self._traffic: Traffic | None = None
         room = Sizes(buffers.length, buffers.length, 0)
         projected = inputs.run(room, assignment.all_composited)
-        self._projected = projected.splats
+        self._own = projected.splats
         self._shared = memory.share(projected.totals)  # barrier A
         self._counted = torch.cuda.Event()
         self._counted.record()
-        own = Splats.of(projected.splats, projected.ids)
-        self._places, self._plan = torch.ops.blitzgs.send_splats_(
-            list(own), projected.splats.rank_masks, self._shared.everyone, ranks.rank, buffers.buffers,
-            buffers.length,
+        self._places, plan = torch.ops.blitzgs.send_splats_(
+            list(projected.composited), projected.splats.rank_masks, self._shared.everyone, ranks.rank,
+            buffers.buffers, buffers.length,
         )  # fmt: skip
         memory.barrier()  # B
         memory.generation += 1
         self._generation = memory.generation
+        mark("project")
+        n_isects = self._read().n_isects if attempt.sizes is None else attempt.sizes.isects
+        self.arrived = Arrived(buffers.splats, plan[:1], n_isects)
+        self.gradient_table: Tensor | None = buffers.tables[ranks.rank]
+        mark("exchange")
 
-    def _receive(self) -> Arrived:
-        n_isects = self._read().n_isects if self._capacity is None else self._capacity.isects
-        return Arrived(self._buffers.splats, self._plan[:1], n_isects)
-
-    def _gradient_table(self) -> Tensor:
-        return self._buffers.tables[self._ranks.rank]
-
-    def _finish(self) -> HostCounts | None:
-        traffic = self._read()
-        self.needed = Sizes(traffic.most, traffic.most, traffic.most_isects, traffic.most_blocks)
-        if traffic.most > self._buffers.length:
+    def finish(self) -> HostCounts | None:
+        """See `Exchange.finish`."""
+        traffic, room = self._read(), self._attempt.sizes
+        fits = traffic.most <= self._buffers.length
+        if room is not None:
+            fits = fits and traffic.most_isects <= room.isects and traffic.most_blocks <= room.blocks
+        self._attempt.end(traffic.needed, fits)
+        if not fits:
             return None
-        room = self._capacity
-        if room is not None and (traffic.most_isects > room.isects or traffic.most_blocks > room.blocks):
-            return None
-        projected = splats_of(self._projected[:12], traffic.counts)
-        self._places = self._places[: runs_of(len(projected.camera_ids))]
+        own = splats_of(self._own[:12], traffic.counts)
+        self._places = self._places[: runs_of(len(own.camera_ids))]
         visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
-        return HostCounts(projected, self._buffers.splats.first(sum(traffic.received)), visible, traffic)
+        composited = self._buffers.splats.first(sum(traffic.received))
+        return HostCounts(own, composited, visible, traffic, self)
 
     def _read(self) -> Traffic:
         """Wait for the counts of all ranks."""
@@ -167,24 +176,27 @@ class _PeerExchange(Exchange):
             self._traffic = Traffic.of(self._shared.host.tolist(), self._n_views, self._ranks.rank)
         return self._traffic
 
-    def _check_current(self) -> None:
+    def expect_gradients(self) -> None:
+        """See `WayBack.expect_gradients`."""
         if self._generation != self._memory.generation:
             raise RuntimeError(
                 "a later exchange has overwritten this one's splats: run the backward pass of a frame before "
                 "the next forward pass"
             )
 
-    def _cleared_table(self) -> Tensor:
+    def cleared_table(self) -> Tensor:
+        """See `WayBack.cleared_table`."""
         self._memory.barrier()
         return self._buffers.tables[self._ranks.rank][: sum(self._read().received)].zero_()
 
-    def _return_gradients(self, parts: Sequence[Tensor]) -> SplatGradients:
-        # The gradients are in the tables, where their owners read them.
+    def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
+        """See `WayBack.return_gradients`; the gradients are in the tables, where their owners read them."""
         self._memory.barrier()  # C
         traffic = self._read()
         mine = zip(self._buffers.tables, traffic.starts, traffic.sent, strict=True)
         return SplatGradients([table[start : start + n] for table, start, n in mine], self._places)
 
-    def _return_sums(self, sums: Tensor) -> Tensor:
+    def return_sums(self, sums: Tensor) -> Tensor:
+        """See `WayBack.return_sums`."""
         traffic = self._read()
         return carry_sums(sums, self._places, traffic, int(traffic.counts[1]), self._ranks)

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One training step stays short to read (see tests/walk.py)."""
+
+import pytest
+
+from blitzgs.distributed.group import Ranks
+from tests.walk import kernel_files, walk_of_a_step
+
+MOST_PYTHON, MOST_KERNELS, MOST_VISITS = 20, 100, 2
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return walk_of_a_step(Ranks())
+
+
+def test_a_step_is_read_in_few_files_and_no_file_again_and_again(walk):
+    assert walk.stops[0] == "blitzgs/training/step.py"
+    assert "blitzgs/pipeline.py" in walk.files and "blitzgs/ops/project_step.py" in walk.files
+    assert len(walk.files) <= MOST_PYTHON, walk.files
+    assert max(walk.revisited.values()) <= MOST_VISITS, walk.revisited
+
+
+def test_the_kernels_of_a_step_lie_in_few_files(walk):
+    assert {"project_fwd", "rasterize_fwd", "project_bwd_step_"} <= set(walk.ops)
+    kernels = kernel_files(walk.ops)
+    assert "csrc/project/project_step_cuda.cu" in kernels and "csrc/math/tiles.h" in kernels
+    assert len(kernels) <= MOST_KERNELS, kernels

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What somebody reads to follow one training step: `python -m tests.walk` counts files, and stops on the way.
+
+Python is traced while a trainer takes a step: every function of `blitzgs/` counts at its first call, in the
+order of these calls. Functions of one file that follow each other are one stop. C++ and CUDA are counted from
+the ops that the step calls: the files of `csrc/` that check and register an op and that launch its kernels,
+and all that they include from there.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training.trainer import Trainer
+from tests.training.tiny import tiny_config, tiny_scene
+
+T = TypeVar("T")
+ROOT = Path(__file__).resolve().parents[1]
+STEPS_BEFORE = 3  # of warm-up: the first steps know no sizes
+# What CUDA calls where the CPU calls something else.
+ON_CUDA = {"rasterize_bwd": "rasterize_bwd_packed_"}
+BETWEEN_PEERS = ("send_splats_", "barrier_")
+
+
+class Walk(NamedTuple):
+    """One step, as it is read.
+
+    Attributes:
+        stops: files of `blitzgs/`, in the order in which their functions are first called.
+        ops: that were called, in order.
+    """
+
+    stops: list[str]
+    ops: list[str]
+
+    @property
+    def files(self) -> list[str]:
+        """The different files, in the order of the first visit."""
+        return list(dict.fromkeys(self.stops))
+
+    @property
+    def revisited(self) -> dict[str, int]:
+        """Files with more than one visit."""
+        return {file: n for file, n in Counter(self.stops).items() if n > 1}
+
+
+class _Trace:
+    """Notes the files of functions at their first calls, while those that it is `of` run."""
+
+    def __init__(self) -> None:
+        self.files: dict[object, str] = {}
+
+    def _note(self, frame: Any, event: str, _: object) -> None:
+        if event == "call":
+            self.files.setdefault(frame.f_code, frame.f_code.co_filename)
+
+    def of(self, call: Callable[..., T]) -> Callable[..., T]:
+        def traced(*arguments: Any, **options: Any) -> T:
+            before = sys.getprofile()
+            sys.setprofile(self._note)
+            try:
+                return call(*arguments, **options)
+            finally:
+                sys.setprofile(before)
+
+        return traced
+
+
+def walk_of_a_step(ranks: Ranks, *overrides: str, whole: bool = False) -> Walk:
+    """Train a few steps and follow the next one on this thread; `whole`: with the trainer's own part."""
+    scene, images = tiny_scene()
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        trainer = Trainer(tiny_config(*overrides), scene, images, Path(folder), ranks)
+        trainer.state.start_clock()
+        for step in range(1, STEPS_BEFORE + 1):
+            trainer.step(step)
+        trace = _Trace()
+        stepper = trainer.state.stepper
+        stepper.forward, stepper.backward = trace.of(stepper.forward), trace.of(stepper.backward)
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+            (trace.of(trainer.step) if whole else trainer.step)(STEPS_BEFORE + 1)
+        trainer.close()
+    own = str(ROOT / "blitzgs") + "/"
+    files = [str(Path(file).relative_to(ROOT)) for file in trace.files.values() if file.startswith(own)]
+    ops = [e.name.partition("::")[2] for e in profile.events() if e.name.startswith("blitzgs::")]
+    return Walk([file for file, _ in groupby(files)], list(dict.fromkeys(ops)))
+
+
+@cache
+def _included(file: Path) -> frozenset[Path]:
+    """Return a file and all of `csrc/` that it includes."""
+    found = {file}
+    for name in re.findall(r'#include "([^"]+)"', file.read_text()):
+        if (ROOT / "csrc" / name).exists():
+            found |= _included(ROOT / "csrc" / name)
+    return frozenset(found)
+
+
+def kernel_files(ops: Iterable[str]) -> list[str]:
+    """Return the files of `csrc/` behind ops on CUDA: argument checks and kernels, with includes."""
+    files = {ROOT / "csrc" / "registration.cpp"}
+    for op in ops:
+        name = ON_CUDA.get(op, op)
+        for check in ROOT.glob("csrc/*/*_op.cpp"):
+            if f'm.impl("{name}"' in check.read_text():
+                files |= _included(check)
+                for kernels in check.parent.glob("*_cuda.cu"):
+                    files |= _included(kernels)
+    return sorted(str(file.relative_to(ROOT)) for file in files)
+
+
+def _report(title: str, walk: Walk) -> None:
+    kernels = kernel_files(walk.ops)
+    print(f"{title}: {len(walk.files)} Python and {len(kernels)} C++/CUDA files, {len(walk.stops)} stops")
+    print("  ops:", *walk.ops)
+    for stop in walk.stops:
+        print("   ", stop)
+    print("  revisited:", walk.revisited or "none")
+    print("  C++/CUDA:", *kernels, sep="\n    ")
+
+
+if __name__ == "__main__":
+    _report("one rank", walk_of_a_step(Ranks()))
+    _report("one rank, with the trainer's loop", walk_of_a_step(Ranks(), whole=True))
