@@ -107,13 +107,13 @@ class DenseAdam:
 
     def step(self, table, frame, gradients, scale_reg, step):
         """Take a step with the gradients that the trainer's optimiser is about to be given."""
-        rows, options = frame.rows, frame.options.projection(frame.views)
+        splats, options = frame.projected, frame.options.projection(frame.views)
         *v, _ = torch.ops.blitzgs.project_bwd(
             list(table.parameters), [frame.views.viewmats, frame.views.Ks],
-            [rows.camera_ids, rows.visible_ids, rows.row_offsets], options.ints, options.floats,
+            [splats.camera_ids, splats.visible_ids, splats.splat_offsets], options.ints, options.floats,
             list(gradients.parts), None, scale_reg, False,
         )  # fmt: skip
-        self.move.grad.zero_().index_copy_(0, rows.visible_ids.long(), flat(v))
+        self.move.grad.zero_().index_copy_(0, splats.visible_ids.long(), flat(v))
         self.adam.step()
         self.params.addcmul_(self.move.data, self.rates[step])
         self.move.data.zero_()
