@@ -172,9 +172,10 @@ def decay_opacities(table: GaussianTable, share: float) -> None:
         table: changed in place.
         share: in [0, 1).
     """
-    logits = table["opacities"]
     if share > 0:
-        logits.add_(math.log1p(-share) - softplus(logits + math.log(share)))
+        # In float64, so that CPU and GPU round to the same.
+        logits = table["opacities"].double()
+        table["opacities"].copy_(logits + (math.log1p(-share) - softplus(logits + math.log(share))))
 
 
 def child_ids(parents: Tensor, time: int, slots: Tensor) -> Tensor:

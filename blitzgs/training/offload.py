@@ -22,10 +22,8 @@ from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.training.views import ViewSet
 from blitzgs.view.gate import ViewGate
-from blitzgs.view.residence import Cameras, Residence
-
-# Views that are looked ahead at, as many as fit into the bits of a number.
-_HORIZON = 32
+from blitzgs.view.residence import Residence
+from blitzgs.view.sight import MOST_VIEWS, Cameras
 
 
 class Course:
@@ -52,7 +50,7 @@ class Course:
 
     def cameras(self, step: int, limits: tuple[float, float, float]) -> Cameras:
         """Return the views of a step (from 1) and of those that follow, as far as one looks ahead."""
-        batches = [self._sampler.batch(step - 1 + ahead) for ahead in range(_HORIZON // self.batch_size)]
+        batches = [self._sampler.batch(step - 1 + ahead) for ahead in range(MOST_VIEWS // self.batch_size)]
         indices = torch.tensor([self._train[view] for batch in batches for view in batch])
         device = self._columns[0].device
         if device.type == "cuda":

@@ -25,36 +25,20 @@ from torch import Tensor
 
 from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import BLOCK_ROWS
-from blitzgs.ops.residence import seen_blocks, swap_blocks_
+from blitzgs.ops.residence import swap_blocks_
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostTable
+from blitzgs.view.sight import Cameras, Sight
 
 # What steps change, and what is therefore written back.
 _WRITTEN = (
     *PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step", "grad_sum", "grad_count", "max_radii",
 )  # fmt: skip
-_MOST_VIEWS = 32  # of one call of `seen_blocks`
 _FREE = -1
 
 
 class ResidenceError(RuntimeError):
     """What views see does not fit into the pool; names the sizes and what to do."""
-
-
-class Cameras(NamedTuple):
-    """Views of any sizes, on the device, and the limits they share.
-
-    Attributes:
-        viewmats: float32 [V, 4, 4], world to camera.
-        Ks: float32 [V, 3, 3], pixels.
-        sizes: int32 [V, 2], width and height, pixels.
-        limits: near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
-    """
-
-    viewmats: Tensor
-    Ks: Tensor
-    sizes: Tensor
-    limits: tuple[float, float, float]
 
 
 class Traffic(NamedTuple):
@@ -81,7 +65,7 @@ class Traffic(NamedTuple):
     def values(self) -> dict[str, float]:
         """Return the share of blocks that were there already, and megabytes a step, for a log."""
         return {
-            "resident_hits": 1.0 - self.loaded / max(1, self.needed),
+            "resident_hits": max(0.0, 1.0 - self.loaded / max(1, self.needed)),
             "moved_mb_per_step": (self.bytes_in + self.bytes_out) / 1e6 / max(1, self.steps),
         }
 
@@ -226,7 +210,7 @@ class Residence:
         """
         self._open()
         self._begun = self._mark()
-        self._sight = _Sight(self._bounds[: self._blocks], cameras, batch_size)
+        self._sight = Sight(self._bounds[: self._blocks], cameras, batch_size)
         if self._ready_for != step:
             # They have not come ahead, or not all of them.
             self._load(self._sight.by(0), self._begun, required=True)
@@ -256,7 +240,7 @@ class Residence:
         """Have the blocks that some views see in the pool, to look at them; as `bring`."""
         self._open()
         self._ready_for = None
-        self._sight = _Sight(self._bounds[: self._blocks], cameras, len(cameras.viewmats))
+        self._sight = Sight(self._bounds[: self._blocks], cameras, len(cameras.viewmats))
         wanted = self._sight.by(0)
         self._count(needed=int(wanted.sum()))
         self._load(wanted, self._mark(), required=True)
@@ -358,39 +342,6 @@ class Residence:
         """Let the device's work wait for the moves."""
         if self._stream is not None:
             torch.cuda.current_stream(self._device).wait_stream(self._stream)
-
-
-class _Sight:
-    """Which blocks the views of some batches see; the numbers travel to the host in the background."""
-
-    def __init__(self, bounds: Tensor, cameras: Cameras, batch_size: int) -> None:
-        self._batch_size = batch_size
-        seen = seen_blocks(bounds, *cameras[:3], *cameras.limits)
-        self._event: torch.cuda.Event | None = None
-        if seen.is_cuda:
-            host = torch.empty(seen.shape, dtype=seen.dtype, pin_memory=True)
-            host.copy_(seen, non_blocking=True)
-            self._event = torch.cuda.current_stream(seen.device).record_event()
-            seen = host
-        self._seen = seen
-
-    def _read(self) -> npt.NDArray[np.uint32]:
-        if self._event is not None:
-            self._event.synchronize()
-            self._event = None
-        return self._seen.numpy().view(np.uint32)
-
-    def by(self, batch: int) -> npt.NDArray[np.bool_]:
-        """Return the blocks that a batch sees, counted from the first; bool [N]."""
-        bits = ((1 << self._batch_size) - 1) << batch * self._batch_size
-        found: npt.NDArray[np.bool_] = (self._read() & np.uint32(bits & 0xFFFFFFFF)) != 0
-        return found
-
-    def next_use(self, blocks: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the number of the first batch that sees each block; more than any where none does."""
-        seen = self._read()[blocks].astype(np.int64)
-        first_view = np.frexp((seen & -seen).astype(np.float64))[1] - 1
-        return np.where(seen == 0, _MOST_VIEWS, first_view // self._batch_size).astype(np.int64)
 
 
 def _row_bytes(column: Tensor) -> int:

@@ -13,7 +13,8 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.view.gate import SceneGate
-from blitzgs.view.residence import Cameras, Residence
+from blitzgs.view.residence import Residence
+from blitzgs.view.sight import Cameras
 
 # What views are rendered from: a table on their device, or one on the host with its pool.
 Scene = GaussianTable | Residence

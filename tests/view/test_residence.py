@@ -11,7 +11,8 @@ from blitzgs.ops.residence import seen_blocks
 from blitzgs.view import host_table
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostMemoryError, HostTable
-from blitzgs.view.residence import Cameras, Residence, ResidenceError, Traffic
+from blitzgs.view.residence import Residence, ResidenceError, Traffic
+from blitzgs.view.sight import Cameras
 from tests.helpers import DEVICES
 from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which blocks the views of this step and of steps to come may see."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from blitzgs.ops.residence import seen_blocks
+
+MOST_VIEWS = 32  # that are looked at together
+
+
+class Cameras(NamedTuple):
+    """Views of any sizes, on the device, and the limits they share.
+
+    Attributes:
+        viewmats: float32 [V, 4, 4], world to camera.
+        Ks: float32 [V, 3, 3], pixels.
+        sizes: int32 [V, 2], width and height, pixels.
+        limits: near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
+    """
+
+    viewmats: Tensor
+    Ks: Tensor
+    sizes: Tensor
+    limits: tuple[float, float, float]
+
+
+class Sight:
+    """Which blocks the views of some batches see; the numbers travel to the host in the background."""
+
+    def __init__(self, bounds: Tensor, cameras: Cameras, batch_size: int) -> None:
+        """Begin to look.
+
+        Args:
+            bounds: of N blocks, float32 [N, 8].
+            cameras: views of some batches, in their order, at most 32.
+            batch_size: views of a batch.
+        """
+        self._batch_size = batch_size
+        seen = seen_blocks(bounds, *cameras[:3], *cameras.limits)
+        self._event: torch.cuda.Event | None = None
+        if seen.is_cuda:
+            host = torch.empty(seen.shape, dtype=seen.dtype, pin_memory=True)
+            host.copy_(seen, non_blocking=True)
+            self._event = torch.cuda.current_stream(seen.device).record_event()
+            seen = host
+        self._seen = seen
+
+    def _read(self) -> npt.NDArray[np.uint32]:
+        if self._event is not None:
+            self._event.synchronize()
+            self._event = None
+        return self._seen.numpy().view(np.uint32)
+
+    def by(self, batch: int) -> npt.NDArray[np.bool_]:
+        """Return the blocks that a batch (0 is the first) sees, bool [N]; waits for the device."""
+        bits = ((1 << self._batch_size) - 1) << batch * self._batch_size
+        found: npt.NDArray[np.bool_] = (self._read() & np.uint32(bits & 0xFFFFFFFF)) != 0
+        return found
+
+    def next_use(self, blocks: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return the number of the first batch that sees each block; more than any where none does."""
+        seen = self._read()[blocks].astype(np.int64)
+        first_view = np.frexp((seen & -seen).astype(np.float64))[1] - 1
+        return np.where(seen == 0, MOST_VIEWS, first_view // self._batch_size).astype(np.int64)
