@@ -17,12 +17,13 @@ from blitzgs.ops.counter_random import hash_keys, normal
 from blitzgs.population.candidates import Candidates, Veto, spawn_features
 from blitzgs.population.importance import CULL, PHI
 from blitzgs.population.lineage import Births, Cause, Lineage
+from blitzgs.population.scale_floor import FLOOR
 from blitzgs.view.blocks import morton_order
 
 SPLIT_SHRINK = 1.6
 CHILDREN_OF_A_SPLIT = 2
-# Columns of the importance passes, once there are any, that children have of their parent.
-INHERITED = (PHI, CULL)
+# Columns, once there are any, that children have of their parent.
+INHERITED = (PHI, CULL, FLOOR)
 # Columns that gather what happens between density events.
 STATISTICS = ("grad_sum", "grad_count", "max_radii")
 _ID_MASK = (1 << 63) - 1

@@ -58,6 +58,9 @@ class ModelConfig:
         eps2d: screen-space blur added to the projected covariance, pixels squared.
         deterministic: repeat a run bit for bit on CUDA too (the CPU always does), at some cost.
         initial_opacity: opacity of the initial Gaussians.
+        scale_floor: smallest standard deviation of a Gaussian, in pixels of the training view that samples it
+            most finely, which is found anew at every tenth density event; 0: none. Mip-Splatting's 3D filter
+            has 0.447.
     """
 
     sh_degree: int = 3
@@ -68,6 +71,7 @@ class ModelConfig:
     eps2d: float = 0.3
     deterministic: bool = False
     initial_opacity: float = 0.1
+    scale_floor: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,7 @@ RANGES: Mapping[str, Range] = {
     "model.far": Range(1e-9, 1e12),
     "model.eps2d": Range(0, 100),
     "model.initial_opacity": Range(1e-4, 0.9999),
+    "model.scale_floor": Range(0, 100),
     "lod.fork": Range(1.01, 100),
     "lod.visible_threshold": Range(0, 1),
     "lod.base_resolution": Range(1e-6, 1),

@@ -15,6 +15,7 @@ from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import Frame, RenderOptions
 from blitzgs.population.exploration import PositionNoise
 from blitzgs.population.importance import CULL
+from blitzgs.population.scale_floor import FLOOR, raise_scales
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms, loss_terms
@@ -163,6 +164,8 @@ class Stepper:
         )
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
+        if FLOOR in table:
+            raise_scales(table, frame.projected.visible_ids)
         mark("optimiser")
         self._blocks.update(table, frame.projected.visible_ids)
         mark("other")

@@ -38,7 +38,7 @@ RELOCATION = ("population.strategy=relocation", "loss.opacity=0.01", "population
 OPTIONS = {
     "relocation": RELOCATION,
     "absolute": ("population.absolute_gradients=true", "population.absolute_threshold=8e-3"),
-    "relocate": ("population.relocate=true", "population.max_gaussians=490"),
+    "relocate": ("population.relocate=true", "model.scale_floor=0.447", "population.max_gaussians=490"),
 }
 FIRST = Path("checkpoints") / "checkpoint_000000"
 

@@ -70,6 +70,14 @@ VARIANTS = {
         "schedule.evaluate_every=25",
         "schedule.checkpoint_every=35",
     ),
+    "relocation": (
+        "population.relocate=true",
+        "population.absolute_gradients=true",
+        "population.min_opacity=0.08",
+        "population.reset_opacity=0.09",
+        "loss.opacity=0.01",
+        "model.scale_floor=0.447",
+    ),
     "resets": (
         "schedule.reset_every=15",
         "population.opacity_decay=0.01",

@@ -12,6 +12,7 @@ from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, 
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
 from blitzgs.population.redistribution import redistribute
 from blitzgs.population.relocation import relocate
+from blitzgs.population.scale_floor import FLOOR, scale_floors
 from blitzgs.training.guard import ModelLostError, check_table
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
@@ -51,6 +52,8 @@ def run(state: TrainingState, event: Event) -> None:
     if redistribute(state.table, state.ranks, state.config.ranks.max_imbalance):
         counts["redistributed"] = 1
         state.sort()
+    if state.config.model.scale_floor > 0 and _finds_floors(state, event.time):
+        find_floors(state)
     state.stepper.reindex()
     peak = max(state.progress.peak_gaussians, counts["gaussians"])
     state.progress = dataclasses.replace(state.progress, peak_gaussians=peak)
@@ -89,6 +92,21 @@ def change_population(state: TrainingState, time: int, rules: DensityRules) -> D
     if moved is None:
         return report
     return dataclasses.replace(report, cloned=report.cloned + moved.cloned, relocated=moved.relocated)
+
+
+def find_floors(state: TrainingState) -> None:
+    """Find the floor of each Gaussian's scales."""
+    model = state.config.model
+    views = (state.views.pick([index]) for index in state.capture.train)
+    near = model.near * state.space.extent
+    state.table[FLOOR] = scale_floors(state.table["means"], views, near, model.scale_floor)
+
+
+def _finds_floors(state: TrainingState, time: int) -> bool:
+    """Tell whether a density event finds the floors of scales anew: the first, and then every tenth."""
+    schedule, unscaled = state.config.schedule, state.schedule.pace.time(time)
+    count = round((unscaled - schedule.densify_from) / schedule.densify_every)
+    return count % 10 == 0
 
 
 def training_pixels(state: TrainingState) -> int:
