@@ -220,7 +220,7 @@ class Residence:
 
     def prefetch(self, step: int) -> None:
         """While the step of `bring` runs, load the blocks of the next one, `step`."""
-        now, soon = self._sight.by(0), self._sight.by(1)
+        now = self._sight.by(0)
         slots = self._slot_of[now.nonzero()[0]]
         if (slots < 0).any():
             raise RuntimeError("blocks of this step have left the pool; this is a bug, please report it")
@@ -229,7 +229,8 @@ class Residence:
         self._is_changed[slots] = True
         self._rest_changed = self._rest > 0
         self._count(steps=1, needed=len(slots))
-        if self._load(soon, self._begun, kept=now):
+        # Batches of more than half of what can be looked at together show no more than the present one.
+        if self._sight.batches > 1 and self._load(self._sight.by(1), self._begun, kept=now):
             self._ready_for = step
 
     def note(self, index: BlockIndex) -> None:

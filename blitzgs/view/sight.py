@@ -32,7 +32,11 @@ class Cameras(NamedTuple):
 
 
 class Sight:
-    """Which blocks the views of some batches see; the numbers travel to the host in the background."""
+    """Which blocks the views of some batches see; the numbers travel to the host in the background.
+
+    Attributes:
+        batches: how many.
+    """
 
     def __init__(self, bounds: Tensor, cameras: Cameras, batch_size: int) -> None:
         """Begin to look.
@@ -43,6 +47,7 @@ class Sight:
             batch_size: views of a batch.
         """
         self._batch_size = batch_size
+        self.batches = len(cameras.viewmats) // batch_size
         seen = seen_blocks(bounds, *cameras[:3], *cameras.limits)
         self._event: torch.cuda.Event | None = None
         if seen.is_cuda:

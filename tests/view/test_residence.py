@@ -140,6 +140,18 @@ def test_a_step_waits_for_what_did_not_come_ahead():
             residence.prefetch(step + 1)
 
 
+def test_large_batches_do_without_a_look_ahead():
+    _, residence = make_residence(60_000, slots=233)
+    course = cameras(40)
+    course.Ks[:, :2, :2] *= 8
+    for step in range(2):
+        index = residence.bring(step, first(course, 20 * step, 20), 20)
+        found = index.active(residence.pool, *first(course, 20 * step, 20)[:2], WIDTH, HEIGHT, *LIMITS)
+        assert int(found.length) > 0
+        residence.prefetch(step + 1)
+    assert residence.traffic.needed > residence.traffic.loaded
+
+
 def test_a_budget_below_two_blocks_is_refused():
     with pytest.raises(ResidenceError, match="less than two blocks"):
         make_residence(slots=0)
