@@ -101,6 +101,11 @@ class ScheduleConfig:
             measures how fast it is and changes its pace accordingly; `scale` stays 1. 0: no such limit.
         pace: pairs (image of the run, factor): from that image on, `scale` counts times the factor. A run
             with `minutes` notes its changes of pace here; without `minutes` they are followed as they are.
+        adaptive: places `t1`, `densify_until` and `t2`, in this order, where the run's own growth and loss
+            say, at most `adaptive_limit` of each earlier or later (`blitzgs/training/adaptive.py`).
+        adaptive_limit: that share.
+        placed: the places found so far, up to three times. A run with `adaptive` notes them here; without it
+            they are followed as they are.
         batch_size: views per optimiser step B; one step advances the clock by B.
         densify_from, densify_until, densify_every: density-control events at from, from + every, ... < until.
         size_prune_after: density events later than this also prune by size.
@@ -121,6 +126,9 @@ class ScheduleConfig:
     scale: float = 1.0
     minutes: float = 0.0
     pace: tuple[tuple[int, float], ...] = ()
+    adaptive: bool = False
+    adaptive_limit: float = 0.4
+    placed: tuple[int, ...] = ()
     batch_size: int = 1
     densify_from: int = 500
     densify_until: int = 15_000

@@ -66,6 +66,8 @@ RANGES: Mapping[str, Range] = {
     "schedule.scale": SCALE,
     "schedule.minutes": Range(0, 1e6),
     "schedule.pace": Range(1e-4, 1e9),
+    "schedule.adaptive_limit": Range(0, 1, high_open=True),
+    "schedule.placed": _TIME,
     "schedule.batch_size": Range(1, 32),
     "schedule.densify_from": _TIME,
     "schedule.densify_until": _TIME,
@@ -148,6 +150,7 @@ def problems(config: Config) -> Iterator[str]:
         # The rate falls by a power of the ratio of position_final to it, which must stay a number.
         yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
     yield from _problems_of_length(schedule)
+    yield from _problems_of_places(schedule)
     if not population.min_opacity < population.reset_opacity:
         yield (
             f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
@@ -184,6 +187,19 @@ def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
         yield (
             f"schedule.scale: must be 1 with schedule.minutes (--minutes), which chooses the scale; got "
             f"{schedule.scale}: add --schedule.scale=1 or leave out the minutes"
+        )
+
+
+def _problems_of_places(schedule: ScheduleConfig) -> Iterator[str]:
+    """Say what is wrong with where T1, the end of densification and T2 are."""
+    placed = [time for time in schedule.placed if time > 0]
+    if len(schedule.placed) > 3 or placed != sorted(placed):
+        yield f"schedule.placed: must be up to 3 times, none before the last, got {list(schedule.placed)}"
+    times = [time for time in (schedule.t1, schedule.densify_until, schedule.t2) if time > 0]
+    if schedule.adaptive and times != sorted(times):
+        yield (
+            "schedule.adaptive: needs t1 <= densify_until <= t2, of which t1 and t2 may be 0; got "
+            f"{schedule.t1}, {schedule.densify_until} and {schedule.t2}"
         )
 
 

@@ -17,7 +17,7 @@ from blitzgs.training.inputs import capture_fingerprint
 
 # Fields of these sections that do not decide how long Gaussians live.
 _IDLE = {
-    "schedule": ("checkpoint_every", "evaluate_every", "gate_from", "minutes"),
+    "schedule": ("checkpoint_every", "evaluate_every", "gate_from", "minutes", "adaptive_limit", "placed"),
     "population": ("lineage", "gate", "gate_rate"),
 }
 

@@ -65,6 +65,7 @@ class Progress:
         gated_views: the training views, in their order, as "1" where the LOD gate holds and "0" where it
             would keep almost all; empty without a gate.
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
+        signals: `blitzgs.training.adaptive.Signals.saved`, where there are any.
     """
 
     step: int
@@ -78,6 +79,7 @@ class Progress:
     finest_level: int | None = None
     gated_views: str = ""
     train_views: str = ""
+    signals: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 @dataclass
@@ -249,12 +251,14 @@ def with_pace_of(config: Config, saved: Config | None) -> Config:
     """Return a configuration for going on from a checkpoint, or from the start where `saved` is None.
 
     With `schedule.minutes` the run has measured its pace so far, or is about to measure it; without, the
-    configuration says what the pace is.
+    configuration says what the pace is. The same goes for the places of `schedule.adaptive`.
     """
-    if config.schedule.minutes == 0:
-        return config
-    pace = () if saved is None else saved.schedule.pace
-    return dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, pace=pace))
+    schedule = config.schedule
+    if schedule.minutes > 0:
+        schedule = dataclasses.replace(schedule, pace=() if saved is None else saved.schedule.pace)
+    if schedule.adaptive:
+        schedule = dataclasses.replace(schedule, placed=() if saved is None else saved.schedule.placed)
+    return dataclasses.replace(config, schedule=schedule)
 
 
 def _is_free(name: str) -> bool:

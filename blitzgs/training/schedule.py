@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -13,7 +13,13 @@ from torch import Tensor
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
 from blitzgs.training.pace import Pace
 
-EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "evaluate", "checkpoint"]
+EventKind = Literal[
+    "densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "place", "evaluate", "checkpoint"
+]
+# What `schedule.placed` holds, in this order.
+PLACED = ("t1", "densify_until", "t2")
+# Nothing is placed later than this share of the run, unless the fixed schedule has it there.
+_LAST_PLACE = 0.95
 # The columns of the learning-rate table.
 RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
@@ -25,6 +31,25 @@ class Event:
     time: int
     order: int
     kind: EventKind
+
+
+def latest_times(config: ScheduleConfig) -> list[int]:
+    """Return the latest places of T1, the end of densification and T2, in times of the configuration."""
+    most = 1 + config.adaptive_limit if config.adaptive else 1.0
+    last = int(_LAST_PLACE * config.iterations)
+    times = (config.t1, config.densify_until, config.t2)
+    return [min(int(most * time), max(time, last)) for time in times]
+
+
+def _with_places(config: ScheduleConfig) -> ScheduleConfig:
+    """Return a configuration with T1, the end of densification and T2 where they are placed.
+
+    What is still open is expected as late as it may come.
+    """
+    if not (config.adaptive or config.placed):
+        return config
+    t1, until, t2 = (*config.placed, *latest_times(config)[len(config.placed) :])
+    return replace(config, t1=t1, densify_until=until, t2=t2)
 
 
 class Schedule:
@@ -41,7 +66,7 @@ class Schedule:
     """
 
     def __init__(self, config: ScheduleConfig) -> None:
-        self._config = config
+        self._config = _with_places(config)
         self.pace = Pace(config.scale, config.pace)
         self.batch_size = config.batch_size
         self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
@@ -61,6 +86,7 @@ class Schedule:
             ("pass_1", config.t1, config.t1 + 1, min(config.t1, 1)),
             ("pass_2", config.t2, config.t2 + 1, min(config.t2, 1)),
             self._clear_cull(),
+            ("place", config.densify_from, config.iterations, self._looks_every()),
             ("evaluate", config.evaluate_every, math.inf, config.evaluate_every),
             ("checkpoint", config.checkpoint_every, math.inf, config.checkpoint_every),
         ]
@@ -71,6 +97,12 @@ class Schedule:
             for time in self._series(first, until, every, begin, end)
         ]
         return sorted(found)
+
+    def _looks_every(self) -> int:
+        """Return how often a run looks for the next time to place; 0: it need not."""
+        config = self._config
+        is_open = config.adaptive and len(config.placed) < len(PLACED)
+        return config.densify_every if is_open else 0
 
     def _clear_cull(self) -> tuple[EventKind, float, float, float]:
         """Drop the cull mask halfway between the last importance pass and the end."""

@@ -16,6 +16,7 @@ from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.lineage import Lineage, initial_births, ledger_of
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run
+from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.batches import Images
 from blitzgs.training.config import Config
@@ -119,6 +120,7 @@ def set_up(
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=open_gate(config, capture, ranks),
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
+        signals=Signals.of(progress.signals) if config.schedule.adaptive else None,
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
 

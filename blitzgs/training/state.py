@@ -19,6 +19,7 @@ from blitzgs.pipeline import RenderOptions
 from blitzgs.population.candidates import Veto
 from blitzgs.population.lineage import Lineage
 from blitzgs.scene.capture import Capture
+from blitzgs.training.adaptive import Signals
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.batches import Images
 from blitzgs.training.config import Config
@@ -68,6 +69,7 @@ class TrainingState:
         log: where the run reports; silent until the loop opens the run's own.
         stops: whether the run has to stop soon, which long events ask every few seconds; the same answer on
             every rank. The loop that runs the events sets it.
+        signals: what a run with `schedule.adaptive` has measured, or None.
         clock: monotonic seconds, that training time is counted by.
     """
 
@@ -93,6 +95,7 @@ class TrainingState:
     lineage: Lineage | None
     log: RunLog
     growth_was_limited: bool = False
+    signals: Signals | None = None
     stops: Callable[[], bool] = never
     clock: Callable[[], float] = time.monotonic
     _started: float = field(default_factory=time.monotonic)

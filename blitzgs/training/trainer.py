@@ -29,6 +29,7 @@ from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
+from blitzgs.training.schedule import PLACED
 from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
 from blitzgs.training.step_report import log_step, measure_step
@@ -150,6 +151,8 @@ class Trainer:
         frame, terms, sums = state.stepper.forward(step, options, batch, gate=gate)
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.stepper.table, frame)
+        if state.signals is not None:
+            state.signals.add(sums, len(names), batch.views.width * batch.views.height)
         is_logged = end // config.log.every > begin // config.log.every
         measured = measure_step(state, frame, batch) if is_logged else None
         v_means2d = state.stepper.backward(
@@ -230,10 +233,13 @@ class Trainer:
                 "budget_seconds": 60 * state.config.schedule.minutes,
                 "scale": state.images_seen / state.config.schedule.iterations,
             }
+        if state.signals is not None:
+            places = zip(PLACED, state.config.schedule.placed, state.signals.reasons, strict=False)
+            summary["placed"] = {name: {"time": time, "reason": reason} for name, time, reason in places}
         if state.ranks.rank == 0:
             write_picture(state, population)
             try:
-                # The pace has been measured since the run wrote its configuration.
+                # The pace and the places have been measured since the run wrote its configuration.
                 save_config(state.config, state.folder / run.CONFIG)
                 write_file(state.folder / run.SUMMARY, json.dumps(summary, indent=1))
             except OSError as error:

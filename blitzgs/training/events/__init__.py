@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from blitzgs.training.events import clear_cull, densify, evaluate, importance, reset_opacities, save
+from blitzgs.training.events import clear_cull, densify, evaluate, importance, place, reset_opacities, save
 from blitzgs.training.schedule import Event, EventKind
 from blitzgs.training.state import TrainingState
 
@@ -19,6 +19,7 @@ HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
     "pass_1": importance.run,
     "pass_2": importance.run,
     "clear_cull": clear_cull.run,
+    "place": place.run,
     "evaluate": evaluate.run,
     "checkpoint": save.run,
 }

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run with `schedule.adaptive` measures, and where it places T1, the end of densification and T2.
+
+Two signals are looked at, each the same on every rank because it is made of sums over all ranks:
+
+- the growth of the population from look to look, in the mean over the last looks and at its highest. Early in
+  a run it is high; where it falls, few candidates are left that the statistics ask for;
+- the loss, mean |render - photograph| over windows of at least one epoch, in which all views count alike. Its
+  relative fall per share of the schedule says what more of the same would still bring.
+
+T1 comes when growth has slowed, densification ends when growth has all but stopped or the loss no longer
+falls, and T2 comes when the loss has settled after that. Each of them lies within `schedule.adaptive_limit`
+of where the fixed schedule has it, and all three in this order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from blitzgs.distributed.host_sum import HostSum
+from blitzgs.training.config import ScheduleConfig
+from blitzgs.training.schedule import PLACED, latest_times
+
+# Milestones of a run: what its importance passes left.
+AFTER_PASSES = ("after_pass_1", "after_pass_2")
+# Growth is the mean over so many looks.
+LOOKS = 3
+# Growth relative to its highest: slowed, and all but stopped.
+SLOWED, STOPPED = 0.5, 0.1
+# A window of the loss is at least this share of the schedule.
+WINDOW = 1 / 60
+# The fall of the logarithm of the loss, per length of the schedule, below which it counts as settled: going
+# on so for all of the schedule would bring a loss that is 10 % lower.
+SETTLED = 0.1
+
+
+@dataclass
+class Signals:
+    """What has been measured so far; saved with every checkpoint.
+
+    Attributes:
+        loss: sum of the steps' mean losses since the last window, and their images.
+        windows: pairs (time of the configuration at the end, mean loss), oldest first.
+        population: Gaussians at the last look.
+        growth: relative, at each look.
+        passes: importance passes before the last look.
+        step: of the last look.
+        reasons: for each of the times that are placed.
+    """
+
+    loss: tuple[float, int] = (0.0, 0)
+    windows: list[list[float]] = field(default_factory=list)
+    population: int = 0
+    growth: list[float] = field(default_factory=list)
+    passes: int = 0
+    step: int = 0
+    reasons: list[str] = field(default_factory=list)
+    _pending: tuple[HostSum, int, float] | None = None
+
+    @classmethod
+    def of(cls, saved: dict[str, Any]) -> Signals:
+        """Go on from what `saved` returned; anew from an empty dictionary."""
+        return cls(**saved | ({"loss": tuple(saved["loss"])} if saved else {}))
+
+    def saved(self) -> dict[str, Any]:
+        """Return everything that is known, of the last step too, as JSON holds it."""
+        self._read()
+        names = [entry.name for entry in dataclasses.fields(self) if entry.name != "_pending"]
+        return {name: list(x) if isinstance(x := getattr(self, name), (list, tuple)) else x for name in names}
+
+    def add(self, sums: HostSum, views: int, pixels: int) -> None:
+        """Note a step's loss, to be read with the next step's, when nothing has to be waited for.
+
+        Args:
+            sums: of the step.
+            views: B.
+            pixels: of each view.
+        """
+        self._read()
+        self._pending = sums, views, 3.0 * pixels
+
+    def _read(self) -> None:
+        if self._pending is None:
+            return
+        (sums, views, samples), self._pending = self._pending, None
+        total, images = self.loss
+        of_step = math.fsum(sums.read()[:views].tolist()) / samples
+        self.loss = total + of_step, images + views
+
+    def look(self, step: int, time: float, population: int, milestones: dict[str, int], window: int) -> None:
+        """Take note of where the run stands.
+
+        Args:
+            step: optimiser steps taken.
+            time: of the configuration.
+            population: Gaussians of all ranks.
+            milestones: `Progress.milestones`.
+            window: images that a window of the loss has at least.
+        """
+        self._read()
+        before = self.population
+        after_passes = [milestones[name] for name in AFTER_PASSES if name in milestones]
+        if len(after_passes) > self.passes:
+            before = after_passes[-1]  # what a pass took out is no growth
+        if before > 0:
+            self.growth.append(max(0.0, population / before - 1))
+        self.step, self.population, self.passes = step, population, len(after_passes)
+        total, images = self.loss
+        if images >= window:
+            self.windows.append([time, total / images])
+            self.loss = 0.0, 0
+
+    def next_place(self, config: ScheduleConfig, time: float) -> tuple[int, str] | None:
+        """Return where the next of the three times lies, and why; None: not yet, or all are placed.
+
+        Args:
+            config: with the times that are placed.
+            time: of the configuration, now.
+        """
+        index = len(config.placed)
+        if index == len(PLACED):
+            return None
+        fixed = (config.t1, config.densify_until, config.t2)[index]
+        if fixed == 0:
+            return 0, "there is none"
+        latest = latest_times(config)[index]
+        if time >= latest:
+            return latest, "the latest that schedule.adaptive_limit allows"
+        if time < self._earliest(config, index, fixed):
+            return None
+        reason = self._slow_growth(SLOWED if index == 0 else STOPPED) if index < 2 else None
+        if reason is None and index > 0:
+            reason = self._settled_loss(config, config.placed[1] if index == 2 else config.placed[0])
+        return None if reason is None else (math.ceil(time), reason)
+
+    def _earliest(self, config: ScheduleConfig, index: int, fixed: int) -> float:
+        least = 1 - config.adaptive_limit
+        if index < 2:
+            return least * fixed
+        # T2 keeps some of its distance from the end of densification.
+        return config.placed[1] + least * (config.t2 - config.densify_until)
+
+    def _slow_growth(self, share: float) -> str | None:
+        if len(self.growth) <= LOOKS:
+            return None
+        means = [sum(self.growth[k : k + LOOKS]) / LOOKS for k in range(len(self.growth) - LOOKS + 1)]
+        if means[-1] > share * max(means):
+            return None
+        return (
+            f"the population grows by {means[-1]:.2%} from look to look, after {max(means):.2%} at its peak"
+        )
+
+    def _settled_loss(self, config: ScheduleConfig, since: float) -> str | None:
+        windows = [window for window in self.windows if window[0] > since]
+        if len(windows) < LOOKS:
+            return None
+        (begin, first), (end, last) = windows[-LOOKS], windows[-1]
+        fall = math.log(max(first, 1e-12) / max(last, 1e-12)) * config.iterations / (end - begin)
+        if fall > SETTLED:
+            return None
+        return f"the loss fell from {first:.5f} to {last:.5f} between {begin:,.0f} and {end:,.0f}"

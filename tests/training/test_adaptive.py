@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The adaptive schedule: what it measures, where it places its times, and that a run can be repeated."""
+
+import json
+import math
+import os
+import random
+import signal
+from dataclasses import replace
+
+import pytest
+import torch
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training.adaptive import SETTLED, Signals
+from blitzgs.training.config import ScheduleConfig
+from blitzgs.training.config_io import ConfigError
+from blitzgs.training.schedule import Schedule, latest_times
+from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.training.test_trainer import assert_same_table
+from tests.training.tiny import tiny_config, tiny_scene
+
+CONFIG = ScheduleConfig(
+    iterations=3_000, densify_from=100, densify_until=1_500, densify_every=50, t1=800, t2=1_600, adaptive=True
+)
+FLAGS = (
+    "schedule.adaptive=true",
+    "schedule.iterations=160",
+    "schedule.densify_every=8",
+    "schedule.densify_from=16",
+    "schedule.densify_until=80",
+    "schedule.t1=48",
+    "schedule.t2=96",
+    "population.importance=true",
+    "view.lod=true",
+    "log.pictures=0",
+)
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def signals(growth=(), windows=()):
+    return Signals(growth=list(growth), windows=[list(window) for window in windows])
+
+
+def test_t1_comes_when_growth_has_slowed():
+    falling = [0.2, 0.2, 0.2, 0.2, 0.1, 0.05, 0.05]
+    early, late = 0.6 * CONFIG.t1, latest_times(CONFIG)[0]
+    assert late == 1_120
+    assert signals(falling).next_place(CONFIG, early - 1) is None
+    place, reason = signals(falling).next_place(CONFIG, early + 0.5)
+    assert place == early + 1
+    assert reason == "the population grows by 6.67% from look to look, after 20.00% at its peak"
+    assert signals([0.2, 0.2, 0.15, 0.15, 0.15]).next_place(CONFIG, late - 1) is None
+    place, reason = signals([0.2] * 5).next_place(CONFIG, late + 3)
+    assert (place, reason) == (late, "the latest that schedule.adaptive_limit allows")
+    assert signals(falling[-3:]).next_place(CONFIG, early) is None  # too little is known
+    assert signals().next_place(replace(CONFIG, t1=0), 0.0) == (0, "there is none")
+
+
+def test_densification_ends_with_growth_or_when_the_loss_settles():
+    config, now = replace(CONFIG, placed=(700,)), 1_000.0
+    grows = [0.2] * 6
+    assert signals(grows).next_place(config, now) is None
+    place, reason = signals([*grows, 0.02, 0.01, 0.0]).next_place(config, now)
+    assert place == 1_000 and reason.startswith("the population grows by 1.00%")
+    for pace, settled in ((1.1 * SETTLED, False), (0.9 * SETTLED, True)):
+        windows = [(time, 0.1 * math.exp(-pace * time / 3_000)) for time in (650, 750, 850, 950)]
+        found = signals(grows, windows).next_place(config, now)
+        assert (found is not None) == settled
+        assert not settled or "between 750 and 950" in found[1]
+    # What came before T1 says nothing about what came after.
+    assert signals(grows, [(500, 0.1), (600, 0.1), (750, 0.1)]).next_place(config, now) is None
+
+
+def test_t2_comes_when_the_loss_has_settled_after_densification():
+    config = replace(CONFIG, placed=(700, 1_200))
+    still = [(1_150, 0.1), (1_250, 0.1), (1_300, 0.1), (1_350, 0.1)]
+    assert signals((), still[:3]).next_place(config, 1_300.0) is None
+    assert signals((), still).next_place(config, 1_259.0) is None  # 0.6 of the distance of 100
+    assert signals((), still).next_place(config, 1_360.0)[0] == 1_360
+    assert signals([0.0] * 9).next_place(config, 1_360.0) is None
+    assert signals().next_place(replace(config, placed=(700, 1_200, 1_360)), 9e9) is None
+
+
+def test_what_a_pass_takes_out_is_no_growth():
+    found = Signals()
+    for step, population, milestones in (
+        (1, 100, {"initial": 90}),
+        (2, 150, {"initial": 90}),
+        (3, 110, {"initial": 90, "after_pass_1": 100}),
+        (4, 99, {"initial": 90, "after_pass_1": 100}),
+    ):
+        found.look(step, 10.0 * step, population, milestones, window=1)
+    assert found.growth == pytest.approx([0.5, 0.1, 0.0])
+
+
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_what_has_happened_stays_when_a_time_is_placed(batch_size):
+    chance = random.Random(5)
+    for scale in (0.3, 1.0, 2.0):
+        config = replace(CONFIG, batch_size=batch_size, scale=scale, reset_every=300)
+        schedule, happened, step = Schedule(config), [], 0
+        while step < schedule.steps:
+            begin, step = step * batch_size, step + 1
+            events = schedule.events(begin, begin + batch_size)
+            happened += [event for event in events if event.kind != "place"]
+            if any(event.kind == "place" for event in events):
+                time = schedule.pace.time(step * batch_size)
+                index = len(config.placed)
+                if time >= (latest := latest_times(config)[index]):
+                    config = replace(config, placed=(*config.placed, latest))
+                elif chance.random() < 0.05 and time > 200:
+                    config = replace(config, placed=(*config.placed, math.ceil(time)))
+                schedule = Schedule(config)
+        assert len(config.placed) == 3
+        assert config.placed[0] <= config.placed[1] <= config.placed[2]
+        fixed = Schedule(replace(config, adaptive=False))
+        assert happened == fixed.events(0, fixed.iterations)
+        kinds = [event.kind for event in happened]
+        assert kinds.count("pass_1") == kinds.count("pass_2") == kinds.count("clear_cull") == 1
+
+
+def train(folder, *overrides, resume=False):
+    trainer = Trainer(tiny_config(*FLAGS, *overrides), *tiny_scene(), folder, Ranks(), resume)
+    return trainer, trainer.train()
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("adaptive")
+    return folder, *train(folder)
+
+
+def test_a_run_places_its_times_and_says_why(whole_run):
+    folder, trainer, summary = whole_run
+    placed = trainer.state.config.schedule.placed
+    assert len(placed) == 3 and list(placed) == sorted(placed)
+    for place, fixed in zip(placed, (48, 80, 96), strict=True):
+        assert 0.6 * fixed - 1 <= place <= 1.4 * fixed
+    assert placed != (48, 80, 96)
+    assert [summary["placed"][name]["time"] for name in ("t1", "densify_until", "t2")] == list(placed)
+    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    logged = [record for record in records if record.get("event") == "place"]
+    assert [record["time"] for record in logged] == list(placed)
+    assert all(record["reason"] for record in logged)
+    assert [record["reason"] for record in logged] == [x["reason"] for x in summary["placed"].values()]
+    times = {record["event"]: record["t"] for record in records if "event" in record}
+    assert times["pass_1"] == placed[0] and times["pass_2"] == placed[2]
+    assert times["densify"] < placed[1]
+    assert trainer.state.signals.windows and trainer.state.signals.growth
+    assert json.loads((folder / "summary.json").read_text())["placed"] == summary["placed"]
+
+
+def test_a_fixed_run_with_the_places_is_the_same(whole_run, tmp_path):
+    _, whole, _ = whole_run
+    placed = list(whole.state.config.schedule.placed)
+    fixed, summary = train(tmp_path, "schedule.adaptive=false", f"schedule.placed={placed}")
+    assert_same_table(fixed.state.table, whole.state.table)
+    assert "placed" not in summary and fixed.state.signals is None
+
+
+@pytest.mark.parametrize("last", [32, 41, 57, 90])
+def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
+    """Stopped at a look, within a window of the loss, and after places."""
+    _, whole, _ = whole_run
+    step = Trainer.step
+
+    def interrupted(self, number):
+        step(self, number)
+        if number == last:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Trainer, "step", interrupted)
+    assert train(tmp_path)[1] is None
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    second, summary = train(tmp_path, resume=True)
+    assert second.state.config.schedule.placed == whole.state.config.schedule.placed
+    assert second.state.signals.saved() == whole.state.signals.saved()
+    assert_same_table(second.state.table, whole.state.table)
+    assert summary["placed"] == whole_run[2]["placed"]
+
+
+def _train_on(ranks, folder):
+    torch.set_num_threads(1)
+    trainer = Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, ranks)
+    trainer.train()
+    return trainer.state.config.schedule.placed, trainer.state.signals.saved()
+
+
+@pytest.mark.parametrize(("world_size", "device"), on_each_device(2))
+def test_ranks_decide_alike(whole_run, tmp_path, world_size, device):
+    answers = run_ranks(_train_on, world_size, tmp_path, device=device)
+    assert all(answer == answers[0] for answer in answers)
+    if device == "cpu":
+        assert answers[0][0] == whole_run[1].state.config.schedule.placed
+
+
+@pytest.mark.parametrize("flag", ["schedule.scale=0.5", "schedule.minutes=0.02"])
+def test_places_are_times_of_the_configuration(tmp_path, flag):
+    trainer, summary = train(tmp_path, flag)
+    placed = trainer.state.config.schedule.placed
+    assert len(placed) == 3
+    for place, fixed in zip(placed, (48, 80, 96), strict=True):
+        assert 0.6 * fixed - 1 <= place <= 1.4 * fixed
+    assert list(summary["placed"]) == ["t1", "densify_until", "t2"]
+
+
+def test_errors_name_the_value():
+    with pytest.raises(ConfigError, match="adaptive: needs t1 <= densify_until <= t2.*got 48, 80 and 70"):
+        tiny_config(*FLAGS, "schedule.t2=70")
+    with pytest.raises(ConfigError, match=r"placed: must be up to 3 times.*got \[50, 40\]"):
+        tiny_config(*FLAGS, "schedule.placed=[50, 40]")
+    with pytest.raises(ConfigError, match=r"schedule.adaptive_limit: must be in \[0, 1\)"):
+        tiny_config(*FLAGS, "schedule.adaptive_limit=1")
