@@ -10,8 +10,9 @@ r"""How good models become, and how soon: captures x recipes x seeds, beside gsp
 
 A recipe is a configuration file or "defaults", with overrides; or one of gsplat's strategies, with options
 of its trainer (`benchmarks/opponents/gsplat_training.py`): gsplat-default (as in its wheel),
-gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) and gsplat-mcmc. A --plan
-holds the same in YAML:
+gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) and gsplat-mcmc; or
+"partition-4x5:" before a configuration, for blocks that are trained apart and merged
+(`benchmarks/opponents/spatial_partition.py`). A --plan holds the same in YAML:
 
     captures: {park: DATA/park}
     recipes: {aerial: configs/aerial.yaml, mcmc: gsplat-mcmc --cap_max=2000000}
@@ -71,10 +72,10 @@ class Job:
 class Pool:
     """Runs trainings side by side, one a slot."""
 
-    def __init__(self, out: Path, gpus: int, per_gpu: int) -> None:
-        """Share the GPUs, or without any the CPU, among `per_gpu` runs each."""
-        self.out, self.gpus, self.per_gpu = out, gpus, per_gpu
-        self.slots = list(range(max(gpus, 1) * per_gpu))
+    def __init__(self, out: Path, gpus: int, per_gpu: int, ranks: int = 1) -> None:
+        """Share the GPUs, or without any the CPU, among `per_gpu` runs each, or in groups of `ranks`."""
+        self.out, self.gpus, self.per_gpu, self.ranks = out, gpus, per_gpu, ranks
+        self.slots = list(range(max(gpus // ranks, 1) * per_gpu))
         self.jobs: list[Job] = []
         for folder in (quality_report.RUNS, "logs", "specs"):
             (out / folder).mkdir(parents=True, exist_ok=True)
@@ -95,12 +96,14 @@ class Pool:
             "BLITZGS_COMMIT": commit(),
         }
         if self.gpus:
-            visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
-            gpu = slot % self.gpus
-            environment["CUDA_VISIBLE_DEVICES"] = (
-                visible[gpu] if gpu < len(visible) and visible[gpu] else str(gpu)
-            )
+            visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+            visible = visible or [str(gpu) for gpu in range(self.gpus)]
+            first = slot % (self.gpus // self.ranks) * self.ranks
+            environment["CUDA_VISIBLE_DEVICES"] = ",".join(visible[first : first + self.ranks])
         command = [sys.executable, str(worker), str(spec_path), str(self.result_path(spec))]
+        if self.ranks > 1:
+            torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={self.ranks}"]
+            command[1:1] = torchrun
         process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
         self.jobs.append(Job(spec, slot, process, log))
 
@@ -225,6 +228,9 @@ def make_parser() -> argparse.ArgumentParser:
         "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
     )
     parser.add_argument("--per-gpu", type=positive, default=1, metavar="N", help="runs on each (%(default)s)")
+    parser.add_argument(
+        "--ranks", type=positive, default=1, metavar="N", help="GPUs that train each run (%(default)s)"
+    )
     parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
     parser.add_argument(
         "--collect",
@@ -250,10 +256,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if captures or recipes or args.collect is None:
             device = "cuda" if args.gpus > 0 else "cpu"
             seeds = args.seeds or plan.get("seeds") or [0]
-            specs = runs_of(captures, recipes, seeds, args.evaluate_at, args.lpips, device)
+            specs = runs_of(captures, recipes, seeds, args.evaluate_at, args.lpips, device, args.ranks)
+            if args.ranks > 1 and (args.per_gpu > 1 or 0 < args.gpus < args.ranks):
+                raise ValueError(f"--ranks {args.ranks} needs as many --gpus, and --per-gpu 1")
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    work(specs, Pool(args.out, args.gpus, args.per_gpu), args.minutes)
+    work(specs, Pool(args.out, args.gpus, args.per_gpu, args.ranks), args.minutes)
     print(quality_report.report(args.out))
     wanted = {spec.name for spec in specs}
     failed = [r for r in quality_report.read_runs(args.out / quality_report.RUNS) if r["status"] != "done"]

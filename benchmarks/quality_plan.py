@@ -19,6 +19,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, load_config, to_dict
 
 OPPONENT = "gsplat-"
+PARTITION = "partition-"
 DEFAULTS = "defaults"
 SAFE = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+=")
 
@@ -31,12 +32,14 @@ class RunSpec:
         capture: its name.
         data: overrides of the section `data`, the path among them.
         recipe: its name.
-        source: a YAML file, "defaults", or "gsplat-" and one of gsplat's strategies.
+        source: a YAML file, "defaults", "gsplat-" and one of gsplat's strategies, or
+            "partition-COLUMNSxROWS:" and a YAML file or "defaults".
         overrides: "--section.field=value" of the configuration, or "--option=value" of the opponent.
         seed: of the training.
         evaluate_at: image counts at which held-out views are measured, beside the end.
         lpips: TorchScript file, or None.
         device: "cpu" or "cuda".
+        ranks: processes, and GPUs, that train together.
     """
 
     capture: str
@@ -48,11 +51,26 @@ class RunSpec:
     evaluate_at: list[int]
     lpips: str | None
     device: str
+    ranks: int = 1
 
     @property
     def strategy(self) -> str | None:
         """The opponent's strategy; None when BlitzGS trains."""
         return self.source.removeprefix(OPPONENT) if self.source.startswith(OPPONENT) else None
+
+    @property
+    def grid(self) -> tuple[int, int] | None:
+        """Columns and rows of a spatial partition; None where the whole scene is trained.
+
+        Raises:
+            ValueError: the source is not as it should be.
+        """
+        if not self.source.startswith(PARTITION):
+            return None
+        shape = self.source.removeprefix(PARTITION).partition(":")[0].split("x")
+        if len(shape) != 2 or not all(number.isdigit() and int(number) > 0 for number in shape):
+            raise ValueError(f"{self.source}: write partition-COLUMNSxROWS:SOURCE, as partition-4x5:defaults")
+        return int(shape[0]), int(shape[1])
 
     def config(self) -> Config:
         """Return the training's configuration; an opponent's has the capture alone."""
@@ -63,7 +81,8 @@ class RunSpec:
             "schedule.evaluate_every=0",
             f"log.lpips_weights={json.dumps(self.lpips)}",
         ]
-        path = None if self.strategy is not None or self.source == DEFAULTS else self.source
+        source = self.source if self.grid is None else self.source.partition(":")[2]
+        path = None if self.strategy is not None or source == DEFAULTS else source
         return load_config(path, [*own, *self.data, *log])
 
     def options(self) -> GsplatOptions:
@@ -78,12 +97,15 @@ class RunSpec:
         del values["log"], values["data"]["path"], values["seed"]
         if self.strategy is not None:
             values = {"data": values["data"], "strategy": self.strategy} | dataclasses.asdict(self.options())
+        if self.grid is not None:
+            values["grid"] = self.grid
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
 
     @property
     def name(self) -> str:
         """Of the run's files."""
-        return f"{self.capture}.{self.recipe}.s{self.seed}.{self.settings}"
+        together = f".r{self.ranks}" if self.ranks > 1 else ""
+        return f"{self.capture}.{self.recipe}.s{self.seed}.{self.settings}{together}"
 
 
 def parse_flags(flags: Iterable[str]) -> dict[str, Any]:
@@ -141,6 +163,7 @@ def runs_of(
     evaluate_at: Sequence[int],
     lpips: Path | None,
     device: str,
+    ranks: int = 1,
 ) -> list[RunSpec]:
     """Return every run, checked; all recipes and captures of one seed come before the next seed.
 
@@ -151,6 +174,7 @@ def runs_of(
         evaluate_at: see `RunSpec`.
         lpips: TorchScript file, or None.
         device: "cpu" or "cuda".
+        ranks: of each run.
 
     Raises:
         ValueError: something is missing or cannot be used; names it.
@@ -175,6 +199,7 @@ def runs_of(
                     evaluate_at=sorted(set(evaluate_at)),
                     lpips=None if lpips is None else str(lpips.resolve()),
                     device=device,
+                    ranks=ranks,
                 )
                 check(spec)
                 specs.append(spec)
@@ -186,6 +211,8 @@ def check(spec: RunSpec) -> None:
     if spec.strategy is not None and spec.strategy not in STRATEGIES:
         known = ", ".join(OPPONENT + name for name in STRATEGIES)
         raise ValueError(f"recipe {spec.recipe}: there is no opponent {spec.source}; known are {known}")
+    if spec.ranks > 1 and (spec.strategy is not None or spec.grid is not None):
+        raise ValueError(f"recipe {spec.recipe}: {spec.source} trains on one rank, not on {spec.ranks}")
     try:
         spec.config()
         if spec.strategy is not None:

@@ -82,7 +82,8 @@ def labels(runs: Sequence[Run]) -> Callable[[Run], str]:
 
     def label(run: Run) -> str:
         several = len(settings[run["capture"], run["recipe"]]) > 1
-        return f"{run['recipe']} ({run['settings']})" if several else run["recipe"]
+        name = f"{run['recipe']} ({run['settings']})" if several else run["recipe"]
+        return f"{name}, {run['ranks']} ranks" if run.get("ranks", 1) > 1 else name
 
     return label
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 from harness import commit, environment
+from opponents import spatial_partition
 from opponents.gsplat_training import GsplatTrainer
 from quality_plan import RunSpec
 
@@ -27,7 +28,9 @@ from blitzgs.training import run
 from blitzgs.training.evaluation import METRICS, evaluate, load_lpips
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
+from blitzgs.training.population_report import population_report
 from blitzgs.training.trainer import Trainer
+from blitzgs.training.views import Space, ViewSet, render_options
 
 # Where gsplat's results are commonly quoted; training views are measured there, too, and at every end.
 QUOTED_STEPS = (7_000, 15_000)
@@ -108,6 +111,7 @@ class RecordedTrainer(Trainer):
     """A trainer that measures on the way, and leaves no checkpoint."""
 
     recorder: Recorder
+    population: dict[str, Any]  # of the finished run
 
     def step(self, step: int) -> None:
         """Take a step; measure where that was planned, before the schedule's events."""
@@ -118,6 +122,7 @@ class RecordedTrainer(Trainer):
     def _finish(self) -> dict[str, Any]:
         """Measure the trained model."""
         self._record(end=True)
+        self.population = population_report(self.state, self._memory)
         return {}
 
     def _record(self, end: bool) -> None:
@@ -130,7 +135,7 @@ class RecordedTrainer(Trainer):
             self.recorder.record(
                 state.images_seen,
                 seconds,
-                len(state.table),
+                state.population(),
                 end,
                 lambda indices: measure(state, indices, None),
             )
@@ -142,13 +147,14 @@ def train_ours(spec: RunSpec) -> dict[str, Any]:
     ranks = Ranks.from_environment(spec.device)
     capture, images = open_capture(config, ranks)
     with tempfile.TemporaryDirectory() as folder:
-        trainer = RecordedTrainer(config, capture, images, Path(folder), ranks)
+        shared = Path(ranks.broadcast_object(folder))  # of all ranks, which are on one host
+        trainer = RecordedTrainer(config, capture, images, shared, ranks)
         schedule = trainer.state.schedule
         recorder = Recorder(spec, (), schedule.iterations, capture, ranks.device)
         trainer.recorder = recorder
         if trainer.train() is None:
             raise InterruptedError("stopped by a signal")
-    return figures(recorder, trainer.state.progress.peak_gaussians)
+    return figures(recorder, trainer.state.progress.peak_gaussians) | {"population": trainer.population}
 
 
 def train_opponent(spec: RunSpec) -> dict[str, Any]:
@@ -179,6 +185,37 @@ def train_opponent(spec: RunSpec) -> dict[str, Any]:
     return figures(recorder, trainer.peak)
 
 
+def train_partition(spec: RunSpec) -> dict[str, Any]:
+    """Train the blocks of a grid one after the other, and measure the model that they are merged to."""
+    config, shape = spec.config(), spec.grid
+    assert shape is not None
+    ranks = Ranks.from_environment(spec.device)
+    capture, images = open_capture(config, ranks)
+    begin = time.monotonic()
+    grid = spatial_partition.Grid(capture, *shape)
+    blocks = spatial_partition.divide(capture, grid)
+    split_seconds = time.monotonic() - begin
+    merged = spatial_partition.train(config, capture, images, ranks, grid, blocks)
+    space = Space.of(capture.offset, capture.extent)
+    views = ViewSet(list(capture.cameras), space, ranks.device)
+    lpips, owners = load_lpips(spec.lpips), TileOwners(ranks)
+
+    def measure_now(indices: Sequence[int]) -> dict[str, Any]:
+        how = render_options(config, space, merged.sh_degree)
+        return evaluate(merged.table, views, capture.cameras, images, indices, how, None, owners, lpips=lpips)
+
+    done = sum(block["images"] for block in merged.blocks)
+    seconds = split_seconds + merged.merge_seconds + sum(block["seconds"] for block in merged.blocks)
+    recorder = Recorder(spec, (), done, capture, ranks.device)
+    recorder.record(done, seconds, len(merged.table), True, measure_now)
+    return figures(recorder, max(block["peak"] for block in merged.blocks)) | {
+        "blocks": merged.blocks,
+        "coverage": spatial_partition.coverage(capture, blocks),
+        "split_seconds": split_seconds,
+        "merge_seconds": merged.merge_seconds,
+    }
+
+
 def figures(recorder: Recorder, peak_gaussians: int) -> dict[str, Any]:
     """Return what a finished run reports."""
     last = recorder.evaluations[-1]
@@ -201,6 +238,7 @@ def describe(spec: RunSpec) -> dict[str, Any]:
         "capture": spec.capture,
         "recipe": spec.recipe,
         "seed": spec.seed,
+        "ranks": spec.ranks,
         "settings": spec.settings,
         "source": os.path.relpath(spec.source) if spec.source.endswith((".yaml", ".yml")) else spec.source,
         "overrides": [*spec.data[1:], *spec.overrides],
@@ -222,13 +260,15 @@ def main(arguments: Sequence[str]) -> int:
     result = describe(spec)
     begin = time.monotonic()
     try:
-        found = train_ours(spec) if spec.strategy is None else train_opponent(spec)
+        train = train_ours if spec.strategy is None else train_opponent
+        found = (train if spec.grid is None else train_partition)(spec)
         result |= {"status": "done", "environment": environment(spec.device)} | found
     except Exception as error:
         traceback.print_exc()
         result |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
     result["wall_seconds"] = time.monotonic() - begin
-    write(result_path, result)
+    if os.environ.get("RANK", "0") == "0":
+        write(result_path, result)
     return 0 if result["status"] == "done" else 1
 
 

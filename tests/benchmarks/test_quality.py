@@ -212,3 +212,14 @@ def test_the_scene_is_in_gsplats_unit():
     space = space_of(scene)
     assert space.unit == pytest.approx(math.hypot(3, 2.5))
     assert space.extent == pytest.approx(1.1 * 3 / math.hypot(3, 2.5))
+
+
+def test_several_ranks_train_one_run_to_the_same_model(tmp_path, capture):
+    flags = ["--out", str(tmp_path), "--gpus", "0", "--evaluate-at", "40", "--seeds", "3"]
+    flags += ["--capture", f"tiny={capture}", "--recipe", f"ours=defaults {FLAGS}"]
+    assert bm_quality.main(flags) == bm_quality.main([*flags, "--ranks", "2"]) == 0
+    one, two = sorted(quality_report.read_runs(tmp_path / "runs"), key=lambda run: len(run["name"]))
+    assert two["name"] == one["name"] + ".r2" and (one["ranks"], two["ranks"]) == (1, 2)
+    assert two["gaussians"] == one["gaussians"] and len(two["population"]["peak_memory_bytes"]) == 2
+    psnr = [run["evaluations"][-1]["test"]["psnr"] for run in (one, two)]
+    assert psnr[1] == pytest.approx(psnr[0], abs=0.05)

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The usual way to a large scene: a uniform grid of blocks with halos, trained one by one, then merged.
+
+The grid divides the bounding box of the training cameras on the plane that they fly in (the two main axes
+of their centres); the outermost blocks reach to infinity. A block is grown by its halo, a share of a cell's
+edge on each side. It starts from the points in its grown cell and is trained on the cameras that
+
+- stand in the grown cell (VastGaussian's position rule), or
+- have at least a quarter of the points in their picture in it (VastGaussian's visibility rule, with points
+  in the place of its projected boxes; Lin et al. 2024, section 3.2).
+
+All else is the training of the whole scene: its configuration, its unit of length and its extent. Of each
+block's model the Gaussians in its own cell, without the halo, are kept; together they are the merged model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.model import REQUIRED, GaussianTable
+from blitzgs.scene.cameras import camera_centers
+from blitzgs.scene.capture import Capture
+from blitzgs.training.batches import Images
+from blitzgs.training.config import Config
+from blitzgs.training.trainer import Trainer
+
+Float64 = npt.NDArray[np.float64]
+HALO = 0.2  # of a cell's edge, on each side
+LEAST_SEEN = 0.25  # of the points in a camera's picture
+LEAST_POINTS = 4  # to start a block from
+_SAMPLED_POINTS = 20_000  # that decide what cameras see
+
+
+class Grid:
+    """A grid of `columns` x `rows` cells over the training cameras of a capture, numbered row by row."""
+
+    def __init__(self, capture: Capture, columns: int, rows: int) -> None:
+        """Divide the bounding box of the cameras on the plane of their flight.
+
+        Raises:
+            ValueError: the training cameras stand in a line, or in fewer than two places.
+        """
+        self.shape = np.array([columns, rows])
+        centres = camera_centers(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
+        self._middle = centres.mean(axis=0)
+        _, spread, axes = np.linalg.svd(centres - self._middle, full_matrices=False)
+        if len(centres) < 3 or spread[1] < 1e-6 * max(spread[0], 1e-300):
+            raise ValueError(f"{capture.root}: the training cameras span no plane to lay a grid over")
+        self._axes = axes[:2]
+        flat = (centres - self._middle) @ self._axes.T
+        self._low = flat.min(axis=0)
+        self._edge = (flat.max(axis=0) - self._low) / self.shape
+
+    @property
+    def cells(self) -> int:
+        """How many there are."""
+        return int(self.shape.prod())
+
+    def coordinates(self, points: Float64) -> Float64:
+        """Return where points [N, 3] of the re-centred capture lie, in cells from a corner, [N, 2]."""
+        return ((points - self._middle) @ self._axes.T - self._low) / self._edge
+
+    def inside(self, coordinates: Float64, cell: int, halo: float = 0.0) -> npt.NDArray[np.bool_]:
+        """Return which coordinates [N, 2] lie in a cell grown by `halo` of its edge, [N]."""
+        place = np.array([cell % self.shape[0], cell // self.shape[0]])
+        low = np.where(place == 0, -np.inf, place - halo)
+        high = np.where(place == self.shape - 1, np.inf, place + 1 + halo)
+        within: npt.NDArray[np.bool_] = ((coordinates >= low) & (coordinates < high)).all(axis=1)
+        return within
+
+
+@dataclass(frozen=True)
+class Block:
+    """What one cell is trained on.
+
+    Attributes:
+        cell: its number.
+        cameras: of the capture.
+        points: bool [M], of the capture's points those that it starts from.
+    """
+
+    cell: int
+    cameras: list[int]
+    points: npt.NDArray[np.bool_]
+
+
+def divide(capture: Capture, grid: Grid) -> list[Block]:
+    """Return the blocks of a capture, one for each cell; a camera may belong to several, or to none."""
+    places = grid.coordinates(capture.points)
+    grown = np.stack([grid.inside(places, cell, HALO) for cell in range(grid.cells)])
+    step = max(1, len(capture.points) // _SAMPLED_POINTS)
+    sampled, within = capture.points[::step], grown[:, ::step].astype(np.float64)
+    cameras: list[list[int]] = [[] for _ in range(grid.cells)]
+    for index in capture.train:
+        camera = capture.cameras[index]
+        centre = grid.coordinates(camera_centers(camera.world_to_camera[None]))
+        seen = _in_picture(sampled, camera)
+        shares = within @ seen / max(int(seen.sum()), 1)
+        for cell in range(grid.cells):
+            if shares[cell] >= LEAST_SEEN or grid.inside(centre, cell, HALO)[0]:
+                cameras[cell].append(index)
+    return [Block(cell, cameras[cell], grown[cell]) for cell in range(grid.cells)]
+
+
+def coverage(capture: Capture, blocks: list[Block]) -> dict[str, int]:
+    """Return the training cameras, those in some block and in several, and the assignments of all."""
+    counts = np.zeros(len(capture.cameras), np.int64)
+    for block in blocks:
+        counts[block.cameras] += 1
+    return {
+        "cameras": len(capture.train),
+        "covered": int((counts > 0).sum()),
+        "in_several": int((counts > 1).sum()),
+        "assignments": int(counts.sum()),
+    }
+
+
+@dataclass(frozen=True)
+class Merged:
+    """A model put together from blocks.
+
+    Attributes:
+        table: its Gaussians, in the unit of the whole scene.
+        sh_degree: that it is rendered with.
+        blocks: a record for each cell: "cameras", "points", "seconds" of training, "images" trained on,
+            "gaussians" trained and "kept" of them, "peak"; those that could not be trained have zeros.
+        merge_seconds: of putting the models together.
+    """
+
+    table: GaussianTable
+    sh_degree: int
+    blocks: list[dict[str, Any]]
+    merge_seconds: float
+
+
+class _BlockTrainer(Trainer):
+    """A trainer that leaves its model in memory."""
+
+    def _finish(self) -> dict[str, Any]:
+        self.state.catch_up()
+        return {}
+
+
+def train(
+    config: Config, capture: Capture, images: Images, ranks: Ranks, grid: Grid, blocks: list[Block]
+) -> Merged:
+    """Train every block that has cameras and points, and merge the models.
+
+    Args:
+        config: of each block's training.
+        capture: the whole scene.
+        images: its photographs.
+        ranks: the job, of one rank.
+        grid: whose cells the blocks are.
+        blocks: from `divide`.
+
+    Raises:
+        ValueError: no block could be trained.
+        InterruptedError: stopped by a signal.
+    """
+    records, parts, degree = [], [], 0
+    merge_seconds = 0.0
+    for block in blocks:
+        record = {"cell": block.cell, "cameras": len(block.cameras), "points": int(block.points.sum())}
+        records.append(record | dict.fromkeys(("images", "seconds", "gaussians", "kept", "peak"), 0))
+        if len(block.cameras) < config.schedule.batch_size or record["points"] < LEAST_POINTS:
+            continue
+        trainer = _train_block(config, capture, images, ranks, block)
+        state, begin = trainer.state, time.monotonic()
+        degree = max(degree, state.progress.sh_degree)
+        places = grid.coordinates(state.table["means"].double().cpu().numpy() * state.space.unit)
+        own = torch.from_numpy(grid.inside(places, block.cell)).to(ranks.device)
+        parts.append({name: state.table[name][own].cpu() for name in REQUIRED})
+        merge_seconds += time.monotonic() - begin
+        records[-1] |= {
+            "images": state.images_seen,
+            "seconds": state.progress.seconds,
+            "gaussians": len(state.table),
+            "kept": int(own.sum()),
+            "peak": max(state.progress.peak_gaussians, len(state.table)),
+        }
+        print(f"block {block.cell + 1} of {grid.cells}: {records[-1]}", flush=True)
+    if not parts:
+        raise ValueError(f"{capture.root}: no block of the grid has cameras and points enough to train")
+    begin = time.monotonic()
+    columns: dict[str, Tensor] = {name: torch.cat([part[name] for part in parts]) for name in REQUIRED}
+    columns["id"] = torch.arange(len(columns["id"]))  # blocks number their Gaussians alike
+    table = GaussianTable.create({name: column.to(ranks.device) for name, column in columns.items()})
+    merge_seconds += time.monotonic() - begin
+    return Merged(table, degree, records, merge_seconds)
+
+
+def _train_block(config: Config, capture: Capture, images: Images, ranks: Ranks, block: Block) -> Trainer:
+    chosen = {
+        name: None if (column := getattr(capture, name)) is None else column[block.points]
+        for name in ("points", "colors", "track_lengths", "errors")
+    }
+    part = dataclasses.replace(capture, train=block.cameras, test=[], **chosen)
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = _BlockTrainer(config, part, images, Path(folder), ranks)
+        if trainer.train() is None:
+            raise InterruptedError("stopped by a signal")
+    return trainer
+
+
+def makespan(seconds: list[float], gpus: int) -> float:
+    """Return when the last of some GPUs is done with all blocks, the longest blocks being given out first."""
+    ends = [0.0] * gpus
+    for value in sorted(seconds, reverse=True):
+        ends[ends.index(min(ends))] += value
+    return max(ends)
+
+
+def _in_picture(points: Float64, camera: Any) -> npt.NDArray[np.bool_]:
+    """Return which points [N, 3] a camera has in its picture, whatever hides them."""
+    seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = seen @ camera.K.T
+    x, y, depth = pixels[:, 0], pixels[:, 1], seen[:, 2]
+    inside: npt.NDArray[np.bool_] = (
+        (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width * depth) & (y < camera.height * depth)
+    )
+    return inside
