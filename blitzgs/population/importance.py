@@ -77,10 +77,12 @@ class Importance:
     phi: Tensor
     cull: Tensor
 
-    def store(self, table: GaussianTable) -> None:
-        """Make phi and cull columns of the table, which then move with its rows."""
+    def store(self, table: GaussianTable, with_cull: bool) -> None:
+        """Make phi, and cull where it is used, columns of the table, which then move with its rows."""
         table[PHI] = self.phi
-        table[CULL] = self.cull
+        table.columns.pop(CULL, None)
+        if with_cull:
+            table[CULL] = self.cull
 
 
 def sweep(

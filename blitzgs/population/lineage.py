@@ -122,7 +122,7 @@ class Lineage:
                 name = _PART.fullmatch(path.name)
                 if path.name.startswith(".") or (name and (step == 0 or int(name[2]) > step)):
                     path.unlink()
-            write_file(folder / ABOUT, json.dumps(about or {}, indent=1) + "\n")
+            self.describe(about or {})
         ranks.barrier()
         self._sums = torch.zeros(3, dtype=torch.int64, device=ranks.device)
         self._pending: dict[str, list[_Block]] = {name: [] for name in _INTS}
@@ -130,6 +130,10 @@ class Lineage:
         self._writer = ThreadPoolExecutor(1, "lineage")
         self._writing: list[Future[None]] = []
         self._unwritten: list[tuple[str, dict[str, Tensor], OSError]] = []
+
+    def describe(self, about: dict[str, Any]) -> None:
+        """Say what is trained, for the file `ABOUT`; one rank calls this."""
+        write_file(self._folder / ABOUT, json.dumps(about, indent=1) + "\n")
 
     def born(self, births: Births, step: int) -> None:
         """Log births at the end of an optimiser step."""

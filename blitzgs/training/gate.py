@@ -9,16 +9,22 @@ from pathlib import Path
 from typing import Any
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.spawn_gate import RankVeto, SpawnGate, info_path
+from blitzgs.population.spawn_gate import GateError, RankVeto, SpawnGate, info_path
 from blitzgs.scene.capture import Capture
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import to_dict
 from blitzgs.training.inputs import capture_fingerprint
 
-# Fields of these sections that do not decide how long Gaussians live.
-_IDLE = {
+# What decides how long Gaussians live: these sections, but for the fields named here. What `schedule.minutes`
+# does is in `schedule.pace`, once it is measured.
+_IDLE: dict[str, tuple[str, ...]] = {
     "schedule": ("checkpoint_every", "evaluate_every", "gate_from", "minutes", "adaptive_limit", "placed"),
     "population": ("lineage", "gate", "gate_rate"),
+    "optimiser": (),
+    "loss": (),
+    "model": ("deterministic",),
+    "lod": (),
+    "view": (),
 }
 
 
@@ -33,24 +39,47 @@ def life_fields(config: Config) -> dict[str, Any]:
     }
 
 
-def open_gate(config: Config, capture: Capture, ranks: Ranks) -> RankVeto | None:
+def lineage_subject(config: Config, capture: Capture) -> dict[str, Any]:
+    """Return what a lineage says about the run that it is of, see `blitzgs.population.lineage.ABOUT`."""
+    return {
+        "name": Path(config.data.path).resolve().name,
+        "scene": capture_fingerprint(capture),
+        "schedule": life_fields(config),
+    }
+
+
+def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tuple[RankVeto | None, str]:
     """Open the gate that a configuration names, and warn where it does not suit the run. Collective.
 
+    Args:
+        config: of the run.
+        capture: of the run.
+        ranks: the job.
+        known: digest of the gate that the run has used so far; empty: none is known.
+
+    Returns:
+        The gate, and the digest of its files; None and "" where none is named.
+
     Raises:
-        GateError: its files are missing, damaged or of another kind.
+        GateError: its files are missing, damaged, of another kind, or others than those of `known`.
         MismatchError: the ranks read different files.
     """
     population = config.population
     if population.gate is None:
-        return None
+        return None, ""
     path = Path(population.gate)
     gate = SpawnGate(path)
     digest = hashlib.sha256(path.read_bytes() + info_path(path).read_bytes()).hexdigest()
     ranks.compare_across_ranks({"the spawn gate's files": digest})
+    if known not in ("", digest):
+        raise GateError(
+            f"{path} or {info_path(path).name} beside it has changed since the checkpoint (SHA-256 of both "
+            f"{known[:12]}..., now {digest[:12]}...): put the files back, or start another run"
+        )
     if ranks.rank == 0:
         for problem in misfits(gate, config, capture):
             warnings.warn(f"spawn gate {path}: {problem}", stacklevel=2)
-    return RankVeto(gate, population.gate_rate)
+    return RankVeto(gate, population.gate_rate), digest
 
 
 def misfits(gate: SpawnGate, config: Config, capture: Capture) -> list[str]:
@@ -59,8 +88,14 @@ def misfits(gate: SpawnGate, config: Config, capture: Capture) -> list[str]:
     scene = capture_fingerprint(capture)
     if known := [name for name, other in gate.info.scenes.items() if other == scene]:
         found.append(f"it was fitted on this very capture ({', '.join(known)}): its figures say nothing here")
-    fields, fitted = life_fields(config), gate.info.schedule
+    # A field that the gate's file lacks came later; its default is what runs did before.
+    fields, fitted = life_fields(config), life_fields(Config()) | gate.info.schedule
     if different := sorted(name for name in fields | fitted if fields.get(name) != fitted.get(name)):
         listed = ", ".join(f"{name} ({fitted.get(name)}, here {fields.get(name)})" for name in different)
         found.append(f"it was fitted under another schedule, and survival follows the schedule: {listed}")
+    if config.schedule.minutes > 0:
+        found.append(
+            "with schedule.minutes the run finds its pace while it trains, so that its schedule is not known "
+            "yet, and survival follows the schedule"
+        )
     return found

@@ -66,6 +66,7 @@ class Progress:
             would keep almost all; empty without a gate.
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
         signals: `blitzgs.training.adaptive.Signals.saved`, where there are any.
+        gate: digest of the spawn gate's files; empty without one, and in old checkpoints.
     """
 
     step: int
@@ -80,6 +81,7 @@ class Progress:
     gated_views: str = ""
     train_views: str = ""
     signals: dict[str, Any] = dataclasses.field(default_factory=dict)
+    gate: str = ""
 
 
 @dataclass

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import secrets
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -23,8 +24,8 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import save_config
 from blitzgs.training.evaluation import load_lpips
 from blitzgs.training.folder_checks import check_room, check_writable
-from blitzgs.training.gate import life_fields, open_gate
-from blitzgs.training.inputs import capture_fingerprint, check_alike, check_capture
+from blitzgs.training.gate import lineage_subject, open_gate
+from blitzgs.training.inputs import check_alike, check_capture
 from blitzgs.training.offload import Course, OffloadingStepper
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
@@ -58,6 +59,7 @@ def set_up(
     Raises:
         FileExistsError: the folder holds a trained run and `resume` is not set.
         ConfigError: the run to resume was started with another configuration.
+        GateError: the spawn gate cannot be read, or is not that of the run to resume.
         MismatchError: the ranks differ in configuration, code or capture.
         FolderError: a rank cannot write to the folder, or there is no room.
     """
@@ -80,6 +82,8 @@ def set_up(
         run.check_resumable(restored.config, config)
         check_capture(restored.space, capture, folder)
     progress = keep_to_views(table, progress, capture, ranks)
+    veto, gate_digest = open_gate(config, capture, ranks, progress.gate)
+    progress = replace(progress, gate=gate_digest)
     check_room(folder, table, ranks, config.population.max_gaussians)
     if ranks.rank == 0:
         save_config(config, folder / run.CONFIG)
@@ -118,7 +122,7 @@ def set_up(
         run_id=run_id,
         origin=_origin(restored, resume, folder),
         save_clock=SaveClock(config.log.checkpoint_seconds),
-        veto=open_gate(config, capture, ranks),
+        veto=veto,
         lineage=_start_lineage(config, capture, folder, table, progress, ranks),
         signals=Signals.of(progress.signals) if config.schedule.adaptive else None,
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
@@ -163,12 +167,8 @@ def _start_lineage(
     """Begin the log of births and deaths, or go on from the checkpoint's."""
     if not config.population.lineage:
         return None
-    about = {
-        "name": Path(config.data.path).resolve().name,
-        "scene": capture_fingerprint(capture),
-        "schedule": life_fields(config),
-    }
-    lineage = Lineage(folder / run.LINEAGE, ranks, progress.step, ledger_of(progress.ledger), about)
+    about, ledger = lineage_subject(config, capture), ledger_of(progress.ledger)
+    lineage = Lineage(folder / run.LINEAGE, ranks, progress.step, ledger, about)
     if not progress.ledger:
         lineage.born(initial_births(table["id"], table["parent"], table["means"]), progress.step)
     return lineage

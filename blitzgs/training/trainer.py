@@ -25,6 +25,7 @@ from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
 from blitzgs.training.events import evaluate, handle_all, save
+from blitzgs.training.gate import lineage_subject
 from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
@@ -241,6 +242,8 @@ class Trainer:
             try:
                 # The pace and the places have been measured since the run wrote its configuration.
                 save_config(state.config, state.folder / run.CONFIG)
+                if state.lineage is not None:
+                    state.lineage.describe(lineage_subject(state.config, state.capture))
                 write_file(state.folder / run.SUMMARY, json.dumps(summary, indent=1))
             except OSError as error:
                 warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)

@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,11 +11,14 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.population.candidates import FEATURES
 from blitzgs.population.gate_fit import fit, read_spawns
 from blitzgs.population.importance import CULL, PHI, is_culled
-from blitzgs.population.lineage import Cause, read_lineage
+from blitzgs.population.lineage import ABOUT, Cause, read_lineage
+from blitzgs.population.spawn_gate import GateError, GateInfo, info_path
 from blitzgs.training import run
 from blitzgs.training.events import importance
+from blitzgs.training.gate import life_fields, misfits
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training.test_trainer import assert_same_table, stop_at_step_50
@@ -53,7 +57,8 @@ def test_what_the_passes_keep(whole_run):
     assert second["gaussians"] < second["before"]
     table = trainer.state.table
     assert summary["gaussians"] == len(table) == second["gaussians"]
-    assert table[PHI].shape == (len(table),) and table[CULL].shape == (len(table), 1)
+    assert table[PHI].shape == (len(table),)
+    assert CULL not in table  # which no view asks for: a bit for each Gaussian and view, 0.5 GB and more
     assert ((table[PHI] >= 0) & (table[PHI] < 1)).all()
     assert trainer.state.progress.milestones == {
         "initial": 400,
@@ -62,6 +67,12 @@ def test_what_the_passes_keep(whole_run):
         "before_pass_2": second["before"],
         "after_pass_2": second["gaussians"],
     }
+
+
+def test_the_cull_mask_is_kept_where_views_use_it(tmp_path):
+    trainer, _ = train(tmp_path, "view.cull=true", "schedule.iterations=60")
+    table = trainer.state.table
+    assert table[CULL].shape == (len(table), 1)
     culled = torch.stack([is_culled(table[CULL], v) for v in range(7)])
     assert culled.any() and not culled.all()
 
@@ -98,7 +109,7 @@ def test_resume_is_exact_and_carries_the_columns(whole_run, tmp_path, monkeypatc
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.milestones == whole.state.progress.milestones
     model = run.open_model(tmp_path, Ranks())
-    assert torch.equal(model.table[CULL], whole.state.table[CULL])
+    assert torch.equal(model.table[PHI], whole.state.table[PHI])
 
 
 def test_ablations_keep_the_signals(tmp_path):
@@ -138,7 +149,8 @@ EARLY = ("schedule.checkpoint_every=30", "log.keep_checkpoints=9")
 def _passes_from(ranks, folder):
     """Both passes on a model that is dealt to the ranks; ids and what they have."""
     torch.set_num_threads(1)
-    trainer = Trainer(tiny_config(*PASSES, *EARLY), *tiny_scene(), folder, ranks, resume=True)
+    config = tiny_config(*PASSES, *EARLY, "view.cull=true")
+    trainer = Trainer(config, *tiny_scene(), folder, ranks, resume=True)
     state, out = trainer.state, []
     for event in state.schedule.events(0, 100):
         if event.kind.startswith("pass"):
@@ -153,7 +165,7 @@ def _passes_from(ranks, folder):
 
 @pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 4))
 def test_passes_are_the_same_at_every_world_size(whole_run, tmp_path, world_size, device):
-    train(tmp_path, *EARLY)
+    train(tmp_path, *EARLY, "view.cull=true")
     for later in sorted((tmp_path / "checkpoints").glob("checkpoint_*"))[1:]:
         shutil.rmtree(later)
     expected, milestones = _passes_from(Ranks(device=torch.device(device)), tmp_path)
@@ -210,6 +222,46 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
         grown = events[t]["cloned"] + events[t]["split"]
         assert grown > 10 and grown <= events[t]["vetoed"] <= grown + 2
         assert events[t]["held_back"] == 0
+    # The gate decides the result: a run goes on with the files that it began with.
+    for file in (path, info_path(path)):
+        content = file.read_text()
+        file.write_text(content + " ")
+        with pytest.raises(GateError, match=r"gate.meta.json beside it has changed .* put the files"):
+            train(tmp_path / "gated", *flags, resume=True)
+        file.write_text(content)
+    assert train(tmp_path / "gated", *flags, resume=True)[1] is not None
+
+
+def test_a_schedule_that_a_gate_was_not_fitted_for_is_named():
+    """Fields that decide how long Gaussians live, of all sections, and what only a run finds out."""
+    capture, _ = tiny_scene()
+
+    def gate_of(fitted):
+        return SimpleNamespace(info=GateInfo(FEATURES, fitted, {}))
+
+    here = tiny_config()
+    assert misfits(gate_of(life_fields(here)), here, capture) == []
+    for change in ("optimiser.opacity=0.01", "loss.scale=1", "view.lod=true", "schedule.scale=0.5"):
+        name, _, value = change.partition("=")
+        (text,) = misfits(gate_of(life_fields(tiny_config(change))), here, capture)
+        assert f"{name} ({value}" in text.lower() and "here" in text
+    # What is newer than the gate had no effect when it was fitted: the default.
+    older = {name: value for name, value in life_fields(here).items() if name != "optimiser.position_noise"}
+    assert misfits(gate_of(older), here, capture) == []
+    (text,) = misfits(gate_of(older), tiny_config("optimiser.position_noise=5"), capture)
+    assert "optimiser.position_noise (0.0, here 5.0)" in text
+    (text,) = misfits(gate_of(life_fields(here)), tiny_config("schedule.minutes=3"), capture)
+    assert "with schedule.minutes the run finds its pace while it trains" in text
+
+
+def test_lineage_says_at_what_pace_its_run_went(tmp_path):
+    """`schedule.minutes` changes the pace on the way, and survival follows the pace."""
+    pytest.importorskip("pyarrow")
+    trainer, _ = train(tmp_path, "population.lineage=true", "schedule.minutes=0.02")
+    pace = [[image, factor] for image, factor in trainer.state.config.schedule.pace]
+    assert pace
+    about = json.loads((tmp_path / run.LINEAGE / ABOUT).read_text())
+    assert about["schedule"]["schedule.pace"] == pace
 
 
 def _train_with_lineage(ranks, folder):

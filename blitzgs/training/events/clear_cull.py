@@ -10,7 +10,7 @@ from blitzgs.training.state import TrainingState
 
 def run(state: TrainingState, event: Event) -> None:
     """Drop the mask, and the memory it takes, from a run that used it."""
-    if not state.config.view.cull or CULL not in state.table:
+    if CULL not in state.table:
         return
     state.stepper.settle()
     del state.table.columns[CULL]

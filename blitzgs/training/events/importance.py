@@ -26,7 +26,7 @@ LEAST_VIEWS = 4
 
 
 def run(state: TrainingState, event: Event) -> None:
-    """Score all Gaussians, store phi and the cull matrix, prune by the scores and deal the rows anew.
+    """Score all Gaussians, store phi and the cull mask, prune by the scores and deal the rows anew.
 
     Raises:
         NonFiniteError: a parameter is not finite.
@@ -45,7 +45,7 @@ def run(state: TrainingState, event: Event) -> None:
         cast(ScoreRule, state.config.population.score),
         scene_gate(state.config, state.progress, state.table, state.ranks),
     )
-    found.store(state.table)
+    found.store(state.table, state.config.view.cull)
     before = state.population()
     causes = causes_of_death(state, event, found)
     if state.lineage is not None:
