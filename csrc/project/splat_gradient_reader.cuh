@@ -169,8 +169,8 @@ class SplatGradientReader<RankSplatGradients> {
   };
 
   __device__ __forceinline__ float2 kept_of(const SplatGradient& v) const {
-    const float* kept = source_.absolute ? v.mean2d_abs : v.mean2d;
-    return {kept[0], kept[1]};
+    // By value: an address of either would put the whole splat onto the stack.
+    return source_.absolute ? float2{v.mean2d_abs[0], v.mean2d_abs[1]} : float2{v.mean2d[0], v.mean2d[1]};
   }
   static __device__ __forceinline__ int lane() { return static_cast<int>(threadIdx.x) % 32; }
   // The runs that splats [begin, end) touch, by ranks.
