@@ -12,7 +12,7 @@ from typing import Any
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device
 from blitzgs.distributed.group import Ranks
 from blitzgs.population import gate_evaluation, gate_fit, spawn_samples
-from blitzgs.population.spawn_gate import SpawnGate
+from blitzgs.population.spawn_gate import SpawnGate, gate_file
 from blitzgs.training import run as run_folder
 from blitzgs.training.config_io import ConfigError, load_config
 from blitzgs.training.gate_replay import replay
@@ -48,11 +48,11 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "--rows", type=int, default=spawn_samples.MOST_ROWS, help="spawns, about (%(default)s)"
     )
     judge = add_command(actions, "evaluate", run_evaluate, "judge a gate on the lineage of runs")
-    judge.add_argument("gate", type=Path, metavar="GATE", help="model file")
+    judge.add_argument("gate", type=gate_file, metavar="GATE", help="model file, or default")
     judge.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage")
     judge.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets figures and pictures")
     again = add_command(actions, "replay", run_replay, "train from one checkpoint with several vetoes")
-    again.add_argument("gate", type=Path, metavar="GATE", help="model file")
+    again.add_argument("gate", type=gate_file, metavar="GATE", help="model file, or default")
     again.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
     again.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a run for each veto")
     again.add_argument("--rate", type=float, default=0.6, help="share that is vetoed (%(default)s)")

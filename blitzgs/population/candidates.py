@@ -12,7 +12,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
 
-# In the order of the columns of `spawn_features`.
+# In the order of the columns of `spawn_features`. The first eight are the paper's.
 FEATURES = (
     "gradient",
     "parent_opacity",
@@ -22,6 +22,8 @@ FEATURES = (
     "level",
     "time",
     "is_split",
+    "parent_color_gradient",
+    "parent_flatness",
 )
 
 
@@ -32,7 +34,7 @@ class Candidates:
     Attributes:
         parents: int64 [M], persistent ids of the Gaussians to be cloned or split.
         is_split: bool [M].
-        features: float32 [M, 8], see `FEATURES`.
+        features: float32 [M, F], see `FEATURES`.
         time: of the event, in images.
     """
 
@@ -66,21 +68,26 @@ def spawn_features(
         level_count: number of octree levels.
 
     Returns:
-        float32 [M, 8]: mean gradient over the views that saw the parent (half-image units), the parent's
+        float32 [M, 10]: mean gradient over the views that saw the parent (half-image units), the parent's
         opacity, the mean of its three scales relative to extent, its age in images, those views' number, the
-        child's octree level (the parent's, one more for a split), the time, and whether it is a split.
+        child's octree level (the parent's, one more for a split), the time, and whether it is a split; then
+        the root of Adam's mean squared gradient of the parent's colour, which grows with its weight in the
+        images, and the ratio of the parent's smallest to its largest scale.
     """
     views = table["grad_count"][rows]
     level = table["level"][rows].int()
+    scales = table["scales"][rows].double()
     # In float64, so that the rounded result does not depend on how the maths library vectorises.
     columns = (
         table["grad_sum"][rows] / views.clamp(min=1),
         table["opacities"][rows].double().sigmoid(),
-        table["scales"][rows].double().exp().mean(1) / extent,
+        scales.exp().mean(1) / extent,
         time - table["birth"][rows],
         views,
         torch.where(is_split, (level + 1).clamp(max=level_count - 1), level),
         torch.full_like(views, time),
         is_split,
+        table["exp_avg_sq.sh"][rows, 0].double().mean(1).sqrt(),
+        (scales.amin(1) - scales.amax(1)).exp(),
     )
     return torch.stack([column.float() for column in columns], 1)

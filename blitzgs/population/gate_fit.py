@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -43,7 +43,7 @@ class Spawns:
         name: of the run.
         scene: fingerprint of its capture.
         schedule: fields of its configuration.
-        features: float32 [K, 8], see `candidates.FEATURES`.
+        features: float32 [K, F], see `candidates.FEATURES`; NaN where the log is older than a feature.
         survived: bool [K].
         parents: int64 [K].
         positions: float32 [K, 3], where they were born.
@@ -102,12 +102,18 @@ def read_spawns(folder: Path) -> Spawns:
         name=about["name"],
         scene=about["scene"],
         schedule=about["schedule"],
-        features=np.stack([births[name][spawned].astype(np.float32) for name in FEATURES], 1),
+        features=feature_columns({name: births[name][spawned] for name in FEATURES if name in births}),
         survived=survived,
         parents=births["parent"][spawned],
         positions=np.stack([births[axis][spawned] for axis in "xyz"], 1),
         initial_survival=float(alive[~spawned].mean()),
     )
+
+
+def feature_columns(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+    """Return the features of spawns, float32 [K, F], from columns by name; NaN where there is none."""
+    unknown = np.full(len(next(iter(columns.values()))), np.nan, np.float32)
+    return np.stack([columns.get(name, unknown).astype(np.float32) for name in FEATURES], 1)
 
 
 def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:

@@ -72,7 +72,7 @@ class Births:
         ids: int64 [M].
         parents: int64 [M].
         means: float32 [M, 3].
-        features: float32 [M, 8], of the candidates that they come from.
+        features: float32 [M, F], of the candidates that they come from.
     """
 
     ids: Tensor

@@ -27,6 +27,9 @@ from blitzgs.ops.tree_sums import tree_sums
 from blitzgs.population.candidates import FEATURES, Candidates
 
 FORMAT = 1
+# Names the gate that comes with BlitzGS, for configs/aerial.yaml with the importance passes.
+DEFAULT = "default"
+_SHIPPED = Path(__file__).with_name("gates") / "aerial.json"
 # Leaf values enter as integers in units of 2^-32.
 _LEAF_BITS = 32
 
@@ -50,6 +53,11 @@ class GateInfo:
     schedule: dict[str, Any]
     scenes: dict[str, str]
     auc: dict[str, Any] = field(default_factory=dict)
+
+
+def gate_file(name: str) -> Path:
+    """Return the model file of a gate: a path, or the shipped one for "default"."""
+    return _SHIPPED if name == DEFAULT else Path(name)
 
 
 def info_path(path: Path) -> Path:
@@ -113,7 +121,7 @@ class SpawnGate:
         """Score candidates by their chance to survive.
 
         Args:
-            features: float32 [M, 8], see `FEATURES`; NaN: unknown.
+            features: float32 [M, F], see `FEATURES`; NaN: unknown.
 
         Returns:
             int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.

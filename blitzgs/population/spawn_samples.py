@@ -13,7 +13,7 @@ import torch
 from blitzgs.ops.counter_random import uniform
 from blitzgs.output import new_file
 from blitzgs.population.candidates import FEATURES
-from blitzgs.population.gate_fit import Spawns
+from blitzgs.population.gate_fit import Spawns, feature_columns
 from blitzgs.population.lineage import import_pyarrow
 
 SUFFIX = ".parquet"
@@ -65,7 +65,7 @@ def read_sample(path: Path) -> Spawns:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a sample, or one of other features.
+        ValueError: it is not a sample.
         ImportError: pyarrow is not installed.
     """
     arrow, parquet = import_pyarrow()
@@ -79,14 +79,12 @@ def read_sample(path: Path) -> Spawns:
     if content is None:
         raise ValueError(f"{path} is not a sample of spawns: write one with blitzgs gate sample")
     columns = {name: table[name].to_numpy() for name in table.column_names}
-    if missing := [name for name in FEATURES if name not in columns]:
-        raise ValueError(f"{path}: the sample lacks the features {missing}; write it anew")
     about = json.loads(content)
     return Spawns(
         name=about["name"],
         scene=about["scene"],
         schedule=about["schedule"],
-        features=np.stack([columns[name].astype(np.float32) for name in FEATURES], 1),
+        features=feature_columns({name: columns[name] for name in FEATURES if name in columns}),
         survived=columns["survived"].astype(bool),
         parents=columns["parent"],
         positions=np.stack([columns[axis] for axis in _AXES], 1),

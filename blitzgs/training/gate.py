@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.spawn_gate import GateError, RankVeto, SpawnGate, info_path
+from blitzgs.population.spawn_gate import GateError, RankVeto, SpawnGate, gate_file, info_path
 from blitzgs.scene.capture import Capture
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import to_dict
@@ -67,7 +67,7 @@ def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tup
     population = config.population
     if population.gate is None:
         return None, ""
-    path = Path(population.gate)
+    path = gate_file(population.gate)
     gate = SpawnGate(path)
     digest = hashlib.sha256(path.read_bytes() + info_path(path).read_bytes()).hexdigest()
     ranks.compare_across_ranks({"the spawn gate's files": digest})

@@ -43,6 +43,7 @@ def shaken(table, event):
     table["grad_count"].copy_((5 * draws[:, 0]).int())
     table["grad_sum"].copy_(1e-3 * draws[:, 1] * table["grad_count"])
     table["max_radii"].copy_(30 * draws[:, 2])
+    table["exp_avg_sq.sh"].copy_(draws[:, :1, None].expand_as(table["exp_avg_sq.sh"]))
 
 
 def live(folder):
@@ -89,6 +90,8 @@ def test_a_run_of_events_is_logged_row_by_row(tmp_path):
             "views": int(parent["grad_count"]),
             "level": min(int(parent["level"]) + int(births["is_split"][row]), 3),
             "is_split": float(parent["scales"].max().exp() > RULES.clone_scale),
+            "parent_color_gradient": float(parent["exp_avg_sq.sh"][0].mean().sqrt()),
+            "parent_flatness": float((parent["scales"].min() - parent["scales"].max()).exp()),
         }
         for name, value in want.items():
             assert births[name][row] == pytest.approx(value, rel=1e-5), name
@@ -190,6 +193,6 @@ def test_what_is_settled_is_on_the_disk(tmp_path, monkeypatch):
 def test_features_of_no_candidate(tmp_path):
     table = random_table(5)
     none = torch.zeros(0, dtype=torch.int64)
-    assert spawn_features(table, none, none.bool(), 5, 1.0, 4).shape == (0, 8)
+    assert spawn_features(table, none, none.bool(), 5, 1.0, 4).shape == (0, len(FEATURES))
     with pytest.raises(FileNotFoundError, match="holds no lineage: train with --population.lineage=true"):
         read_lineage(tmp_path)

@@ -151,7 +151,7 @@ def spoil_tree(path, field, value):
         ),
         (lambda path: spoil_tree(path, "left_children", 0), "the nodes of a tree do not form one"),
         (lambda path: spoil_tree(path, "right_children", 1 << 20), "the nodes of a tree do not form one"),
-        (lambda path: spoil_tree(path, "split_indices", 8), "a split of feature 8"),
+        (lambda path: spoil_tree(path, "split_indices", 99), "a split of feature 99"),
     ],
 )
 def test_bad_files_are_named(gate, tmp_path, break_it, message):

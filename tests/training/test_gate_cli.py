@@ -19,7 +19,7 @@ from blitzgs.training.gate_replay import OracleVeto, event_keys, label_events
 from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import OVERRIDES, write_tiny_capture
 
-pytest.importorskip("pyarrow")
+parquet = pytest.importorskip("pyarrow.parquet")
 pytest.importorskip("xgboost")
 # Density events at 20, 40, 60 and 80; the gate judges from 60 on, a checkpoint lies at 50.
 SETTINGS = (
@@ -107,6 +107,12 @@ def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys):
     # Whole families, about as many as wanted.
     assert len(read_sample(part).parents) == np.isin(run.parents, list(drawn)).sum()
     assert 0.35 < len(read_sample(part).parents) / len(run.parents) < 0.65
+    # A feature that the log does not have is unknown.
+    old = parquet.read_table(sample).drop_columns(["parent_flatness"])
+    parquet.write_table(old, tmp_path / "old.parquet")
+    features = read_sample(tmp_path / "old.parquet").features
+    assert np.isnan(features[:, -1]).all()
+    np.testing.assert_array_equal(features[:, :-1], run.features[:, :-1])
     gates = [tmp_path / name for name in ("run.json", "sample.json")]
     for source, gate in zip((lineage_run / "run", sample), gates, strict=True):
         assert main(["gate", "fit", str(source), "--out", str(gate)]) == 0

@@ -205,7 +205,7 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
     pytest.importorskip("xgboost")
     train(tmp_path / "lineage", "population.lineage=true", "population.grad_threshold=1e-4")
     run_of = read_spawns(tmp_path / "lineage" / run.LINEAGE)
-    assert run_of.features.shape[1] == 8 and run_of.times.max() == 80
+    assert run_of.features.shape[1] == len(FEATURES) and run_of.times.max() == 80
     path = tmp_path / "gate.json"
     figures = fit([run_of], path)
     assert figures["protocol"] == "a quarter of the parents held out"
