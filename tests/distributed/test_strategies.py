@@ -12,6 +12,7 @@ from blitzgs.training import run
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.distributed.test_training import records, sorted_table
+from tests.helpers import needs_cuda
 from tests.training.tiny import tiny_config, tiny_scene
 
 # 30 steps of 2 images, with a checkpoint after 10, and density events after 28, 36, 44 and 52 images.
@@ -64,6 +65,21 @@ def test_a_resumed_run_is_the_same(whole, tmp_path):
     resumed, expected = (run.restore(f, Ranks()).table for f in (tmp_path / "run", folder))
     for name in expected:
         assert torch.equal(resumed[name], expected[name]), name
+
+
+@pytest.mark.cuda
+@needs_cuda
+@pytest.mark.parametrize("name", OPTIONS)
+def test_cuda_trains_so_and_resumes_exactly(name, tmp_path):
+    ranks, options = Ranks(device=torch.device("cuda")), (*OPTIONS[name], "model.deterministic=true")
+    _train(ranks, tmp_path / "whole", *options)
+    shutil.copytree(tmp_path / "whole" / FIRST, tmp_path / "run" / FIRST)
+    _train(ranks, tmp_path / "run", *options)
+    resumed, expected = (run.restore(tmp_path / f, Ranks()).table for f in ("run", "whole"))
+    for column in expected:
+        assert torch.equal(resumed[column], expected[column]), column
+    _, events = records(tmp_path / "whole")
+    assert sum(event["cloned"] for event in events) > 30
 
 
 def test_two_ranks_agree_with_one(whole, tmp_path):

@@ -81,6 +81,12 @@ NUMBERS = [(name, value) for name, value in flat_fields(Config()) if isinstance(
 NUMBERS = [(name, value) for name, value in NUMBERS if not isinstance(value, bool)]
 
 
+def test_relocation_has_no_candidates_for_a_gate():
+    assert load_config(None, ["population.strategy=relocation"]).population.growth == 0.05
+    with pytest.raises(ConfigError, match=r"population.gate: .* relocation has none"):
+        load_config(None, ["population.strategy=relocation", "population.gate=gate.json"])
+
+
 def test_every_number_has_a_range_and_every_default_lies_in_it():
     assert sorted(name for name, _ in NUMBERS) == sorted(RANGES)
     assert list(problems(Config())) == []

@@ -12,6 +12,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference import render
 from blitzgs.training.trainer import Trainer
+from tests.helpers import needs_cuda
 from tests.training.tiny import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 STATISTICS = ("grad_sum", "grad_count", "max_radii")
@@ -26,13 +27,15 @@ QUIET = (
 STILL = [f"optimiser.{name}=0" for name in ("position", "sh_dc", "sh_rest", "opacity", "scale", "rotation")]
 
 
-def make_trainer(folder, *overrides) -> Trainer:
+def make_trainer(folder, *overrides, device: str = "cpu") -> Trainer:
     """A trainer of eight training views, each of which sees a part of the Gaussians."""
     scene, images = tiny_scene()
     scene.train, scene.test = list(range(8)), []
     for camera in scene.cameras:
         camera.K = camera.K * np.array([[2.5, 1, 1], [1, 2.5, 1], [1, 1, 1]])
-    trainer = Trainer(tiny_config(*QUIET, *overrides), scene, images, folder, Ranks())
+    trainer = Trainer(
+        tiny_config(*QUIET, *overrides), scene, images, folder, Ranks(device=torch.device(device))
+    )
     trainer.state.start_clock()
     return trainer
 
@@ -167,6 +170,21 @@ def test_absolute_gradients_are_summed_pixel_by_pixel(tmp_path):
     assert table["grad_sum"].sum() > 1.2 * signed.state.table["grad_sum"].sum()
     trainer.close()
     signed.close()
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_cuda_sums_the_same_absolute_gradients(tmp_path):
+    sums = []
+    for device in ("cpu", "cuda"):
+        options = ("population.absolute_gradients=true", "schedule.batch_size=3", *STILL)
+        trainer = make_trainer(tmp_path / device, *options, device=device)
+        take_steps(trainer, 2)
+        table = trainer.state.table
+        sums.append(table["grad_sum"][table["id"].argsort()].cpu())
+        trainer.close()
+    error = (sums[0] - sums[1]).abs() / sums[0].mean()
+    assert error.quantile(0.9) < 1e-3 and error.max() < 0.1
 
 
 @pytest.mark.parametrize("batch_size", [2, 4, 8])
