@@ -77,7 +77,7 @@ int main(int argc, char** argv) {
   constexpr std::int64_t kFirstTile = 0, kAllTiles = -1, kCountThem = -1;
   const std::vector<std::int64_t> grid{kViews, kWidth, kHeight, kTileSize, kFirstTile, kAllTiles};
   const auto lists = call<2>("blitzgs::intersect", means2d, conics, alphas, depths, camera_ids, std::nullopt,
-                             grid, kCountThem, std::nullopt);
+                             grid, kCountThem, std::nullopt, /*unchecked=*/false);
   const auto images =
       call<7>("blitzgs::rasterize_fwd", means2d, conics, alphas, colors, std::nullopt, lists[0], lists[1],
               grid, std::nullopt, /*clear_rest=*/true, /*backward_follows=*/false, std::nullopt);
