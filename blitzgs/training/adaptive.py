@@ -3,20 +3,22 @@
 
 Two signals are looked at, each the same on every rank because it is made of sums over all ranks:
 
-- the growth of the population from look to look, in the mean over the last looks and at its highest. Early in
-  a run it is high; where it falls, few candidates are left that the statistics ask for;
+- the demand of density control: the share of the Gaussians that an event would clone or split, those included
+  that a limit of the population or the spawn gate held back. It is the mean over the last events that counts,
+  relative to the highest such mean; early in a run it is high;
 - the loss, mean |render - photograph| over windows of at least one epoch, in which all views count alike. Its
   relative fall per share of the schedule says what more of the same would still bring.
 
-T1 comes when growth has slowed, densification ends when growth has all but stopped or the loss no longer
-falls, and T2 comes when the loss has settled after that. Each of them lies within `schedule.adaptive_limit`
-of where the fixed schedule has it, and all three in this order.
+T1 comes when demand has fallen, densification ends when demand has all but gone or the loss no longer falls,
+and T2 comes when the loss has settled after that. Each of them lies within `schedule.adaptive_limit` of where
+the fixed schedule has it, and all three in this order.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,12 +26,10 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.schedule import PLACED, latest_times
 
-# Milestones of a run: what its importance passes left.
-AFTER_PASSES = ("after_pass_1", "after_pass_2")
-# Growth is the mean over so many looks.
-LOOKS = 3
-# Growth relative to its highest: slowed, and all but stopped.
-SLOWED, STOPPED = 0.5, 0.1
+# Demand is the mean over so many events, and the loss is compared over so many windows.
+EVENTS = 3
+# Demand relative to its highest: fallen, and all but gone.
+FALLEN, GONE = 0.5, 0.1
 # A window of the loss is at least this share of the schedule.
 WINDOW = 1 / 60
 # The fall of the logarithm of the loss, per length of the schedule, below which it counts as settled: going
@@ -44,19 +44,13 @@ class Signals:
     Attributes:
         loss: sum of the steps' mean losses since the last window, and their images.
         windows: pairs (time of the configuration at the end, mean loss), oldest first.
-        population: Gaussians at the last look.
-        growth: relative, at each look.
-        passes: importance passes before the last look.
-        step: of the last look.
+        demand: share of the Gaussians that each density event wanted to clone or split.
         reasons: for each of the times that are placed.
     """
 
     loss: tuple[float, int] = (0.0, 0)
     windows: list[list[float]] = field(default_factory=list)
-    population: int = 0
-    growth: list[float] = field(default_factory=list)
-    passes: int = 0
-    step: int = 0
+    demand: list[float] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
     _pending: tuple[HostSum, int, float] | None = None
 
@@ -90,24 +84,15 @@ class Signals:
         of_step = math.fsum(sums.read()[:views].tolist()) / samples
         self.loss = total + of_step, images + views
 
-    def look(self, step: int, time: float, population: int, milestones: dict[str, int], window: int) -> None:
-        """Take note of where the run stands.
+    def densified(self, counts: Mapping[str, int]) -> None:
+        """Note a density event: its `DensityReport` over all ranks, and the "gaussians" after it."""
+        grown = counts["cloned"] + counts["split"] - counts["relocated"]
+        before = counts["gaussians"] + counts["pruned"] - grown
+        self.demand.append((grown + counts["held_back"] + counts["vetoed"]) / max(1, before))
 
-        Args:
-            step: optimiser steps taken.
-            time: of the configuration.
-            population: Gaussians of all ranks.
-            milestones: `Progress.milestones`.
-            window: images that a window of the loss has at least.
-        """
+    def look(self, time: float, window: int) -> None:
+        """End a window of the loss at a time of the configuration, if it has at least `window` images."""
         self._read()
-        before = self.population
-        after_passes = [milestones[name] for name in AFTER_PASSES if name in milestones]
-        if len(after_passes) > self.passes:
-            before = after_passes[-1]  # what a pass took out is no growth
-        if before > 0:
-            self.growth.append(max(0.0, population / before - 1))
-        self.step, self.population, self.passes = step, population, len(after_passes)
         total, images = self.loss
         if images >= window:
             self.windows.append([time, total / images])
@@ -131,7 +116,7 @@ class Signals:
             return latest, "the latest that schedule.adaptive_limit allows"
         if time < self._earliest(config, index, fixed):
             return None
-        reason = self._slow_growth(SLOWED if index == 0 else STOPPED) if index < 2 else None
+        reason = self._low_demand(FALLEN if index == 0 else GONE) if index < 2 else None
         if reason is None and index > 0:
             reason = self._settled_loss(config, config.placed[1] if index == 2 else config.placed[0])
         return None if reason is None else (math.ceil(time), reason)
@@ -143,21 +128,19 @@ class Signals:
         # T2 keeps some of its distance from the end of densification.
         return config.placed[1] + least * (config.t2 - config.densify_until)
 
-    def _slow_growth(self, share: float) -> str | None:
-        if len(self.growth) <= LOOKS:
+    def _low_demand(self, share: float) -> str | None:
+        if len(self.demand) <= EVENTS:
             return None
-        means = [sum(self.growth[k : k + LOOKS]) / LOOKS for k in range(len(self.growth) - LOOKS + 1)]
+        means = [sum(self.demand[k : k + EVENTS]) / EVENTS for k in range(len(self.demand) - EVENTS + 1)]
         if means[-1] > share * max(means):
             return None
-        return (
-            f"the population grows by {means[-1]:.2%} from look to look, after {max(means):.2%} at its peak"
-        )
+        return f"density control asks for {means[-1]:.2%} of the Gaussians, {max(means):.2%} at most before"
 
     def _settled_loss(self, config: ScheduleConfig, since: float) -> str | None:
         windows = [window for window in self.windows if window[0] > since]
-        if len(windows) < LOOKS:
+        if len(windows) < EVENTS:
             return None
-        (begin, first), (end, last) = windows[-LOOKS], windows[-1]
+        (begin, first), (end, last) = windows[-EVENTS], windows[-1]
         fall = math.log(max(first, 1e-12) / max(last, 1e-12)) * config.iterations / (end - begin)
         if fall > SETTLED:
             return None

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The adaptive schedule: what it measures, where it places its times, and that a run can be repeated."""
 
+import itertools
 import json
 import math
 import os
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.host_sum import HostSum
 from blitzgs.training.adaptive import SETTLED, Signals
 from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_io import ConfigError
@@ -41,18 +43,18 @@ FLAGS = (
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def signals(growth=(), windows=()):
-    return Signals(growth=list(growth), windows=[list(window) for window in windows])
+def signals(demand=(), windows=()):
+    return Signals(demand=list(demand), windows=[list(window) for window in windows])
 
 
-def test_t1_comes_when_growth_has_slowed():
+def test_t1_comes_when_demand_has_fallen():
     falling = [0.2, 0.2, 0.2, 0.2, 0.1, 0.05, 0.05]
     early, late = 0.6 * CONFIG.t1, latest_times(CONFIG)[0]
     assert late == 1_120
     assert signals(falling).next_place(CONFIG, early - 1) is None
     place, reason = signals(falling).next_place(CONFIG, early + 0.5)
     assert place == early + 1
-    assert reason == "the population grows by 6.67% from look to look, after 20.00% at its peak"
+    assert reason == "density control asks for 6.67% of the Gaussians, 20.00% at most before"
     assert signals([0.2, 0.2, 0.15, 0.15, 0.15]).next_place(CONFIG, late - 1) is None
     place, reason = signals([0.2] * 5).next_place(CONFIG, late + 3)
     assert (place, reason) == (late, "the latest that schedule.adaptive_limit allows")
@@ -60,19 +62,19 @@ def test_t1_comes_when_growth_has_slowed():
     assert signals().next_place(replace(CONFIG, t1=0), 0.0) == (0, "there is none")
 
 
-def test_densification_ends_with_growth_or_when_the_loss_settles():
+def test_densification_ends_with_demand_or_when_the_loss_settles():
     config, now = replace(CONFIG, placed=(700,)), 1_000.0
-    grows = [0.2] * 6
-    assert signals(grows).next_place(config, now) is None
-    place, reason = signals([*grows, 0.02, 0.01, 0.0]).next_place(config, now)
-    assert place == 1_000 and reason.startswith("the population grows by 1.00%")
+    wanted = [0.2] * 6
+    assert signals(wanted).next_place(config, now) is None
+    place, reason = signals([*wanted, 0.02, 0.01, 0.0]).next_place(config, now)
+    assert place == 1_000 and reason.startswith("density control asks for 1.00% of")
     for pace, settled in ((1.1 * SETTLED, False), (0.9 * SETTLED, True)):
         windows = [(time, 0.1 * math.exp(-pace * time / 3_000)) for time in (650, 750, 850, 950)]
-        found = signals(grows, windows).next_place(config, now)
+        found = signals(wanted, windows).next_place(config, now)
         assert (found is not None) == settled
         assert not settled or "between 750 and 950" in found[1]
     # What came before T1 says nothing about what came after.
-    assert signals(grows, [(500, 0.1), (600, 0.1), (750, 0.1)]).next_place(config, now) is None
+    assert signals(wanted, [(500, 0.1), (600, 0.1), (750, 0.1)]).next_place(config, now) is None
 
 
 def test_t2_comes_when_the_loss_has_settled_after_densification():
@@ -85,16 +87,25 @@ def test_t2_comes_when_the_loss_has_settled_after_densification():
     assert signals().next_place(replace(config, placed=(700, 1_200, 1_360)), 9e9) is None
 
 
-def test_what_a_pass_takes_out_is_no_growth():
-    found = Signals()
-    for step, population, milestones in (
-        (1, 100, {"initial": 90}),
-        (2, 150, {"initial": 90}),
-        (3, 110, {"initial": 90, "after_pass_1": 100}),
-        (4, 99, {"initial": 90, "after_pass_1": 100}),
+def test_demand_counts_what_was_held_back_too():
+    found, nothing = Signals(), {"cloned": 0, "split": 0, "pruned": 0, "held_back": 0, "vetoed": 0}
+    for counts, share in (
+        ({"cloned": 10, "split": 5, "pruned": 20, "gaussians": 195}, 0.075),
+        ({"held_back": 30, "vetoed": 20, "gaussians": 200}, 0.25),
+        ({"cloned": 12, "relocated": 8, "held_back": 6, "gaussians": 104}, 0.1),  # 4 more, and 8 elsewhere
     ):
-        found.look(step, 10.0 * step, population, milestones, window=1)
-    assert found.growth == pytest.approx([0.5, 0.1, 0.0])
+        found.densified(nothing | {"relocated": 0} | counts)
+        assert found.demand[-1] == pytest.approx(share)
+
+
+def test_a_window_of_the_loss_has_as_many_images_as_it_should():
+    found, sums = Signals(), HostSum(Ranks(), torch.tensor([[[6.0, 1.0]], [[12.0, 1.0]]]).double())
+    for step in range(1, 6):
+        found.add(sums, views=2, pixels=3)
+        found.look(10.0 * step, window=4)
+    assert found.windows == [[20.0, 1.0], [40.0, 1.0]] and found.loss == (2.0, 2)
+    again = Signals.of(json.loads(json.dumps(found.saved())))
+    assert again == found
 
 
 @pytest.mark.parametrize("batch_size", [1, 4])
@@ -151,7 +162,7 @@ def test_a_run_places_its_times_and_says_why(whole_run):
     times = {record["event"]: record["t"] for record in records if "event" in record}
     assert times["pass_1"] == placed[0] and times["pass_2"] == placed[2]
     assert times["densify"] < placed[1]
-    assert trainer.state.signals.windows and trainer.state.signals.growth
+    assert trainer.state.signals.windows and trainer.state.signals.demand
     assert json.loads((folder / "summary.json").read_text())["placed"] == summary["placed"]
 
 
@@ -202,9 +213,11 @@ def test_ranks_decide_alike(whole_run, tmp_path, world_size, device):
 
 @pytest.mark.parametrize("flag", ["schedule.scale=0.5", "schedule.minutes=0.02"])
 def test_places_are_times_of_the_configuration(tmp_path, flag):
-    trainer, summary = train(tmp_path, flag)
+    trainer = Trainer(tiny_config(*FLAGS, flag), *tiny_scene(), tmp_path, Ranks())
+    trainer.state.clock = itertools.count(0, 0.01).__next__  # an image takes a hundredth of a second
+    summary = trainer.train()
     placed = trainer.state.config.schedule.placed
-    assert len(placed) == 3
+    assert summary["images"] == pytest.approx(80 if "scale" in flag else 120, rel=0.2)
     for place, fixed in zip(placed, (48, 80, 96), strict=True):
         assert 0.6 * fixed - 1 <= place <= 1.4 * fixed
     assert list(summary["placed"]) == ["t1", "densify_until", "t2"]

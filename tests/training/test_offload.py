@@ -70,6 +70,16 @@ VARIANTS = {
         "schedule.evaluate_every=25",
         "schedule.checkpoint_every=35",
     ),
+    "smooth": (
+        "schedule.adaptive=true",
+        "population.importance=true",
+        "schedule.t1=24",
+        "schedule.t2=40",
+        "schedule.densify_until=32",
+        "schedule.densify_every=4",
+        "view.lod=true",
+        "view.smooth=true",
+    ),
     "relocation": (
         "population.relocate=true",
         "population.absolute_gradients=true",

@@ -48,6 +48,8 @@ def run(state: TrainingState, event: Event) -> None:
             "and points belong together, or prune less (population.min_opacity, prune_screen_radius, "
             "prune_world_scale; schedule.size_prune_after)"
         )
+    if state.signals is not None:
+        state.signals.densified(counts)
     held_back = counts["held_back"]
     if redistribute(state.table, state.ranks, state.config.ranks.max_imbalance):
         counts["redistributed"] = 1

@@ -12,23 +12,22 @@ from blitzgs.training.state import TrainingState
 
 
 def run(state: TrainingState, event: Event) -> None:
-    """Measure, and place a time where the signals say so; every rank decides alike, from sums over all."""
-    signals, progress, config = state.signals, state.progress, state.config.schedule
-    # Small steps of a compressed schedule may hold several looks.
-    if signals is None or signals.step == progress.step:
+    """Measure, and place what the signals say; every rank decides alike, from sums over all."""
+    signals = state.signals
+    if signals is None:
         return
-    pace = state.schedule.pace
+    pace, config = state.schedule.pace, state.config.schedule
     time = pace.time(state.images_seen)
-    window = max(len(state.capture.train), math.ceil(WINDOW * config.iterations * pace.scale))
-    signals.look(progress.step, time, state.population(), progress.milestones, window)
-    found = signals.next_place(config, time)
-    if found is None:
-        return
-    place, reason = found
-    name = PLACED[len(config.placed)]
-    signals.reasons.append(reason)
-    state.config = replace(state.config, schedule=replace(config, placed=(*config.placed, place)))
-    # The rates do not depend on these times, so the optimiser need not follow.
-    state.schedule = Schedule(state.config.schedule)
-    text = f"{name} is placed at {place:,}: {reason}" if place else None
-    state.log.event(event.time, "place", {"name": name, "time": place, "reason": reason}, text)
+    signals.look(time, max(len(state.capture.train), math.ceil(WINDOW * config.iterations * pace.scale)))
+    # A compressed schedule may have passed the latest places of several.
+    while (found := signals.next_place(config, time)) is not None:
+        place, reason = found
+        name = PLACED[len(config.placed)]
+        signals.reasons.append(reason)
+        config = replace(config, placed=(*config.placed, place))
+        text = f"{name} is placed at {place:,}: {reason}" if place else None
+        state.log.event(event.time, "place", {"name": name, "time": place, "reason": reason}, text)
+    if config != state.config.schedule:
+        # The rates do not depend on these times, so the optimiser need not follow.
+        state.config = replace(state.config, schedule=config)
+        state.schedule = Schedule(config)
