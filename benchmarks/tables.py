@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""The paper's tables on any scenes: runs what is missing, and writes Markdown and CSV beside its figures.
+
+    python benchmarks/tables.py ablation --out TABLES --seeds 0 1 2 --gpus 4 \
+        --scenes town=DATA/town "park=DATA/park --data.downscale=2" \
+        --config configs/aerial.yaml --gate gates/aerial.json
+    python benchmarks/tables.py scaling --out TABLES --scenes city=DATA/city --gpus 4 --ranks 1 2 4
+    python benchmarks/tables.py cost --out TABLES --scenes city=DATA/city --gpus 4 --ranks 1 2 4
+    python benchmarks/tables.py oracle --out TABLES --runs town=RUNS/town --gate gates/aerial.json --gpus 1
+    python benchmarks/tables.py popping --out TABLES --runs town=RUNS/town
+
+main, ablation, rho, onset, scaling and trajectory train, by `bm_quality.py`: a process for each run, into
+TABLES/runs. `benchmarks/paper_tables.yaml` has their arms and the paper's figures; every arm is --config with
+importance passes, phi, LOD gate, per-view mask and --gate, less what its row leaves out. Without --gate the
+arms that differ by the gate alone are left out. cost runs `bm_exchange.py`; oracle `blitzgs gate replay` from
+a run with lineage and checkpoints; popping `bm_popping.py` on the model of a run with levels.
+
+--dry-run lists what would run. --resume carries on in a folder that has results: what is finished is not run
+again. --collect adds results of other folders, as bm_quality.py does; without --scenes and --runs, the table
+is made of those in TABLES alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bm_quality
+import quality_report
+import tables_report
+import torch
+import yaml
+from quality_plan import parse_named, runs_of
+
+from blitzgs.training.config_io import load_config
+
+HERE = Path(__file__).parent
+PAPER = HERE / "paper_tables.yaml"
+EVERYTHING = "--population.importance=true --view.lod=true --view.cull=true"
+TRAINED = ("main", "ablation", "rho", "onset", "scaling", "trajectory")
+OF_RUNS = ("oracle", "popping")
+ORACLE_ARMS = 5
+TABLES = (*TRAINED, "cost", *OF_RUNS)
+
+
+def recipes_of(plan: dict[str, Any], config: str, gate: Path | None, flags: str = "") -> dict[str, str]:
+    """Return the recipes of a table for `bm_quality.py`.
+
+    Args:
+        plan: the table's entry of `paper_tables.yaml`.
+        config: file that all arms start from, or "defaults".
+        gate: model file of a spawn gate, or None.
+        flags: for all arms, before their own.
+    """
+    common = f"{EVERYTHING} {flags}".strip()
+    if gate is not None:
+        common += f" --population.gate={gate.resolve()}"
+    recipes = {}
+    for name, arm in plan["arms"].items():
+        without_gate = arm["flags"] == "--population.gate=null"
+        if gate is None and (arm.get("needs_gate", False) or (without_gate and name == "no_gate")):
+            continue
+        source = f"partition-{arm['grid']}:{config}" if "grid" in arm else config
+        own = arm["flags"]
+        if "gate_from" in arm:
+            until = load_config(None if config == "defaults" else config).schedule.densify_until
+            own += f" --schedule.gate_from={round(arm['gate_from'] * until)}"
+        recipes[name] = f"{source} {common} {own}".strip()
+    return recipes | plan.get("opponents", {})
+
+
+def train(table: str, plan: dict[str, Any], args: argparse.Namespace, scenes: dict[str, str]) -> int:
+    """Train what a table needs and is not finished; returns the exit status."""
+    recipes = recipes_of(plan, args.config, args.gate, args.flags)
+    common = ["--out", str(args.out), "--gpus", str(args.gpus), "--evaluate-at"]
+    common += ["--seeds", *map(str, args.seeds)]
+    for name, text in scenes.items():
+        common += ["--capture", f"{name}={text}"]
+    for name, text in recipes.items():
+        common += ["--recipe", f"{name}={text}"]
+    for flag in ("lpips", "minutes"):
+        if (value := getattr(args, flag)) is not None:
+            common += [f"--{flag}", str(value)]
+    status = 0
+    for ranks in args.ranks if table == "scaling" else [1]:
+        if args.dry_run:
+            device = "cuda" if args.gpus > 0 else "cpu"
+            for spec in runs_of(scenes, recipes, args.seeds, [], args.lpips, device, ranks):
+                state = "finished" if quality_report.is_done(args.out, spec.name) else "to run"
+                print(f"{state}: {spec.name}: {' '.join([spec.source, *spec.overrides])}")
+        else:
+            status |= bm_quality.main([*common, "--ranks", str(ranks)])
+    return status
+
+
+def result_path(table: str, args: argparse.Namespace, scene: str) -> Path:
+    """Return where the result of a scene lies that is not a training of `bm_quality.py`."""
+    if table == "oracle":
+        return Path(args.out / f"oracle.{scene}" / "replay.json")
+    return Path(args.out / f"{table}.{scene}.json")
+
+
+def measure(table: str, args: argparse.Namespace, scenes: dict[str, str]) -> None:
+    """Run the other benchmark that a table is made of, for the scenes that have no result."""
+    device = "cuda" if args.gpus > 0 else "cpu"
+    for scene, text in scenes.items():
+        path = result_path(table, args, scene)
+        command = [sys.executable]
+        if table == "cost":
+            folder, *fields = text.split()
+            downscale = next((f.partition("=")[2] for f in fields if f.startswith("--data.downscale=")), "1")
+            command += [str(HERE / "bm_exchange.py"), "--data", folder, "--downscale", downscale]
+            command += ["--device", device, "--json", str(path), "--ranks", *map(str, args.ranks)]
+        elif table == "oracle":
+            if args.gate is None:
+                raise ValueError("oracle: give the model file of a spawn gate, --gate FILE")
+            command += ["-m", "blitzgs", "gate", "replay", str(args.gate), text, "--out", str(path.parent)]
+            command += ["--device", device]
+        else:
+            command = ["bm_popping.popping", text]
+        # A replay writes its result after each arm.
+        done = path.exists() and (table != "oracle" or len(json.loads(path.read_text())) == ORACLE_ARMS)
+        print(f"{'finished' if done else 'to run'}: {' '.join(command)}", flush=True)
+        if done or args.dry_run:
+            continue
+        if table == "popping":
+            from bm_popping import popping  # renders with OpenCV's video writer, which the others do not need
+
+            path.write_text(json.dumps(popping(Path(text), None, device), indent=1))
+        else:
+            subprocess.run(command, check=True)
+
+
+def read_results(table: str, out: Path) -> dict[str, Any]:
+    """Return scene -> result of what `measure` left in a folder."""
+    pattern = "oracle.*/replay.json" if table == "oracle" else f"{table}.*.json"
+    found = {}
+    for path in sorted(out.glob(pattern)):
+        name = path.parent.name if table == "oracle" else path.stem
+        found[name.partition(".")[2]] = json.loads(path.read_text())
+    return found
+
+
+def tabulate(table: str, plan: dict[str, Any], out: Path) -> str:
+    """Write the table of all results in a folder; returns its Markdown.
+
+    Raises:
+        ValueError: there are none.
+    """
+    reference, parts = plan.get("reference", []), []
+    rows: list[dict[str, Any]] = []
+    if table in TRAINED:
+        runs = quality_report.read_runs(out / quality_report.RUNS)
+        runs = [run for run in runs if run["status"] == "done"]
+        arms = plan["arms"] | {name: {"title": name} for name in plan.get("opponents", {})}
+        texts, rows = tables_report.arm_rows(runs, arms)
+        if table == "scaling":
+            tables_report.speedups(rows)
+            texts = [text | {"speedup": row["speedup"]} for text, row in zip(texts, rows, strict=True)]
+        if table == "trajectory":
+            rows = texts = tables_report.trajectory_rows(runs, "full", reference) if rows else []
+            reference = []
+        parts = [(table, texts), ("partition", tables_report.partition_rows(runs, arms))]
+    for scene, found in read_results(table, out).items():
+        if table == "cost":
+            rows += tables_report.cost_rows(scene, found["results"], reference)
+        elif table == "oracle":
+            rows += tables_report.oracle_rows(scene, found, reference)
+        else:
+            rows += tables_report.popping_rows(scene, found)
+    if not rows:
+        raise ValueError(f"{out} has no finished results for {table}: give --scenes (or --runs) to make some")
+    parts = parts or [(table, rows)]
+    return tables_report.write(out, table, plan["source"], [*parts, ("paper", reference)], rows)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the command line's parser."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("table", choices=TABLES)
+    parser.add_argument("--out", type=Path, required=True, metavar="TABLES", help="folder of the results")
+    parser.add_argument("--scenes", nargs="+", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
+    parser.add_argument("--runs", nargs="+", default=[], metavar="NAME=RUN", help="for oracle and popping")
+    parser.add_argument(
+        "--config", default="configs/aerial.yaml", metavar="YAML", help="of all arms (%(default)s)"
+    )
+    parser.add_argument("--flags", default="", metavar='"--FIELD=VALUE ..."', help="for all arms")
+    parser.add_argument("--gate", type=Path, metavar="FILE", help="spawn gate, fitted on other scenes")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    gpus = torch.cuda.device_count()
+    parser.add_argument(
+        "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
+    )
+    parser.add_argument(
+        "--ranks", type=bm_quality.positive, nargs="+", default=[1, 2, 4], help="of scaling and cost"
+    )
+    parser.add_argument("--lpips", type=Path, metavar="FILE", help="as for bm_quality.py")
+    parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
+    parser.add_argument("--collect", type=Path, nargs="+", default=[], metavar="SOURCE")
+    parser.add_argument("--resume", action="store_true", help="carry on in a folder that has results")
+    parser.add_argument("--dry-run", action="store_true", help="list the runs, and stop")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make a table; returns the exit status: 1 when a run failed."""
+    parser = make_parser()
+    args = parser.parse_args(arguments)
+    plan, status = yaml.safe_load(PAPER.read_text())[args.table], 0
+    try:
+        scenes = dict(map(parse_named, args.runs if args.table in OF_RUNS else args.scenes))
+        if (args.out / quality_report.RUNS).is_dir() and scenes and not (args.resume or args.dry_run):
+            raise ValueError(f"{args.out} has results: --resume carries on, or choose another --out")
+        if not args.dry_run:
+            quality_report.collect(args.out, args.collect)
+        if scenes and args.table in TRAINED:
+            status = train(args.table, plan, args, scenes)
+        elif scenes:
+            measure(args.table, args, scenes)
+        if not args.dry_run:
+            print(tabulate(args.table, plan, args.out))
+    except (ValueError, OSError, subprocess.CalledProcessError) as error:
+        parser.error(str(error))
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

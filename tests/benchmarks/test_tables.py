@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's tables as commands: their arms, their runs, and their rows beside the paper's figures."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import bm_popping  # noqa: E402
+import tables  # noqa: E402
+import tables_report  # noqa: E402
+from quality_plan import runs_of  # noqa: E402
+
+from tests.training.tiny import OVERRIDES, write_tiny_capture  # noqa: E402
+
+PLANS = yaml.safe_load(tables.PAPER.read_text())
+FLAGS = " ".join(f"--{text}" for text in OVERRIDES)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tables") / "capture"
+    write_tiny_capture(folder)
+    return folder
+
+
+def finished(recipe, seed, psnr, capture="town", **more):
+    ends = {"psnr": psnr, "ssim": 0.9, "psnr_corrected": psnr}
+    return {
+        "name": f"{capture}.{recipe}.s{seed}", "status": "done", "capture": capture, "recipe": recipe,
+        "seed": seed, "settings": "0", "images": 100, "seconds": 10.0 + seed, "images_per_second": 9.0,
+        "gaussians": 1_000_000, "peak_gaussians": 2_500_000, "peak_memory_bytes": 5_000_000_000,
+        "evaluations": [{"images": 100, "seconds": 10.0, "gaussians": 1_000_000, "test": ends}],
+    } | more  # fmt: skip
+
+
+@pytest.mark.parametrize("config", ["configs/aerial.yaml", "configs/paper.yaml"])
+@pytest.mark.parametrize("table", tables.TRAINED)
+def test_every_arm_is_a_configuration_of_its_own(capture, monkeypatch, table, config):
+    monkeypatch.chdir(ROOT)
+    plan = PLANS[table]
+    recipes = tables.recipes_of(plan, config, Path("gates/some.json"))
+    ours = {name: text for name, text in recipes.items() if not text.startswith("gsplat-")}
+    specs = runs_of({"x": str(capture)}, ours, [0], [], None, "cpu")
+    assert len({spec.settings for spec in specs}) == len(ours) == len(plan["arms"])
+    full = tables.recipes_of(PLANS["ablation"], config, Path("gates/some.json"))["full"]
+    chosen = runs_of({"x": str(capture)}, {"full": full}, [0], [], None, "cpu")[0].config()
+    assert chosen.population.importance and chosen.view.lod and chosen.view.cull
+    assert chosen.population.gate == str(ROOT / "gates/some.json")
+
+
+def test_without_a_gate_its_arms_are_left_out_and_onsets_follow_the_schedule(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    recipes = tables.recipes_of(PLANS["ablation"], "configs/paper.yaml", None)
+    assert "no_gate" not in recipes and {"full", "all_off", "no_phi", "partition_4x5"} <= set(recipes)
+    assert list(tables.recipes_of(PLANS["rho"], "configs/paper.yaml", None)) == ["rate_0"]
+    onsets = tables.recipes_of(PLANS["onset"], "configs/paper.yaml", Path("g.json"))
+    assert [text.rpartition("=")[2] for text in onsets.values()] == ["16000", "20000", "24000", "28000"]
+
+
+def test_a_trajectory_is_trained_once_and_tabulated(tmp_path, capture, capsys):
+    out = tmp_path / "out"
+    flags = ["trajectory", "--out", str(out), "--scenes", f"tiny={capture}", "--config", "defaults"]
+    flags += ["--flags", FLAGS, "--gpus", "0", "--seeds", "1"]
+    assert tables.main([*flags, "--dry-run"]) == 0 and not out.exists()
+    assert "to run: tiny.full.s1" in capsys.readouterr().out
+    assert tables.main(flags) == 0
+    assert "| final | 0.0" in capsys.readouterr().out
+    rows = {row["stage"]: row for row in csv.DictReader((out / "trajectory.csv").open())}
+    assert float(rows["peak"]["tiny"]) >= float(rows["final"]["tiny"]) > 0
+    assert rows["before_pass_1"]["paper Rubble"] == "5.22"
+    with pytest.raises(SystemExit):
+        tables.main(flags)
+    assert "--resume carries on" in capsys.readouterr().err
+    written = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*")}
+    assert tables.main([*flags, "--resume"]) == 0 and len(written) == 1
+    assert written == {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*")}
+
+
+def test_arms_have_median_and_worst_beside_the_paper(tmp_path, capsys):
+    source = tmp_path / "quality.json"
+    runs = [finished("full", seed, 27.0 + seed) for seed in range(3)] + [finished("all_off", 0, 27.1)]
+    block = {"cameras": 40, "seconds": 4.0, "gaussians": 500_000, "kept": 250_000}
+    cover = {"cameras": 100, "covered": 99, "in_several": 80, "assignments": 160}
+    parts = {"blocks": [block] * 4, "coverage": cover, "split_seconds": 0.5, "merge_seconds": 0.5}
+    runs.append(finished("partition_4x5", 0, 25.0, **parts))
+    source.write_text(json.dumps({"runs": runs}))
+    out = tmp_path / "out"
+    assert tables.main(["ablation", "--out", str(out), "--collect", str(source)]) == 0
+    text = capsys.readouterr().out
+    assert "| town | full | 1 | 3 | 28.00 (27.00) |" in text and "8.66 -> 4.65" in text
+    rows = list(csv.DictReader((out / "ablation.csv").open()))
+    assert [row["arm"] for row in rows] == ["full", "all off", "partition 4 x 5"]
+    assert (rows[0]["PSNR"], rows[0]["worst PSNR"], rows[0]["paper PSNR"]) == ("28.0", "27.0", "23.46")
+    assert rows[0]["worst seconds"] == "12.0" and rows[1]["paper time"] == "71m46s"
+    # 4 blocks of 4 s on 4 GPUs take as long as one, besides the split and the merge.
+    assert "| 99 of 100 | 1.6 | 80.0% | 40 to 40 | 2 | 1 | 50.0% | 17 | 5 |" in text
+    with pytest.raises(SystemExit):
+        tables.main(["rho", "--out", str(out)])
+    assert "has no finished results for rho" in capsys.readouterr().err
+
+
+def test_runs_of_other_settings_are_no_seeds_of_an_arm():
+    runs = [finished("full", 0, 27.0), finished("full", 0, 28.0, settings="1")]
+    texts, _ = tables_report.arm_rows(runs, PLANS["ablation"]["arms"])
+    assert [(row["arm"], row["seeds"]) for row in texts] == [("full (0)", 1), ("full (1)", 1)]
+
+
+def test_scaling_has_the_speedup_of_each_number_of_ranks(tmp_path, capsys):
+    runs = [finished("full", 0, 27.0, ranks=n, seconds=12.0 / n, name=f"a.r{n}") for n in (1, 2, 4)]
+    source = tmp_path / "quality.json"
+    source.write_text(json.dumps({"runs": runs}))
+    assert tables.main(["scaling", "--out", str(tmp_path / "out"), "--collect", str(source)]) == 0
+    rows = list(csv.DictReader((tmp_path / "out" / "scaling.csv").open()))
+    assert [(row["GPUs"], float(row["speedup"])) for row in rows] == [("1", 1.0), ("2", 2.0), ("4", 4.0)]
+
+
+def test_cost_and_oracle_are_read_from_finished_results(tmp_path, capsys):
+    stages = ("project", "exchange", "sort", "raster", "loss", "raster back", "exchange back", "optimiser")
+    ms = dict.fromkeys(stages, 1.0) | {"other": 0.5, "alone": 8.5, "step": 8.0}
+    report = {"ranks": 2, "gaussians": 3_000_000, "ms": ms}
+    (tmp_path / "cost.town.json").write_text(json.dumps({"results": [report]}))
+    assert tables.main(["cost", "--out", str(tmp_path)]) == 0
+    (row,) = csv.DictReader((tmp_path / "cost.csv").open())
+    named = ("preprocess", "communicate", "render", "loss", "backward", "other", "total", "paper total")
+    assert [float(row[name]) for name in named] == [2, 2, 1, 1, 1, 1.5, 8.5, 119.7]
+
+    arms = [
+        {"arm": "reference", "psnr": 27.0, "ssim": 0.9, "peak": 2_000_000, "final": 10, "seconds": 5.0},
+        {"arm": "gate", "psnr": 27.1, "ssim": 0.9, "peak": 1_500_000, "final": 10, "seconds": 4.0},
+    ]
+    (tmp_path / "oracle.town").mkdir()
+    (tmp_path / "oracle.town" / "replay.json").write_text(json.dumps(arms))
+    assert tables.main(["oracle", "--out", str(tmp_path)]) == 0
+    rows = list(csv.DictReader((tmp_path / "oracle.csv").open()))
+    assert (rows[1]["change"], rows[1]["peak change"], rows[1]["paper peak change"]) == (
+        "0.1", "-25.0%", "-16.6 %",
+    )  # fmt: skip
+
+
+def test_popping_is_measured_once(tmp_path, monkeypatch, capsys):
+    figures = {"mean_change": 1.0, "largest_change": 2.0}
+    jumps = figures | {"mean": 0.1, "largest": 0.2, "pixel": 3.0, "kept": 0.5}
+    calls = []
+
+    def popping(run, out, device):
+        calls.append((run, device))
+        return {"frames": 3, "levels": 2, "full": figures, "gated": jumps, "smooth": jumps}
+
+    monkeypatch.setattr(bm_popping, "popping", popping)
+    flags = ["popping", "--out", str(tmp_path), "--runs", "town=RUNS/town", "--gpus", "0"]
+    assert tables.main([*flags, "--dry-run"]) == 0 and not calls
+    assert tables.main(flags) == tables.main([*flags, "--resume"]) == 0
+    assert calls == [(Path("RUNS/town"), "cpu")]
+    rows = list(csv.DictReader((tmp_path / "popping.csv").open()))
+    assert [(row["levels"], row["largest"]) for row in rows] == [
+        ("full", ""), ("gated", "0.2"), ("smooth", "0.2"),
+    ]  # fmt: skip
