@@ -18,7 +18,7 @@ import quality_report  # noqa: E402
 import quality_run  # noqa: E402
 from opponents import relocation  # noqa: E402
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer  # noqa: E402
-from quality_plan import RunSpec, runs_of  # noqa: E402
+from quality_plan import RunSpec, read_plan, runs_of  # noqa: E402
 
 from blitzgs.reference.gaussians import covariance_factors  # noqa: E402
 from tests.helpers import DEVICES  # noqa: E402
@@ -75,6 +75,16 @@ def test_runs_are_done_once_and_a_failure_stops_no_other(tmp_path, capture, caps
     rows = list(csv.DictReader((elsewhere / "quality.csv").open()))
     assert [row["images"] for row in rows] == ["40", "100"]
     assert float(rows[1]["train_psnr"]) == last["train"]["psnr"] and rows[1]["is_end"] == "1"
+
+
+@pytest.mark.parametrize("name", ["ablation", "gate_rates"])
+def test_the_plans_that_come_along_can_be_run(name, capture, monkeypatch):
+    root = Path(bm_quality.__file__).parents[1]
+    monkeypatch.chdir(root)
+    plan = read_plan(root / "benchmarks" / f"{name}.yaml")
+    specs = runs_of({"tiny": str(capture)}, plan["recipes"], plan["seeds"], [], None, "cpu")
+    assert len(specs) == 3 * len(plan["recipes"])
+    assert len({spec.settings for spec in specs}) == len(plan["recipes"])  # no two arms are the same
 
 
 def test_bad_plans_name_what_is_wrong(tmp_path, capture, capsys):
