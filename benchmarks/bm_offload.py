@@ -161,6 +161,7 @@ def measure_pool(
             over.steps(stepper, order, at, steps)
         except ResidenceError as error:
             result["failed"] = str(error)
+            at += 2 * steps
             continue
         before = residence.traffic
         seconds = over.steps(stepper, order, at + steps, steps)
