@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
             raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
-                model.table,
+                model.scene(ranks.device),
                 ViewSet(list(capture.cameras), model.space, ranks.device),
                 capture.cameras,
                 images,

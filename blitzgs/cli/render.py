@@ -53,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
         views = ViewSet(list(cameras), model.space, ranks.device)
         gate = lod_gate(model.config, model.progress)
         options = render_options(model.config, model.space, model.progress.sh_degree, gate)
+        scene = model.scene(ranks.device)
         owners, lod = TileOwners(ranks), scene_gate(model.config, model.progress, model.table, ranks)
         output = OutputFolder(args.out, stored.inputs)
         # Of all views, so that a view's file has the same name whichever split is rendered.
@@ -62,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
             for position, index in enumerate(indices):
                 # The ranks take turns at writing.
                 destination = position % ranks.world_size
-                render = render_view(model.table, views, index, options, owners, destination, lod)
+                render = render_view(scene, views, index, options, owners, destination, lod)
                 report(position + 1, len(indices))
                 if render is None:
                     continue

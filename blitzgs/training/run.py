@@ -24,6 +24,9 @@ from blitzgs.training.guard import bad_column, check_before_saving
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.views import Space
+from blitzgs.view.host_table import HostTable
+from blitzgs.view.residence import Residence
+from blitzgs.view.seen import Scene
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -93,12 +96,25 @@ class TrainedModel:
         progress: where the run stood.
         space: how the trained world lies in the capture's.
         table: this rank's Gaussians.
+        pool_bytes: of a device that they may take, where the run trained with a pool; else 0.
     """
 
     config: Config
     progress: Progress
     space: Space
     table: GaussianTable
+    pool_bytes: int = 0
+
+    def scene(self, device: torch.device) -> Scene:
+        """Return what views on a device are rendered from; a table with a pool is moved for it, once.
+
+        Raises:
+            ResidenceError: the pool has room for less than two blocks.
+        """
+        if self.pool_bytes == 0:
+            return self.table
+        self.table = HostTable(self.table.columns, pinned=device.type == "cuda")
+        return Residence(self.table, device, self.pool_bytes, None)
 
 
 def save(
@@ -208,7 +224,9 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
         FileNotFoundError: the folder is not a run, or holds no checkpoint.
     """
     check_is_run(folder)
-    restored = restore(folder, ranks)
+    pool_bytes = _pool_bytes(folder / CONFIG)
+    home = torch.device("cpu") if pool_bytes > 0 else ranks.device
+    restored = restore(folder, ranks, home)
     if restored is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
     config, progress, table = restored.config, restored.progress, restored.table
@@ -216,9 +234,17 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
         _compare_with_file(config, folder / CONFIG)
     if data is not None:
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=data))
-    optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, ranks.device)
+    optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
-    return TrainedModel(config, progress, restored.space, table)
+    return TrainedModel(config, progress, restored.space, table, pool_bytes)
+
+
+def _pool_bytes(path: Path) -> int:
+    """Return how many bytes of a device a run's Gaussians may take, by its configuration; 0: all."""
+    try:
+        return int(load_config(path).memory.resident_gb * 1e9)
+    except ConfigError:
+        return 0
 
 
 def _compare_with_file(config: Config, path: Path) -> None:

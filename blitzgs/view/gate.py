@@ -118,12 +118,13 @@ class SceneGate:
     def __init__(self, gate: LodGate, most_kept: float, table: GaussianTable, ranks: Ranks) -> None:
         """Draw the sample. Collective: every rank calls this with its share of the Gaussians, caught up."""
         self.gate, self.most_kept, self._ranks = gate, most_kept, ranks
-        count = int(ranks.all_reduce(torch.tensor([len(table)], device=table.device)).item())
+        device = ranks.device  # which need not be that of the table
+        count = int(ranks.all_reduce(torch.tensor([len(table)], device=device)).item())
         chosen = uniform(table["id"], _SAMPLE_KEY) < SAMPLE / max(count, 1)
-        reach = torch.tensor(gate.reach(), dtype=torch.float64, device=table.device)
-        level = table["level"][chosen].long().clamp(max=gate.count - 1)
-        self._means, self._reach = table["means"][chosen].double(), reach[level]
-        self._size = int(ranks.all_reduce(chosen.sum()).item())
+        reach = torch.tensor(gate.reach(), dtype=torch.float64, device=device)
+        level = table["level"][chosen].to(device).long().clamp(max=gate.count - 1)
+        self._means, self._reach = table["means"][chosen].to(device).double(), reach[level]
+        self._size = int(ranks.all_reduce(torch.tensor(len(level), device=device)).item())
 
     def kept(self, centres: Tensor) -> list[float]:
         """Predict the share of all Gaussians that views keep. Collective.

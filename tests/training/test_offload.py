@@ -9,9 +9,14 @@ import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.training import run
+from blitzgs.training.evaluation import render_view
+from blitzgs.training.lod import scene_gate
 from blitzgs.training.trainer import Trainer
-from blitzgs.view.residence import ResidenceError
+from blitzgs.view.residence import Residence, ResidenceError
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import DEVICES
 from tests.training.tiny import HEIGHT, WIDTH, Camera, Capture, Images, random_gaussians, tiny_config
@@ -150,6 +155,25 @@ def test_two_ranks_share_a_run_beyond_their_memory(tmp_path):
     for expected, got in zip(whole, pooled, strict=True):
         for name in expected:
             assert torch.equal(got[name], expected[name]), name
+
+
+def test_a_model_is_rendered_through_a_pool(tmp_path):
+    trainer, _ = train(tmp_path, RESIDENT, "schedule.iterations=15", "view.lod=true", "view.most_kept=1",
+                       "schedule.densify_until=10")  # fmt: skip
+    model, ranks = run.open_model(tmp_path, Ranks()), Ranks()
+    table = model.table
+    lod = scene_gate(model.config, model.progress, table, ranks)
+    options, owners = trainer.state.render_options, TileOwners(ranks)
+    expected = [render_view(table, trainer.state.views, i, options, owners, lod=lod) for i in (0, 5)]
+    whole = GaussianTable({name: table[name].clone() for name in table})
+    scene = model.scene(ranks.device)
+    assert isinstance(scene, Residence) and len(scene.pool) < 0.42 * len(whole)
+    for i, image in zip((0, 5), expected, strict=True):
+        assert torch.equal(render_view(scene, trainer.state.views, i, options, owners, lod=lod), image)
+        assert image.std() > 0.01
+    scene.collect()
+    for name in whole:
+        assert torch.equal(model.table[name], whole[name]), name
 
 
 def test_a_batch_that_does_not_fit_is_named(tmp_path):
