@@ -158,10 +158,10 @@ def test_a_long_run_stays_with_dense_adam_and_needs_no_more_memory(tmp_path, dev
     table, optimiser = state.table, state.optimiser
     dense, start, lazy_step = DenseAdam(table, optimiser), flat(table.parameters), optimiser.step
 
-    def both(table, frame, gradients, scale_reg, opacity_reg, step, sums=None):
+    def both(table, frame, gradients, scale_reg, opacity_reg, step, *others):
         assert opacity_reg is None  # the twin has no term for it
         dense.step(table, frame, gradients, scale_reg, step)
-        lazy_step(table, frame, gradients, scale_reg, opacity_reg, step, sums)
+        lazy_step(table, frame, gradients, scale_reg, opacity_reg, step, *others)
 
     optimiser.step = both
     for step in range(1, steps + 1):
