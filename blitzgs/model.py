@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,6 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from blitzgs.ops.cull_mask import SECTOR_WORDS, rows_of_sectors, sectors_of_rows
 from blitzgs.ops.take_rows import take_rows
 
 # The learned parameters, before activation: log scales, opacity logits, unnormalised quaternions.
@@ -19,6 +21,8 @@ EXP_AVG_SQS = tuple(f"exp_avg_sq.{name}" for name in PARAMETERS)
 # What new rows must bring; every other column starts at zero.
 REQUIRED = (*PARAMETERS, "last_step", "id", "parent", "birth", "level")
 NO_PARENT = -1
+# The cull matrix, from the first importance pass on: which views leave a row out.
+CULL = "cull"
 
 
 class RowExchange(Protocol):
@@ -39,6 +43,11 @@ class Column:
 
     dtype: torch.dtype
     shape: tuple[int, ...]
+
+    @property
+    def bytes(self) -> int:
+        """Of a row."""
+        return self.dtype.itemsize * math.prod(self.shape)
 
 
 def schema(sh_degree: int) -> dict[str, Column]:
@@ -74,11 +83,22 @@ def schema(sh_degree: int) -> dict[str, Column]:
     return columns
 
 
+def as_stored(name: str, column: Tensor) -> Tensor:
+    """Return what `GaussianTable.columns` has of a column [N, ...]: itself, but for `CULL`."""
+    return sectors_of_rows(column).view(-1, column.shape[1]) if name == CULL else column
+
+
 class GaussianTable:
     """One rank's Gaussians as named columns of equal length N.
 
     The operations `append`, `keep`, `permute`, `renew` and `exchange` act on every column alike, one column
     at a time, so that peak memory exceeds the table by one column and not by a second table.
+
+    The column `CULL`, int32 [N, words] with a bit for each view, is stored by blocks of rows, as `cull` has
+    it, and transposed whenever it is set, read or moved.
+
+    Attributes:
+        columns: as they are stored, by name; of `CULL` the memory of `cull`, [256 ceil(N / 256), words].
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
@@ -105,7 +125,7 @@ class GaussianTable:
                     f"GaussianTable: column '{name}' must be {column.dtype} {list(wanted)} on {sh.device}, "
                     f"got {tensor.dtype} {list(tensor.shape)} on {tensor.device}"
                 )
-        self.columns: dict[str, Tensor] = dict(columns)
+        self.columns: dict[str, Tensor] = {name: as_stored(name, column) for name, column in columns.items()}
 
     @classmethod
     def create(cls, rows: Mapping[str, Tensor]) -> GaussianTable:
@@ -120,7 +140,13 @@ class GaussianTable:
         return int(self.columns["means"].shape[0])
 
     def __getitem__(self, name: str) -> Tensor:
+        if name == CULL and self.cull is not None:
+            return rows_of_sectors(self.cull, len(self))
         return self.columns[name]
+
+    def __delitem__(self, name: str) -> None:
+        """Drop a column."""
+        del self.columns[name]
 
     def __setitem__(self, name: str, tensor: Tensor) -> None:
         """Replace or add a column of the table's length; it moves with the others from then on."""
@@ -132,10 +158,40 @@ class GaussianTable:
 
     def _store(self, name: str, tensor: Tensor) -> None:
         """Make a tensor the column of a name. Every operation puts its new columns here, one by one."""
-        self.columns[name] = tensor
+        self._hold(name, as_stored(name, tensor))
+
+    def _to_change(self) -> list[str]:
+        """Return the columns in the order in which they change: `CULL` while others tell its length."""
+        return sorted(self, key=lambda name: name != CULL)
+
+    def release(self) -> dict[str, Tensor]:
+        """Return all columns, [N, ...], and leave the table without any."""
+        columns = {name: self[name] for name in self}
+        self.columns = {}
+        return columns
+
+    def _hold(self, name: str, stored: Tensor) -> None:
+        """Keep what is stored of a column."""
+        self.columns[name] = stored
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.columns)
+
+    @property
+    def cull(self) -> Tensor | None:
+        """The column `CULL` by blocks, int32 [ceil(N / 256), columns, 8], see `blitzgs.ops.cull_mask`."""
+        stored = self.columns.get(CULL)
+        return None if stored is None else stored.view(-1, 32 * stored.shape[1], SECTOR_WORDS)
+
+    def row_of(self, name: str) -> Column:
+        """Return what a column holds."""
+        column = self.columns[name]
+        return Column(column.dtype, tuple(column.shape[1:]))
+
+    @property
+    def row_bytes(self) -> dict[str, int]:
+        """The bytes of a row in each column."""
+        return {name: self.row_of(name).bytes for name in self}
 
     @property
     def device(self) -> torch.device:
@@ -168,7 +224,8 @@ class GaussianTable:
             ValueError: a required column is missing, an unknown one is given, or shapes or dtypes differ.
         """
         count = self._check_new(rows)
-        for name, column in self.columns.items():
+        for name in self._to_change():
+            column = self[name]
             new = rows[name] if name in rows else column.new_zeros((count, *column.shape[1:]))
             self._store(name, torch.cat((column, new)))
 
@@ -176,12 +233,12 @@ class GaussianTable:
         """Check rows that are to be added; return how many."""
         if missing := [name for name in REQUIRED if name not in rows]:
             raise ValueError(f"GaussianTable: new rows lack the columns {missing}")
-        if unknown := [name for name in rows if name not in self.columns]:
+        if unknown := [name for name in rows if name not in self]:
             raise ValueError(f"GaussianTable: the table has no columns {unknown}")
         count = int(rows["means"].shape[0])
         for name, new in rows.items():
-            column = self.columns[name]
-            wanted = (count, *column.shape[1:])
+            column = self.row_of(name)
+            wanted = (count, *column.shape)
             if tuple(new.shape) != wanted or new.dtype != column.dtype:
                 raise ValueError(
                     f"GaussianTable: column '{name}' of new rows must be {column.dtype} {list(wanted)}, "
@@ -215,8 +272,8 @@ class GaussianTable:
         """
         self._check_new(new)
         # One after the other, so that no more than one column is there twice.
-        for name, column in self.columns.items():
-            self._store(name, take_rows(column, rows, new.get(name)))
+        for name in self._to_change():
+            self._store(name, take_rows(self[name], rows, new.get(name)))
 
     def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
         """Move every row to a rank. Collective: every rank calls it; rows arrive by source rank, in order.
@@ -229,10 +286,11 @@ class GaussianTable:
         counts = torch.bincount(destination_ranks, minlength=ranks.world_size)
         sent = counts.tolist()
         received = ranks.exchange_counts(counts).tolist()
-        for name in list(self.columns):
-            column = self.columns.pop(name)
-            self._store(name, ranks.all_to_all(take_rows(column, order), sent, received))
+        for name in self._to_change():
+            moved = take_rows(self[name], order)
+            del self[name]
+            self._store(name, ranks.all_to_all(moved, sent, received))
 
     def _select(self, rows: Tensor) -> None:
-        for name, column in self.columns.items():
-            self._store(name, take_rows(column, rows))
+        for name in self._to_change():
+            self._store(name, take_rows(self[name], rows))

@@ -178,6 +178,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Gradient-boosted trees: the sum of the leaves that each row of features reaches.
   m.def("tree_sums(Tensor features, Tensor roots, Tensor nodes, Tensor leaves, int depth) -> Tensor");
 
+  // A mask of bits by row [N, words], and by block and column [blocks, 32 words, 8].
+  m.def("sectors_of_rows(Tensor rows) -> Tensor");
+  m.def("rows_of_sectors(Tensor sectors, int n) -> Tensor");
+
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
 

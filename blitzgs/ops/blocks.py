@@ -46,7 +46,7 @@ class GateRules(NamedTuple):
         reach: for each of 1 to 32 levels the distance up to which it is kept, in the unit of the means, the
             same or less for finer levels; negative: nowhere.
         lod_views: bit v is set when view v has an LOD gate.
-        cull: int32 [N, words], `blitzgs.population.importance.Importance.cull`; None: there is none.
+        cull: int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.cull_mask`; None: there is none.
         columns: of `cull`, one for each view; negative: the view has no mask. Empty: no view has one.
     """
 

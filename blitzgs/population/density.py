@@ -12,10 +12,10 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
-from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.model import CULL, PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
 from blitzgs.population.candidates import Candidates, Veto, spawn_features
-from blitzgs.population.importance import CULL, PHI
+from blitzgs.population.importance import PHI
 from blitzgs.population.lineage import Births, Cause, Lineage
 from blitzgs.population.scale_floor import FLOOR
 from blitzgs.view.blocks import morton_order

@@ -92,5 +92,5 @@ def rows_that_fit(rows: int, row_bytes: int, widest_column: int, available: int,
 
 def _row_bytes(table: GaussianTable) -> tuple[int, int]:
     """Return the bytes of one row in all columns, and in the widest."""
-    sizes = [table[name][:1].nbytes for name in table] if len(table) else [1]
+    sizes = list(table.row_bytes.values())
     return sum(sizes), max(sizes)

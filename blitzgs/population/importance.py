@@ -29,7 +29,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
 from blitzgs.distributed.transport import open_transport
-from blitzgs.model import GaussianTable
+from blitzgs.model import CULL, GaussianTable
 from blitzgs.ops.view_sums import ViewSums, view_sums_
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.survey import Survey, survey
@@ -39,8 +39,8 @@ from blitzgs.view.seen import Scene, Seen, seen, table_of
 SCORE_EPS = 1e-6
 PHI_EPS = 0.1
 VIEW_MASS = 0.99
-# Columns of a table from the first pass on.
-PHI, CULL = "phi", "cull"
+# Column of a table from the first pass on, beside `CULL`.
+PHI = "phi"
 _WORD = 32
 ScoreRule = Literal["density", "root", "weight"]
 # How a view's term grows with its pixels, of which there are less than 2^31: bits before the point.

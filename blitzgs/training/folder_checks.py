@@ -132,7 +132,7 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
     Raises:
         FolderError: on every rank, when there is no room for a checkpoint even now.
     """
-    row = sum(table[name].element_size() * table[name][:1].numel() for name in table) if len(table) else 0
+    row = sum(table.row_bytes.values())
     parts = ranks.all_gather_object((len(table), row))
     rows, row = sum(count for count, _ in parts), max(size for _, size in parts)
     free = ranks.broadcast_object(shutil.disk_usage(folder).free if ranks.rank == 0 else 0)

@@ -134,7 +134,7 @@ def check_before_saving(table: GaussianTable, step: int, ranks: Ranks) -> None:
     Raises:
         NonFiniteError: on every rank, naming the step, the rank, the column and the Gaussians.
     """
-    floats = [name for name in table if table[name].is_floating_point()]
+    floats = [name for name in table if table.row_of(name).dtype.is_floating_point]
     found = ranks.all_gather_object(bad_column(table, floats))
     culprits = [f"rank {rank}: {text}" for rank, text in enumerate(found) if text is not None]
     if culprits:

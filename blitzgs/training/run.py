@@ -144,7 +144,8 @@ def save(
         "run": run_id,
     }
     keep = config.log.keep_checkpoints
-    return checkpoint.save(folder / CHECKPOINTS, table.columns, state, ranks, keep, shared)
+    columns = {name: table[name] for name in table}
+    return checkpoint.save(folder / CHECKPOINTS, columns, state, ranks, keep, shared)
 
 
 @dataclass

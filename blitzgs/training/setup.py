@@ -100,7 +100,7 @@ def set_up(
     sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
     sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed)
     if config.memory.resident_gb > 0:
-        table = HostTable(table.columns, pinned=ranks.device.type == "cuda")
+        table = HostTable(table.release(), pinned=ranks.device.type == "cuda")
     return TrainingState(
         config=config,
         capture=capture,

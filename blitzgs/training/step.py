@@ -14,7 +14,6 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import Frame, RenderOptions
 from blitzgs.population.exploration import PositionNoise
-from blitzgs.population.importance import CULL
 from blitzgs.population.scale_floor import FLOOR, raise_scales
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
@@ -101,7 +100,7 @@ class Stepper:
             begin with [2 B].
         """
         table, ranks, views = self.table, self._owners.ranks, batch.views
-        rules = None if gate is None else gate.rules(table, table.columns.get(CULL))
+        rules = None if gate is None else gate.rules(table)
 
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         for attempt in self._transport.capacity.attempts():

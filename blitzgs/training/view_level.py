@@ -8,8 +8,7 @@ import math
 import warnings
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.model import GaussianTable
-from blitzgs.population.importance import CULL
+from blitzgs.model import CULL, GaussianTable
 from blitzgs.scene.capture import Capture
 from blitzgs.training.inputs import train_views_fingerprint
 from blitzgs.training.lod import lod_gate, scene_gate
@@ -69,7 +68,7 @@ def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ra
     if progress.train_views not in ("", views):
         progress = dataclasses.replace(progress, gated_views="")
         if CULL in table:
-            del table.columns[CULL]
+            del table[CULL]
             if ranks.rank == 0:
                 warnings.warn(
                     f"the checkpoint was trained on other views than the {len(capture.train)} of today: the "

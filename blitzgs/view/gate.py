@@ -93,14 +93,9 @@ class ViewGate:
     lod_views: int
     columns: Sequence[int] = ()
 
-    def rules(self, table: GaussianTable, cull: Tensor | None = None) -> GateRules:
-        """Return what the views leave out of a table, as the ops take it.
-
-        Args:
-            table: the Gaussians.
-            cull: the table's cull matrix, where there are `columns`.
-        """
-        return GateRules(table["level"], list(self.reach), self.lod_views, cull, list(self.columns))
+    def rules(self, table: GaussianTable) -> GateRules:
+        """Return what the views leave out of a table, as the ops take it."""
+        return GateRules(table["level"], list(self.reach), self.lod_views, table.cull, list(self.columns))
 
 
 class SceneGate:

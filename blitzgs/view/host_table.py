@@ -43,9 +43,10 @@ class HostTable(GaussianTable):
         self._pinned = pinned
         self._rooms: dict[str, Tensor] = {}
         for name in list(columns):
-            self._store(name, columns.pop(name))
+            del columns[name]
+            self._hold(name, self.columns[name])
 
-    def _store(self, name: str, tensor: Tensor) -> None:
+    def _hold(self, name: str, tensor: Tensor) -> None:
         for lost in self._rooms.keys() - self.columns.keys():
             del self._rooms[lost]
         room = self._rooms.get(name)

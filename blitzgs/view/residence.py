@@ -15,7 +15,7 @@ both steps together do not fit, the next one waits for the rest of its blocks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.model import CULL, EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.residence import swap_blocks_
 from blitzgs.view.blocks import BlockIndex
@@ -100,7 +100,7 @@ class Residence:
         # First in line for multiprocessors: it needs few of them, and the next step waits for it.
         self._stream = torch.cuda.Stream(device, priority=-1) if device.type == "cuda" else None
         self._storage: dict[str, Tensor] = {}
-        self.pool = GaussianTable({name: table[name][:0] for name in table})
+        self.pool = self._pool_of({name: column[:0] for name, column in table.columns.items()}, 0)
         self._is_open = self._rest_changed = False
         self.reindex(schedule)
 
@@ -125,7 +125,7 @@ class Residence:
         """Make room for as many blocks as the budget has; a block of fewer than 256 rows has its own slot."""
         table = self.table
         names = [*_WRITTEN, *(name for name in table if name not in _WRITTEN)]
-        sizes = {name: BLOCK_ROWS * _row_bytes(table[name]) for name in names}
+        sizes = {name: BLOCK_ROWS * table.row_bytes[name] for name in names}
         self._bytes_in = sum(sizes.values())
         self._bytes_out = sum(sizes[name] for name in _WRITTEN)
         has_rest = self._rest > 0
@@ -137,17 +137,15 @@ class Residence:
             )
         rows = slots * BLOCK_ROWS + self._rest
         room = (slots + has_rest) * BLOCK_ROWS
-        if any(not _fits(self._storage.get(name), table[name], room) for name in names):
+        if any(not _fits(self._storage.get(name), table.columns[name], room) for name in names):
             # The old pool goes before the new one comes.
             self.pool.columns.clear()
             self._storage.clear()
             self._storage = {
-                name: torch.zeros(
-                    (room, *table[name].shape[1:]), dtype=table[name].dtype, device=self._device
-                )
-                for name in names
+                name: torch.zeros((room, *row.shape), dtype=row.dtype, device=self._device)
+                for name, row in ((name, table.row_of(name)) for name in names)
             }
-        self.pool = GaussianTable({name: self._storage[name][:rows] for name in names})
+        self.pool = self._pool_of({name: self._storage[name] for name in names}, rows)
         self._block_in = np.full(slots, _FREE, dtype=np.int64)
         self._slot_of = np.full(self._blocks, _FREE, dtype=np.int64)
         self._is_changed = np.zeros(slots, dtype=bool)
@@ -155,11 +153,21 @@ class Residence:
         self._clock = 0
         self._ready_for: int | None = None
 
+    @staticmethod
+    def _pool_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
+        """Return a table of the first rows of columns, as tables store them."""
+        pool = GaussianTable({name: column[:rows] for name, column in columns.items() if name != CULL})
+        if CULL in columns:
+            pool.columns[CULL] = columns[CULL][: -(-rows // BLOCK_ROWS) * BLOCK_ROWS]
+        return pool
+
     def _open(self) -> None:
         """Begin to use the pool: the last, partial block comes to stay."""
         if not self._is_open and self._rest:
             for name, column in self.pool.columns.items():
-                column[-self._rest :].copy_(self.table[name][-self._rest :])
+                # The mask of the last block is as long as that of any.
+                count = BLOCK_ROWS if name == CULL else self._rest
+                column[-count:].copy_(self.table.columns[name][-count:])
         self._is_open = True
 
     def collect(self) -> None:
@@ -314,7 +322,7 @@ class Residence:
         old, is_changed = self._block_in[slots], self._is_changed[slots]
         leaving = np.where(is_changed, old, _FREE)
         lists = torch.from_numpy(np.stack((slots, leaving, coming)).astype(np.int32))
-        columns = list(self.pool.columns.values()), [self.table[name] for name in self.pool]
+        columns = list(self.pool.columns.values()), [self.table.columns[name] for name in self.pool]
         if self._stream is None:
             swap_blocks_(*columns, len(_WRITTEN), *lists)
         else:
@@ -343,10 +351,6 @@ class Residence:
         """Let the device's work wait for the moves."""
         if self._stream is not None:
             torch.cuda.current_stream(self._device).wait_stream(self._stream)
-
-
-def _row_bytes(column: Tensor) -> int:
-    return column.element_size() * int(np.prod(column.shape[1:]))
 
 
 def _fits(storage: Tensor | None, column: Tensor, rows: int) -> bool:

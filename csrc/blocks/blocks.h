@@ -16,7 +16,7 @@
 //
 // A gate on the views (view_gate.h) drops rows by the same principle: the distances of a box decide for its
 // blocks, then for its rows; what is undecided stays, and the exact test follows when the rows have caught
-// up.
+// up. A mask drops a block without reading its rows where it leaves all of them out (cull_mask.h).
 //
 // The test is conservative: every row that projection would project is in the set
 // (tests/view/test_blocks.py). O(N / 256 + rows of the blocks across a border + active rows) per view.
@@ -38,6 +38,7 @@
 namespace blitzgs {
 
 constexpr int kBlockRows = 256;
+static_assert(kBlockRows == kSectorRows);
 constexpr int kBlockBounds = 8;  // lowest corner, highest corner, largest sigma, whether all rows are finite
 
 BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
@@ -217,8 +218,15 @@ BLITZGS_HD void gate_block(const BlockGate& gate, const GateTable& table, std::i
     if (range.near2 > table.reach2[coarsest < last ? coarsest : last]) seen.some &= others;
     if (!(range.far2 <= table.reach2[finest < last ? finest : last])) seen.all &= others;
   }
+  for (int view = 0; view < rules.n_views; ++view) {
+    if (!has_bit(seen.some & rules.cull_views, view)) continue;
+    const std::int64_t sector = sector_at(block, rules.cull_columns, table.columns[view]);
+    const SectorBits culled = sector_bits(rules.cull + sector, rows_in_block(rules.n_rows, block));
+    if (culled.all) seen.some &= ~(1u << view);
+    if (culled.any) seen.all &= ~(1u << view);
+  }
   seen.inside &= seen.some;
-  seen.all &= seen.some & ~rules.cull_views;
+  seen.all &= seen.some;
 }
 
 template <bool kGated>

@@ -6,20 +6,22 @@
 // level 0 at any distance, and a level beyond L_max(t) nowhere (reach < 0). Comparing squared distances
 // decides the same sets without a logarithm.
 //
-// Cull mask: view v leaves out row i iff bit columns[v] of the row's cull matrix is set.
+// Cull mask: view v leaves out row i iff the row's bit in column columns[v] of the cull matrix is set. The
+// matrix is stored by block and column (cull_mask.h).
 //
 // The op clears the bits of (row, view) pairs that are left out, in the lists of the active set. Each row
 // decides for itself, in float32 and from caught-up means, so the sets depend neither on the order of the
 // rows nor on how they are divided among ranks. In place, one thread a row: deterministic. O(listed rows).
 //
 // ids int32 [room] and views int32 [room], of which the first count [1] are valid; means [N, 3]; level uint8
-// [N]; viewmats [B, 4, 4], rigid; cull int32 [N, words].
+// [N]; viewmats [B, 4, 4], rigid; cull int32 [ceil(N / 256), columns, 8].
 #pragma once
 #include <cstdint>
 
 #include "common/host_device.h"
 #include "common/limits.h"
 #include "common/stream.h"
+#include "cull_mask/cull_mask.h"
 
 namespace blitzgs {
 
@@ -33,8 +35,8 @@ struct GateTable {
 // What is left out of B views of a table.
 struct GateRules {
   const std::uint8_t* level;  // [N]
-  const std::int32_t* cull;   // [N, words]; may be null
-  std::int64_t words;
+  const std::int32_t* cull;   // [sector_blocks(N), cull_columns, kSectorWords]; may be null
+  std::int64_t n_rows, cull_columns;
   int n_views, n_levels;
   std::uint32_t lod_views;   // bits of the views that have an LOD gate
   std::uint32_t cull_views;  // and of those that have a mask
@@ -84,9 +86,7 @@ BLITZGS_HD std::uint32_t views_that_cull(const GateRules& rules, const GateTable
   if (!(seen & rules.cull_views)) return culled;
   for (int view = 0; view < rules.n_views; ++view) {
     if (!has_bit(seen & rules.cull_views, view)) continue;
-    const std::int32_t column = table.columns[view];
-    const auto word = static_cast<std::uint32_t>(rules.cull[row * rules.words + column / 32]);
-    if (has_bit(word, column % 32)) culled |= 1u << view;
+    if (sector_bit(rules.cull, rules.cull_columns, table.columns[view], row)) culled |= 1u << view;
   }
   return culled;
 }

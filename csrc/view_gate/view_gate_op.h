@@ -35,8 +35,8 @@ inline void set_columns(const char* op, const std::vector<std::int64_t>& columns
                   " views need as many columns of the cull matrix, got ", columns.size());
   STD_TORCH_CHECK(has_cull, "blitzgs::", op, ": columns need a cull matrix");
   for (int view = 0; view < rules.n_views; ++view) {
-    STD_TORCH_CHECK(columns[view] < 32 * rules.words, "blitzgs::", op, ": the cull matrix has ",
-                    32 * rules.words, " columns, got column ", columns[view]);
+    STD_TORCH_CHECK(columns[view] < rules.cull_columns, "blitzgs::", op, ": the cull matrix has ",
+                    rules.cull_columns, " columns, got column ", columns[view]);
     rules.table.columns[view] = static_cast<std::int32_t>(columns[view]);
     if (columns[view] >= 0) rules.cull_views |= 1u << view;
   }
@@ -50,12 +50,13 @@ inline HeldRules hold_rules(const char* op, std::int64_t rows, int views, const 
   HeldRules held{as_contiguous(level), std::nullopt};
   if (cull) {
     check_dtype(op, "cull", *cull, ScalarType::Int);
-    check_shape(op, "cull", *cull, {rows, -1});
+    check_shape(op, "cull", *cull, {sector_blocks(rows), -1, kSectorWords});
     held.cull = as_contiguous(*cull);
-    held.rules.words = held.cull->size(1);
+    held.rules.cull_columns = held.cull->size(1);
   }
   held.rules.level = data<std::uint8_t>(held.level);
   held.rules.cull = data_or_null<std::int32_t>(held.cull);
+  held.rules.n_rows = rows;
   held.rules.n_views = views;
   held.rules.lod_views = static_cast<std::uint32_t>(lod_views);
   set_reach(op, reach, held.rules);

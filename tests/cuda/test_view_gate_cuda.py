@@ -20,7 +20,7 @@ def gated(table, viewmats, gate, count):
         torch.full((room,), -1, dtype=torch.int32, device=device),
         torch.tensor([count], dtype=torch.int32, device=device),
     )
-    gate_views_(active, table["means"], viewmats, gate.rules(table, table["cull"]))
+    gate_views_(active, table["means"], viewmats, gate.rules(table))
     assert (active.views[count:] == -1).all()
     return active.views[:count]
 

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.model import CULL
 from blitzgs.population.candidates import FEATURES
 from blitzgs.population.gate_fit import fit, read_spawns
-from blitzgs.population.importance import CULL, PHI, is_culled
+from blitzgs.population.importance import PHI, is_culled
 from blitzgs.population.lineage import ABOUT, Cause, read_lineage
 from blitzgs.population.spawn_gate import GateError, GateInfo, info_path
 from blitzgs.training import run

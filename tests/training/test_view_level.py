@@ -15,8 +15,8 @@ from blitzgs import pipeline
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
-from blitzgs.model import GaussianTable
-from blitzgs.population.importance import CULL, is_culled
+from blitzgs.model import CULL, GaussianTable
+from blitzgs.population.importance import is_culled
 from blitzgs.training import run
 from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_io import ConfigError
@@ -153,7 +153,7 @@ def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
     gate = scene_gate(state.config, state.progress, state.table, Ranks()).gate
     reach = torch.tensor(gate.reach(), dtype=torch.float64)[state.table["level"].long()]
     assert (distances <= reach).double().mean() < 0.95
-    small = GaussianTable(state.table.columns)
+    small = GaussianTable({name: state.table[name] for name in state.table})
     small.keep(distances <= reach)
     image = pipeline.forward(small, view, state.render_options).renders[0]
     assert found["psnr"] == image_metrics(image, tiny_scene()[1].get(3), None)["psnr"]

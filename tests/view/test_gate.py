@@ -11,12 +11,12 @@ import torch
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileAssignment, TileOwners
-from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.model import CULL, EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import RenderOptions, Views
-from blitzgs.population.importance import CULL, ViewBatch, is_culled, sweep
+from blitzgs.population.importance import ViewBatch, is_culled, sweep
 from blitzgs.training.batches import Batch
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
@@ -84,7 +84,7 @@ def test_every_set_is_that_of_the_definition(device, lod_views, columns):
         active = some_rows(table, 4, seed)
         before = active.views.clone()
         gate = ViewGate(GATE.reach(), sum(1 << v for v in lod_views), columns)
-        gate_views_(active, table["means"], viewmats, gate.rules(table, table[CULL]))
+        gate_views_(active, table["means"], viewmats, gate.rules(table))
         ids, views = active.listed()
         kept, close = (
             pairs[ids.long()] for pairs in kept_by_definition(table, viewmats, GATE, lod_views, columns)
@@ -129,13 +129,13 @@ def test_images_are_those_of_the_gaussians_that_are_kept_with_blocks_and_without
         torch.tensor([count], dtype=torch.int32, device=device),
     )
     for active in (with_blocks, without):
-        gate_views_(active, table["means"], viewmats, gate.rules(table, table[CULL]))
+        gate_views_(active, table["means"], viewmats, gate.rules(table))
     images = render(table, viewmats, Ks, with_blocks)
     assert torch.equal(images, render(table, viewmats, Ks, without))
     kept, _ = kept_by_definition(table, viewmats, GATE, (0, 1, 3), COLUMNS)
     everything = render(table, viewmats, Ks)
     for view in range(4):
-        small = GaussianTable(table.columns)
+        small = GaussianTable({name: table[name] for name in table})
         small.keep(kept[:, view])
         alone = render(small, viewmats[view : view + 1], Ks[view : view + 1])
         assert torch.equal(images[view], alone[0])
@@ -218,7 +218,7 @@ def test_the_set_before_catching_up_misses_nothing(device):
     crossed, listed, without = 0, 0, 0
     for step in range(1, steps + 1):
         viewmats, Ks = views[step * 7 % len(views)]
-        rules, size = gate.rules(table, table[CULL]), (WIDTH, HEIGHT, NEAR, FAR)
+        rules, size = gate.rules(table), (WIDTH, HEIGHT, NEAR, FAR)
         found = allowed(index.active(table, viewmats, Ks, *size, rules=rules).listed())
         if step % 20 == 0:
             dense = GaussianTable({name: table[name].clone() for name in table})
@@ -247,6 +247,29 @@ def test_the_set_before_catching_up_misses_nothing(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_blocks_that_a_mask_leaves_out_are_dropped_unread(device):
+    """And blocks of which it leaves nothing out are taken whole, as without a mask."""
+    table = make_scene(30_000 + 100, device)
+    viewmats, Ks = make_views(1, device)
+    size, blocks = (WIDTH, HEIGHT, NEAR, FAR), -(-len(table) // 256)
+    plain = BlockIndex(table).active(table, viewmats, Ks, *size)
+    seen_blocks = (plain.listed()[0] // 256).unique()
+    assert len(seen_blocks) > 8
+    mask, none = torch.zeros_like(table[CULL]), torch.zeros(blocks, dtype=torch.bool, device=device)
+    left_out = none.index_fill(0, seen_blocks[::2].long(), True)
+    left_out[-1] = True  # a block that is not full
+    of_row = left_out.repeat_interleave(256)[: len(table)]
+    mask[:, 1] = torch.where(of_row, 1 << 5, 0).int()
+    table[CULL] = mask
+    rules = ViewGate([math.inf], 0, (37,)).rules(table)
+    found = BlockIndex(table).active(table, viewmats, Ks, *size, rules=rules)
+    assert int(found.blocks) <= int(plain.blocks) - len(seen_blocks[::2])
+    kept = ~of_row[plain.listed()[0].long()]
+    for a, b in zip(found.listed(), plain.listed(), strict=True):
+        assert torch.equal(a, b[kept])
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("columns", [(), COLUMNS])
 def test_the_gated_set_does_not_depend_on_the_order_of_the_rows(device, columns):
     """And where no step is pending, it is what the exact test leaves of the set without a gate."""
@@ -254,7 +277,7 @@ def test_the_gated_set_does_not_depend_on_the_order_of_the_rows(device, columns)
     viewmats, Ks = make_views(device=device)
     gate, sets, exact = ViewGate(GATE.reach(), 0b1011, columns), [], []
     for _ in range(2):
-        rules = gate.rules(table, table[CULL])
+        rules = gate.rules(table)
         index = BlockIndex(table)
         with_gate = index.active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR, rules=rules)
         sets.append({(int(table["id"][row]), view) for row, view in allowed(with_gate.listed())})
@@ -300,7 +323,7 @@ def _gated_image(ranks):
     shares = scene.kept(centres_of(viewmats))
     images = []
     masked = BlockIndex(table).active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
-    rules = ViewGate(GATE.reach(), 0b1101, COLUMNS).rules(table, table[CULL])
+    rules = ViewGate(GATE.reach(), 0b1101, COLUMNS).rules(table)
     gate_views_(masked, table["means"], viewmats, rules)
     smooth = replace(GATE, smooth=True)
     faded = SceneGate(smooth, math.inf, table, ranks).active(table, viewmats)
@@ -340,7 +363,7 @@ def test_a_sweep_scores_what_the_gate_lets_views_show(device):
     kept, _ = kept_by_definition(table, viewmats, GATE, gated)
     score = torch.zeros(len(table), dtype=torch.float64, device=device)
     for view in range(4):
-        small = GaussianTable(table.columns)
+        small = GaussianTable({name: table[name] for name in table})
         small.keep(kept[:, view])
         one = Views(viewmats[view : view + 1], Ks[view : view + 1], WIDTH, HEIGHT)
         alone = sweep(small, [ViewBatch([0], one)], 1, OPTIONS, ranks)
@@ -363,9 +386,9 @@ def test_errors_name_the_value():
     with pytest.raises(RuntimeError, match="finer levels reach no farther, got 1 and 2 for the"):
         call([1.0, 2.0], 1)
     with pytest.raises(RuntimeError, match="2 views need as many columns of the cull matrix, got 3"):
-        call([1.0], 0, table[CULL], [0, 1, 2])
+        call([1.0], 0, table.cull, [0, 1, 2])
     with pytest.raises(RuntimeError, match="the cull matrix has 64 columns, got column 64"):
-        call([1.0], 0, table[CULL], [0, 64])
+        call([1.0], 0, table.cull, [0, 64])
     with pytest.raises(RuntimeError, match="columns need a cull matrix"):
         call([1.0], 0, None, [0, 1])
     many, _ = make_views(33)
@@ -381,5 +404,5 @@ def test_opcheck(device):
     torch.library.opcheck(
         torch.ops.blitzgs.gate_views_,
         (active.ids, active.views, active.length, table["means"], table["level"], viewmats, GATE.reach(), 5,
-         table[CULL], list(COLUMNS)),
+         table.cull, list(COLUMNS)),
     )  # fmt: skip

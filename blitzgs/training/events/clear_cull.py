@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from blitzgs.population.importance import CULL
+from blitzgs.model import CULL
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
 
@@ -13,6 +13,6 @@ def run(state: TrainingState, event: Event) -> None:
     if CULL not in state.table:
         return
     state.stepper.settle()
-    del state.table.columns[CULL]
+    del state.table[CULL]
     state.stepper.reindex()
     state.log.event(event.time, "clear_cull", {}, "the cull mask is cleared")

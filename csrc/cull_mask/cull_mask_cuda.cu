@@ -1,0 +1,53 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "common/launch.cuh"
+#include "common/warp.cuh"
+#include "cull_mask/cull_mask.h"
+
+namespace blitzgs::cuda {
+
+namespace {
+
+// The word that has bit i of lane's bit `lane`: a warp transposes 32 x 32 bits.
+__device__ std::uint32_t transpose_bits(std::uint32_t word, int lane) {
+  std::uint32_t own = 0;
+#pragma unroll
+  for (int bit = 0; bit < 32; ++bit) {
+    const std::uint32_t of_bit = __ballot_sync(kFullWarp, word >> bit & 1u);
+    if (lane == bit) own = of_bit;
+  }
+  return own;
+}
+
+// A CUDA block handles a block of rows, each of its warps 32 of them and a word of each sector.
+template <bool kToSectors>
+__global__ void __launch_bounds__(kSectorRows) transpose_kernel(const CullMask mask) {
+  const int group = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const std::int64_t block = blockIdx.x, row = block * kSectorRows + threadIdx.x;
+  const bool present = row < mask.n;
+  for (std::int64_t word = 0; word < mask.words; ++word) {
+    std::int32_t& of_row = mask.rows[(present ? row : 0) * mask.words + word];
+    std::int32_t& of_sector = mask.sectors[sector_at(block, 32 * mask.words, 32 * word + lane) + group];
+    if (kToSectors) {
+      of_sector =
+          static_cast<std::int32_t>(transpose_bits(present ? static_cast<std::uint32_t>(of_row) : 0u, lane));
+    } else {
+      const std::uint32_t own = transpose_bits(static_cast<std::uint32_t>(of_sector), lane);
+      if (present) of_row = static_cast<std::int32_t>(own);
+    }
+  }
+}
+
+template <bool kToSectors>
+void transpose(const CullMask& mask, CudaStream stream) {
+  if (mask.n == 0 || mask.words == 0) return;
+  transpose_kernel<kToSectors>
+      <<<static_cast<unsigned>(sector_blocks(mask.n)), kSectorRows, 0, stream>>>(mask);
+  check_launch("cull mask");
+}
+
+}  // namespace
+
+void sectors_of_rows(const CullMask& mask, CudaStream stream) { transpose<true>(mask, stream); }
+void rows_of_sectors(const CullMask& mask, CudaStream stream) { transpose<false>(mask, stream); }
+
+}  // namespace blitzgs::cuda
