@@ -21,8 +21,8 @@ class GrowthLimit:
 
     Attributes:
         count: Gaussians, over all ranks.
-        reason: what sets the limit, for the log: "population.max_gaussians", "population.pixels_per_gaussian"
-            or "memory".
+        reason: what sets the limit, for the log: "memory" or the option, "population.max_gaussians",
+            "population.pixels_per_gaussian" or "population.gaussians_per_point".
     """
 
     count: int
@@ -30,7 +30,12 @@ class GrowthLimit:
 
 
 def growth_limit(
-    max_gaussians: int, pixels: int, pixels_per_gaussian: float, memory_count: int | None
+    max_gaussians: int,
+    pixels: int,
+    pixels_per_gaussian: float,
+    points: int,
+    gaussians_per_point: float,
+    memory_count: int | None,
 ) -> GrowthLimit | None:
     """Return the tightest of the limits on a population; None when there is none.
 
@@ -38,6 +43,8 @@ def growth_limit(
         max_gaussians: a fixed limit; 0: none.
         pixels: of all training photographs together.
         pixels_per_gaussian: how many of them a Gaussian needs as its evidence; 0: no such limit.
+        points: of the reconstruction, which found them where the photographs show detail; 0: no such limit.
+        gaussians_per_point: how many Gaussians a point is evidence for; 0: no such limit.
         memory_count: from `memory_limit`; None: no such limit.
     """
     limits = []
@@ -46,6 +53,9 @@ def growth_limit(
     if pixels_per_gaussian > 0:
         count = max(1, int(pixels / pixels_per_gaussian))
         limits.append(GrowthLimit(count, "population.pixels_per_gaussian"))
+    if gaussians_per_point > 0 and points > 0:
+        count = max(1, int(points * gaussians_per_point))
+        limits.append(GrowthLimit(count, "population.gaussians_per_point"))
     if memory_count is not None:
         limits.append(GrowthLimit(memory_count, "memory"))
     return min(limits, key=lambda limit: limit.count, default=None)

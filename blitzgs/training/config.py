@@ -235,6 +235,8 @@ class PopulationConfig:
             event from `schedule.gate_from` on.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).
         pixels_per_gaussian: nor does it exceed the pixels of all training photographs over this. 0: no cap.
+        gaussians_per_point: nor the points of the reconstruction times this, whose number follows the detail
+            that photographs share. 0: no cap.
         min_observations: a Gaussian is densified by the mean of at least so many gradients, one for each view
             of a step that sees it; they are gathered over as many density events as that takes.
     """
@@ -262,6 +264,7 @@ class PopulationConfig:
     gate_rate: float = 0.6
     lineage: bool = False
     pixels_per_gaussian: float = 24.0
+    gaussians_per_point: float = 0.0
     min_observations: int = 1
 
 

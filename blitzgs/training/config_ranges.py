@@ -109,6 +109,7 @@ RANGES: Mapping[str, Range] = {
     "population.prune_world_scale": _LENGTH,
     "population.max_gaussians": Range(0, 1e11),
     "population.pixels_per_gaussian": Range(0, 1e9),
+    "population.gaussians_per_point": Range(0, 1e6),
     "population.min_observations": Range(1, 1e6),
     "population.gate_rate": Range(0, 1),
     "population.pass1_keep": _SHARE,

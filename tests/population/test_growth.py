@@ -12,10 +12,23 @@ from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
 
 
 def test_the_tightest_limit_wins_and_is_named():
-    assert growth_limit(0, 1_000_000, 0.0, None) is None
-    assert growth_limit(500, 1_000_000, 24.0, None) == GrowthLimit(500, "population.max_gaussians")
-    assert growth_limit(0, 1_000_000, 24.0, None) == GrowthLimit(41_666, "population.pixels_per_gaussian")
-    assert growth_limit(50_000, 1_000_000, 24.0, 40_000) == GrowthLimit(40_000, "memory")
+    def limit(**changed):
+        none = {
+            "max_gaussians": 0,
+            "pixels_per_gaussian": 0.0,
+            "gaussians_per_point": 0.0,
+            "memory_count": None,
+        }
+        return growth_limit(**none | {"pixels": 1_000_000, "points": 3_000} | changed)
+
+    by_pixels = GrowthLimit(41_666, "population.pixels_per_gaussian")
+    by_points = GrowthLimit(31_500, "population.gaussians_per_point")
+    assert limit() is None
+    assert limit(max_gaussians=500, pixels_per_gaussian=24.0) == GrowthLimit(500, "population.max_gaussians")
+    assert limit(pixels_per_gaussian=24.0) == by_pixels
+    assert limit(pixels_per_gaussian=24.0, gaussians_per_point=10.5) == by_points
+    assert limit(gaussians_per_point=10.5, points=0) is None
+    assert limit(max_gaussians=50_000, memory_count=40_000) == GrowthLimit(40_000, "memory")
 
 
 def test_memory_holds_the_table_a_copy_of_its_widest_column_and_the_scratch():

@@ -36,6 +36,8 @@ def run(state: TrainingState, event: Event) -> None:
         population.max_gaussians,
         pixels,
         population.pixels_per_gaussian,
+        len(state.capture.points),
+        population.gaussians_per_point,
         memory_limit(state.table, state.ranks),
     )
     report = change_population(state, event.time, density_rules(state, event.time, limit))
