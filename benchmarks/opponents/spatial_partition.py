@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The usual way to a large scene: a uniform grid of blocks with halos, trained one by one, then merged.
 
-The grid divides the bounding box of the training cameras on the plane that they fly in (the two main axes
-of their centres); the outermost blocks reach to infinity. A block is grown by its halo, a share of a cell's
-edge on each side. It starts from the points in its grown cell and is trained on the cameras that
+The grid divides the box around the capture's points, the farthest 2 % at each end left out, on the plane that
+the cameras fly in (the two main axes of their centres). The outermost blocks reach to infinity. A block is
+grown by its halo, a share of a cell's edge on each side. It starts from the points in its grown cell and is
+trained on the cameras that
 
 - stand in the grown cell (VastGaussian's position rule), or
 - have at least a quarter of the points in their picture in it (VastGaussian's visibility rule, with points
@@ -36,6 +37,7 @@ from blitzgs.training.config import Config
 from blitzgs.training.trainer import Trainer
 
 Float64 = npt.NDArray[np.float64]
+LEFT_OUT = 0.02  # of the points, on each side of the box that is divided
 HALO = 0.2  # of a cell's edge, on each side
 LEAST_SEEN = 0.25  # of the points in a camera's picture
 LEAST_POINTS = 4  # to start a block from
@@ -43,13 +45,13 @@ _SAMPLED_POINTS = 20_000  # that decide what cameras see
 
 
 class Grid:
-    """A grid of `columns` x `rows` cells over the training cameras of a capture, numbered row by row."""
+    """A grid of `columns` x `rows` cells over the points of a capture, numbered row by row."""
 
     def __init__(self, capture: Capture, columns: int, rows: int) -> None:
-        """Divide the bounding box of the cameras on the plane of their flight.
+        """Divide the box around most points on the plane of the cameras' flight.
 
         Raises:
-            ValueError: the training cameras stand in a line, or in fewer than two places.
+            ValueError: the training cameras stand in a line, or the points do.
         """
         self.shape = np.array([columns, rows])
         centres = camera_centers(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
@@ -58,9 +60,11 @@ class Grid:
         if len(centres) < 3 or spread[1] < 1e-6 * max(spread[0], 1e-300):
             raise ValueError(f"{capture.root}: the training cameras span no plane to lay a grid over")
         self._axes = axes[:2]
-        flat = (centres - self._middle) @ self._axes.T
-        self._low = flat.min(axis=0)
-        self._edge = (flat.max(axis=0) - self._low) / self.shape
+        flat = (capture.points - self._middle) @ self._axes.T
+        self._low, high = np.quantile(flat, [LEFT_OUT, 1 - LEFT_OUT], axis=0)
+        self._edge = (high - self._low) / self.shape
+        if not (self._edge > 0).all():
+            raise ValueError(f"{capture.root}: the points span no plane to lay a grid over")
 
     @property
     def cells(self) -> int:
