@@ -42,21 +42,22 @@ class Course:
             views: all cameras.
         """
         self.batch_size = sampler.batch_size
-        self._sampler, self._train, self._views = sampler, train, views
+        self._sampler, self._train, self._views = sampler, list(train), views
 
     @cached_property
-    def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self._views.columns()
+    def _columns(self) -> tuple[Tensor, ...]:
+        return tuple(column[self._train] for column in self._views.columns())
 
     def cameras(self, step: int, limits: tuple[float, float, float]) -> Cameras:
         """Return the views of a step (from 1) and of those that follow, as far as one looks ahead."""
         batches = [self._sampler.batch(step - 1 + ahead) for ahead in range(MOST_VIEWS // self.batch_size)]
-        indices = torch.tensor([self._train[view] for batch in batches for view in batch])
+        # A view's place among the training views is its column of the cull matrix, too.
+        columns = torch.tensor([view for batch in batches for view in batch])
         device = self._columns[0].device
         if device.type == "cuda":
-            indices = indices.pin_memory().to(device, non_blocking=True)
-        viewmats, Ks, sizes = (column[indices] for column in self._columns)  # noqa: N806
-        return Cameras(viewmats, Ks, sizes, limits)
+            columns = columns.pin_memory().to(device, non_blocking=True)
+        viewmats, Ks, sizes = (column[columns] for column in self._columns)  # noqa: N806
+        return Cameras(viewmats, Ks, sizes, limits, columns)
 
 
 class OffloadingStepper(Stepper):
@@ -129,6 +130,8 @@ class OffloadingStepper(Stepper):
         """See `Stepper.forward`."""
         self._stands_at = None
         cameras = self._course.cameras(step, options.limits)
+        if gate is None or not gate.columns:
+            cameras = cameras._replace(columns=None)
         self._blocks = self._residence.bring(step, cameras, self._course.batch_size)
         mark("other")
         rendered = super().forward(step, options, batch, mark, gate)

@@ -28,7 +28,7 @@ from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.residence import swap_blocks_
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostTable
-from blitzgs.view.sight import Cameras, Sight
+from blitzgs.view.sight import Cameras, Sight, culled_blocks
 
 # What steps change, and what is therefore written back.
 _WRITTEN = (
@@ -120,6 +120,8 @@ class Residence:
         levels = torch.zeros(1, 2, dtype=torch.uint8)
         self._bounds = torch.cat((index.bounds, nothing)).to(self._device)
         self._level_ranges = torch.cat((index.level_ranges, levels)).to(self._device)
+        cull = self.table.cull
+        self._culled = None if cull is None else culled_blocks(cull[: self._blocks]).to(self._device)
 
     def _make_pool(self) -> None:
         """Make room for as many blocks as the budget has; a block of fewer than 256 rows has its own slot."""
@@ -218,7 +220,7 @@ class Residence:
         """
         self._open()
         self._begun = self._mark()
-        self._sight = Sight(self._bounds[: self._blocks], cameras, batch_size)
+        self._sight = Sight(self._bounds[: self._blocks], cameras, batch_size, self._culled)
         if self._ready_for != step:
             # They have not come ahead, or not all of them.
             self._load(self._sight.by(0), self._begun, required=True)

@@ -13,6 +13,8 @@ from torch import Tensor
 from blitzgs.ops.residence import seen_blocks
 
 MOST_VIEWS = 32  # that are looked at together
+_WORD = 32
+_MOST_WORDS = 1 << 26  # of a mask that are looked at together
 
 
 class Cameras(NamedTuple):
@@ -23,12 +25,14 @@ class Cameras(NamedTuple):
         Ks: float32 [V, 3, 3], pixels.
         sizes: int32 [V, 2], width and height, pixels.
         limits: near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
+        columns: of the cull matrix, int64 [V]; None: the views have no mask.
     """
 
     viewmats: Tensor
     Ks: Tensor
     sizes: Tensor
     limits: tuple[float, float, float]
+    columns: Tensor | None = None
 
 
 class Sight:
@@ -38,17 +42,22 @@ class Sight:
         batches: how many.
     """
 
-    def __init__(self, bounds: Tensor, cameras: Cameras, batch_size: int) -> None:
+    def __init__(
+        self, bounds: Tensor, cameras: Cameras, batch_size: int, culled: Tensor | None = None
+    ) -> None:
         """Begin to look.
 
         Args:
             bounds: of N blocks, float32 [N, 8].
             cameras: views of some batches, in their order, at most 32.
             batch_size: views of a batch.
+            culled: of the same blocks, from `culled_blocks`.
         """
         self._batch_size = batch_size
         self.batches = len(cameras.viewmats) // batch_size
         seen = seen_blocks(bounds, *cameras[:3], *cameras.limits)
+        if culled is not None and cameras.columns is not None:
+            seen &= ~_culling_views(culled, cameras.columns)
         self._event: torch.cuda.Event | None = None
         if seen.is_cuda:
             host = torch.empty(seen.shape, dtype=seen.dtype, pin_memory=True)
@@ -74,3 +83,24 @@ class Sight:
         seen = self._read()[blocks].astype(np.int64)
         first_view = np.frexp((seen & -seen).astype(np.float64))[1] - 1
         return np.where(seen == 0, MOST_VIEWS, first_view // self._batch_size).astype(np.int64)
+
+
+def culled_blocks(cull: Tensor) -> Tensor:
+    """Return the views that leave out all rows of each block, int32 [N, columns / 32].
+
+    Args:
+        cull: int32 [N, columns, 8], see `blitzgs.ops.cull_mask`; of whole blocks.
+    """
+    bits = torch.arange(_WORD, device=cull.device)
+    length = max(1, _MOST_WORDS // max(1, cull[:1].numel()))
+    parts = [cull.new_empty(0, cull.shape[1] // _WORD)]
+    for some in cull.split(length):
+        is_culled = (some == -1).all(2).view(len(some), -1, _WORD)
+        parts.append((is_culled.long() << bits).sum(2).int())
+    return torch.cat(parts)
+
+
+def _culling_views(culled: Tensor, columns: Tensor) -> Tensor:
+    """Return for each block the bits of the views (of columns [V]) that leave out all its rows, int32 [N]."""
+    found = culled[:, columns // _WORD] >> columns % _WORD & 1
+    return (found.long() << torch.arange(len(columns), device=columns.device)).sum(1).int()

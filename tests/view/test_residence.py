@@ -12,7 +12,7 @@ from blitzgs.view import host_table
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostMemoryError, HostTable
 from blitzgs.view.residence import Residence, ResidenceError, Traffic
-from blitzgs.view.sight import Cameras
+from blitzgs.view.sight import Cameras, Sight, culled_blocks
 from tests.helpers import DEVICES
 from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 
@@ -237,3 +237,27 @@ def test_the_given_columns_are_moved():
     moved = HostTable(table.columns, pinned=False)
     assert not table.columns
     assert_same_bits(moved, expected)
+
+
+def test_blocks_that_views_leave_out_are_not_seen():
+    generator = torch.Generator().manual_seed(0)
+    blocks, views = 11, 70
+    rows = torch.randint(-(2**31), 2**31 - 1, (blocks * BLOCK_ROWS, 3), generator=generator).int()
+    shown = torch.rand(blocks, 96, generator=generator) < 0.5
+    bits = (rows[:, :, None] >> torch.arange(32) & 1).bool().view(blocks, BLOCK_ROWS, 96) | ~shown[:, None]
+    # By block and column, as the kernels have it.
+    words = bits.view(blocks, 8, 32, 96).long() << torch.arange(32)[:, None]
+    sectors = words.sum(2).mT.contiguous()
+    culled = culled_blocks(torch.where(sectors < 1 << 31, sectors, sectors - (1 << 32)).int())
+    expected = bits.all(1)
+    assert torch.equal((culled[:, :, None] >> torch.arange(32) & 1).bool().flatten(1), expected)
+    assert 0.3 < expected.float().mean() < 0.7
+    columns = torch.randperm(views, generator=generator)[:32]
+    bounds = torch.tensor([0.0, 0, 0, 0, 0, 0, 1, 1]).repeat(blocks, 1)
+    viewmats, Ks = torch.eye(4).repeat(32, 1, 1), torch.eye(3).repeat(32, 1, 1)
+    viewmats[:, 2, 3] = 5.0
+    sizes = torch.full((32, 2), 100, dtype=torch.int32)
+    sight = Sight(bounds, Cameras(viewmats, Ks, sizes, LIMITS, columns), 1, culled)
+    for view, column in enumerate(columns.tolist()):
+        assert np.array_equal(sight.by(view), ~expected[:, column].numpy())
+    assert all(Sight(bounds, Cameras(viewmats, Ks, sizes, LIMITS), 1, culled).by(31))
