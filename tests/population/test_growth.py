@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.population import growth
 from blitzgs.population.density import DensityRules, densify
 from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit, rows_that_fit
 from tests.helpers import needs_cuda
@@ -50,6 +51,18 @@ def test_a_gpu_holds_more_than_a_small_table_and_less_than_its_memory():
     _, total = torch.cuda.mem_get_info()
     row_bytes = sum(table[name][:1].nbytes for name in table)
     assert 100_000 < count < total // row_bytes
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_a_table_on_the_host_is_limited_by_the_memory_of_the_host(monkeypatch):
+    table, ranks = random_table(1000), Ranks(device=torch.device("cuda"), local_world_size=2)
+    sizes = table.row_bytes.values()
+    monkeypatch.setattr(growth, "available_bytes", lambda: 2_000_000_000)
+    available = 1_000_000_000 + 1000 * sum(sizes)
+    assert memory_limit(table, ranks) == rows_that_fit(1000, sum(sizes), max(sizes), available, 0)
+    monkeypatch.setattr(growth, "available_bytes", lambda: None)
+    assert memory_limit(table, ranks) is None
 
 
 def test_statistics_are_gathered_until_there_are_enough():
