@@ -12,7 +12,8 @@ namespace {
 struct Rows {
   std::vector<float> means = {1, 3, 0, 1, 0, 3, 4, 0, 0};
   std::vector<std::uint8_t> level = {0, 1, 2};
-  std::vector<std::int32_t> ids = {0, 1, 2}, views = {3, 3, 3}, cull = {0, 0, 0};
+  std::vector<std::int32_t> ids = {0, 1, 2}, views = {3, 3, 3};
+  std::vector<std::int32_t> cull = std::vector<std::int32_t>(32 * blitzgs::kSectorWords);
   std::vector<float> viewmats = {0, 0, 1, 0,  0, 1, 0, 0, -1, 0, 0, 1, 0, 0, 0, 1,
                                  1, 0, 0, -1, 0, 1, 0, 0, 0,  0, 1, 0, 0, 0, 0, 1};
 
@@ -20,7 +21,7 @@ struct Rows {
     blitzgs::ViewGateArgs args{};
     args.ids = ids.data(), args.views = views.data(), args.room = 3;
     args.means = means.data(), args.viewmats = viewmats.data();
-    args.rules.level = level.data(), args.rules.cull = cull.data(), args.rules.words = 1;
+    args.rules.level = level.data(), args.rules.cull = cull.data(), args.rules.cull_columns = 32;
     args.rules.n_views = 2, args.rules.n_levels = 2;
     return args;
   }
@@ -62,6 +63,7 @@ TEST_CASE("the bits of a column leave the view that has it") {
   blitzgs::ViewGateArgs args = rows.args();
   args.rules.cull_views = 2;
   args.rules.table.columns[0] = -1, args.rules.table.columns[1] = 31;
-  rows.cull = {0, INT32_MIN, INT32_MAX};
+  rows.cull[blitzgs::sector_at(0, 32, 31)] = 1 << 1;
+  rows.cull[blitzgs::sector_at(0, 32, 30)] = 1 << 2;
   REQUIRE(rows.left(args) == std::vector<std::int32_t>{3, 1, 3});
 }
