@@ -113,8 +113,10 @@ class OffloadingStepper(Stepper):
         """See `Stepper.settle`: write changes back to the host, and empty the pool."""
         self._residence.collect()
 
-    def report(self) -> dict[str, float]:
+    def report(self, whole: bool = False) -> dict[str, float]:
         """See `Stepper.report`: how many blocks were there already, and megabytes moved in a step."""
+        if whole:
+            return self._residence.traffic.values()
         traffic = self._residence.traffic.since(self._reported)
         self._reported = self._residence.traffic
         return traffic.values()

@@ -74,8 +74,8 @@ class Stepper:
         """Have this rank's whole table hold what the steps have changed. Here it always does."""
         return None
 
-    def report(self) -> dict[str, float]:
-        """Return figures about the steps since the last call, for the log."""
+    def report(self, whole: bool = False) -> dict[str, float]:
+        """Return figures about the steps since the last call or, if `whole`, about all; none here."""
         return {}
 
     def forward(

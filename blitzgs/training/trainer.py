@@ -207,6 +207,7 @@ class Trainer:
     def _finish(self) -> dict[str, Any]:
         """Save and evaluate the trained model; return and write the summary."""
         state, step = self.state, self.state.progress.step
+        residency = state.stepper.report(whole=True)
         state.catch_up()
         if state.population() == 0:
             raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
@@ -217,18 +218,22 @@ class Trainer:
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()
         state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
-        summary = evaluate.run(state) | {
-            "images": state.images_seen,
-            "seconds": state.progress.seconds,
-            "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
-            "gaussians": state.population(),
-            "peak_gaussians": state.progress.peak_gaussians,
-            "population": population,
-            "peak_memory_bytes": run.peak_memory_bytes(state.ranks.device),
-            "config_hash": config_hash(state.config),
-            "run": state.run_id,
-            "versions": run.versions(state.ranks.device),
-        }
+        summary = (
+            evaluate.run(state)
+            | {
+                "images": state.images_seen,
+                "seconds": state.progress.seconds,
+                "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
+                "gaussians": state.population(),
+                "peak_gaussians": state.progress.peak_gaussians,
+                "population": population,
+                "peak_memory_bytes": run.peak_memory_bytes(state.ranks.device),
+                "config_hash": config_hash(state.config),
+                "run": state.run_id,
+                "versions": run.versions(state.ranks.device),
+            }
+            | residency
+        )
         if state.config.schedule.minutes > 0:
             summary |= {
                 "budget_seconds": 60 * state.config.schedule.minutes,

@@ -114,6 +114,8 @@ def test_a_run_with_a_quarter_of_its_blocks_on_the_device_is_the_same_run(tmp_pa
     assert_same_run(pooled, whole)
     for name in ("psnr", "ssim", "gaussians"):
         assert summary[name] == expected[name]
+    assert 0 <= summary["resident_hits"] < 1 and summary["moved_mb_per_step"] > 0
+    assert "resident_hits" not in expected
     records = [json.loads(line) for line in (tmp_path / "pooled" / "log.jsonl").read_text().splitlines()]
     shares = [record["resident_hits"] for record in records if "loss" in record]
     assert len(shares) == 3 and all(0 <= share < 1 for share in shares)
