@@ -15,6 +15,10 @@ importance passes, phi, LOD gate, per-view mask and --gate, less what its row le
 arms that differ by the gate alone are left out. cost runs `bm_exchange.py`; oracle `blitzgs gate replay` from
 a run with lineage and checkpoints; popping `bm_popping.py` on the model of a run with levels.
 
+The ablation of the model level alone, for captures too small to have levels:
+    python benchmarks/tables.py ablation --flags "--view.lod=false --view.cull=false" \
+        --arms full no_importance no_phi no_pass_1 no_pass_2 no_gate all_off ...
+
 --dry-run lists what would run. --resume carries on in a folder that has results: what is finished is not run
 again. --collect adds results of other folders, as bm_quality.py does; without --scenes and --runs, the table
 is made of those in TABLES alone.
@@ -24,6 +28,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -48,7 +53,9 @@ ORACLE_ARMS = 5
 TABLES = (*TRAINED, "cost", *OF_RUNS)
 
 
-def recipes_of(plan: dict[str, Any], config: str, gate: Path | None, flags: str = "") -> dict[str, str]:
+def recipes_of(
+    plan: dict[str, Any], config: str, gate: Path | None, flags: str = "", arms: Sequence[str] | None = None
+) -> dict[str, str]:
     """Return the recipes of a table for `bm_quality.py`.
 
     Args:
@@ -56,10 +63,17 @@ def recipes_of(plan: dict[str, Any], config: str, gate: Path | None, flags: str 
         config: file that all arms start from, or "defaults".
         gate: model file of a spawn gate, or None.
         flags: for all arms, before their own.
+        arms: those wanted; None: all.
+
+    Raises:
+        ValueError: the table has no such arm.
     """
+    known = [*plan["arms"], *plan.get("opponents", {})]
+    if arms is not None and (unknown := sorted(set(arms) - set(known))):
+        raise ValueError(f"--arms: there is no {', '.join(unknown)} in this table; it has {', '.join(known)}")
     common = f"{EVERYTHING} {flags}".strip()
     if gate is not None:
-        common += f" --population.gate={gate.resolve()}"
+        common += f" --population.gate={shlex.quote(str(gate.resolve()))}"
     recipes = {}
     for name, arm in plan["arms"].items():
         without_gate = arm["flags"] == "--population.gate=null"
@@ -71,12 +85,13 @@ def recipes_of(plan: dict[str, Any], config: str, gate: Path | None, flags: str 
             until = load_config(None if config == "defaults" else config).schedule.densify_until
             own += f" --schedule.gate_from={round(arm['gate_from'] * until)}"
         recipes[name] = f"{source} {common} {own}".strip()
-    return recipes | plan.get("opponents", {})
+    recipes |= plan.get("opponents", {})
+    return {name: text for name, text in recipes.items() if arms is None or name in arms}
 
 
 def train(table: str, plan: dict[str, Any], args: argparse.Namespace, scenes: dict[str, str]) -> int:
     """Train what a table needs and is not finished; returns the exit status."""
-    recipes = recipes_of(plan, args.config, args.gate, args.flags)
+    recipes = recipes_of(plan, args.config, args.gate, args.flags, args.arms)
     common = ["--out", str(args.out), "--gpus", str(args.gpus), "--evaluate-at"]
     common += ["--seeds", *map(str, args.seeds)]
     for name, text in scenes.items():
@@ -112,7 +127,7 @@ def measure(table: str, args: argparse.Namespace, scenes: dict[str, str]) -> Non
         path = result_path(table, args, scene)
         command = [sys.executable]
         if table == "cost":
-            folder, *fields = text.split()
+            folder, *fields = shlex.split(text)
             downscale = next((f.partition("=")[2] for f in fields if f.startswith("--data.downscale=")), "1")
             command += [str(HERE / "bm_exchange.py"), "--data", folder, "--downscale", downscale]
             command += ["--device", device, "--json", str(path), "--ranks", *map(str, args.ranks)]
@@ -192,6 +207,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--config", default="configs/aerial.yaml", metavar="YAML", help="of all arms (%(default)s)"
     )
     parser.add_argument("--flags", default="", metavar='"--FIELD=VALUE ..."', help="for all arms")
+    parser.add_argument("--arms", nargs="+", metavar="ARM", help="only these, by their names in the plan")
     parser.add_argument("--gate", type=Path, metavar="FILE", help="spawn gate, fitted on other scenes")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     gpus = torch.cuda.device_count()

@@ -77,7 +77,7 @@ def test_runs_are_done_once_and_a_failure_stops_no_other(tmp_path, capture, caps
     assert float(rows[1]["train_psnr"]) == last["train"]["psnr"] and rows[1]["is_end"] == "1"
 
 
-@pytest.mark.parametrize("name", ["ablation", "gate_rates"])
+@pytest.mark.parametrize("name", ["ablation", "adaptive"])
 def test_the_plans_that_come_along_can_be_run(name, capture, monkeypatch):
     root = Path(bm_quality.__file__).parents[1]
     monkeypatch.chdir(root)

@@ -60,6 +60,12 @@ def test_without_a_gate_its_arms_are_left_out_and_onsets_follow_the_schedule(mon
     recipes = tables.recipes_of(PLANS["ablation"], "configs/paper.yaml", None)
     assert "no_gate" not in recipes and {"full", "all_off", "no_phi", "partition_4x5"} <= set(recipes)
     assert list(tables.recipes_of(PLANS["rho"], "configs/paper.yaml", None)) == ["rate_0"]
+    chosen = tables.recipes_of(
+        PLANS["ablation"], "defaults", Path("g"), "--view.lod=false", ["no_gate", "full"]
+    )
+    assert list(chosen) == ["full", "no_gate"] and "--view.lod=false" in chosen["full"]
+    with pytest.raises(ValueError, match="there is no fulll in this table; it has full, no_lod"):
+        tables.recipes_of(PLANS["ablation"], "defaults", None, arms=["fulll"])
     onsets = tables.recipes_of(PLANS["onset"], "configs/paper.yaml", Path("g.json"))
     assert [text.rpartition("=")[2] for text in onsets.values()] == ["16000", "20000", "24000", "28000"]
 
