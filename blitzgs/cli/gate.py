@@ -99,7 +99,8 @@ def run_evaluate(args: argparse.Namespace) -> int:
         seen = "  (the gate was fitted on this scene)" if result["seen"] else ""
         r = result.get("regions", {}).get("r")
         regions = "" if r is None else f"; regions r {r:.2f}"
-        print(_judgement(result) + regions + seen)
+        onset = f"; from the onset on AUC {result['judged']['auc']:.3f}" if "judged" in result else ""
+        print(_judgement(result) + onset + regions + seen)
     print(f"{args.out}: evaluation.json, survival.svg and maps of regions")
     return 0
 

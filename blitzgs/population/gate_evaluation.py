@@ -31,7 +31,8 @@ def evaluate(gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, folder: 
         folder: gets the pictures.
 
     Returns:
-        For each run: `gate_fit.judge` of all its spawns, whether the gate was fitted on its scene, the share
+        For each run: `gate_fit.judge` of all its spawns and, as `judged`, of those that a gate would judge
+        (where some of these survived and some did not), whether the gate was fitted on its scene, the share
         of initial Gaussians and of each birth cohort that survived, and `regions`.
     """
     results, curves = [], {}
@@ -47,6 +48,8 @@ def evaluate(gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, folder: 
         if late.any():
             where, actual, predicted = region_rates(run.only(late), scores[late])
             result["regions"] = {"cells": int(where.sum()), "r": correlation(actual[where], predicted[where])}
+            if 0 < run.survived[late].mean() < 1:
+                result["judged"] = judge(run.only(late), scores[late])
             picture = maps({"survived": actual, "predicted at birth, as many": predicted})
             (folder / f"regions_{run.name}.svg").write_text(picture)
         curves[run.name] = [(entry["until"], entry["survived"]) for entry in cohorts]

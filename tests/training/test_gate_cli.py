@@ -65,6 +65,9 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     (entry,) = json.loads((tmp_path / "judged" / "evaluation.json").read_text())
     own = read_spawns(folder / "run" / "lineage")
     assert entry["spawns"] == len(own.survived) and entry["seen"]
+    late = own.only(own.times >= 60)
+    assert entry["judged"]["spawns"] == len(late.survived) < entry["spawns"]
+    assert entry["judged"]["survived"] == late.survived.mean() and entry["judged"]["auc"] > 0.5
     assert sum(cohort["born"] for cohort in entry["cohorts"]) == entry["spawns"]
     for name in ("survival.svg", "regions_capture.svg"):
         ElementTree.parse(tmp_path / "judged" / name)
