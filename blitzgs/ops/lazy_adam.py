@@ -179,13 +179,14 @@ def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     return _once(lr_table, (beta1, beta2), lambda: _make_table(lr_table, beta1, beta2))
 
 
-def table_without_rates(steps: int, beta1: float, beta2: float) -> Tensor:
+def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0) -> Tensor:
     """Return `schedule_table` of a schedule whose learning rates are zero: powers and corrections alone.
 
     Args:
         steps: S + 1.
         beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
         beta2: decay of the second moment, in (0, 1).
+        before: steps that were taken before the table begins: its corrections are those of later steps.
 
     Returns:
         float64 [S + 1, 30] on the CPU.
@@ -203,6 +204,7 @@ def table_without_rates(steps: int, beta1: float, beta2: float) -> Tensor:
     powers = (beta1**t, beta2**t, ratio**t, root**t)
     for column, power in enumerate(powers, start=24):
         table[:, column] = power
+    t += before
     # -expm1(t log beta) keeps the digits that 1 - beta^t loses while t is small.
     first = 1 / (-torch.expm1(t[1:] * math.log(beta1)) if beta1 > 0 else torch.ones(steps - 1))
     second = (-torch.expm1(t[1:] * math.log(beta2))).rsqrt()

@@ -13,54 +13,62 @@ from blitzgs.ops.lazy_adam import explicit_steps, table_without_rates
 # csrc/lazy_adam/adam_table.h: a row has 4 orders of 6 groups, then powers and corrections. A parameter that
 # is stepped alone takes the place of SH, whose first three values have a group and the rest another.
 _ORDERS, _GROUPS, _OWN = 4, 6, (4, 5)
-_FIRST_CAPACITY = 1024
+# Steps that the tables hold. Then all rows settle and the tables begin anew, so that they do not grow.
+CAPACITY = 4096
 
 
 class Drift:
-    """The tables of one parameter for the op, up to the step that was taken last.
+    """The tables of one parameter for the op, from the step at which they began to that taken last.
 
     The drift of a row from step p to step s is a sum over the steps between, so each step adds its term to
     the rows of the steps before: as many as matter, after which the moments have decayed below rounding.
+    Steps are counted from `begin` in the tables, and in the columns that say where rows stand.
 
     Attributes:
-        table: float64 [S + 1, 30], see csrc/lazy_adam/adam_table.h.
-        lr_table: float32 [S + 1, 6].
+        begin: the step at which the tables begin.
+        table: float64 [CAPACITY + 1, 30], see csrc/lazy_adam/adam_table.h.
+        lr_table: float32 [CAPACITY + 1, 6].
         reach: for how many steps a row without a gradient moves.
     """
 
-    def __init__(self, betas: tuple[float, float], dtype: torch.dtype, device: torch.device) -> None:
+    def __init__(
+        self, betas: tuple[float, float], dtype: torch.dtype, device: torch.device, begin: int
+    ) -> None:
         """Start without any step.
 
         Args:
             betas: decay rates of the moments.
             dtype: of the parameter.
             device: likewise.
+            begin: steps that were taken before; all rows stand there.
 
         Raises:
             ValueError: decay rates outside their range.
         """
         self.betas = betas
         self.reach = explicit_steps(*betas, dtype)
-        self.table = torch.zeros(0, _ORDERS * _GROUPS, dtype=torch.float64, device=device)
-        self.lr_table = torch.zeros(0, _GROUPS, dtype=torch.float32, device=device)
-        self._grow(_FIRST_CAPACITY)
+        self.lr_table = torch.zeros(CAPACITY + 1, _GROUPS, dtype=torch.float32, device=device)
         ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
         distances = np.arange(self.reach, 0, -1)[:, None]
         decays = (ratio * root ** np.arange(_ORDERS)) ** distances
         self._decays = torch.from_numpy(decays).to(device)[:, :, None]
+        self.restart(begin)
 
-    def _grow(self, capacity: int) -> None:
-        device, known = self.lr_table.device, len(self.lr_table)
-        table = table_without_rates(capacity + 1, *self.betas)
+    def restart(self, begin: int) -> None:
+        """Begin anew at a step at which all rows and their moments stand."""
+        self.begin = begin
+        table = table_without_rates(len(self.lr_table), *self.betas, begin)
         first, second = table[:, 28], table[:, 29]
-        # What a step adds to the steps before it, for a learning rate of 1; there is no step 0.
+        # What a step adds to the steps before it, for a learning rate of 1.
         shares = torch.stack([first * second ** (order - 1) for order in range(_ORDERS)], dim=1)
         shares[0] = 0
-        self._shares = shares.to(device)[:, :, None]
-        table, rates = table.to(device), self.lr_table.new_zeros(capacity + 1, _GROUPS)
-        table[:known, : _ORDERS * _GROUPS] = self.table[:, : _ORDERS * _GROUPS]
-        rates[:known] = self.lr_table
-        self.table, self.lr_table = table, rates
+        self._shares = shares.to(self.lr_table.device)[:, :, None]
+        self.table = table.to(self.lr_table.device)
+        self.lr_table.zero_()
+
+    def is_full(self, step: int) -> bool:
+        """Tell whether the tables have no room for steps after `step`."""
+        return step - self.begin >= len(self.lr_table) - 1
 
     def add(self, step: int, lr: float, lr_rest: float) -> None:
         """Take note of a step; queues a few small kernels and copies nothing to the device.
@@ -70,13 +78,12 @@ class Drift:
             lr: learning rate of the first three values of a row.
             lr_rest: of the others.
         """
-        if step >= len(self.lr_table):
-            self._grow(2 * step)
-        begin = max(0, step - self.reach)
-        tails = self.table[begin:step, : _ORDERS * _GROUPS].view(-1, _ORDERS, _GROUPS)
-        decays, shares = self._decays[begin - step :], self._shares[step]
+        place = step - self.begin
+        first = max(0, place - self.reach)
+        tails = self.table[first:place, : _ORDERS * _GROUPS].view(-1, _ORDERS, _GROUPS)
+        decays, shares = self._decays[first - place :], self._shares[place]
         for groups, rate in [(_OWN, lr)] if lr == lr_rest else [(_OWN[:1], lr), (_OWN[1:], lr_rest)]:
             owned = slice(groups[0], groups[-1] + 1)
             rate = float(np.float32(rate))  # as in lr_table
             tails[:, :, owned].addcmul_(decays, shares, value=rate)
-            self.lr_table[step, owned].fill_(rate)
+            self.lr_table[place, owned].fill_(rate)

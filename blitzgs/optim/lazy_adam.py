@@ -13,7 +13,8 @@ from torch.nn import Parameter
 from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
 
-# Of the state of a parameter: the step that its rows' parameters, and their moments, stand at.
+# Of the state of a parameter: the step that its rows' parameters, and their moments, stand at, counted from
+# `Drift.begin`.
 _STEPS = ("last_step", "moment_step")
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -95,6 +96,11 @@ class LazyAdam(torch.optim.Optimizer):
             if param.grad is None:
                 continue
             state, drift = self._state_of(param), self._drift_of(place, group, param)
+            if drift.is_full(int(state["step"])):
+                self._settle_one(group, param, state, drift)
+                drift.restart(int(state["step"]))
+                for name in _STEPS:
+                    state[name].zero_()
             state["step"] += 1
             rest = group["lr"] if group["lr_rest"] is None else group["lr_rest"]
             drift.add(int(state["step"]), float(group["lr"]), float(rest))
@@ -119,7 +125,7 @@ class LazyAdam(torch.optim.Optimizer):
         gradients = [values.new_empty(len(values), 0)] * 4 + [values]
         torch.ops.blitzgs.lazy_adam_step_(
             *_alone(param, state), [state["last_step"], state["moment_step"]], gradients, ids,
-            [drift.table, drift.lr_table], [int(state["step"]), drift.reach, 0],
+            [drift.table, drift.lr_table], [int(state["step"]) - drift.begin, drift.reach, 0],
             [*drift.betas, group["eps"]],
         )  # fmt: skip
 
@@ -139,27 +145,34 @@ class LazyAdam(torch.optim.Optimizer):
                 continue
             if chosen is not None and id(param) not in chosen:
                 continue
-            state, drift = self._state_of(param), self._drift_of(place, group, param)
-            torch.ops.blitzgs.lazy_adam_catch_up_(
-                *_alone(param, state), [state["last_step"], state["moment_step"]], rows,
-                [drift.table, drift.lr_table], [int(state["step"]), drift.reach, 0],
-                [*drift.betas, group["eps"]], None,
-            )  # fmt: skip
+            self._catch_up_one(group, param, self._state_of(param), self._drift_of(place, group, param), rows)
+
+    def _catch_up_one(
+        self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift, rows: Tensor | None
+    ) -> None:
+        torch.ops.blitzgs.lazy_adam_catch_up_(
+            *_alone(param, state), [state["last_step"], state["moment_step"]], rows,
+            [drift.table, drift.lr_table], [int(state["step"]) - drift.begin, drift.reach, 0],
+            [*drift.betas, group["eps"]], None,
+        )  # fmt: skip
 
     @torch.no_grad()
     def settle(self) -> None:
         """Bring all rows and their moments to where `torch.optim.Adam` has them."""
-        self.catch_up()
-        for _, group, param in self._placed():
-            if not self.state.get(param):
-                continue
-            state = self._state_of(param)
-            behind = (int(state["step"]) - state["moment_step"]).double()
-            behind = behind.view(-1, *(1,) * (param.dim() - 1))
-            for name, beta in zip(_MOMENTS, group["betas"], strict=True):
-                state[name] *= (beta**behind).to(param.dtype)
-            for name in _STEPS:
-                state[name].fill_(int(state["step"]))
+        for place, group, param in self._placed():
+            if self.state.get(param):
+                self._settle_one(group, param, self._state_of(param), self._drift_of(place, group, param))
+
+    def _settle_one(self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift) -> None:
+        if param.numel() > 0:
+            self._catch_up_one(group, param, state, drift, None)
+        place = int(state["step"]) - drift.begin
+        behind = (place - state["moment_step"]).double()
+        behind = behind.view(-1, *(1,) * (param.dim() - 1))
+        for name, beta in zip(_MOMENTS, group["betas"], strict=True):
+            state[name] *= (beta**behind).to(param.dtype)
+        for name in _STEPS:
+            state[name].fill_(place)
 
     def state_dict(self) -> dict[str, Any]:
         """Settle all rows and return the state as `torch.optim.Adam` has it: step, exp_avg, exp_avg_sq."""
@@ -186,7 +199,7 @@ class LazyAdam(torch.optim.Optimizer):
             state = self.state.get(param)
             if state:
                 state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32)
-                stand = torch.full((len(param),), int(state["step"]), dtype=torch.int32, device=param.device)
+                stand = torch.zeros(len(param), dtype=torch.int32, device=param.device)
                 state.update({name: stand.clone() for name in _STEPS})
 
     def append(self, rows: Mapping[str, Tensor]) -> dict[str, Parameter]:
@@ -272,7 +285,8 @@ class LazyAdam(torch.optim.Optimizer):
         betas = tuple(group["betas"])
         drift = self._drifts.get(place)
         if drift is None:
-            drift = self._drifts[place] = Drift(betas, param.dtype, param.device)
+            taken = int(self.state[param]["step"])
+            drift = self._drifts[place] = Drift(betas, param.dtype, param.device, taken)
         if drift.betas != betas:
             raise ValueError(f"LazyAdam: betas cannot change from {drift.betas} to {betas} after a step")
         return drift

@@ -8,7 +8,8 @@ import pickle
 import pytest
 import torch
 
-from blitzgs.optim import LazyAdam
+from blitzgs.optim import LazyAdam, drift
+from blitzgs.optim.drift import Drift
 from tests.helpers import BACKENDS, DEVICES, relative_error
 
 SHAPES = {"means": (3,), "quats": (4,), "opacities": (), "sh": (16, 3), "features": (7,)}
@@ -244,3 +245,32 @@ def test_wrong_use_is_refused():
     optimizer.state[param]["exp_avg"] = torch.zeros(5, 3)
     with pytest.raises(ValueError, match="a parameter has 4 rows and its exp_avg 5"):
         optimizer.step()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_tables_that_are_full_begin_anew_and_nothing_is_lost(backend, monkeypatch):
+    monkeypatch.setattr(drift, "CAPACITY", 40)
+    pair = Pair(backend, eps=1e-8)
+    for number in range(170):
+        pair.step()
+        if number == 100:  # in the middle of the tables
+            pair.ours.load_state_dict(copy.deepcopy(pair.ours.state_dict()))
+    pair.require_equal()
+    assert all(len(kept.table) == 41 and kept.begin > 100 for kept in pair.ours._drifts.values())
+    pair.ours.settle()
+    for name in SHAPES:
+        ours, dense = pair.ours.state[pair.lazy[name]], pair.torchs.state[pair.dense[name]]
+        assert int(ours["step"]) == int(dense["step"]) == 170
+        for moment in ("exp_avg", "exp_avg_sq"):
+            assert relative_error(ours[moment], dense[moment]) < BOUND[pair.dtype], name
+
+
+def test_tables_do_not_grow_over_a_hundred_thousand_steps():
+    kept = Drift((0.9, 0.999), torch.float32, torch.device("cpu"), 0)
+    sizes = {len(kept.table), len(kept.lr_table)}
+    for step in range(1, 100_001):
+        if kept.is_full(step - 1):
+            kept.restart(step - 1)
+        kept.add(step, 1e-3, 1e-3)
+        sizes |= {len(kept.table), len(kept.lr_table)}
+    assert sizes == {drift.CAPACITY + 1} and kept.begin > 90_000
