@@ -242,6 +242,38 @@ TEST_CASE("the backward pass is the derivative of the splats") {
   REQUIRE(v_viewmats[15] == 0.0);
 }
 
+TEST_CASE("opacities fade with the distance by their levels, and a level beyond the last is the last") {
+  const World world;
+  std::vector<std::uint8_t> level(World::kCount);
+  for (int i = 0; i < World::kCount; ++i) level[i] = static_cast<std::uint8_t>(i % 3);
+  const double reach = 4.0, fork = 2.0;
+  ProjectInputs<double> in = world.inputs();
+  const Projected plain = project(in);
+  in.options.fade_slope = fork / (fork - 1);
+  in.fade = {level.data(), 2, {0.0f, static_cast<float>(1 / (reach * reach))}};
+  const Projected faded = project(in);
+  std::size_t at = 0, whole = 0, fainter = 0, gone = 0;
+  for (std::size_t i = 0; i < plain.opacities.size(); ++i) {
+    const std::int32_t id = plain.gaussian_ids[i], view = plain.camera_ids[i];
+    const double* mean = &world.means[3 * id];
+    const double x = mean[0] + 0.1 * view, z = mean[2] + 2.0 + view;  // relative to the camera
+    const double relative = (x * x + mean[1] * mean[1] + z * z) / (reach * reach);
+    const double weight = level[id] == 0 ? 1 : std::clamp((1 - relative) * fork / (fork - 1), 0.0, 1.0);
+    const bool there =
+        at < faded.opacities.size() && faded.gaussian_ids[at] == id && faded.camera_ids[at] == view;
+    if (!there) {
+      // Its box may have shrunk out of the image.
+      REQUIRE(weight < 1);
+      ++gone;
+      continue;
+    }
+    REQUIRE(faded.opacities[at++] == Approx(weight * plain.opacities[i]).epsilon(1e-9));
+    ++(weight == 1 ? whole : fainter);
+  }
+  REQUIRE(at == faded.opacities.size());
+  REQUIRE(std::min({whole, fainter, gone}) > 50);
+}
+
 TEST_CASE("no Gaussians, no views, and Gaussians of NaN give no splats") {
   World world;
   ProjectInputs<double> in = world.inputs();
