@@ -153,7 +153,8 @@ class Trainer:
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.stepper.table, frame)
         if state.signals is not None:
-            state.signals.add(sums, len(names), batch.views.width * batch.views.height)
+            pixels = batch.views.width * batch.views.height
+            state.signals.add(sums, len(names), pixels, end, len(state.capture.train))
         is_logged = end // config.log.every > begin // config.log.every
         measured = measure_step(state, frame, batch) if is_logged else None
         v_means2d = state.stepper.backward(

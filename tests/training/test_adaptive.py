@@ -17,6 +17,7 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.training.adaptive import SETTLED, Signals
 from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_io import ConfigError
+from blitzgs.training.pace import Pace
 from blitzgs.training.schedule import Schedule, latest_times
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
@@ -43,48 +44,60 @@ FLAGS = (
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def signals(demand=(), windows=()):
-    return Signals(demand=list(demand), windows=[list(window) for window in windows])
+def signals(demand=(), epochs=()):
+    return Signals(demand=list(demand), epochs=[list(epoch) for epoch in epochs])
+
+
+def place(found, config, time):
+    return found.next_place(config, Pace(1.0, ()), time)
+
+
+def epochs_of_50(rate, until=3_000):
+    """Epochs of a loss that falls by `rate` per length of the schedule."""
+    return [(end, 0.1 * math.exp(-rate * end / CONFIG.iterations)) for end in range(50, until + 1, 50)]
 
 
 def test_t1_comes_when_demand_has_fallen():
     falling = [0.2, 0.2, 0.2, 0.2, 0.1, 0.05, 0.05]
     early, late = 0.6 * CONFIG.t1, latest_times(CONFIG)[0]
     assert late == 1_120
-    assert signals(falling).next_place(CONFIG, early - 1) is None
-    place, reason = signals(falling).next_place(CONFIG, early + 0.5)
-    assert place == early + 1
+    assert place(signals(falling), CONFIG, early - 1) is None
+    where, reason = place(signals(falling), CONFIG, early + 0.5)
+    assert where == early + 1
     assert reason == "density control asks for 6.67% of the Gaussians, 20.00% at most before"
-    assert signals([0.2, 0.2, 0.15, 0.15, 0.15]).next_place(CONFIG, late - 1) is None
-    place, reason = signals([0.2] * 5).next_place(CONFIG, late + 3)
-    assert (place, reason) == (late, "the latest that schedule.adaptive_limit allows")
-    assert signals(falling[-3:]).next_place(CONFIG, early) is None  # too little is known
-    assert signals().next_place(replace(CONFIG, t1=0), 0.0) == (0, "there is none")
+    assert place(signals([0.2, 0.2, 0.15, 0.15, 0.15]), CONFIG, late - 1) is None
+    where, reason = place(signals([0.2] * 5), CONFIG, late + 3)
+    assert (where, reason) == (late, "the latest that schedule.adaptive_limit allows")
+    assert place(signals(falling[-3:]), CONFIG, early) is None  # too little is known
+    assert place(signals(), replace(CONFIG, t1=0), 0.0) == (0, "there is none")
 
 
 def test_densification_ends_with_demand_or_when_the_loss_settles():
     config, now = replace(CONFIG, placed=(700,)), 1_000.0
     wanted = [0.2] * 6
-    assert signals(wanted).next_place(config, now) is None
-    place, reason = signals([*wanted, 0.02, 0.01, 0.0]).next_place(config, now)
-    assert place == 1_000 and reason.startswith("density control asks for 1.00% of")
-    for pace, settled in ((1.1 * SETTLED, False), (0.9 * SETTLED, True)):
-        windows = [(time, 0.1 * math.exp(-pace * time / 3_000)) for time in (650, 750, 850, 950)]
-        found = signals(wanted, windows).next_place(config, now)
+    assert place(signals(wanted), config, now) is None
+    where, reason = place(signals([*wanted, 0.02, 0.01, 0.0]), config, now)
+    assert where == 1_000 and reason.startswith("density control asks for 1.00% of")
+    for rate, settled in ((1.1 * SETTLED, False), (0.9 * SETTLED, True)):
+        found = place(signals(wanted, epochs_of_50(rate, 950)), config, now)
         assert (found is not None) == settled
-        assert not settled or "between 750 and 950" in found[1]
+        assert not settled or "until 950, over 1 epochs each" in found[1]
     # What came before T1 says nothing about what came after.
-    assert signals(wanted, [(500, 0.1), (600, 0.1), (750, 0.1)]).next_place(config, now) is None
+    assert place(signals(wanted, epochs_of_50(0, 750)), config, now) is None
+    assert place(signals(wanted, epochs_of_50(0, 800)), config, now) is not None
+    # Short epochs are put together to spans of a sixtieth of the schedule.
+    short = [(end, 0.1) for end in range(20, 801, 20)]
+    assert "over 3 epochs each" in place(signals(wanted, [*short, (820, 0.1)]), config, now)[1]
+    assert place(signals(wanted, short), config, now) is None
 
 
 def test_t2_comes_when_the_loss_has_settled_after_densification():
     config = replace(CONFIG, placed=(700, 1_200))
-    still = [(1_150, 0.1), (1_250, 0.1), (1_300, 0.1), (1_350, 0.1)]
-    assert signals((), still[:3]).next_place(config, 1_300.0) is None
-    assert signals((), still).next_place(config, 1_259.0) is None  # 0.6 of the distance of 100
-    assert signals((), still).next_place(config, 1_360.0)[0] == 1_360
-    assert signals([0.0] * 9).next_place(config, 1_360.0) is None
-    assert signals().next_place(replace(config, placed=(700, 1_200, 1_360)), 9e9) is None
+    assert place(signals((), epochs_of_50(0, 1_250)), config, 1_300) is None
+    assert place(signals((), epochs_of_50(0, 1_300)), config, 1_259) is None  # 0.6 of the distance of 100
+    assert place(signals((), epochs_of_50(0, 1_300)), config, 1_300)[0] == 1_300
+    assert place(signals([0.0] * 9), config, 1_360) is None
+    assert place(signals(), replace(config, placed=(700, 1_200, 1_360)), 2_999) is None
 
 
 def test_demand_counts_what_was_held_back_too():
@@ -98,14 +111,13 @@ def test_demand_counts_what_was_held_back_too():
         assert found.demand[-1] == pytest.approx(share)
 
 
-def test_a_window_of_the_loss_has_as_many_images_as_it_should():
+def test_the_loss_is_that_of_whole_epochs():
     found, sums = Signals(), HostSum(Ranks(), torch.tensor([[[6.0, 1.0]], [[12.0, 1.0]]]).double())
     for step in range(1, 6):
-        found.add(sums, views=2, pixels=3)
-        found.look(10.0 * step, window=4)
-    assert found.windows == [[20.0, 1.0], [40.0, 1.0]] and found.loss == (2.0, 2)
+        found.add(sums, views=2, pixels=3, images=2 * step, epoch=4)
     again = Signals.of(json.loads(json.dumps(found.saved())))
     assert again == found
+    assert found.epochs == [[4, 1.0], [8, 1.0]] and found.loss == (2.0, 2)
 
 
 @pytest.mark.parametrize("batch_size", [1, 4])
@@ -162,7 +174,7 @@ def test_a_run_places_its_times_and_says_why(whole_run):
     times = {record["event"]: record["t"] for record in records if "event" in record}
     assert times["pass_1"] == placed[0] and times["pass_2"] == placed[2]
     assert times["densify"] < placed[1]
-    assert trainer.state.signals.windows and trainer.state.signals.demand
+    assert trainer.state.signals.epochs and trainer.state.signals.demand
     assert json.loads((folder / "summary.json").read_text())["placed"] == summary["placed"]
 
 
@@ -176,7 +188,7 @@ def test_a_fixed_run_with_the_places_is_the_same(whole_run, tmp_path):
 
 @pytest.mark.parametrize("last", [32, 41, 57, 90])
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
-    """Stopped at a look, within a window of the loss, and after places."""
+    """Stopped at a look, within an epoch, and after places."""
     _, whole, _ = whole_run
     step = Trainer.step
 

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
-from blitzgs.training.adaptive import WINDOW
 from blitzgs.training.schedule import PLACED, Event, Schedule
 from blitzgs.training.state import TrainingState
 
@@ -17,10 +15,8 @@ def run(state: TrainingState, event: Event) -> None:
     if signals is None:
         return
     pace, config = state.schedule.pace, state.config.schedule
-    time = pace.time(state.images_seen)
-    signals.look(time, max(len(state.capture.train), math.ceil(WINDOW * config.iterations * pace.scale)))
     # A compressed schedule may have passed the latest places of several.
-    while (found := signals.next_place(config, time)) is not None:
+    while (found := signals.next_place(config, pace, state.images_seen)) is not None:
         place, reason = found
         name = PLACED[len(config.placed)]
         signals.reasons.append(reason)
