@@ -154,7 +154,7 @@ def _visible(calls: list[ProjectionInputs]) -> tuple[Tensor, Sizes | None]:
     parts = [project_splats(inputs) for inputs in calls]
     if len(parts) > 1:
         return torch.cat([splats.visible_ids for splats in parts]).unique(), None
-    return parts[0].visible_ids, Sizes._make(parts[0].counts.tolist())
+    return parts[0].visible_ids, Sizes(*parts[0].counts.tolist())
 
 
 class _Visible(torch.autograd.Function):
