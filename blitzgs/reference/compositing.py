@@ -87,8 +87,8 @@ def _alphas(
     means2d: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
     """Return alpha [M, H W] clipped at 0.99 and before clipping."""
-    columns = torch.arange(width, dtype=means2d.dtype) + 0.5
-    rows = torch.arange(height, dtype=means2d.dtype) + 0.5
+    columns = torch.arange(width, dtype=means2d.dtype, device=means2d.device) + 0.5
+    rows = torch.arange(height, dtype=means2d.dtype, device=means2d.device) + 0.5
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     dx = x.reshape(1, -1) - means2d[:, :1]
     dy = y.reshape(1, -1) - means2d[:, 1:]
