@@ -27,7 +27,7 @@ from blitzgs.ops.tree_sums import tree_sums
 from blitzgs.population.candidates import FEATURES, Candidates
 
 FORMAT = 1
-# Names the gate that comes with BlitzGS, for configs/aerial.yaml with the importance passes.
+# Names the gate that comes with BlitzGS, for configs/compact.yaml.
 DEFAULT = "default"
 _SHIPPED = Path(__file__).with_name("gates") / "aerial.json"
 # Leaf values enter as integers in units of 2^-32.

@@ -230,7 +230,7 @@ class PopulationConfig:
         phi: from the first pass on, weigh the gradients that density control adds up with phi, the share of
             the views seeing a Gaussian in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
-            BlitzGS and suits configs/aerial.yaml; null: none.
+            BlitzGS and suits configs/compact.yaml; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).

@@ -40,7 +40,7 @@ def finished(recipe, seed, psnr, capture="town", **more):
     } | more  # fmt: skip
 
 
-@pytest.mark.parametrize("config", ["configs/aerial.yaml", "configs/paper.yaml"])
+@pytest.mark.parametrize("config", ["configs/compact.yaml", "configs/paper.yaml"])
 @pytest.mark.parametrize("table", tables.TRAINED)
 def test_every_arm_is_a_configuration_of_its_own(capture, monkeypatch, table, config):
     monkeypatch.chdir(ROOT)
