@@ -29,7 +29,7 @@ from blitzgs.population.candidates import FEATURES, Candidates
 FORMAT = 1
 # Names the gate that comes with BlitzGS, for configs/compact.yaml.
 DEFAULT = "default"
-_SHIPPED = Path(__file__).with_name("gates") / "aerial.json"
+_SHIPPED = Path(__file__).with_name("gates") / "compact.json"
 # Leaf values enter as integers in units of 2^-32.
 _LEAF_BITS = 32
 

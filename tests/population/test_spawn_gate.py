@@ -2,6 +2,7 @@
 """The spawn gate: its trees against XGBoost, its veto against sorting, its fit on lives that can be told."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from blitzgs.population.spawn_gate import (
     RandomVeto,
     RankVeto,
     SpawnGate,
+    gate_file,
     info_path,
     veto_lowest,
 )
@@ -75,6 +77,19 @@ def test_trees_are_those_of_xgboost(gate, tmp_path, device, suffix):
     margins = torch.from_numpy(booster.predict(data, output_margin=True)).double()
     assert (scores - scores.mean() - margins + margins.mean()).abs().max() < 1e-4
     assert SpawnGate(copy).scores(some.features[:0]).shape == (0,)
+
+
+def test_the_gate_that_comes_along():
+    gate = SpawnGate(gate_file("default"))
+    assert gate.info.schedule["schedule.iterations"] == 30_000 and len(gate.info.scenes) >= 2
+    held_out = gate.info.auc["held_out"]
+    assert {entry["run"] for entry in held_out} == set(gate.info.scenes)
+    assert all(entry["auc"] > 0.6 for entry in held_out)
+    some = candidates()
+    some.features[:, 2] = 10.0 ** torch.linspace(-5, -1, 1000)  # scales as they are
+    scores = gate.scores(some.features)
+    assert scores[-100:].double().mean() > scores[:100].double().mean()  # large ones weigh more
+    assert gate_file("gates/mine.json") == Path("gates/mine.json")
 
 
 def test_vetoes_the_lowest_of_clones_and_of_splits():
