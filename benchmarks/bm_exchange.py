@@ -194,7 +194,7 @@ class Workload:
         return {
             "rows": len(frame.projected.gaussian_ids),
             "visible": len(frame.projected.visible_ids),
-            "sent": 0 if frame.traffic is None else _sent_elsewhere(frame.traffic),
+            "sent": 0 if frame.traffic is None else _sent_elsewhere(frame.traffic, self.ranks.rank),
             "work": sums,
             "ranges": batch.ranges,
         }
@@ -227,8 +227,8 @@ def balance_of(result: dict[str, Any]) -> float:
     return cost_balance(work + TILE_COST, ranges.bounds)
 
 
-def _sent_elsewhere(traffic: Traffic) -> int:
-    return sum(traffic.sent) - traffic.sent[traffic.rank]
+def _sent_elsewhere(traffic: Traffic, rank: int) -> int:
+    return sum(traffic.sent) - traffic.sent[rank]
 
 
 def half_precision_error(load: Workload) -> dict[str, float]:
