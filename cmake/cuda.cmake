@@ -49,9 +49,8 @@ target_compile_options(
 
 # Several kernels compute the same splats, colours and tiles. Without contraction they all get the same bits.
 set_source_files_properties(
-  ${CMAKE_SOURCE_DIR}/csrc/project/prefilter_cuda.cu
+  ${CMAKE_SOURCE_DIR}/csrc/project/project_cuda.cu
   ${CMAKE_SOURCE_DIR}/csrc/project/write_splats_cuda.cu
-  ${CMAKE_SOURCE_DIR}/csrc/project/write_colors_cuda.cu
   ${CMAKE_SOURCE_DIR}/csrc/intersect/intersect_cuda.cu
   PROPERTIES COMPILE_OPTIONS "-fmad=false"
 )

@@ -8,7 +8,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "common/splat_gradient.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 namespace {
@@ -46,7 +46,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // ([visible, splats]; none: wait for their number); splats (camera_ids, visible_ids, splat_offsets); ints
   // (width, height, tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d,
   // radius_clip[, fade_slope, reach of each level]). level: of the Gaussians, where opacities fade by it
-  // (csrc/project/level_fade.h).
+  // (csrc/project/project.h).
   m.def(
       "project_fwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] active, int[] ints, float[] floats, "
       "int[] rank_tiles, int[] capacity, Tensor? ids, Tensor? level) -> (Tensor gaussian_ids, "

@@ -92,7 +92,7 @@ def test_one_file_alone_decides_which_gpus_and_sizes_take_which_branch():
     )
     files = sorted(path.relative_to(CSRC) for path in CSRC.glob("*/*.*"))
     deciding = [str(file) for file in files if branches.search(source(file))]
-    assert deciding == ["common/branches.cuh"]
+    assert deciding == ["common/cuda.cuh"]
 
 
 def kernels_launched_early():
@@ -100,7 +100,7 @@ def kernels_launched_early():
     names = {}
     for path in sorted([*CSRC.glob("*/*.cu"), *CSRC.glob("*/*.cuh")]):
         file = str(path.relative_to(CSRC))
-        if file == "common/launch.cuh":
+        if file == "common/cuda.cuh":
             continue
         text = source(file)
         for match in re.finditer(r"launch_early\(\s*[^,]+,\s*([^,]+)", text):

@@ -6,7 +6,7 @@ import pytest
 from blitzgs.distributed.group import Ranks
 from tests.walk import kernel_files, walk_of_a_step
 
-MOST_PYTHON, MOST_KERNELS, MOST_VISITS = 20, 100, 2
+MOST_PYTHON, MOST_KERNELS, MOST_VISITS = 20, 61, 2
 
 
 @pytest.fixture(scope="module")

@@ -28,9 +28,9 @@ from tests.training.tiny import tiny_config, tiny_scene
 T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 STEPS_BEFORE = 3  # of warm-up: the first steps know no sizes
-# What CUDA calls where the CPU calls something else.
+# What CUDA calls where the CPU calls something else, and beside that.
 ON_CUDA = {"rasterize_bwd": "rasterize_bwd_packed_"}
-BETWEEN_PEERS = ("send_splats_", "barrier_")
+MORE_ON_CUDA = ("copy_to_host_",)
 
 
 class Walk(NamedTuple):
@@ -110,8 +110,7 @@ def _included(file: Path) -> frozenset[Path]:
 def kernel_files(ops: Iterable[str]) -> list[str]:
     """Return the files of `csrc/` behind ops on CUDA: argument checks and kernels, with includes."""
     files = {ROOT / "csrc" / "registration.cpp"}
-    for op in ops:
-        name = ON_CUDA.get(op, op)
+    for name in (*(ON_CUDA.get(op, op) for op in ops), *MORE_ON_CUDA):
         for check in ROOT.glob("csrc/*/*_op.cpp"):
             if f'm.impl("{name}"' in check.read_text():
                 files |= _included(check)

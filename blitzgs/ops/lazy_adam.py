@@ -171,7 +171,7 @@ def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
         beta2: decay of the second moment, in (0, 1).
 
     Returns:
-        float64 [S + 1, 30], the table described in csrc/lazy_adam/adam_table.h, on the device of `lr_table`.
+        float64 [S + 1, 30], the table described in csrc/lazy_adam/lazy_adam.h, on the device of `lr_table`.
 
     Raises:
         ValueError: decay rates outside their range.

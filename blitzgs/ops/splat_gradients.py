@@ -11,7 +11,7 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Where the parts of a splat gradient begin in its floats (csrc/common/splat_gradient.h), and how many these
+# Where the parts of a splat gradient begin in its floats (csrc/common/kernel.h), and how many these
 # are.
 _MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT = torch.ops.blitzgs.splat_gradient_layout()
 

@@ -10,7 +10,7 @@ import torch
 
 from blitzgs.ops.lazy_adam import explicit_steps, table_without_rates
 
-# csrc/lazy_adam/adam_table.h: a row has 4 orders of 6 groups, then powers and corrections. A parameter that
+# csrc/lazy_adam/lazy_adam.h: a row has 4 orders of 6 groups, then powers and corrections. A parameter that
 # is stepped alone takes the place of SH, whose first three values have a group and the rest another.
 _ORDERS, _GROUPS, _OWN = 4, 6, (4, 5)
 # Steps that the tables hold. Then all rows settle and the tables begin anew, so that they do not grow.
@@ -26,7 +26,7 @@ class Drift:
 
     Attributes:
         begin: the step at which the tables begin.
-        table: float64 [CAPACITY + 1, 30], see csrc/lazy_adam/adam_table.h.
+        table: float64 [CAPACITY + 1, 30], see csrc/lazy_adam/lazy_adam.h.
         lr_table: float32 [CAPACITY + 1, 6].
         reach: for how many steps a row without a gradient moves.
     """

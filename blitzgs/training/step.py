@@ -163,7 +163,7 @@ class Stepper:
         )
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
-        if FLOOR in table:
+        if FLOOR in table.columns:
             raise_scales(table, frame.projected.visible_ids)
         mark("optimiser")
         self._blocks.update(table, frame.projected.visible_ids)

@@ -27,10 +27,8 @@
 #include <cmath>
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/limits.h"
-#include "common/stream.h"
-#include "lazy_adam/adam_table.h"
+#include "common/kernel.h"
+#include "lazy_adam/lazy_adam.h"
 #include "math/frustum.h"
 #include "math/morton.h"
 #include "view_gate/view_gate.h"

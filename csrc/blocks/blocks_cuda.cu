@@ -2,13 +2,9 @@
 #include <algorithm>
 
 #include "blocks/blocks.h"
-#include "common/launch.cuh"
-#include "common/multiprocessors.h"
-#include "common/running_sum.cuh"
-#include "common/warp.cuh"
-#include "common/zeros.cuh"
+#include "common/cuda.cuh"
 #include "math/morton_cuda.cuh"
-#include "view_gate/gate_table.cuh"
+#include "view_gate/view_gate.h"
 
 namespace blitzgs::cuda {
 
@@ -105,7 +101,7 @@ __global__ void __launch_bounds__(kGroup)
   __shared__ int of_warps[kWarps];
   wait_for_earlier_kernels();
   const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
-  if (kGated) fill_gate_table(in.gate.rules, in.camera.viewmats, table);
+  if (kGated) fill_gate_table(in.gate.rules, in.camera.viewmats, threadIdx.x, table);
   if (thread < in.views) {
     planes[thread] = make_frustum(in.camera, thread);
     if (blockIdx.x == 0) planes_out[thread] = planes[thread];
@@ -150,7 +146,7 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
   const std::int32_t count = *n_blocks > plan.room ? 0 : *counters.n_mixed;
   if (static_cast<std::int32_t>(blockIdx.x) >= count) return;
   if (threadIdx.x < in.views) shared[threadIdx.x] = planes[threadIdx.x];
-  if (kGated) fill_gate_table(in.gate.rules, in.camera.viewmats, table);
+  if (kGated) fill_gate_table(in.gate.rules, in.camera.viewmats, threadIdx.x, table);
   __syncthreads();
   for (std::int32_t i = blockIdx.x; i < count; i += gridDim.x) {
     const std::int32_t place = mixed[i];

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Tells tests which branches the loaded code takes (branches.cuh).
+// Tells tests which branches the loaded code takes (cuda.cuh).
 #include <cuda_runtime.h>
 
-#include "common/branches.cuh"
+#include "common/cuda.cuh"
 
 namespace {
 // One value for each architecture in the library: the current device reads that of the code it runs.

@@ -8,16 +8,17 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
-
 #include <algorithm>
 #include <cstdint>
 #include <initializer_list>
+#include <limits>
 #include <optional>
 #include <sstream>
 #include <string>
 #include <vector>
 
-#include "common/stream.h"
+#include "common/kernel.h"
+#include "math/tiles.h"
 
 #ifdef BLITZGS_BACKEND_CUDA
 #define BLITZGS_DISPATCH_KEY CUDA
@@ -188,6 +189,64 @@ void dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
   }
 #endif
   f(float{});
+}
+
+// The optional argument n_splats of an op, int64 [1]: how many splats of its columns are valid
+// (kernel.h).
+
+struct SplatCount {
+  std::int64_t n_splats;  // at most
+  const std::int64_t*
+      known_splats;  // null: all n_splats; otherwise the kernels read it, and the host does not wait
+};
+
+inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor>& n_splats,
+                                      const Tensor& splats) {
+  const std::int64_t room = splats.size(0);
+  if (!n_splats) return {room, nullptr};
+  check_dtype(op, "n_splats", *n_splats, ScalarType::Long);
+  check_shape(op, "n_splats", *n_splats, {1});
+  STD_TORCH_CHECK(
+      n_splats->is_cpu() == splats.is_cpu() && n_splats->get_device_index() == splats.get_device_index(),
+      "blitzgs::", op, ": n_splats must be on the device of the splats");
+#ifdef BLITZGS_BACKEND_CUDA
+  return {room, data<std::int64_t>(*n_splats)};
+#else
+  return {splats_there(room, data<std::int64_t>(*n_splats)), nullptr};
+#endif
+}
+
+// The arguments that describe tiles, checked the same way in every op.
+
+// numbers: n_cameras, width, height, tile_size, tile_begin, tile_end (-1: all tiles).
+inline TileGrid checked_tile_grid(const char* op, const std::vector<std::int64_t>& numbers) {
+  STD_TORCH_CHECK(numbers.size() == 6, "blitzgs::", op,
+                  ": grid must be (n_cameras, width, height, tile_size, tile_begin, tile_end), got ",
+                  numbers.size(), " numbers");
+  const std::int64_t n_cameras = numbers[0], width = numbers[1], height = numbers[2], tile_size = numbers[3],
+                     tile_begin = numbers[4], tile_end = numbers[5];
+  constexpr std::int64_t kMost = std::numeric_limits<std::int32_t>::max();
+  STD_TORCH_CHECK(n_cameras >= 0 && n_cameras <= kMost, "blitzgs::", op,
+                  ": n_cameras must be at least 0, got ", n_cameras);
+  STD_TORCH_CHECK(width > 0 && height > 0 && width <= (1 << 20) && height <= (1 << 20), "blitzgs::", op,
+                  ": width and height must be in [1, 2^20], got ", width, " x ", height);
+  STD_TORCH_CHECK(tile_size > 0 && tile_size <= 64, "blitzgs::", op, ": tile_size must be in [1, 64], got ",
+                  tile_size);
+  const TileGrid grid =
+      make_tile_grid(static_cast<int>(n_cameras), static_cast<int>(width), static_cast<int>(height),
+                     static_cast<int>(tile_size), tile_begin, tile_end);
+  STD_TORCH_CHECK(0 <= grid.tile_begin && grid.tile_begin <= grid.tile_end && grid.tile_end <= grid.count(),
+                  "blitzgs::", op, ": tile_begin and tile_end must be a range of the ", grid.count(),
+                  " tiles, got [", tile_begin, ", ", tile_end, ")");
+  return grid;
+}
+
+// A tensor in the host's pinned memory that kernels write to.
+inline void check_host_values(const char* op, const Tensor& host, std::initializer_list<std::int64_t> shape) {
+  check_dtype(op, "host", host, ScalarType::Long);
+  check_shape(op, "host", host, shape);
+  STD_TORCH_CHECK(host.is_cpu() && host.is_contiguous(), "blitzgs::", op,
+                  ": host must be contiguous and in pinned memory of the host");
 }
 
 }  // namespace blitzgs

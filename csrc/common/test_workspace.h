@@ -5,7 +5,7 @@
 #include <memory>
 #include <vector>
 
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

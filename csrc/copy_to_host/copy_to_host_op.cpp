@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "copy_to_host/copy_to_host_op.h"
+#include "common/op.h"
+#include "copy_to_host/copy_to_host.h"
 
 #ifdef BLITZGS_BACKEND_CUDA
 namespace blitzgs {

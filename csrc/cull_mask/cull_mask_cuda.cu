@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/launch.cuh"
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
 #include "cull_mask/cull_mask.h"
 
 namespace blitzgs::cuda {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/cuda_check.h"
+#include "common/cuda.cuh"
 #include "density_stats/density_stats.h"
 
 namespace blitzgs::cuda {

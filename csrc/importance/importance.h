@@ -14,8 +14,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/splat_count.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 #include "math/tiles.h"
 
 namespace blitzgs {
@@ -31,7 +30,7 @@ struct ContributionInput {
   const std::int64_t* tile_offsets;
   std::int64_t n_splats;
   TileGrid grid;
-  const std::int64_t* known_splats = nullptr;  // common/splat_count.h; CUDA alone
+  const std::int64_t* known_splats = nullptr;  // common/kernel.h; CUDA alone
 };
 
 struct ContributionSums {

@@ -3,9 +3,8 @@
 
 #include <string>
 
-#include "common/launch.cuh"
-#include "rasterize/compositor.cuh"
-#include "rasterize/pack_splats.cuh"
+#include "common/cuda.cuh"
+#include "rasterize/forward.cuh"
 
 namespace blitzgs::cuda {
 

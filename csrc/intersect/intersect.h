@@ -10,7 +10,7 @@
 //   tile t's list is isect_splats[tile_offsets[t] .. tile_offsets[t + 1]). Tiles that grid does not own have
 //   empty lists.
 //
-// known_splats: null, or the number of splats in device memory (common/splat_count.h; CUDA alone).
+// known_splats: null, or the number of splats in device memory (common/kernel.h; CUDA alone).
 //
 // capacity is the length of isect_splats; entries from tile_offsets[B*T] on are left unspecified. If there
 // are more entries than that, the CPU kernel returns their number and writes no list, and the op fails with
@@ -24,8 +24,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/splat_count.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 #include "math/tiles.h"
 
 namespace blitzgs {

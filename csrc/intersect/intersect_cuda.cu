@@ -10,14 +10,10 @@
 #include <algorithm>
 #include <cuda/std/functional>
 
-#include "common/arrays.h"
-#include "common/launch.cuh"
-#include "common/multiprocessors.h"
-#include "common/running_sum.cuh"
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
+#include "common/kernel.h"
 #include "intersect/depth_order.cuh"
 #include "intersect/radix_sweep.cuh"
-#include "intersect/touched_tiles.cuh"
 
 namespace blitzgs::cuda {
 

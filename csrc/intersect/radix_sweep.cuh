@@ -9,10 +9,8 @@
 #include <cstdint>
 #include <cuda/atomic>
 
-#include "common/launch.cuh"
-#include "common/running_sum.cuh"
-#include "common/stream.h"
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
+#include "common/kernel.h"
 
 namespace blitzgs::cuda {
 

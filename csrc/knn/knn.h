@@ -14,8 +14,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 #include "math/morton.h"
 
 namespace blitzgs {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <cub/cub.cuh>
 
-#include "common/cuda_check.h"
+#include "common/cuda.cuh"
 #include "knn/knn.h"
 #include "math/morton_cuda.cuh"
 

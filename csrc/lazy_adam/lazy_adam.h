@@ -9,7 +9,7 @@
 // eps), t = P + j, rho_j = a_t beta2^(j/2), mu_j = lr_t b_t / a_t q_0^j, q_0 = beta1 / sqrt(beta2). rho_j
 // changes far more slowly than mu_j falls, so the sum is taken by the two-point Gauss rule of the weights mu
 // over rho: two places and weights with the weights' first four moments sum over j of mu_j rho_j^k =
-// tail_k[P] - q_k^(s-P) tail_k[s], k = 0 .. 3, of tails that are tabulated once per schedule (adam_table.h).
+// tail_k[P] - q_k^(s-P) tail_k[s], k = 0 .. 3, of tails that are tabulated once per schedule (lazy_adam.h).
 // The rule is exact where eps is lost against sqrt(v) (moment 0) and where it dominates (moment 1); in
 // between, at its worst near eps = 3 sqrt(v), its relative error is below half the square of rho's relative
 // variance: 1e-9 of the drift in mid-schedule, the rounding of float32 after some 200 single-view steps.
@@ -29,11 +29,27 @@
 #include <cmath>
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/stream.h"
-#include "lazy_adam/adam_table.h"
+#include "common/kernel.h"
+
+// Columns of the table of a learning-rate schedule, double [S + 1, 30], made once in Python
+// (blitzgs/ops/lazy_adam.py). S is the last step; row t holds, with
+//   a_t = 1 / sqrt(1 - beta2^t),  b_t = 1 / (1 - beta1^t)  (row 0: 0)  and  q_k = beta1 beta2^((k - 1) / 2),
+// for the groups g = means, quats, scales, opacities, SH DC, SH rest and the orders k = 0 .. 3
+//   tail_k[t] = sum over u = t + 1 .. S of lr_u b_u a_u^(k - 1) q_k^(u - t).
 
 namespace blitzgs {
+
+constexpr int kAdamGroups = 6;  // learning rates: the SH column has two
+constexpr int kAdamOrders = 4;
+
+constexpr int kTails = 0;         // + 6 k + g
+constexpr int kBeta1Power = 24;   // beta1^t
+constexpr int kBeta2Power = 25;   // beta2^t
+constexpr int kRatioPower = 26;   // q_0^t
+constexpr int kRootPower = 27;    // beta2^(t/2)
+constexpr int kCorrection1 = 28;  // b_t
+constexpr int kCorrection2 = 29;  // a_t
+constexpr int kAdamTable = 30;
 
 constexpr int kAdamColumns = 5;  // means, quats, scales, opacities, sh
 

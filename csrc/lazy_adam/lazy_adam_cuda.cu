@@ -3,9 +3,7 @@
 #include <stdexcept>
 #include <type_traits>
 
-#include "common/launch.cuh"
-#include "common/multiprocessors.h"
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
 #include "lazy_adam/lazy_adam_device.cuh"
 
 namespace blitzgs::cuda {

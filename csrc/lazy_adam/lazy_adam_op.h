@@ -18,7 +18,7 @@ inline void check_adam_list(const char* op, const std::vector<Tensor>& tensors, 
 }
 
 // The optimiser's state of a table, and where its schedule stands. last_steps: (last_step, moment_step);
-// tables: (table of adam_table.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays:
+// tables: (table of lazy_adam.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays:
 // (beta1, beta2, eps).
 struct AdamTensors {
   const char* op;

@@ -22,8 +22,7 @@
 #include <cstdint>
 #include <limits>
 
-#include "common/host_device.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

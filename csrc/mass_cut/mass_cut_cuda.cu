@@ -1,9 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 
-#include "common/launch.cuh"
-#include "common/multiprocessors.h"
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
 #include "mass_cut/mass_cut.h"
 
 namespace blitzgs::cuda {

@@ -5,7 +5,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "common/host_device.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

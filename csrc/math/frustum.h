@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What a view can see of Gaussians of which only the mean and a largest standard deviation are known. Blocks
-// of the table, their rows (blocks/blocks.h) and the candidates of a projection (project/prefilter_cuda.cu)
+// of the table, their rows (blocks/blocks.h) and the candidates of a projection (project/project_cuda.cu)
 // are all tested by these planes.
 //
 // A Gaussian with axes up to sigma cannot be seen iff its mean lies behind the near plane, beyond the far
@@ -11,8 +11,8 @@
 #pragma once
 #include <cmath>
 
-#include "math/fused.h"
 #include "math/projection.h"
+#include "math/vec.h"
 
 namespace blitzgs {
 

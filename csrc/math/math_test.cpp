@@ -7,8 +7,8 @@
 #include <vector>
 
 #include "common/catch.h"
+#include "math/gaussian.h"
 #include "math/projection.h"
-#include "math/sh.h"
 #include "project/project_splat.h"
 
 using namespace blitzgs;

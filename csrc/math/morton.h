@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <cstdint>
 
-#include "common/host_device.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

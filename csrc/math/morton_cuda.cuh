@@ -3,9 +3,8 @@
 #pragma once
 #include <cstdint>
 
-#include "common/cuda_check.h"
-#include "common/stream.h"
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
+#include "common/kernel.h"
 #include "math/morton.h"
 
 namespace blitzgs::cuda {

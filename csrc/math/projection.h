@@ -3,7 +3,7 @@
 // the 2x3 factor M = J W A (Sigma' = M M^T + eps I): the determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is
 // then a sum of non-negative terms, where the usual ac - b^2 cancels for elongated splats.
 #pragma once
-#include "math/covariance.h"
+#include "math/gaussian.h"
 
 namespace blitzgs {
 

@@ -18,8 +18,8 @@
 #include <cmath>
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "math/fused.h"
+#include "common/kernel.h"
+#include "math/vec.h"
 
 namespace blitzgs {
 
@@ -197,6 +197,25 @@ BLITZGS_HD void for_each_tile(const T* mean2d, const T* conic, T opacity, int wi
   for_each_tile_row(mean2d, conic, opacity, width, height, tile_size, [&](int ty, int begin, int end) {
     for (int tx = begin; tx < end; ++tx) f(tx, ty);
   });
+}
+
+// Which ranks need a splat: each rank composites a range of the flattened tiles of all cameras
+// (math/tiles.h).
+
+// Rank m composites tiles [begin[m], end[m]). Ranges may be empty and may overlap; their begins ascend.
+struct RankTiles {
+  std::int64_t begin[kMaxRanks], end[kMaxRanks];
+  int n_ranks;
+};
+
+// Calls f(rank, tiles) for each rank that composites some of the tiles [begin, end).
+template <class F>
+BLITZGS_HD void for_each_rank(const RankTiles& ranks, std::int64_t begin, std::int64_t end, const F& f) {
+  for (int m = 0; m < ranks.n_ranks && ranks.begin[m] < end; ++m) {
+    const std::int64_t low = ranks.begin[m] > begin ? ranks.begin[m] : begin;
+    const std::int64_t high = ranks.end[m] < end ? ranks.end[m] : end;
+    if (low < high) f(m, high - low);
+  }
 }
 
 }  // namespace blitzgs

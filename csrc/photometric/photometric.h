@@ -27,8 +27,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

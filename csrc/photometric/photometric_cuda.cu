@@ -14,9 +14,7 @@
 #include <algorithm>
 #include <climits>
 
-#include "common/block_sum.cuh"
-#include "common/launch.cuh"
-#include "common/multiprocessors.h"
+#include "common/cuda.cuh"
 #include "photometric/photometric.h"
 #include "photometric/photometric_device.cuh"
 

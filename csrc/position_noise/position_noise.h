@@ -17,9 +17,9 @@
 #pragma once
 #include <cstdint>
 
-#include "common/stream.h"
+#include "common/kernel.h"
 #include "math/counter_random.h"
-#include "math/covariance.h"
+#include "math/gaussian.h"
 
 namespace blitzgs {
 

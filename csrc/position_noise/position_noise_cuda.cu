@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/cuda_check.h"
+#include "common/cuda.cuh"
 #include "position_noise/position_noise.h"
 
 namespace blitzgs::cuda {

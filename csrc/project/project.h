@@ -27,14 +27,114 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <variant>
 
-#include "common/stream.h"
-#include "math/rank_tiles.h"
-#include "project/level_fade.h"
+#include "common/kernel.h"
+#include "lazy_adam/lazy_adam.h"
+#include "math/tiles.h"
 #include "project/project_splat.h"
-#include "project/splat_gradients.h"
+#include "scatter/scatter.h"
+
+// Smooth levels: the opacity of a Gaussian fades out towards the distance beyond which a view leaves out its
+// octree level (view_gate.h), where the LOD gate alone would cut it off.
+//
+// weight(d) = clamp((1 - d^2 / reach^2) f / (f - 1), 0, 1) for a mean at distance d from the camera: 0 from
+// `reach` on, 1 up to reach / sqrt(f), which is half a level nearer. Everything fainter by it follows from
+// the faded opacity: the alpha of a pixel, which splats exist, and which tiles they touch. What the gate
+// leaves out has the weight 0, so the gate before the projection saves work and changes nothing.
+//
+// A weight is a constant for the gradient of means and poses: it says what a view shows, not where the
+// scene is. The opacity's gradient has it as a factor.
 
 namespace blitzgs {
+
+struct LevelFade {
+  const std::uint8_t* level;         // [N]; null: nothing fades
+  int n_levels;                      // a level beyond the last counts as the last
+  float inverse_reach2[kMaxLevels];  // 1 / reach^2; 0: kept at any distance
+};
+
+BLITZGS_HD float inverse_reach2_of(const LevelFade& fade, std::int64_t id) {
+  if (!fade.level) return 0.0f;
+  const int level = fade.level[id], last = fade.n_levels - 1;
+  return fade.inverse_reach2[level < last ? level : last];
+}
+
+// Where the projection's backward pass finds the gradients of the splats. Each source has the same three
+// members, for splat r: geometry(r), color(r), and whether there are colours at all.
+
+// In columns: [P, 2], [P, 3], [P], [P], [P, 3]; depths and colors may be null (zero).
+template <class T>
+struct SplatGradientColumns {
+  const T *means2d, *conics, *depths, *opacities, *colors;
+
+  BLITZGS_HD bool colored() const { return colors != nullptr; }
+  BLITZGS_HD GeometryGradient<T> geometry(std::int64_t r) const {
+    return {{means2d[2 * r], means2d[2 * r + 1]},
+            {conics[3 * r], conics[3 * r + 1], conics[3 * r + 2]},
+            depths ? depths[r] : T(0),
+            opacities[r]};
+  }
+  BLITZGS_HD Vec3<T> color(std::int64_t r) const { return load3(colors + 3 * r); }
+};
+
+// In the table that the rasteriser's backward pass adds them up in.
+struct PackedSplatGradients {
+  const SplatGradient* splats;
+
+  BLITZGS_HD bool colored() const { return true; }
+  BLITZGS_HD GeometryGradient<float> geometry(std::int64_t r) const {
+    const SplatGradient& v = splats[r];
+    return {{v.mean2d[0], v.mean2d[1]}, {v.conic[0], v.conic[1], v.conic[2]}, 0.f, v.opacity};
+  }
+  // By member, so that the compiler knows the alignment.
+  BLITZGS_HD Vec3<float> color(std::int64_t r) const {
+    const SplatGradient& v = splats[r];
+    return {v.color[0], v.color[1], v.color[2]};
+  }
+};
+
+// In such tables of all ranks that composited the splats (CUDA), added up in the order of ranks. The memory
+// is shared: `tables` are mapped here, each from this rank's first splat on.
+struct RankSplatGradients {
+  const SplatPlace* places;
+  int n_ranks;
+  const SplatGradient* tables[kMaxPeers];
+  std::int32_t sizes[kMaxPeers];  // this rank's splats in each
+  float* means2d;                 // null, or [P, 2]: where the projection's backward pass leaves these sums
+  bool absolute;                  // those of mean2d_abs instead
+
+  BLITZGS_HD bool colored() const { return true; }
+  BLITZGS_HD GeometryGradient<float> geometry(std::int64_t r) const {
+    const SplatGradient splat = sum(r);
+    return PackedSplatGradients{&splat}.geometry(0);
+  }
+  BLITZGS_HD Vec3<float> color(std::int64_t r) const {
+    const SplatGradient splat = sum(r);
+    return PackedSplatGradients{&splat}.color(0);
+  }
+  BLITZGS_HD SplatGradient sum(std::int64_t r) const {
+    SplatGradient sum{};
+    for (int m = 0; m < n_ranks; ++m) {
+      const SplatGradient* splat = at(m, r);
+      if (!splat) continue;
+      const SplatGradient v = *splat;
+      sum.add(v);
+    }
+    return sum;
+  }
+  // The splat at rank m; null: that composited none of it.
+  BLITZGS_HD const SplatGradient* at(int m, std::uint64_t r) const {
+    const SplatPlace place = places[r / kPlaceSplats * n_ranks + m];
+    const auto in_run = static_cast<std::uint32_t>(r % kPlaceSplats);
+    const std::int64_t splat = place.of(in_run);
+    return place.has(in_run) && splat < sizes[m] ? tables[m] + splat : nullptr;
+  }
+};
+
+// One that a kernel on CUDA reads; the CPU reads columns.
+using SplatGradientSource =
+    std::variant<SplatGradientColumns<float>, PackedSplatGradients, RankSplatGradients>;
 
 // means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3] or null; viewmats [B, 4, 4],
 // Ks [B, 3, 3]. Candidates: rows active_ids (ascending), or all N when null; bit v of active_views[c] allows
@@ -153,6 +253,33 @@ void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::in
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
+}  // namespace cuda
+
+// The projection's backward pass and the optimiser's step of the visible Gaussians in one: what project_bwd
+// and lazy_adam do one after the other, but for the gradients, which need never be stored. Parameters are
+// raw, with SH; `adam` lists splats.visible_ids and has no gradients; the listed rows' parameters stand at
+// adam.step - 1.
+
+// Gradients of the visible Gaussians in scratch memory, which `adam` is then given.
+template <class T>
+ProjectGradients<T> scratch_gradients(const SplatIndex& splats, AdamArgs<T>& adam, Workspace& workspace) {
+  T* slots[kAdamColumns];
+  for (int c = 0; c < kAdamColumns; ++c) {
+    slots[c] = workspace.allocate<T>(splats.n_visible * adam.columns[c].width);
+    adam.columns[c].grad = slots[c];
+  }
+  return {slots[0], slots[1], slots[2], slots[3], slots[4], nullptr};
+}
+
+namespace cpu {
+template <class T>
+void project_bwd_step(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
+                      const Regularisers<T>&, AdamArgs<T> adam, Workspace&, CudaStream);
+}  // namespace cpu
+namespace cuda {
+template <class T>
+void project_bwd_step(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,
+                      const Regularisers<T>&, AdamArgs<T> adam, Workspace&, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

@@ -1,10 +1,212 @@
 // SPDX-License-Identifier: Apache-2.0
 // The projection's backward pass on CUDA, whatever becomes of the gradients.
 #pragma once
+#include "common/cuda.cuh"
+#include "project/project.h"
 #include "project/project_device.cuh"
-#include "project/splat_gradient_reader.cuh"
+
+// How the lanes of a warp, neighbours among the visible Gaussians, read the gradients of their splats.
 
 namespace blitzgs::cuda {
+
+// Each lane where they are.
+template <class Source>
+class SplatGradientReader {
+ public:
+  static constexpr bool kPulls = false;
+  static std::size_t shared_bytes(const Source&, int, int) { return 0; }
+
+  __device__ SplatGradientReader(const Source& source, void*, int) : source_(source) {}
+  __device__ __forceinline__ void pull(std::int32_t, std::int32_t) const {}
+  __device__ __forceinline__ void finish_pull(std::int32_t, std::int32_t) const {}
+  // Calls f(splat, what to ask for its gradients) for the lane's splats [begin, end), as the whole warp does.
+  template <class F>
+  __device__ __forceinline__ void for_each(std::int32_t begin, std::int32_t end, const F& f) const {
+    for (std::int64_t r = begin; r < end; ++r) f(r, source_);
+  }
+
+ private:
+  const Source& source_;
+};
+
+// Splats in the memory of other GPUs come by way of shared memory. Neighbouring splats lie as neighbours at
+// each rank, too, so a warp pulls them in whole lines, all of them before it waits for anything, where a lane
+// for each splat would use a third of the links. Splats that do not fit into the stage (of more than
+// kMostRuns views, or a warp's with very many at several ranks) are read where they are. What lanes have in
+// common is kept in shared memory or worked out anew: they have no registers to spare for it.
+template <>
+class SplatGradientReader<RankSplatGradients> {
+  using Gradient = SplatGradient;
+  static constexpr int kPieces = sizeof(Gradient) / 16;  // of 16 bytes in a splat
+  static constexpr int kMostRuns = 6;  // of 32 splats that a warp's stage holds: of so many views
+  static constexpr int kSpare = 8;     // splats more, for some that lie at several ranks
+
+  // The splats of a run that lie at one rank: which, the first one's place there and in the stage.
+  struct Segment {
+    std::uint32_t bits;
+    std::int32_t from, to;
+  };
+  __host__ __device__ static int runs_for(int n_views) {
+    return n_views < 1 ? 1 : n_views < kMostRuns ? n_views : kMostRuns;
+  }
+  __host__ __device__ static int warp_bytes(int n_runs, int n_ranks) {
+    const int bytes = (32 * n_runs + kSpare + 1) * static_cast<int>(sizeof(Gradient)) + 32 * n_runs +
+                      (n_runs + 1) * n_ranks * static_cast<int>(sizeof(Segment));
+    return (bytes + 15) / 16 * 16;
+  }
+
+ public:
+  static constexpr bool kPulls = true;
+  static std::size_t shared_bytes(const RankSplatGradients& source, int n_views, int n_warps) {
+    return n_warps * static_cast<std::size_t>(warp_bytes(runs_for(n_views), source.n_ranks));
+  }
+
+  // memory: of the block.
+  __device__ __forceinline__ SplatGradientReader(const RankSplatGradients& source, void* memory, int n_views)
+      : source_(source), memory_(static_cast<char*>(memory)), n_runs_(runs_for(n_views)) {}
+
+  // Begins to bring the warp's splats into the stage; a lane's are [begin, end).
+  __device__ __forceinline__ void pull(std::int32_t lane_begin, std::int32_t lane_end) {
+    const std::int32_t begin = first_of(lane_begin), end = last_of(lane_end);
+    if (lane() < kPieces) reinterpret_cast<float4*>(stage() + nothing())[lane()] = {0.f, 0.f, 0.f, 0.f};
+    bool fits = end - begin <= 32 * n_runs_;
+    const int segments = fits ? n_segments(begin, end) : 0, n_ranks = source_.n_ranks;
+    int total = 0;
+    for (int base = 0; base < segments; base += 32) {
+      const int s = base + lane();
+      int count = 0;
+      if (s < segments) {
+        const int run = begin / kPlaceSplats + s / n_ranks;
+        const SplatPlace place =
+            source_.places[begin / kPlaceSplats * static_cast<std::int64_t>(n_ranks) + s];
+        const int low = max(begin - kPlaceSplats * run, 0),
+                  high = min(end - kPlaceSplats * run, kPlaceSplats);
+        const std::uint32_t bits = place.bits & (~0u << low) & (~0u >> (kPlaceSplats - high));
+        count = count_bits(bits);
+        const std::int32_t from = static_cast<std::int32_t>(place.of(low));
+        fits &= count == 0 || from + count <= source_.sizes[s % n_ranks];
+        segment_list()[s] = {bits, from, total};
+      }
+      int sum = count;
+#pragma unroll
+      for (int step = 1; step < 32; step *= 2) {
+        const int before = __shfl_up_sync(kFullWarp, sum, step);
+        if (lane() >= step) sum += before;
+      }
+      if (s < segments) segment_list()[s].to += sum - count;
+      total += __shfl_sync(kFullWarp, sum, 31);
+    }
+    fits_ = __all_sync(kFullWarp, fits) && total <= nothing();
+    __syncwarp();
+    if (fits_) {
+      int m = 0;
+#pragma unroll 1
+      for (int s = 0; s < segments; ++s) {
+        const Segment segment = segment_list()[s];
+        const auto* from = reinterpret_cast<const float4*>(source_.tables[m] + segment.from);
+        const auto to = static_cast<unsigned>(__cvta_generic_to_shared(stage() + segment.to));
+        const int pieces = kPieces * count_bits(segment.bits);
+#pragma unroll
+        for (int i = 0; i < kPieces; ++i) {
+          const int at = 32 * i + lane();
+          if (at < pieces) {
+            asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(to + 16 * at), "l"(from + at));
+          }
+        }
+        if (++m == n_ranks) m = 0;
+      }
+    }
+  }
+  // Waits for the splats that were pulled, and finds them in the stage: those at several ranks added up, in
+  // the order of these.
+  __device__ __forceinline__ void finish_pull(std::int32_t begin, std::int32_t end) const {
+    asm volatile("cp.async.wait_all;" ::: "memory");
+    __syncwarp();
+    const std::int32_t first = first_of(begin), last = last_of(end);
+#pragma unroll 1
+    for (std::int32_t r = first + lane(); r < last; r += 32) {
+      float2 mean2d{};
+      if (fits_) {
+        const Segment* segments =
+            segment_list() + (r / kPlaceSplats - first / kPlaceSplats) * source_.n_ranks;
+        const std::uint32_t bit = 1u << r % kPlaceSplats;
+        int found = nothing();
+        for (int m = 0; m < source_.n_ranks; ++m) {
+          const Segment segment = segments[m];
+          if ((segment.bits & bit) == 0) continue;
+          const int at = segment.to + count_bits(segment.bits & (bit - 1));
+          if (found == nothing()) {
+            found = at;
+          } else {
+            stage()[found].add(stage()[at]);
+          }
+        }
+        index()[r - first] = static_cast<std::uint8_t>(found);
+        mean2d = kept_of(stage()[found]);
+      } else if (source_.means2d) {
+        mean2d = kept_of(source_.sum(r));
+      }
+      if (source_.means2d) reinterpret_cast<float2*>(source_.means2d)[r] = mean2d;
+    }
+    __syncwarp();
+  }
+  template <class F>
+  __device__ __forceinline__ void for_each(std::int32_t begin, std::int32_t end, const F& f) const {
+    const Found found{source_, stage(), index(), first_of(begin), fits_};
+    for (std::int32_t r = begin; r < end; ++r) f(r, found);
+  }
+
+ private:
+  struct Found {
+    const RankSplatGradients& source;
+    const Gradient* stage;
+    const std::uint8_t* index;
+    std::int32_t first;
+    bool fits;
+    __device__ __forceinline__ GeometryGradient<float> geometry(std::int32_t r) const {
+      return fits ? PackedSplatGradients{stage}.geometry(index[r - first]) : source.geometry(r);
+    }
+    __device__ __forceinline__ Vec3<float> color(std::int32_t r) const {
+      return fits ? PackedSplatGradients{stage}.color(index[r - first]) : source.color(r);
+    }
+  };
+
+  __device__ __forceinline__ float2 kept_of(const SplatGradient& v) const {
+    // By value: an address of either would put the whole splat onto the stack.
+    return source_.absolute ? float2{v.mean2d_abs[0], v.mean2d_abs[1]} : float2{v.mean2d[0], v.mean2d[1]};
+  }
+  static __device__ __forceinline__ int lane() { return static_cast<int>(threadIdx.x) % 32; }
+  // The runs that splats [begin, end) touch, by ranks.
+  __device__ __forceinline__ int n_segments(std::int32_t begin, std::int32_t end) const {
+    return begin == end ? 0 : ((end - 1) / kPlaceSplats - begin / kPlaceSplats + 1) * source_.n_ranks;
+  }
+
+  // The warp's splats: the first lane's first, and the last lane's last that has any.
+  static __device__ __forceinline__ std::int32_t first_of(std::int32_t begin) {
+    return __shfl_sync(kFullWarp, begin, 0);
+  }
+  static __device__ __forceinline__ std::int32_t last_of(std::int32_t end) {
+    return __reduce_max_sync(kFullWarp, end);
+  }
+
+  // The stage's last splat, zeros, stands for splats that no rank composited.
+  __device__ __forceinline__ int nothing() const { return 32 * n_runs_ + kSpare; }
+  __device__ __forceinline__ Gradient* stage() const {
+    return reinterpret_cast<Gradient*>(memory_ + threadIdx.x / 32 * warp_bytes(n_runs_, source_.n_ranks));
+  }
+  // By splat of the stage's: where it is there.
+  __device__ __forceinline__ std::uint8_t* index() const {
+    return reinterpret_cast<std::uint8_t*>(stage() + nothing() + 1);
+  }
+  __device__ __forceinline__ Segment* segment_list() const {
+    return reinterpret_cast<Segment*>(index() + 32 * n_runs_);
+  }
+
+  const RankSplatGradients& source_;
+  char* memory_;
+  int n_runs_;
+  bool fits_ = true;
+};
 
 constexpr int kBackwardThreads = 128;
 

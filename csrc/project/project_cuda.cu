@@ -1,7 +1,213 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "project/prefilter.cuh"
+// The projection on CUDA: the quick test of all candidates, the colours of the splats, and what queues the
+// kernels. Compiled without FMA contraction (cmake/cuda.cmake), as write_splats_cuda.cu.
+#include "common/cuda.cuh"
+#include "math/frustum.h"
+#include "project/project_device.cuh"
+
+#include <algorithm>
+
+// The first kernel of the projection: a quick test of every candidate, from its mean and its largest scale.
 
 namespace blitzgs::cuda {
+
+namespace {
+
+constexpr int kWarps = kPrefilterThreads / 32, kMostOfWarp = kMostAtOnce / kWarps;
+constexpr int kBlocksPerMultiprocessor = 8;
+
+// Not inlined: the doubles of this would have the loop of the kernel spill registers.
+__device__ __noinline__ void store_frustum(const Camera<float>* camera, int width, int height,
+                                           float near_plane, float far_plane, float eps2d, Frustum* frustum) {
+  *frustum = make_frustum(*camera, width, height, near_plane, far_plane, eps2d);
+}
+
+// An upper bound. Stored opacities may exceed 1, logits cannot.
+__device__ float largest_scale(const Inputs& in, std::int64_t id) {
+  const float* s = in.scales + 3 * id;
+  const float widest = fmaxf(s[0], fmaxf(s[1], s[2]));
+  if (in.options.raw) return 1.001f * __expf(widest);
+  return in.opacities[id] <= 1.f ? widest : kAnyWidth;
+}
+
+// The views that may see each of kPrefilterBatch candidates first, first + 32, ..., from the mean, then the
+// scale.
+__device__ void quick_views(const Inputs& in, std::int64_t n_candidates, const Frustum* frusta,
+                            std::int64_t first, std::uint32_t* maybe, std::int32_t* ids) {
+  Vec3<float> means[kPrefilterBatch];
+  float norms[kPrefilterBatch];
+#pragma unroll
+  for (int k = 0; k < kPrefilterBatch; ++k) {
+    const std::int64_t c = first + 32 * k;
+    const bool present = c < n_candidates;
+    ids[k] = present ? static_cast<std::int32_t>(candidate_id(in, c)) : 0;
+    maybe[k] = !present ? 0u : in.active_views ? static_cast<std::uint32_t>(in.active_views[c]) : ~0u;
+    if (in.n_views < 32) maybe[k] &= (1u << in.n_views) - 1u;
+    means[k] = maybe[k] ? load3(in.means + std::int64_t{3} * ids[k]) : Vec3<float>{0.f, 0.f, 0.f};
+    norms[k] = norm1(means[k]);
+  }
+  for (int view = 0; view < in.n_views; ++view) {
+    const Frustum& frustum = frusta[view];
+#pragma unroll
+    for (int k = 0; k < kPrefilterBatch; ++k) {
+      if (!may_be_in_depth(frustum, means[k], norms[k])) maybe[k] &= ~(1u << view);
+    }
+  }
+  float scales[kPrefilterBatch];
+#pragma unroll
+  for (int k = 0; k < kPrefilterBatch; ++k) scales[k] = maybe[k] ? largest_scale(in, ids[k]) : 0.f;
+  for (int view = 0; view < in.n_views; ++view) {
+    const Frustum& frustum = frusta[view];
+#pragma unroll
+    for (int k = 0; k < kPrefilterBatch; ++k) {
+      if (!may_overlap(frustum, means[k], norms[k], scales[k])) maybe[k] &= ~(1u << view);
+    }
+  }
+}
+
+// A block takes candidates turn by turn; those that some view may see are listed behind those of the turns
+// before.
+__global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
+    prefilter_kernel(const Inputs in, const Prefiltered kept, const RunningSum before) {
+  __shared__ Camera<float> cameras[kMaxViews];
+  __shared__ Frustum frusta[kMaxViews];
+  __shared__ std::uint32_t left_views[kWarps][kMostOfWarp];
+  __shared__ std::int32_t left_ids[kWarps][kMostOfWarp];
+  __shared__ int left[kWarps];
+  const std::int64_t n_candidates = candidates_of(in);
+  const int at_once = prefiltered_at_once(n_candidates), of_warp = at_once / kWarps;
+  const std::int64_t n_turns = (n_candidates + at_once - 1) / at_once;
+  if (blockIdx.x == 0 && threadIdx.x == 0 && n_turns == 0) *kept.count = 0;
+  if (blockIdx.x >= n_turns) return;
+  load_cameras(in, cameras);
+  __syncthreads();
+  for (int view = threadIdx.x; view < in.n_views; view += kPrefilterThreads)
+    store_frustum(cameras + view, in.options.width, in.options.height, in.options.near_plane,
+                  in.options.far_plane, in.options.eps2d, frusta + view);
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const unsigned below = (1u << lane) - 1u;
+  for (;;) {
+    const int turn = before.take_turn();
+    if (turn >= n_turns) return;
+    const std::int64_t first = turn * std::int64_t{at_once} + warp * of_warp;
+    int n_left = 0;
+    for (int batch = 0; batch < of_warp; batch += 32 * kPrefilterBatch) {
+      std::uint32_t maybe[kPrefilterBatch];
+      std::int32_t ids[kPrefilterBatch];
+      quick_views(in, n_candidates, frusta, first + batch + lane, maybe, ids);
+#pragma unroll
+      for (int k = 0; k < kPrefilterBatch; ++k) {
+        const unsigned some = __ballot_sync(kFullWarp, maybe[k] != 0);
+        if (maybe[k]) {
+          const int at = n_left + __popc(some & below);
+          left_views[warp][at] = maybe[k];
+          left_ids[warp][at] = ids[k];
+        }
+        n_left += __popc(some);
+      }
+    }
+    if (lane == 0) left[warp] = n_left;
+    __syncthreads();
+    int at = 0, of_block = 0;
+#pragma unroll
+    for (int other = 0; other < kWarps; ++other) {
+      if (other < warp) at += left[other];
+      of_block += left[other];
+    }
+    const std::int64_t base = before.sum_before<kPrefilterThreads>(turn, of_block);
+    if (turn == n_turns - 1 && threadIdx.x == 0) *kept.count = base + of_block;
+    for (int i = lane; i < n_left; i += 32) {
+      kept.views[base + at + i] = left_views[warp][i];
+      kept.ids[base + at + i] = left_ids[warp][i];
+    }
+  }
+}
+
+}  // namespace
+
+void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, CudaStream stream) {
+  const std::int64_t turns = in.n_views > 0 ? most_prefilter_turns(in.n_candidates) : 0;
+  if (turns == 0) {
+    check(cudaMemsetAsync(kept.count, 0, sizeof(*kept.count), stream), "project");
+    return;
+  }
+  const std::int64_t blocks = std::min<std::int64_t>(turns, kBlocksPerMultiprocessor * multiprocessors());
+  auto* zeros = turn_zeros(turns, workspace, stream);
+  prefilter_kernel<<<static_cast<unsigned>(blocks), kPrefilterThreads, 0, stream>>>(in, kept,
+                                                                                    RunningSum(zeros));
+  check_launch("project");
+}
+
+namespace {
+
+constexpr int kColorThreads = 128, kColorBlocks = 5;  // such blocks fill a multiprocessor
+constexpr int kSplatsOfBlock = 2 * kColorThreads;
+
+// Writes the colour of splat i, of Gaussian id (-1: none), and hides the splat if it is not finite; the whole
+// warp takes part. sh_slot: where `stage` gathers its SH row.
+template <int DEGREE, bool QUADS>
+__device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>& camera,
+                                           const Vec3<float>& mean, ShStage<DEGREE>& stage, int sh_slot,
+                                           const ProjectOutputs<float>& out, std::int64_t i,
+                                           std::int32_t id) {
+  bool shown = true;
+  if constexpr (QUADS) {
+    stage.wait();
+    if (id < 0) return;
+    ShRow<DEGREE> sh;
+    stage.read(sh_slot, &sh);
+    shown = splat_color(camera, mean, sh.values, DEGREE, out.colors + 3 * i);
+  } else if (id >= 0) {
+    shown = splat_color(camera, mean, in.sh + 3 * in.options.sh_stride * std::int64_t{id}, DEGREE,
+                        out.colors + 3 * i);
+  }
+  if (shown) return;
+  out.opacities[i] = 0.f;
+  reinterpret_cast<int2*>(out.radii)[i] = {0, 0};
+  out.tiles_touched[i] = 0;
+}
+
+template <int DEGREE, bool QUADS>
+__global__ void __launch_bounds__(kColorThreads, kColorBlocks)
+    color_kernel(const Inputs in, const ProjectIds ids, const ProjectCapacity capacity,
+                 const ProjectOutputs<float> out) {
+  __shared__ ShStage<DEGREE> stages[QUADS ? kColorThreads / 32 : 1];
+  __shared__ Camera<float> cameras[kMaxViews];
+  __shared__ TripleStage triples[kColorThreads / 32];
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
+  const std::int64_t n_splats = fitting(capacity).splats, step = gridDim.x * std::int64_t{kSplatsOfBlock};
+  const std::int64_t of_block = blockIdx.x * std::int64_t{kSplatsOfBlock};
+  if (of_block >= n_splats) return;
+  load_cameras(in, cameras);
+  __syncthreads();
+  for (std::int64_t begin = of_block; begin < n_splats; begin += step) {
+#pragma unroll 1
+    for (int first = 0; first < kSplatsOfBlock; first += kColorThreads) {
+      const std::int64_t i = begin + first + threadIdx.x;
+      const std::int32_t id = i < n_splats ? ids.gaussian_ids[i] : -1;
+      int sh_slot = 0;
+      if constexpr (QUADS) sh_slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
+      const int view = id < 0 ? 0 : ids.camera_ids[i];
+      const Vec3<float> mean = triples[warp].gather(in.means, id, lane);
+      emit_color<DEGREE, QUADS>(in, cameras[view], mean, stage, sh_slot, out, i, id);
+      __syncwarp();
+    }
+  }
+}
+
+}  // namespace
+
+void write_colors(const Inputs& in, const ProjectCapacity& capacity, const ProjectColumns<float>& columns,
+                  CudaStream stream) {
+  if (capacity.sizes.splats == 0 || !in.sh) return;
+  const std::int64_t blocks = (capacity.sizes.splats + kSplatsOfBlock - 1) / kSplatsOfBlock;
+  dispatch_sh(in, [&](auto degree, auto quads) {
+    color_kernel<degree.value, quads.value><<<static_cast<unsigned>(blocks), kColorThreads, 0, stream>>>(
+        in, columns.ids, capacity, columns.values);
+  });
+  check_launch("project");
+}
 
 template <>
 void project<float>(const Inputs& in, const RankTiles& rank_tiles, SplatMemory<float>& memory,

@@ -5,11 +5,10 @@
 #pragma once
 #include <cstdint>
 
-#include "common/limits.h"
+#include "common/kernel.h"
 #include "math/frustum.h"
+#include "math/gaussian.h"
 #include "math/projection.h"
-#include "math/rank_tiles.h"
-#include "math/sh.h"
 #include "math/tiles.h"
 
 namespace blitzgs {
@@ -30,7 +29,7 @@ struct ActiveGaussian {
   UnitQuaternion<T> quat;
   Columns3<T> rotation, axes;
   T opacity;
-  T inverse_reach2;  // of its level (level_fade.h); 0: it fades nowhere
+  T inverse_reach2;  // of its level (project.h); 0: it fades nowhere
 };
 
 template <class T>
@@ -90,7 +89,7 @@ BLITZGS_HD ActiveGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* qua
   return gaussian;
 }
 
-// The weight of a Gaussian's opacity in a view with smooth levels (level_fade.h).
+// The weight of a Gaussian's opacity in a view with smooth levels (project.h).
 template <class T>
 BLITZGS_HD T level_weight(const Camera<T>& camera, const ActiveGaussian<T>& gaussian, T slope) {
   if (!(gaussian.inverse_reach2 > T(0))) return T(1);

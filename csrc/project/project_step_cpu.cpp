@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "project/project_step.h"
+#include "project/project.h"
 
 namespace blitzgs::cpu {
 

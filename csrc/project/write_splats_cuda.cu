@@ -4,9 +4,8 @@
 // bits.
 #include <algorithm>
 
-#include "common/multiprocessors.h"
-#include "common/warp.cuh"
-#include "project/prefilter.cuh"
+#include "common/cuda.cuh"
+#include "project/project_device.cuh"
 
 namespace blitzgs::cuda {
 

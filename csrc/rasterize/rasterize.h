@@ -27,7 +27,7 @@
 // background is sum over pixels of v_renders * T, left to the caller. Splats in no list get zeros. v_renders
 // of unowned tiles are not read.
 //
-// Forward may be queued with room for more splats than there are (known_splats, common/splat_count.h; CUDA
+// Forward may be queued with room for more splats than there are (known_splats, common/kernel.h; CUDA
 // alone): it packs, and zeroes gradients of, those that are there; gradients behind them are unspecified.
 // Backward may then be given just these splats.
 //
@@ -36,9 +36,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/splat_count.h"
-#include "common/splat_gradient.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 #include "math/tiles.h"
 
 namespace blitzgs {

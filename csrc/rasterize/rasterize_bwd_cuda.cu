@@ -9,11 +9,8 @@
 #include <stdexcept>
 #include <string>
 
-#include "common/launch.cuh"
-#include "common/warp.cuh"
-#include "rasterize/backward_pixel.cuh"
-#include "rasterize/splat_entries.cuh"
-#include "rasterize/unpack_gradients.cuh"
+#include "common/cuda.cuh"
+#include "rasterize/gradients.cuh"
 
 namespace blitzgs::cuda {
 

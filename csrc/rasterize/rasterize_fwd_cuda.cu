@@ -2,10 +2,8 @@
 #include <algorithm>
 #include <string>
 
-#include "common/launch.cuh"
-#include "common/warp.cuh"
-#include "rasterize/compositor.cuh"
-#include "rasterize/pack_splats.cuh"
+#include "common/cuda.cuh"
+#include "rasterize/forward.cuh"
 
 namespace blitzgs::cuda {
 

@@ -5,8 +5,6 @@
 #include <tuple>
 
 #include "common/op.h"
-#include "common/splat_count_op.h"
-#include "common/tile_grid_op.h"
 
 namespace blitzgs {
 namespace {

@@ -12,8 +12,7 @@
 #include <stdexcept>
 #include <string>
 
-#include "common/cuda_check.h"
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_order.cuh"
 

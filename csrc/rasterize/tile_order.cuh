@@ -7,8 +7,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/warp.cuh"
-#include "common/zeros.cuh"
+#include "common/cuda.cuh"
 #include "math/tiles.h"
 #include "rasterize/rasterize.h"
 

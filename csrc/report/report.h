@@ -10,7 +10,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/block_sum.cuh"
-#include "common/cuda_check.h"
+#include "common/cuda.cuh"
 #include "report/report.h"
 
 namespace blitzgs::cuda {

@@ -9,7 +9,7 @@
 #include <cstdint>
 
 #include "blocks/blocks.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

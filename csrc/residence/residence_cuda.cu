@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 
-#include "common/cuda_check.h"
+#include "common/cuda.cuh"
 #include "copy_to_host/copy_to_host.h"
 #include "residence/residence.h"
 

@@ -14,9 +14,8 @@
 #pragma once
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/stream.h"
-#include "math/rank_tiles.h"
+#include "common/kernel.h"
+#include "math/tiles.h"
 
 namespace blitzgs {
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 
-#include "common/cuda_check.h"
+#include "common/cuda.cuh"
 #include "scatter/scatter_device.cuh"
 
 namespace blitzgs::cuda {

@@ -5,7 +5,7 @@
 #pragma once
 #include <type_traits>
 
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
 #include "scatter/scatter.h"
 
 namespace blitzgs::cuda {

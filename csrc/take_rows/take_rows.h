@@ -7,7 +7,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/cuda_check.h"
+#include "common/cuda.cuh"
 #include "copy_to_host/copy_to_host.h"
 #include "transport/transport.h"
 

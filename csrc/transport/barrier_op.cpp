@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #ifdef BLITZGS_BACKEND_CUDA
-#include "copy_to_host/copy_to_host_op.h"
+#include "common/op.h"
+#include "copy_to_host/copy_to_host.h"
 #include "transport/peers_op.h"
 
 namespace blitzgs {

@@ -2,8 +2,7 @@
 // Splats to the ranks that composite them, straight into these ranks' memory.
 #include <algorithm>
 
-#include "common/multiprocessors.h"
-#include "common/warp.cuh"
+#include "common/cuda.cuh"
 #include "scatter/scatter_device.cuh"
 #include "transport/transport.h"
 

@@ -8,7 +8,7 @@
 // same totals.
 //
 // The way back needs no op of its own: the owner of splats reads their gradients where the ranks that
-// composited them added them up (RankSplatGradients, project/splat_gradients.h).
+// composited them added them up (RankSplatGradients, project/project.h).
 //
 // device_barrier_, a barrier in stream order: what any rank queued before it is done, and visible, when what
 // any rank queues behind it runs. Each rank also leaves its `values` with every other. control[m], int64:
@@ -16,7 +16,7 @@
 // [n] their sums. host [M, n], in pinned memory: the values for the host. A rank that waits for longer than
 // timeout_seconds aborts its kernels, so that its process sees an error.
 #pragma once
-#include "common/limits.h"
+#include "common/kernel.h"
 #include "project/project.h"
 #include "scatter/scatter.h"
 

@@ -10,8 +10,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/launch.cuh"
+#include "common/cuda.cuh"
 #include "tree_sums/tree_sums.h"
 
 namespace blitzgs::cuda {

@@ -18,9 +18,7 @@
 #pragma once
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/limits.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 #include "cull_mask/cull_mask.h"
 
 namespace blitzgs {
@@ -111,6 +109,15 @@ void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
 }
 namespace cuda {
 void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
+}
+
+// Copies the table of the rules and works out the centres: the part of a thread of the block that calls this.
+BLITZGS_HD void fill_gate_table(const GateRules& rules, const float* viewmats, int thread, GateTable& table) {
+  if (thread < kMaxLevels) table.reach2[thread] = rules.table.reach2[thread];
+  if (thread < rules.n_views) {
+    table.columns[thread] = rules.table.columns[thread];
+    camera_centre(viewmats + 16 * thread, table.centres[thread]);
+  }
 }
 
 }  // namespace blitzgs

@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 
-#include "common/launch.cuh"
-#include "common/multiprocessors.h"
-#include "view_gate/gate_table.cuh"
+#include "common/cuda.cuh"
+#include "view_gate/view_gate.h"
 
 namespace blitzgs::cuda {
 
@@ -18,7 +17,7 @@ __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const V
   const std::int64_t count = args.count ? *args.count : args.room;
   const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
   if (first >= count) return;
-  fill_gate_table(args.rules, args.viewmats, table);
+  fill_gate_table(args.rules, args.viewmats, threadIdx.x, table);
   __syncthreads();
   for (std::int64_t i = first + threadIdx.x; i < count; i += std::int64_t{kThreads} * gridDim.x) {
     gate_entry(args, table, i);

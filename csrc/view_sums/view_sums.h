@@ -17,8 +17,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/launch.cuh"
+#include "common/cuda.cuh"
 #include "view_sums/view_sums.h"
 
 namespace blitzgs::cuda {

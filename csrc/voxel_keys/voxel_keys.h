@@ -9,8 +9,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "common/host_device.h"
-#include "common/stream.h"
+#include "common/kernel.h"
 
 namespace blitzgs {
 

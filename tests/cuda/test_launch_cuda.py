@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that are placed while the ones in front of them still end (csrc/common/launch.cuh)."""
+"""Kernels that are placed while the ones in front of them still end (csrc/common/cuda.cuh)."""
 
 import torch
 from cuda_scenes import Scene, ops

@@ -1,10 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// What comes before compositing on CUDA: splats packed as the kernels read them, and the order of the tiles.
+// What the image and the contributions of splats share on CUDA.
 #pragma once
 #include <cstdint>
 
-#include "common/launch.cuh"
+#include "common/cuda.cuh"
 #include "rasterize/tile_batch.cuh"
+
+// What comes before compositing on CUDA: splats packed as the kernels read them, and the order of the tiles.
 
 namespace blitzgs::cuda {
 
@@ -68,5 +70,68 @@ inline void prepare(const char* what, const RasterizeInput<float>& in, PackedSpl
   if (blocks > 0)
     launch_early(what, prepare_kernel, {blocks, kPackThreads, stream}, in, splats, colors, order);
 }
+
+// Compositing a pixel on CUDA: one definition for the image and for the contributions of splats, so that both
+// see the same alpha T, bit for bit.
+
+// List entries that a block copies at once.
+inline constexpr int kForwardBatch = 256;
+
+// Alpha T of four entries of a batch at a pixel: zero where an entry is not composited.
+struct QuadWeights {
+  float at[4];
+  bool touched[4];
+};
+
+// One pixel's state while its list is composited. Entries are named by their offset in the batch.
+struct Compositor {
+  static constexpr std::uint32_t kNone = ~0u;
+  float transmittance = 1.f;
+  float limit;                  // least log2(alpha) that still counts: infinite once the pixel has ended
+  std::uint32_t last = kNone;   // composited last
+  std::uint32_t ended = kNone;  // at which the pixel ended
+
+  // Composites four entries of a batch. Whether the pixel ends is asked once for all of them.
+  __device__ __forceinline__ QuadWeights add(const char* entries, const QuadOffsets& offsets,
+                                             const Pixel& pixel) {
+    float alpha[4];
+    QuadWeights weights;
+    float after = transmittance;
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      const float log2_a = log2_alpha(entry_at(entries, offsets.at[k]), pixel);
+      weights.touched[k] = log2_a >= limit;
+      alpha[k] = weights.touched[k] ? fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax)) : 0.f;
+      after = __fmaf_rn(-alpha[k], after, after);
+    }
+    if (__any_sync(kFullWarp, after < static_cast<float>(kMinTransmittance))) {
+      end(alpha, weights.touched, offsets);
+    }
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      weights.at[k] = alpha[k] * transmittance;
+      transmittance = __fmaf_rn(-alpha[k], transmittance, transmittance);
+      if (weights.touched[k]) last = offsets.at[k];
+    }
+    return weights;
+  }
+
+  // Takes the entry that would end the pixel, and those behind it, out of the four.
+  __device__ __forceinline__ void end(float (&alpha)[4], bool (&touched)[4], const QuadOffsets& offsets) {
+    float after = transmittance;
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      after = __fmaf_rn(-alpha[k], after, after);
+      if (ended == kNone && after < static_cast<float>(kMinTransmittance)) ended = offsets.at[k];
+      if (ended != kNone) {
+        alpha[k] = 0.f;
+        touched[k] = false;
+        limit = INFINITY;
+      }
+    }
+  }
+
+  __device__ __forceinline__ bool done() const { return limit == INFINITY; }
+};
 
 }  // namespace blitzgs::cuda

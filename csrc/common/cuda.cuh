@@ -1,0 +1,339 @@
+// SPDX-License-Identifier: Apache-2.0
+// What CUDA kernels share: launches, and what the threads of a warp, a block and a grid do together. No
+// torch.
+#pragma once
+#include <cuda_runtime.h>
+#include <array>
+#include <atomic>
+#include <cstdint>
+#include <cuda/atomic>
+#include <stdexcept>
+#include <string>
+#include <type_traits>
+
+#include "common/kernel.h"
+
+// Where the GPU or the size of the work decides which code runs. A test build takes the other branch on the
+// machine at hand: BLITZGS_SM80_BRANCHES compiles the code of GPUs before sm_90 for all of them, and
+// BLITZGS_SMALL_STATES lowers the number of items from which sorts take 64-bit states (docs/testing.md). A
+// library says what it was compiled with (branches_cuda.cu).
+
+#ifndef BLITZGS_SM80_BRANCHES
+#define BLITZGS_SM80_BRANCHES 0
+#endif
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && !BLITZGS_SM80_BRANCHES
+#define BLITZGS_SM90 1
+#else
+#define BLITZGS_SM90 0
+#endif
+
+#ifndef BLITZGS_SMALL_STATES
+#define BLITZGS_SMALL_STATES (1 << 30)  // 32-bit states leave 30 bits for counts
+#endif
+
+namespace blitzgs::cuda {
+
+// Sorts of fewer items have 32-bit states.
+inline constexpr std::int64_t kSmallStates = BLITZGS_SMALL_STATES;
+static_assert(kSmallStates <= 1 << 30);
+
+// Launch helpers for the *_cuda.cu files. No torch.
+
+inline void check(cudaError_t status, const char* what) {
+  if (status != cudaSuccess) {
+    throw std::runtime_error(std::string("blitzgs: CUDA error in ") + what + ": " +
+                             cudaGetErrorString(status));
+  }
+}
+
+inline void check_launch(const char* kernel) { check(cudaGetLastError(), kernel); }
+
+// The number of blocks for n items; callers skip the launch when n is 0.
+inline unsigned blocks_for(std::int64_t n, int threads) {
+  return static_cast<unsigned>((n + threads - 1) / threads);
+}
+
+// The number of multiprocessors, for launches with as many blocks as run at a time.
+
+// The number of multiprocessors of the current device.
+inline int multiprocessors() {
+  int device = 0, count = 0;
+  check(cudaGetDevice(&device), "multiprocessors");
+  check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "multiprocessors");
+  return count;
+}
+
+// Launches that avoid the gap of 1.2 to 2.5 us between two kernels of a stream (programmatic dependent
+// launch, sm_90 and later). The device places a kernel that was launched by launch_early when all blocks of
+// the kernel before it have ended, while that kernel's memory is still being flushed; the new kernel waits
+// for the rest on the device. The rules for such kernels, and why they suffice:
+//
+// - Each of its blocks calls wait_for_earlier_kernels() before its first access to global memory, reads and
+//   writes alike, and before any return: an earlier kernel may still read what this one would overwrite.
+//   Before the call a block touches registers, shared memory and parameters only.
+// - The call returns when the kernel before it has ended and its writes are visible. That kernel called
+//   wait_for_earlier_kernels() itself, or was launched plainly and so began after all earlier kernels had
+//   ended. Hence all earlier kernels have ended, and memory that was given back to the allocator and reused
+//   in stream order is as safe as without early launches.
+// - Only two neighbouring kernels overlap. Plain launches, copies and events wait until the kernel before
+//   them has ended, and so does another stream that waits for such an event.
+// - No kernel lets the next one in before its own blocks end (griddepcontrol.launch_dependents). A waiting
+//   block occupies a multiprocessor, so a kernel that spins for another GPU or stream must not let its
+//   successor in. Other kernels would only lose by it: blocks that are placed while others still run are
+//   spread unevenly over the multiprocessors (docs/decisions/launch-earlier.md).
+// - Kernels of other libraries are launched plainly; they wait for all earlier kernels by themselves.
+
+// A kernel that is launched by launch_early calls this first.
+__device__ __forceinline__ void wait_for_earlier_kernels() {
+#if BLITZGS_SM90
+  asm volatile("griddepcontrol.wait;" ::: "memory");
+#endif
+}
+
+// Whether kernels wait on the current device. This depends on the code that the device runs and not on the
+// device: code that was compiled for an older device and translated when it was loaded does not wait. All
+// kernels are compiled for the same architectures, so asking one of them is enough.
+inline bool kernels_wait(const void* kernel) {
+  if constexpr (BLITZGS_SM80_BRANCHES) return false;
+  enum : signed char { kUnknown, kNo, kYes };
+  static std::array<std::atomic<signed char>, 64> known{};  // by device
+  int device = 0;
+  check(cudaGetDevice(&device), "launch");
+  if (device >= static_cast<int>(known.size())) return false;
+  signed char answer = known[device].load(std::memory_order_relaxed);
+  if (answer == kUnknown) {
+    cudaFuncAttributes code{};
+    check(cudaFuncGetAttributes(&code, kernel), "launch");
+    answer = code.ptxVersion >= 90 ? kYes : kNo;
+    known[device].store(answer, std::memory_order_relaxed);
+  }
+  return answer == kYes;
+}
+
+struct LaunchShape {
+  dim3 blocks;
+  unsigned threads;
+  CudaStream stream;
+  std::size_t shared_bytes = 0;
+};
+
+// Launches a kernel that calls wait_for_earlier_kernels(). A failure names `what`.
+template <class... Parameters>
+void launch_early(const char* what, void (*kernel)(Parameters...), const LaunchShape& shape,
+                  const std::type_identity_t<Parameters>&... arguments) {
+  cudaLaunchAttribute early{};
+  early.id = cudaLaunchAttributeProgrammaticStreamSerialization;
+  early.val.programmaticStreamSerializationAllowed = 1;
+  cudaLaunchConfig_t config{};
+  config.gridDim = shape.blocks;
+  config.blockDim = dim3(shape.threads);
+  config.dynamicSmemBytes = shape.shared_bytes;
+  config.stream = shape.stream;
+  config.attrs = &early;
+  config.numAttrs = kernels_wait(reinterpret_cast<const void*>(kernel)) ? 1 : 0;
+  cudaLaunchKernelEx(&config, kernel, arguments...);
+  check_launch(what);
+}
+
+// Zeroes a few counters between kernels that are launched early. A memset there would bring back the gaps
+// before and behind it.
+
+static __global__ void zero_kernel(std::int32_t* counters, std::int64_t n) {
+  wait_for_earlier_kernels();
+  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
+  if (i < n) counters[i] = 0;
+}
+
+inline void zero(const char* what, std::int32_t* counters, std::int64_t n, CudaStream stream) {
+  launch_early(what, zero_kernel, {blocks_for(n, 256), 256, stream}, counters, n);
+}
+
+// What the lanes of a warp do together.
+
+inline constexpr unsigned kFullWarp = 0xffffffffu;  // all lanes take part
+
+template <class T>
+__device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
+#pragma unroll
+  for (int step = 1; step < 32; step *= 2) {
+    const T before = __shfl_up_sync(kFullWarp, value, step);
+    if (lane >= step) value += before;
+  }
+  return value;
+}
+
+// Sum over a block of THREADS threads, on thread 0.
+template <int THREADS>
+__device__ double block_sum(double value) {
+  __shared__ double warps[THREADS / 32];
+  for (int offset = 16; offset > 0; offset /= 2) value += __shfl_down_sync(kFullWarp, value, offset);
+  __syncthreads();
+  if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = value;
+  __syncthreads();
+  double total = 0;
+  if (threadIdx.x == 0) {
+    for (const double part : warps) total += part;
+  }
+  return total;
+}
+
+// Sums of block sums over the blocks of one launch, while these run.
+
+// The sum over all blocks before a block, where each block has a sum in [0, 2^62). A block publishes its own
+// sum. It then adds up the sums of its predecessors, backwards, until it meets one that has published the sum
+// up to and including itself, and publishes its own such sum. No second launch is needed. Blocks are numbered
+// in the order in which they start, so all predecessors of a block that waits run or have run.
+class RunningSum {
+ public:
+  // zeros: one word for each block and one more, all zero.
+  explicit RunningSum(std::uint64_t* zeros) : turn_(zeros), states_(zeros + 1) {}
+
+  // Returns the block's number. All of its threads call this, and it is a barrier for them. A block may call
+  // it again when it knows the sum before its last number; it then does the work of several blocks.
+  __device__ int take_turn() const {
+    __shared__ int turn;
+    if (threadIdx.x == 0) turn = static_cast<int>(Word(*turn_).fetch_add(1, ::cuda::memory_order_relaxed));
+    __syncthreads();
+    return turn;
+  }
+
+  // Returns the sum before a block. All threads of the block call this, each looks at one predecessor at a
+  // time, and it is a barrier for them.
+  template <int kThreads>
+  __device__ std::int64_t sum_before(int block, std::int64_t own) const {
+    __shared__ std::int64_t parts[kThreads / 32];
+    __shared__ bool ends[kThreads / 32];
+    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    if (threadIdx.x == 0) publish(block, kOwn, own);
+    std::int64_t sum = 0;
+    for (int end = block; end > 0; end -= kThreads) {
+      const int at = end - 1 - static_cast<int>(threadIdx.x);
+      std::uint64_t state = kThrough;  // before the first block the sum is 0
+      do {
+        if (at >= 0) state = Word(states_[at]).load(::cuda::memory_order_relaxed);
+      } while (__any_sync(kFullWarp, state < kOwn));
+      const unsigned through = __ballot_sync(kFullWarp, state >= kThrough);
+      std::int64_t part = lane <= __ffs(through) - 1 || !through ? value(state) : 0;
+      for (int step = 16; step > 0; step /= 2) part += __shfl_xor_sync(kFullWarp, part, step);
+      __syncthreads();
+      if (lane == 0) {
+        parts[warp] = part;
+        ends[warp] = through != 0;
+      }
+      __syncthreads();
+      bool ended = false;
+      for (int w = 0; w < kThreads / 32 && !ended; ++w) {
+        sum += parts[w];
+        ended = ends[w];
+      }
+      if (ended) break;
+    }
+    if (threadIdx.x == 0) publish(block, kThrough, sum + own);
+    return sum;
+  }
+
+ private:
+  using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
+  // The two high bits say what the rest is: the block's own sum, or the sum up to and including this block.
+  // Both are in one word, so no fence is needed to order them.
+  static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kThrough = std::uint64_t{2} << 62;
+
+  __device__ static std::int64_t value(std::uint64_t state) {
+    return static_cast<std::int64_t>(state & (kOwn - 1));
+  }
+  __device__ void publish(int block, std::uint64_t kind, std::int64_t sum) const {
+    Word(states_[block]).store(kind | static_cast<std::uint64_t>(sum), ::cuda::memory_order_relaxed);
+  }
+
+  std::uint64_t *turn_, *states_;
+};
+
+// The sum over all earlier turns, for blocks of a launch that take turns, while they run.
+
+// Each turn has a sum in [0, 2^62). The first block that asks gets no turn: one of its warps adds the sums
+// up, in order, for all other blocks, each of which reads a single word. The result arrives later than with
+// RunningSum, but it costs the blocks no time if they have other work between publishing their sum and asking
+// for the sum before them. Turns are numbered in the order in which they are asked for, so a block that waits
+// for earlier turns waits for blocks that run.
+class TurnSums {
+ public:
+  // zeros: one word for each turn and one more, all zero.
+  explicit TurnSums(std::uint64_t* zeros) : asked_(zeros), states_(zeros + 1) {}
+
+  // Called by one thread of a block: returns its next turn, or -1, in which case the block's first warp must
+  // call add_up() and nothing else. Later turns wait until a turn that was taken is published.
+  __device__ int next() const {
+    return static_cast<int>(Word(*asked_).fetch_add(1, ::cuda::memory_order_relaxed)) - 1;
+  }
+  // The same, called by all threads of a block, and a barrier for them.
+  __device__ int first() const {
+    __shared__ int turn;
+    if (threadIdx.x == 0) turn = next();
+    __syncthreads();
+    return turn;
+  }
+  // Publishes the sum of a turn; called by one thread.
+  __device__ void publish(int turn, std::int64_t own) const { set(turn, kOwn, own); }
+  // Waits for the sum of all earlier turns and returns it; called by one thread.
+  __device__ std::int64_t before(int turn) const {
+    std::uint64_t state;
+    do state = look(turn);
+    while (state < kBefore);
+    return value(state);
+  }
+
+  // Adds up the sums of turns [0, n), all of which are taken at some time; called by one warp.
+  __device__ void add_up(int n) const {
+    constexpr int kEach = 4;  // turns that a lane reads at a time
+    const int lane = threadIdx.x % 32;
+    std::int64_t sum = 0;
+    for (int done = 0; done < n;) {
+      const int begin = done + kEach * lane;
+      std::uint64_t states[kEach];
+#pragma unroll
+      for (int k = 0; k < kEach; ++k) states[k] = begin + k < n ? look(begin + k) : 0;
+      int ready = 0;
+      std::int64_t own = 0;
+#pragma unroll
+      for (int k = 0; k < kEach; ++k) {
+        if (ready < k || states[k] == 0) continue;
+        ready = k + 1;
+        own += value(states[k]);
+      }
+      // Turns behind the first one that is not published yet have to wait for it.
+      const unsigned short_of = __ballot_sync(kFullWarp, ready < kEach);
+      const int last = short_of ? __ffs(short_of) - 1 : 31;
+      if (lane > last) own = 0;
+      const std::int64_t until = sum_of_lanes_until(own, lane);
+      std::int64_t before = sum + until - own;
+#pragma unroll
+      for (int k = 0; k < kEach; ++k) {
+        if (lane > last || k >= ready) break;
+        set(begin + k, kBefore, before);
+        before += value(states[k]);
+      }
+      sum += __shfl_sync(kFullWarp, until, 31);
+      done += kEach * last + __shfl_sync(kFullWarp, ready, last);
+    }
+  }
+
+ private:
+  using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
+  // The two high bits say what the rest is: the turn's own sum, or the sum of all earlier turns. Both are in
+  // one word, so no fence is needed to order them.
+  static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kBefore = std::uint64_t{2} << 62;
+
+  __device__ static std::int64_t value(std::uint64_t state) {
+    return static_cast<std::int64_t>(state & (kOwn - 1));
+  }
+  __device__ std::uint64_t look(int turn) const {
+    return Word(states_[turn]).load(::cuda::memory_order_relaxed);
+  }
+  __device__ void set(int turn, std::uint64_t kind, std::int64_t sum) const {
+    Word(states_[turn]).store(kind | static_cast<std::uint64_t>(sum), ::cuda::memory_order_relaxed);
+  }
+
+  std::uint64_t *asked_, *states_;
+};
+
+}  // namespace blitzgs::cuda

@@ -1,0 +1,108 @@
+// SPDX-License-Identifier: Apache-2.0
+// What kernels of both backends and their callers share; no torch here.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+#include <tuple>
+
+// Marks inline maths that g++ and nvcc both compile.
+
+#ifdef __CUDACC__
+#define BLITZGS_HD __host__ __device__ __forceinline__
+#else
+#define BLITZGS_HD inline
+#endif
+
+// Limits that several ops share, each defined here alone.
+
+namespace blitzgs {
+
+inline constexpr int kMaxViews = 32;   // views of one launch: an int32 holds a bit for each
+inline constexpr int kMaxRanks = 63;   // ranks of a job: a non-negative int64 holds a bit for each
+inline constexpr int kMaxLevels = 32;  // octree levels
+inline constexpr int kMaxPeers = 16;   // ranks that write to each other's memory
+
+}  // namespace blitzgs
+
+// What the signatures of CPU and CUDA kernels need in common: the stream in which work is queued, and the
+// source of scratch memory. No torch here.
+
+struct CUstream_st;  // cudaStream_t is a pointer to this; declared so that no CUDA header is needed
+
+namespace blitzgs {
+
+// Scratch memory that lives until the op returns (CUDA: the caching allocator, in stream order).
+class Workspace {
+ public:
+  virtual ~Workspace() = default;
+  virtual void* allocate_bytes(std::size_t bytes) = 0;
+
+  template <class T>
+  T* allocate(std::int64_t count) {
+    return static_cast<T*>(allocate_bytes(static_cast<std::size_t>(count) * sizeof(T)));
+  }
+};
+
+using CudaStream = CUstream_st*;
+
+// Uninitialised arrays of one length in one piece of scratch memory, each aligned for any type. They share a
+// piece because the host spends microseconds on allocating each, while the device waits for the launch behind
+// it.
+template <class... T>
+std::tuple<T*...> allocate_arrays(std::int64_t length, Workspace& workspace) {
+  constexpr std::size_t kAlignment = 256;
+  const auto bytes = [&](std::size_t size) {
+    return (static_cast<std::size_t>(length) * size + kAlignment - 1) / kAlignment * kAlignment;
+  };
+  auto* next = static_cast<std::byte*>(workspace.allocate_bytes((bytes(sizeof(T)) + ...)));
+  const auto take = [&](std::size_t size) {
+    void* const array = next;
+    next += bytes(size);
+    return array;
+  };
+  return {static_cast<T*>(take(sizeof(T)))...};  // braces: from left to right
+}
+
+// Splats whose number only the device knows. The host queues an op before it knows how many splats the ops
+// before it make. The op gets columns with room for n_splats splats and a pointer to their number in device
+// memory: the first *known splats are valid. The memory behind them is undefined and is not read as splats. A
+// number outside [0, n_splats] counts as 0: there was too little room, and the caller discards the result.
+
+// known: null if all n_splats splats are valid. Kernels read it after wait_for_earlier_kernels().
+BLITZGS_HD std::int64_t splats_there(std::int64_t n_splats, const std::int64_t* known) {
+  if (!known) return n_splats;
+  const std::int64_t there = *known;
+  return 0 <= there && there <= n_splats ? there : 0;
+}
+
+template <class Input>
+BLITZGS_HD std::int64_t splats_there(const Input& in) {
+  return splats_there(in.n_splats, in.known_splats);
+}
+
+// The gradient of one splat, as compositing's backward pass adds it up on CUDA and the projection's backward
+// pass reads it. This is the only definition of the layout: Python asks for it (the op
+// splat_gradient_layout).
+
+struct alignas(16) SplatGradient {
+  float mean2d[2], conic[3], opacity;
+  float color[4];       // up to four channels, zero behind the last
+  float mean2d_abs[2];  // sums of absolute values over pixels, where they were asked for
+
+  BLITZGS_HD void add(const SplatGradient& v) {
+    for (int i = 0; i < 2; ++i) mean2d[i] += v.mean2d[i];
+    for (int i = 0; i < 3; ++i) conic[i] += v.conic[i];
+    opacity += v.opacity;
+    for (int i = 0; i < 3; ++i) color[i] += v.color[i];
+    for (int i = 0; i < 2; ++i) mean2d_abs[i] += v.mean2d_abs[i];
+  }
+};
+
+inline constexpr std::int64_t kSplatGradient = sizeof(SplatGradient) / sizeof(float);
+
+// The same as three pieces of 16 bytes, which the rasteriser's kernels move; they rely on these places.
+static_assert(kSplatGradient == 12 && offsetof(SplatGradient, conic) == 8 &&
+              offsetof(SplatGradient, opacity) == 20 && offsetof(SplatGradient, color) == 24 &&
+              offsetof(SplatGradient, mean2d_abs) == 40);
+
+}  // namespace blitzgs

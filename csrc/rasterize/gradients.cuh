@@ -1,0 +1,269 @@
+// SPDX-License-Identifier: Apache-2.0
+// From the gradient of a pixel to the gradients of splats, on CUDA.
+#pragma once
+#include <cub/device/device_radix_sort.cuh>
+#include <stdexcept>
+#include <string>
+
+#include "common/cuda.cuh"
+#include "rasterize/tile_batch.cuh"
+
+// From the two numbers of each (entry, pixel) that the backward pass leaves in shared memory, the weight
+// alpha T and g = dL/d(ln alpha), to an entry's gradients: sums of the weights against the pixels' gradients,
+// and moments of g over the pixel grid, from which the gradients of mean and conic follow.
+
+namespace blitzgs::cuda {
+
+inline constexpr int kGroup = 16;  // entries transposed at a time, one for each lane of a half-warp
+// float2 per entry: its pixels, and a pad that spreads the entries over the banks.
+inline constexpr int kGroupStride = kSubtile * kSubtile + 2;
+
+__device__ __forceinline__ void add_quad(float* address, float a, float b, float c, float d) {
+#if BLITZGS_SM90
+  asm volatile("red.relaxed.gpu.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(address), "f"(a), "f"(b),
+               "f"(c), "f"(d)
+               : "memory");
+#else
+  atomicAdd(address, a);
+  atomicAdd(address + 1, b);
+  atomicAdd(address + 2, c);
+  atomicAdd(address + 3, d);
+#endif
+}
+
+// Gradients of a subtile's pixels, channel by channel.
+template <int CHANNELS>
+struct __align__(16) SubtileGradient {
+  float v[CHANNELS][kSubtile * kSubtile];
+};
+
+// Sums of one entry over pixels: weights times v_render, moments of g about the subtile's centre, and
+// |gradient of the mean|.
+template <int CHANNELS>
+struct EntrySums {
+  float color[CHANNELS] = {};
+  float g = 0.f, gx = 0.f, gy = 0.f, gxx = 0.f, gxy = 0.f, gyy = 0.f;
+  float abs_x = 0.f, abs_y = 0.f;
+};
+
+// Sums over four values at the offsets -1.5, -0.5, 0.5 and 1.5.
+struct Moments {
+  float zeroth, first, second;
+  __device__ __forceinline__ Moments(float a, float b, float c, float d) {
+    const float outer = a + d, inner = b + c;
+    zeroth = outer + inner;
+    first = 1.5f * (d - a) + 0.5f * (c - b);
+    second = 2.25f * outer + 0.25f * inner;
+  }
+};
+
+// x and y: the subtile's centre from the entry's mean.
+template <int CHANNELS, bool ABSOLUTE>
+__device__ __forceinline__ EntrySums<CHANNELS> sum_pixels(const float2* group,
+                                                          const SubtileGradient<CHANNELS>& gradient,
+                                                          const Entry& shape, float x, float y) {
+  EntrySums<CHANNELS> sums;
+  float zeroth[kSubtile], first[kSubtile];
+#pragma unroll
+  for (int row = 0; row < kSubtile; ++row) {
+    const float4 left = reinterpret_cast<const float4*>(group)[2 * row];
+    const float4 right = reinterpret_cast<const float4*>(group)[2 * row + 1];
+#pragma unroll
+    for (int k = 0; k < CHANNELS; ++k) {
+      const float4 v = reinterpret_cast<const float4*>(gradient.v[k])[row];
+      sums.color[k] += left.x * v.x + left.z * v.y + right.x * v.z + right.z * v.w;
+    }
+    const Moments moments(left.y, left.w, right.y, right.w);
+    zeroth[row] = moments.zeroth;
+    first[row] = moments.first;
+    sums.gxx += moments.second;
+    if constexpr (ABSOLUTE) {
+      const float g[kSubtile] = {left.y, left.w, right.y, right.w};
+#pragma unroll
+      for (int column = 0; column < kSubtile; ++column) {
+        const float dx = x + (static_cast<float>(column) - 1.5f), dy = y + (static_cast<float>(row) - 1.5f);
+        const float u = shape.l11 * dx + shape.l21 * dy, w = shape.l22 * dy;
+        sums.abs_x += fabsf(g[column] * (shape.l11 * u));
+        sums.abs_y += fabsf(g[column] * (shape.l21 * u + shape.l22 * w));
+      }
+    }
+  }
+  const Moments columns(zeroth[0], zeroth[1], zeroth[2], zeroth[3]);
+  const Moments mixed(first[0], first[1], first[2], first[3]);
+  sums.g = columns.zeroth;
+  sums.gy = columns.first;
+  sums.gyy = columns.second;
+  sums.gx = mixed.zeroth;
+  sums.gxy = mixed.first;
+  return sums;
+}
+
+// Moments about the subtile's centre to gradients of the splat.
+template <int CHANNELS, bool ABSOLUTE>
+__device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, const Entry& shape, float x,
+                                                 float y) {
+  const float mx = s.gx + x * s.g, my = s.gy + y * s.g;
+  const float mxx = s.gxx + x * (2.f * s.gx + x * s.g);
+  const float mxy = s.gxy + x * s.gy + y * (s.gx + x * s.g);
+  const float myy = s.gyy + y * (2.f * s.gy + y * s.g);
+  const float a = kInverseScale2 * shape.l11 * shape.l11, b = kInverseScale2 * shape.l11 * shape.l21;
+  const float c = kInverseScale2 * (shape.l21 * shape.l21 + shape.l22 * shape.l22);
+  PackedGradient gradient;
+  gradient.quads[0] = {a * mx + b * my, b * mx + c * my, -0.5f * mxx, -mxy};
+  gradient.quads[1] = {-0.5f * myy, s.g * exp2_approx(-shape.log2_opacity), s.color[0], s.color[1]};
+  gradient.quads[2] = {s.color[2], CHANNELS > 3 ? s.color[CHANNELS - 1] : 0.f,
+                       ABSOLUTE ? kInverseScale2 * s.abs_x : 0.f, ABSOLUTE ? kInverseScale2 * s.abs_y : 0.f};
+  return gradient;
+}
+
+// A pixel of the backward pass: from an entry, the two numbers that its gradients are summed from.
+
+// One pixel's state while its list is walked from the back.
+template <int CHANNELS>
+struct BackwardPixel {
+  float transmittance;  // in front of the entries walked so far
+  float behind;         // v . (what would be seen behind there, background included)
+  float v[CHANNELS];
+
+  // Four entries of a batch: writes weight and g of each to slots[k * kGroupStride]. last: offset from which
+  // on the pixel has composited nothing. dot(offset): v . color.
+  template <class Dot>
+  __device__ __forceinline__ void add(const char* entries, const QuadOffsets& offsets, std::uint32_t last,
+                                      const Pixel& pixel, const Dot& dot, float2* slots) {
+    float raw[4], dots[4];
+    bool touched[4];
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      const float log2_a = log2_alpha(entry_at(entries, offsets.at[k]), pixel);
+      raw[k] = exp2_approx(log2_a);
+      touched[k] = log2_a >= kLog2Cut && offsets.at[k] < last;
+      dots[k] = dot(offsets.at[k]);
+    }
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      const float alpha = touched[k] ? fminf(raw[k], static_cast<float>(kAlphaMax)) : 0.f;
+      transmittance *= reciprocal_approx(1.f - alpha);
+      const float weight = alpha * transmittance;
+      const float difference = dots[k] - behind;
+      if (touched[k]) behind = __fmaf_rn(alpha, difference, behind);  // not 0 * NaN where a color is NaN
+      const bool differentiable = touched[k] && raw[k] <= static_cast<float>(kAlphaMax);
+      slots[k * kGroupStride] = {weight, differentiable ? weight * difference : 0.f};
+    }
+  }
+};
+
+// Gradients that repeat bit for bit: the entries of each splat, found by a stable sort, are added in their
+// order.
+
+inline __global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
+  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
+  if (i < n) values[i] = static_cast<std::int32_t>(i);
+}
+
+// Adds each splat's entries in the order of the list of all tiles. Of the n entries those from *n_listed on
+// are of no tile, and name any splat: sorted by the low bits of it, they come behind the listed ones of a
+// splat.
+inline __global__ void sum_entries_kernel(const std::int32_t* sorted_splats, const std::int32_t* entries,
+                                          std::int64_t n, const std::int64_t* n_listed,
+                                          const PackedGradient* entry_gradients,
+                                          PackedGradient* splat_gradients) {
+  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
+  if (i >= 3 * n) return;
+  const int quad = static_cast<int>(i % 3);
+  std::int64_t at = i / 3;
+  const std::int64_t end = *n_listed;
+  const std::int32_t splat = sorted_splats[at];
+  if (entries[at] >= end || (at > 0 && sorted_splats[at - 1] == splat)) return;
+  float4 sum{0.f, 0.f, 0.f, 0.f};
+  for (; at < n && sorted_splats[at] == splat && entries[at] < end; ++at) {
+    const float4 part = entry_gradients[entries[at]].quads[quad];
+    sum = {sum.x + part.x, sum.y + part.y, sum.z + part.z, sum.w + part.w};
+  }
+  splat_gradients[splat].quads[quad] = sum;
+}
+
+// Which entries belong to each splat, in order.
+struct EntriesBySplat {
+  std::int32_t* splats;
+  std::int32_t* entries;
+};
+
+inline EntriesBySplat sort_entries(const std::int32_t* isect_splats, std::int64_t n, std::int64_t n_splats,
+                                   Workspace& workspace, CudaStream stream) {
+  if (n > INT32_MAX) {
+    throw std::runtime_error(
+        "blitzgs::rasterize_bwd: deterministic gradients hold at most 2^31 - 1 intersections, got " +
+        std::to_string(n) + "; render fewer views at once or set deterministic=False");
+  }
+  int bits = 1;
+  while (bits < 31 && (std::int64_t{1} << bits) < n_splats) ++bits;
+  EntriesBySplat sorted{workspace.allocate<std::int32_t>(n), workspace.allocate<std::int32_t>(n)};
+  auto* order = workspace.allocate<std::int32_t>(n);
+  iota_kernel<<<blocks_for(n, 256), 256, 0, stream>>>(order, n);
+  check_launch("rasterize_bwd");
+  std::size_t bytes = 0;
+  check(cub::DeviceRadixSort::SortPairs(nullptr, bytes, isect_splats, sorted.splats, order, sorted.entries, n,
+                                        0, bits, stream),
+        "rasterize_bwd");
+  void* scratch = workspace.allocate_bytes(bytes);
+  check(cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_splats, sorted.splats, order, sorted.entries, n,
+                                        0, bits, stream),
+        "rasterize_bwd");
+  return sorted;
+}
+
+// From gradients packed by splat to one array for each input.
+
+inline constexpr int kUnpackThreads = 256;
+
+// Stores the WIDTH floats of each of the warp's first n_splats lanes to consecutive memory. By way of
+// shared memory, because a store that skips over others' floats fills no sector.
+template <int WIDTH>
+__device__ __forceinline__ void store_splats(float* stage, const float (&mine)[WIDTH], float* out,
+                                             int n_splats, bool add) {
+  const int lane = threadIdx.x % 32;
+#pragma unroll
+  for (int k = 0; k < WIDTH; ++k) stage[WIDTH * lane + k] = mine[k];
+  __syncwarp();
+#pragma unroll
+  for (int k = 0; k < WIDTH; ++k) {
+    const int at = 32 * k + lane;
+    if (at < WIDTH * n_splats) out[at] = add ? out[at] + stage[at] : stage[at];
+  }
+  __syncwarp();
+}
+
+// colors_only: an earlier chunk gave the gradient of everything else.
+inline __global__ void unpack_kernel(const PackedGradient* packed, std::int64_t n, ChannelChunk chunk,
+                                     bool colors_only, RasterizeGradients<float> out) {
+  __shared__ float4 stages[kUnpackThreads / 32][3 * 32];
+  wait_for_earlier_kernels();
+  float4* stage = stages[threadIdx.x / 32];
+  const int lane = threadIdx.x % 32;
+  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kUnpackThreads) + threadIdx.x;
+  const std::int64_t first = i - lane;  // of the warp's splats
+  const int n_splats = static_cast<int>(min(max(n - first, std::int64_t{0}), std::int64_t{32}));
+#pragma unroll
+  for (int k = 0; k < 3; ++k) {
+    const int at = 32 * k + lane;
+    if (at < 3 * n_splats) stage[at] = reinterpret_cast<const float4*>(packed)[3 * first + at];
+  }
+  __syncwarp();
+  const float4 a = stage[3 * lane], b = stage[3 * lane + 1], c = stage[3 * lane + 2];
+  __syncwarp();
+  float* floats = reinterpret_cast<float*>(stage);
+  if (chunk.n_channels == 3) {
+    store_splats<3>(floats, {b.z, b.w, c.x}, out.v_colors + 3 * first, n_splats, false);
+  } else if (i < n) {
+    const float color[4] = {b.z, b.w, c.x, c.y};
+    for (int k = 0; k < chunk.count; ++k) out.v_colors[i * chunk.n_channels + chunk.first + k] = color[k];
+  }
+  if (colors_only) return;
+  const bool add = chunk.first > 0;  // later channels add to what the first ones gave
+  store_splats<2>(floats, {a.x, a.y}, out.v_means2d + 2 * first, n_splats, add);
+  store_splats<3>(floats, {a.z, a.w, b.x}, out.v_conics + 3 * first, n_splats, add);
+  store_splats<1>(floats, {b.y}, out.v_opacities + first, n_splats, add);
+  if (out.v_means2d_abs) store_splats<2>(floats, {c.z, c.w}, out.v_means2d_abs + 2 * first, n_splats, false);
+}
+
+}  // namespace blitzgs::cuda
