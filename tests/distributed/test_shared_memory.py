@@ -112,12 +112,13 @@ def _gradients(ranks):
             )  # fmt: skip
             v_renders = torch.where(frame.renders > 0, 1e-3, 1e-4)
             splats.append(pipeline.backward_splats(frame, v_renders, absolute=absolute))
-            gradients.append(parameter_gradients(table, frame, v_renders))  # from zeros again
             copy = GaussianTable({name: table[name].clone() for name in table})
             if transport is transports[1]:
                 kept = torch.full_like(frame.projected.means2d, torch.nan)
             optimiser.step(copy, frame, splats[-1], None, None, 1, kept, absolute)
             moments.append(copy.exp_avgs)
+            # From zeros again; what the first pass left in the tables is read before.
+            gradients.append(parameter_gradients(table, frame, v_renders))
             frames.append(frame)
         assert splats[0].places is None and splats[1].means2d is None
         found = sum_of_ranks(splats[1], len(frames[1].projected.means2d))
