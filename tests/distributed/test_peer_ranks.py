@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several ranks that write to each other's memory, without a GPU: each is a thread, and ops are played.
+
+What is tested is what the ranks do together: as many barriers on each, also where some of them have too
+little room, and splats and gradients that are found where their transport says.
+"""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import torch
+
+from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.distributed.shared_memory import Shared
+from blitzgs.distributed.transport import PeerTransport
+from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerExchange
+from blitzgs.model import GaussianTable
+from blitzgs.ops.capacity import CapacityEstimate, Sizes
+from blitzgs.ops.projection import VIEW_TOTALS
+from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
+from blitzgs.survey import survey
+from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.helpers import sum_of_ranks
+from tests.training.tiny import random_gaussians
+
+VIEWS, PATIENCE = 3, 30.0
+INTERSECT = torch.ops.blitzgs.intersect
+
+
+class Host:
+    """What the ranks have in common."""
+
+    def __init__(self, world_size):
+        self.meeting = threading.Barrier(world_size, timeout=PATIENCE)
+        self.slots = [None] * world_size
+
+    def gather(self, rank, value):
+        """Every rank's value; collective."""
+        self.slots[rank] = value
+        self.meeting.wait()
+        values = list(self.slots)
+        self.meeting.wait()
+        return values
+
+
+class Memory:
+    """What `SharedMemory` is to a rank."""
+
+    def __init__(self, host, rank):
+        self.host, self.rank, self.generation, self.log = host, rank, 0, []
+        self.reserve(32 * WORDS_PER_SPLAT)
+
+    def barrier(self):
+        self.log.append("barrier")
+        self.host.meeting.wait()
+
+    def share(self, values):
+        self.log.append("share")
+        everyone = torch.stack(self.host.gather(self.rank, values))
+        return Shared(everyone, everyone.sum(0), everyone.clone())
+
+    def reserve(self, words):
+        self.log.append(("reserve", words))
+        self.buffers = self.host.gather(self.rank, torch.full((words,), -1, dtype=torch.int32))
+
+
+class ThreadRanks(Ranks):
+    """The ranks as one of these threads has them."""
+
+    def all_to_all(self, rows, sent, received):
+        self.memory.log.append("all_to_all")
+        parts = [groups[self.rank] for groups in self.memory.host.gather(self.rank, rows.split(list(sent)))]
+        assert [len(part) for part in parts] == list(received)
+        return torch.cat(parts)
+
+
+def _send(columns, masks, everyone, rank, buffers, capacity):
+    """Plays `send_splats_`."""
+    world_size = len(buffers)
+    n_views = everyone.shape[1] - VIEW_TOTALS - 2 * world_size
+    splats = everyone[:, VIEW_TOTALS + n_views :: 2].tolist()
+    most = max(*everyone[:, 1].tolist(), *map(sum, splats), *map(sum, zip(*splats, strict=True)))
+    if most > capacity:
+        return torch.empty(0, world_size, dtype=torch.int64), torch.tensor([0])
+    count = int(everyone[rank, 1])
+    numbers = torch.arange(count, dtype=torch.int32)
+    packed, places = scatter_splats([numbers], masks[:count], splats[rank])
+    (numbers,) = gather_splats(packed, [numbers], splats[rank])
+    for m, which in enumerate(numbers.long().split(splats[rank])):
+        at, begin = sum(sent[m] for sent in splats[:rank]), 0
+        for column in columns:
+            words = words_of(column[:count])
+            width = words.shape[1]
+            buffers[m][begin + at * width :][: len(which) * width] = words[which].flatten()
+            begin += capacity * width
+    return places, torch.tensor([sum(sent[rank] for sent in splats)])
+
+
+def _rasterize_into(*arguments):
+    """Plays `rasterize_fwd_packed_`."""
+    *rest, table, n_splats = arguments
+    table[: int(n_splats)] = 0
+    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_splats)[:6]
+
+
+def _intersect(*arguments):
+    """Plays `intersect` with too little room for entries, which a CPU refuses at once."""
+    *splats, grid, _, n_splats, _ = arguments
+    return INTERSECT(*splats, grid, -1, n_splats, True)
+
+
+class Event:
+    """Plays `torch.cuda.Event`."""
+
+    def record(self):
+        pass
+
+    def synchronize(self):
+        pass
+
+
+@pytest.fixture(autouse=True)
+def without_gpu(monkeypatch):
+    monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", _send)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", _rasterize_into)
+    monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    returned = PeerExchange.return_gradients
+
+    def from_columns(self, gradients):
+        table = self._buffers.tables[self._ranks.rank]  # where compositing has them on a GPU
+        flat = torch.cat([part.reshape(len(part), -1) for part in gradients.parts], 1)
+        table[: len(flat), :9] = flat
+        return returned(self, gradients)
+
+    monkeypatch.setattr(PeerExchange, "return_gradients", from_columns)
+
+
+def _on_all(world_size, function):
+    """[function(ranks) of each rank], and what each did in the shared memory."""
+    host = Host(world_size)
+
+    def rank(number):
+        try:
+            ranks = ThreadRanks(number, world_size, memory=Memory(host, number))
+            return function(ranks), ranks.memory.log
+        except BaseException:
+            host.meeting.abort()
+            raise
+
+    with ThreadPoolExecutor(world_size) as pool:
+        return list(zip(*pool.map(rank, range(world_size)), strict=True))
+
+
+def _scene():
+    """A table, its views, and who owns which of its Gaussians at three ranks: the last has none."""
+    table, views = random_gaussians(600), cameras(VIEWS)
+    tiles = TileRanges((0, 1), VIEWS, views.width, views.height).tiles_per_view * VIEWS
+    ranges = TileRanges((0, tiles // 5, tiles // 2, tiles), VIEWS, views.width, views.height, halo=LOSS_HALO)
+    return table, views, ranges, torch.arange(len(table)) % 7 // 6
+
+
+def _part(table, owner, ranks):
+    rows = owner == ranks.rank
+    return GaussianTable({name: table[name][rows] for name in table})
+
+
+def _keys(ids, camera_ids):
+    return ids * VIEWS + camera_ids
+
+
+@pytest.mark.parametrize("backward_follows", [False, True])
+@pytest.mark.parametrize(
+    ("sizes", "frames"),
+    [
+        (None, 2),
+        (Sizes(10**4, 10**4, 10**5, 10), 1),
+        (Sizes(10**4, 1000, 10**5, 10), 2),  # too few for one rank's, enough for the others'
+        (Sizes(10**4, 10**4, 3000, 10), 2),  # enough for one rank's lists, too few for the others'
+        (Sizes(1, 1, 1), 2),
+    ],
+)
+def test_ranks_begin_a_frame_again_together(sizes, frames, backward_follows):
+    table, views, ranges, owner = _scene()
+    alone = pipeline.forward(table, views, OPTIONS)
+    weights = torch.linspace(-1, 1, alone.renders.numel()).view_as(alone.renders)
+    expected = torch.cat([p.reshape(len(p), -1) for p in pipeline.backward_splats(alone, weights).parts], 1)
+    order = _keys(table["id"][alone.projected.gaussian_ids.long()], alone.projected.camera_ids).argsort()
+
+    def rank(ranks):
+        transport, part = PeerTransport(ranks, CapacityEstimate(sizes)), _part(table, owner, ranks)
+        assignment, before = TileAssignment(ranks, ranges), ranks.memory.generation
+        for count in (frames, 1):  # a second frame has the room that the first one needed
+            frame = pipeline.forward(
+                part, views, OPTIONS, assignment=assignment, transport=transport,
+                backward_follows=backward_follows,
+            )  # fmt: skip
+            assert ranks.memory.generation == before + count
+            before = ranks.memory.generation
+            own = ranges.pixel_mask(ranks.rank, ranks.device)
+            assert torch.equal(frame.renders[own], alone.renders[own])
+            assert torch.equal(frame.visible, alone.visible)
+            for _ in range(2):
+                gradients = pipeline.backward_splats(frame, weights)
+                found = sum_of_ranks(gradients, len(frame.projected.depths))
+                ranks.memory.barrier()  # or the next pass would write while others read
+        ids = part["id"][frame.projected.gaussian_ids.long()]
+        return _keys(ids, frame.projected.camera_ids), found, transport.capacity.sizes
+
+    results, logs = _on_all(3, rank)
+    assert logs[0] == logs[1] == logs[2]
+    assert results[0][2] == results[1][2] == results[2][2]
+    keys, found, _ = (
+        torch.cat(parts) if torch.is_tensor(parts[0]) else parts for parts in zip(*results, strict=True)
+    )
+    assert len(results[2][0]) == 0 and expected.any()
+    torch.testing.assert_close(found[keys.argsort(), :9], expected[order], rtol=1e-4, atol=1e-4)
+
+
+def test_ranks_survey_together():
+    table, views, ranges, owner = _scene()
+    ranges = replace(ranges, halo=0)  # each tile counts once
+    alone = survey(table, views, OPTIONS)
+    order = _keys(table["id"][alone.splats.gaussian_ids.long()], alone.splats.camera_ids).argsort()
+
+    def rank(ranks):
+        part = _part(table, owner, ranks)
+        got = survey(part, views, OPTIONS, TileAssignment(ranks, ranges), PeerTransport(ranks))
+        return (
+            _keys(part["id"][got.splats.gaussian_ids.long()], got.splats.camera_ids),
+            got.weights,
+            got.pixels,
+        )
+
+    results, logs = _on_all(3, rank)
+    assert logs[0] == logs[1] == logs[2]
+    keys, weights, pixels = map(torch.cat, zip(*results, strict=True))
+    assert torch.equal(weights[keys.argsort()], alone.weights[order]) and alone.weights.any()
+    assert torch.equal(pixels[keys.argsort()], alone.pixels[order])
