@@ -82,8 +82,8 @@ __global__ void __launch_bounds__(kThreads) second_scan_kernel(const MassCutArgs
 // Later rounds: the listed items.
 __global__ void __launch_bounds__(kThreads) scan_kernel(const MassCutArgs args, int round) {
   wait_for_earlier_kernels();
-  const int count = args.listed[0];
-  for (int i = blockIdx.x * kThreads + threadIdx.x; i < count; i += gridDim.x * kThreads) {
+  const std::int64_t count = args.listed[0], stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
+  for (std::int64_t i = blockIdx.x * kThreads + threadIdx.x; i < count; i += stride) {
     add_term(args, round, args.listed[1 + i]);
   }
 }
