@@ -87,14 +87,20 @@ def _new_room(like: Tensor, pinned: bool) -> Tensor:
     for advice in ("MADV_HUGEPAGE", "MADV_DONTFORK"):  # fewer pages to pin, none of which a fork takes away
         with contextlib.suppress(AttributeError, OSError):
             pages.madvise(getattr(mmap, advice))
-    room = torch.frombuffer(pages, dtype=torch.uint8, count=max(1, size))[:size]
-    if pinned:
-        address, runtime = room.data_ptr(), torch.cuda.cudart()
-        error = int(runtime.cudaHostRegister(address, size, 0)) if size else 0
+    view = memoryview(pages)
+    room = torch.frombuffer(view, dtype=torch.uint8, count=max(1, size))[:size]
+    if pinned and size:
+        address = room.data_ptr()
+        error = int(torch.cuda.cudart().cudaHostRegister(address, size, 0))
         if error:
             raise HostMemoryError(
                 f"{size / 1e9:.2f} GB of the host's memory cannot be pinned (CUDA error {error}): use a host "
                 "with more memory, or cap population.max_gaussians"
             )
-        weakref.finalize(pages, runtime.cudaHostUnregister, address)
+        weakref.finalize(view, _unpin, address, pages)
     return room.view(like.dtype).view(rows, *like.shape[1:])
+
+
+def _unpin(address: int, _pages: mmap.mmap) -> None:
+    """Unpin memory when its last tensor has gone. Its pages are an argument, so they are unmapped later."""
+    torch.cuda.cudart().cudaHostUnregister(address)

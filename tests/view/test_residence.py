@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import copy
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -229,6 +231,47 @@ def test_a_host_without_room_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(host_table, "_MEMORY", tmp_path / "nothing")
     assert host_table.available_bytes() is None
     assert len(host_copy(make_table(1000))) == 1000
+
+
+class FakeRuntime:
+    """Stands for the CUDA runtime: knows which memory is pinned; it has to be there at every call."""
+
+    def __init__(self):
+        self.pinned, self.calls = {}, 0
+
+    def cudaHostRegister(self, address, size, flags):  # noqa: N802
+        assert is_mapped(address) and is_mapped(address + size - 1) and flags == 0
+        assert address not in self.pinned
+        self.pinned[address] = size
+        self.calls += 1
+        return 0
+
+    def cudaHostUnregister(self, address):  # noqa: N802
+        assert is_mapped(address)
+        del self.pinned[address]
+        return 0
+
+
+def is_mapped(address):
+    ranges = (line.split()[0].split("-") for line in Path("/proc/self/maps").read_text().splitlines())
+    return any(int(begin, 16) <= address < int(end, 16) for begin, end in ranges)
+
+
+def test_memory_is_unpinned_before_it_goes(monkeypatch):
+    runtime, unraisable = FakeRuntime(), []
+    monkeypatch.setattr(torch.cuda, "cudart", lambda: runtime)
+    monkeypatch.setattr(sys, "unraisablehook", unraisable.append)
+    monkeypatch.setattr(sys, "excepthook", lambda *error: unraisable.append(error))
+    table = host_copy(make_table(50_000), "cuda")
+    columns = len(table.columns)
+    assert runtime.calls == len(runtime.pinned) == columns
+    kept = table.columns["sh"][5:9]
+    table.append({name: table[name].clone() for name in table})  # more than there is room for
+    assert runtime.calls == 2 * columns and len(runtime.pinned) == columns + 1
+    del kept
+    assert len(runtime.pinned) == columns
+    del table
+    assert not runtime.pinned and not unraisable
 
 
 def test_the_given_columns_are_moved():
