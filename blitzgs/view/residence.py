@@ -229,7 +229,11 @@ class Residence:
         return self._index()
 
     def prefetch(self, step: int) -> None:
-        """While the step of `bring` runs, load the blocks of the next one, `step`."""
+        """While the step of `bring` runs, load the blocks of the next one, `step`.
+
+        The host has waited for the step's number of splats by now, so its active set has been found: until
+        then the masks of blocks that they leave out wholly are read, whose slots may be given away here.
+        """
         now = self._sight.by(0)
         slots = self._slot_of[now.nonzero()[0]]
         if (slots < 0).any():

@@ -154,10 +154,11 @@ void scan(const MassCutArgs& args, int round, CudaStream stream) {
     launch_early("mass_cut", second_scan_kernel, {std::min(all, resident), kThreads, stream}, args);
   } else {
     const auto groups = static_cast<unsigned>((args.n_segments + kSegmentsAtOnce - 1) / kSegmentsAtOnce);
-    const std::size_t bytes = std::min<std::int64_t>(args.n_segments, kSegmentsAtOnce) * kFirstDigits *
-                              static_cast<std::int64_t>(sizeof(WideSum));
+    constexpr std::size_t kBytes = kFirstDigits * sizeof(WideSum);  // of a segment
+    const std::size_t bytes = std::min<std::int64_t>(args.n_segments, kSegmentsAtOnce) * kBytes;
+    // The most that any call needs, as other threads may launch the kernel meanwhile.
     check(cudaFuncSetAttribute(first_scan_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize,
-                               static_cast<int>(bytes)),
+                               static_cast<int>(kSegmentsAtOnce * kBytes)),
           "mass_cut");
     launch_early("mass_cut", first_scan_kernel,
                  {dim3(std::min(all, resident / 2), groups), kThreads, stream, bytes}, args);

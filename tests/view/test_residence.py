@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import copy
+import gc
 import sys
 from pathlib import Path
 
@@ -258,6 +259,7 @@ def is_mapped(address):
 
 
 def test_memory_is_unpinned_before_it_goes(monkeypatch):
+    gc.collect()  # tables of other tests are unpinned by the real runtime
     runtime, unraisable = FakeRuntime(), []
     monkeypatch.setattr(torch.cuda, "cudart", lambda: runtime)
     monkeypatch.setattr(sys, "unraisablehook", unraisable.append)
