@@ -148,7 +148,7 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
         return torch.zeros_like(weights)
     whole = weights * count // total
     rest = count - int(ranks.all_reduce(whole.sum()))
-    # Other events that draw count their times from 0 up.
+    # Other draws use their event's time, from 0 up: a negative one gives keys of its own.
     keys = sampling_keys((weights * count % total).float(), ids, seed, -1 - time)
     return (whole + smallest(keys, ids, rest, ranks)).clamp(max=MOST_COPIES - 1)
 
@@ -157,7 +157,7 @@ def _share(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: f
     """Give the rows `sources` what is theirs when they become so many, and fresh moments, in place."""
     opacities, scales = shared(table["opacities"][sources], table["scales"][sources], copies)
     if min_opacity > 0:
-        # Who was just above the limit does not die of being shared.
+        # Sharing must not put a Gaussian that was just above the limit below it: it would count as dead.
         opacities = opacities.clamp(min=math.log(min_opacity / (1.0 - min_opacity)))
     table["opacities"][sources] = opacities.float()
     table["scales"][sources] = scales.float()
