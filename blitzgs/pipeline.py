@@ -117,6 +117,7 @@ class Frame(NamedTuple):
         way_back: of the gradients of the splats, to their owners; None: one rank owns all.
         traffic: which splats went where; None: they stayed.
         visible: int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
+        active: rows that were considered, and the views of each; None: all.
         backgrounds: [B, 3]; None: black.
         isect_splats: int32 [I], splats by tile, front to back.
         tile_offsets: int64 [B * T + 1].
@@ -137,6 +138,7 @@ class Frame(NamedTuple):
     way_back: WayBack | None
     traffic: Traffic | None
     visible: Tensor
+    active: ActiveRows | None
     backgrounds: Tensor | None
     isect_splats: Tensor
     tile_offsets: Tensor
@@ -235,6 +237,7 @@ def render(
         way_back=counts.way_back,
         traffic=counts.traffic,
         visible=counts.visible,
+        active=active,
         backgrounds=backgrounds,
         isect_splats=lists[0],
         tile_offsets=lists[1],

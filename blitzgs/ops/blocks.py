@@ -80,6 +80,11 @@ class ActiveRows(NamedTuple):
         length = int(self.length)
         return self.ids[:length], self.views[:length]
 
+    def considered(self) -> Tensor:
+        """Return how many of the listed rows some view still considers, int64 []; does not wait."""
+        listed = torch.arange(len(self.views), device=self.views.device) < self.length
+        return ((self.views != 0) & listed).sum()
+
 
 def morton_keys(points: Tensor) -> Tensor:
     """Return each point's position along the Morton curve of the cloud's bounding cube.

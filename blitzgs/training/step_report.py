@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the log says about one step: loss, PSNR of the batch, visible Gaussians, speed."""
+"""What the log says about one step: loss, PSNR of the batch, active and visible Gaussians, speed."""
 
 from __future__ import annotations
 
@@ -17,16 +17,22 @@ from blitzgs.training.state import TrainingState
 
 
 def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
-    """Return the batch's L_scale, L_opacity and PSNR, the visible Gaussians and all, float64 [5]; no wait."""
+    """Return figures about a batch, float64 [6], without waiting for the device.
+
+    They are its L_scale, L_opacity and PSNR, and the Gaussians of all ranks: those that the step projected,
+    those of them that are visible in a view, and all.
+    """
     length_unit = state.space.extent * state.config.loss.scale_reference
     scale = scale_term(frame, state.stepper.table, length_unit).mean()
     opacity = scale.new_zeros(())
     if state.config.loss.opacity > 0:
         opacity = opacity_term(frame, state.stepper.table).mean()
+    assert frame.active is not None  # as in every step of a training
     counts = [
         state.ranks.all_reduce(torch.full((), float(count), dtype=torch.float64, device=scale.device))
         for count in (len(frame.projected.visible_ids), len(state.table))
     ]
+    counts.insert(0, state.ranks.all_reduce(frame.active.considered().double()))
     return torch.stack([scale.double(), opacity.double(), batch_psnr(frame, batch).double(), *counts])
 
 
@@ -48,11 +54,12 @@ def log_step(
     check_table(state.stepper.table, state.progress.step)
     loss = state.config.loss
     losses = photometric(sums.read()[: 2 * len(names)], batch.samples.cpu(), loss)
-    scale, opacity, psnr, visible, population = measured.tolist()
+    scale, opacity, psnr, active, visible, population = measured.tolist()
     values = {
         "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity,
         "l_scale": scale,
         "psnr": psnr,
+        "active": active,
         "visible": visible,
         "gaussians": int(population),
         "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),

@@ -81,9 +81,11 @@ def whole_run(tmp_path_factory):
 
 
 def test_each_phase_leaves_out_what_the_schedule_says(whole_run):
-    _, trainer, _, steps = whole_run
+    folder, trainer, _, steps = whole_run
     progress, column_of = trainer.state.progress, trainer.state.columns
     dropped = {"lod": 0, "cull": 0}
+    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    active, compared = {line["t"]: line["active"] for line in lines if "loss" in line}, 0
     for step, (gate, rows, (index,), table) in steps.items():
         t = step - 1  # of one image each
         has_lod, has_mask = t >= 60, 40 < t <= 85
@@ -111,7 +113,10 @@ def test_each_phase_leaves_out_what_the_schedule_says(whole_run):
         without = torch.zeros_like(seen)
         without[everything.visible_ids.long()] = True
         assert torch.equal(seen, without & allowed)
-    assert min(dropped.values()) > 100
+        if step in active:
+            assert int(seen.sum()) <= active[step] <= int(allowed.sum()) < len(table["id"])
+            compared += 1
+    assert min(dropped.values()) > 100 and compared > 0
 
 
 def test_what_the_run_says_and_saves(whole_run):

@@ -214,10 +214,13 @@ def test_too_little_room_leaves_the_lists_empty_and_tells_how_much_is_needed(dev
         active = index.active(table, *views, room=room)
         assert int(active.blocks) == needed
         assert len(active.ids) == len(active.views) == 256 * min(room, -(-n // 256))
+        active.views[int(active.length) :] = 1  # what is there does not count
         if room < needed:
             assert int(active.length) == 0
         else:
             assert all(torch.equal(a, b) for a, b in zip(active.listed(), exact.listed(), strict=True))
+        active.views[: needed // 2] = 0  # as gates do
+        assert int(active.considered()) == int((active.listed()[1] != 0).sum())
 
 
 @pytest.mark.parametrize("device", DEVICES)
