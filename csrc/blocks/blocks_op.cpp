@@ -63,9 +63,7 @@ HeldRows hold_rows(const char* op, const Tensor& means, const Tensor& scales,
 }
 
 void check_bounds(const char* op, const Tensor& bounds, std::int64_t rows) {
-  check_dtype(op, "bounds", bounds, ScalarType::Float);
-  check_shape(op, "bounds", bounds, {blocks_of(rows), kBlockBounds});
-  STD_TORCH_CHECK(bounds.is_contiguous(), "blitzgs::", op, ": bounds must be contiguous");
+  check_in_place(op, "bounds", bounds, ScalarType::Float, {blocks_of(rows), kBlockBounds});
 }
 
 Tensor morton_keys(const Tensor& points) {

@@ -77,6 +77,18 @@ inline void check_dtype(const char* op, const char* name, const Tensor& tensor, 
                   torch::headeronly::toString(tensor.scalar_type()));
 }
 
+inline void check_contiguous(const char* op, const char* name, const Tensor& tensor) {
+  STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", op, ": ", name, " must be contiguous");
+}
+
+// A tensor that kernels read or write where it lies, so that it cannot be copied first.
+inline void check_in_place(const char* op, const char* name, const Tensor& tensor, ScalarType dtype,
+                           std::initializer_list<std::int64_t> shape) {
+  check_dtype(op, name, tensor, dtype);
+  check_shape(op, name, tensor, shape);
+  check_contiguous(op, name, tensor);
+}
+
 // float32 everywhere; float64 on the CPU, where it serves gradcheck and accuracy figures.
 inline void check_floating(const char* op, const char* name, const Tensor& tensor) {
   const ScalarType dtype = tensor.scalar_type();
@@ -243,10 +255,8 @@ inline TileGrid checked_tile_grid(const char* op, const std::vector<std::int64_t
 
 // A tensor in the host's pinned memory that kernels write to.
 inline void check_host_values(const char* op, const Tensor& host, std::initializer_list<std::int64_t> shape) {
-  check_dtype(op, "host", host, ScalarType::Long);
-  check_shape(op, "host", host, shape);
-  STD_TORCH_CHECK(host.is_cpu() && host.is_contiguous(), "blitzgs::", op,
-                  ": host must be contiguous and in pinned memory of the host");
+  check_in_place(op, "host", host, ScalarType::Long, shape);
+  STD_TORCH_CHECK(host.is_cpu(), "blitzgs::", op, ": host must be in pinned memory of the host");
 }
 
 }  // namespace blitzgs

@@ -8,10 +8,8 @@ namespace {
 
 void copy_to_host(Tensor host, const Tensor& values) {
   constexpr const char* kOp = "copy_to_host_";
-  check_dtype(kOp, "values", values, ScalarType::Long);
-  check_shape(kOp, "values", values, {-1});
-  STD_TORCH_CHECK(!values.is_cpu() && values.is_contiguous(), "blitzgs::", kOp,
-                  ": values must be contiguous and on the GPU");
+  check_in_place(kOp, "values", values, ScalarType::Long, {-1});
+  STD_TORCH_CHECK(!values.is_cpu(), "blitzgs::", kOp, ": values must be on the GPU");
   check_host_values(kOp, host, {values.size(0)});
   DeviceScope scope(values);
   cuda::copy_to_host(data<std::int64_t>(values), values.size(0), mutable_data<std::int64_t>(host),

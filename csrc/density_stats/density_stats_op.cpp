@@ -8,13 +8,6 @@ namespace {
 
 constexpr const char* kOp = "density_stats_";
 
-void check_column(const char* name, const Tensor& column, ScalarType dtype, std::int64_t rows) {
-  check_dtype(kOp, name, column, dtype);
-  check_shape(kOp, name, column, {rows});
-  STD_TORCH_CHECK(column.is_contiguous(), "blitzgs::", kOp, ": ", name,
-                  " is updated in place and must be contiguous");
-}
-
 void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const Tensor& visible_ids_in,
                     const Tensor& splat_offsets_in, const Tensor& v_means2d_in, const Tensor& conics_in,
                     const std::optional<Tensor>& phi_in, std::int64_t width, std::int64_t height,
@@ -22,9 +15,9 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   check_floating(kOp, "grad_sum", grad_sum);
   const ScalarType dtype = grad_sum.scalar_type();
   const std::int64_t rows = grad_sum.numel();
-  check_column("grad_sum", grad_sum, dtype, rows);
-  check_column("grad_count", grad_count, ScalarType::Int, rows);
-  check_column("max_radii", max_radii, dtype, rows);
+  check_in_place(kOp, "grad_sum", grad_sum, dtype, {rows});
+  check_in_place(kOp, "grad_count", grad_count, ScalarType::Int, {rows});
+  check_in_place(kOp, "max_radii", max_radii, dtype, {rows});
   check_dtype(kOp, "visible_ids", visible_ids_in, ScalarType::Int);
   check_shape(kOp, "visible_ids", visible_ids_in, {-1});
   const std::int64_t visible = visible_ids_in.size(0);

@@ -71,9 +71,9 @@ struct AdamTensors {
     args.table = data<double>(table);
     args.lr_table = data<float>(lr_table);
     if (final_rules) {
-      check_shape(op, "final_rules", *final_rules,
-                  {final_rules_of(table.size(0), explicit_steps),
-                   static_cast<std::int64_t>(sizeof(PendingSteps<T>))});
+      check_in_place(op, "final_rules", *final_rules, ScalarType::Byte,
+                     {final_rules_of(table.size(0), explicit_steps),
+                      static_cast<std::int64_t>(sizeof(PendingSteps<T>))});
       args.final_rules = static_cast<const PendingSteps<T>*>(final_rules->const_data_ptr());
     }
     args.step = static_cast<std::int32_t>(step);
@@ -103,20 +103,10 @@ struct AdamTensors {
                       kAdamNames[c], " must have ", alone ? 0 : values, " values in each of ", rows(),
                       " rows, got ", shape_of(params[c]));
     }
-    check_dtype(op, "last_step", last_step, ScalarType::Int);
-    check_shape(op, "last_step", last_step, {rows()});
-    check_dtype(op, "moment_step", moment_step, ScalarType::Int);
-    check_shape(op, "moment_step", moment_step, {rows()});
-    check_dtype(op, "table", table, ScalarType::Double);
-    check_shape(op, "table", table, {-1, kAdamTable});
-    check_dtype(op, "lr_table", lr_table, ScalarType::Float);
-    check_shape(op, "lr_table", lr_table, {table.size(0), kAdamGroups});
-    if (final_rules) check_dtype(op, "final_rules", *final_rules, ScalarType::Byte);
-    STD_TORCH_CHECK(!final_rules || final_rules->is_contiguous(), "blitzgs::", op,
-                    ": final_rules must be contiguous");
-    STD_TORCH_CHECK(table.is_contiguous() && lr_table.is_contiguous() && last_step.is_contiguous() &&
-                        moment_step.is_contiguous(),
-                    "blitzgs::", op, ": table, lr_table, last_step and moment_step must be contiguous");
+    check_in_place(op, "last_step", last_step, ScalarType::Int, {rows()});
+    check_in_place(op, "moment_step", moment_step, ScalarType::Int, {rows()});
+    check_in_place(op, "table", table, ScalarType::Double, {-1, kAdamTable});
+    check_in_place(op, "lr_table", lr_table, ScalarType::Float, {table.size(0), kAdamGroups});
     STD_TORCH_CHECK(step >= 0 && step < table.size(0), "blitzgs::", op, ": step ", step,
                     " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
   }
@@ -124,8 +114,7 @@ struct AdamTensors {
   void check_column(const Tensor& tensor, int column) const {
     const char* name = kAdamNames[column];
     check_dtype(op, name, tensor, like().scalar_type());
-    STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", op, ": ", name,
-                    " is updated in place and must be contiguous");
+    check_contiguous(op, name, tensor);
     STD_TORCH_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), "blitzgs::", op, ": ", name, " must have ",
                     rows(), " rows, got ", shape_of(tensor));
     STD_TORCH_CHECK(tensor.numel() == params[column].numel(), "blitzgs::", op, ": the moments of ", name,

@@ -10,13 +10,6 @@ namespace {
 
 constexpr const char* kOp = "mass_cut_";
 
-void check_state(const char* name, const Tensor& tensor, ScalarType dtype,
-                 std::initializer_list<std::int64_t> shape) {
-  check_dtype(kOp, name, tensor, dtype);
-  check_shape(kOp, name, tensor, shape);
-  STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", kOp, ": ", name, " must be contiguous");
-}
-
 void mass_cut_(const Tensor& weights, const Tensor& segments, const Tensor& owners, const Tensor& ids,
                Tensor searches, Tensor sums, Tensor listed, Tensor chosen, std::int64_t numerator,
                std::int64_t denominator, std::int64_t first_step, std::int64_t last_step) {
@@ -30,14 +23,14 @@ void mass_cut_(const Tensor& weights, const Tensor& segments, const Tensor& owne
       denominator);
   STD_TORCH_CHECK(0 <= first_step && first_step <= last_step && last_step <= kSteps, "blitzgs::", kOp,
                   ": steps must be in [0, ", kSteps, "], got ", first_step, " to ", last_step);
-  check_state("weights", weights, ScalarType::Long, {-1});
-  check_state("segments", segments, ScalarType::Int, {items});
-  check_state("owners", owners, ScalarType::Int, {items});
-  check_state("ids", ids, ScalarType::Long, {-1});
-  check_state("searches", searches, ScalarType::Long, {n_segments, sizeof(SegmentSearch) / 8});
-  check_state("sums", sums, ScalarType::Long, {n_segments, kDigits});
-  check_state("listed", listed, ScalarType::Int, {items + 1});
-  check_state("chosen", chosen, ScalarType::Bool, {items});
+  check_in_place(kOp, "weights", weights, ScalarType::Long, {-1});
+  check_in_place(kOp, "segments", segments, ScalarType::Int, {items});
+  check_in_place(kOp, "owners", owners, ScalarType::Int, {items});
+  check_in_place(kOp, "ids", ids, ScalarType::Long, {-1});
+  check_in_place(kOp, "searches", searches, ScalarType::Long, {n_segments, sizeof(SegmentSearch) / 8});
+  check_in_place(kOp, "sums", sums, ScalarType::Long, {n_segments, kDigits});
+  check_in_place(kOp, "listed", listed, ScalarType::Int, {items + 1});
+  check_in_place(kOp, "chosen", chosen, ScalarType::Bool, {items});
   DeviceScope scope(weights);
   const MassCutArgs args{data<std::int64_t>(weights),
                          data<std::int32_t>(segments),

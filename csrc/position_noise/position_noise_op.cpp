@@ -12,10 +12,8 @@ void position_noise_(Tensor means, const Tensor& quats_in, const Tensor& scales_
                      const Tensor& opacities_in, const Tensor& ids_in, const Tensor& visible_ids_in,
                      std::int64_t seed, std::int64_t step, double threshold, double strength) {
   check_floating(kOp, "means", means);
-  check_shape(kOp, "means", means, {-1, 3});
-  STD_TORCH_CHECK(means.is_contiguous(), "blitzgs::", kOp,
-                  ": means is updated in place and must be contiguous");
   const ScalarType dtype = means.scalar_type();
+  check_in_place(kOp, "means", means, dtype, {-1, 3});
   const std::int64_t rows = means.size(0);
   check_dtype(kOp, "quats", quats_in, dtype);
   check_shape(kOp, "quats", quats_in, {rows, 4});

@@ -75,12 +75,9 @@ class HeldSplatGradients {
   }
 
   static void check_table(const char* op, const Tensor& tensor) {
-    check_shape(op, "a table of v_splats", tensor, {-1, kSplatGradient});
-    check_dtype(op, "a table of v_splats", tensor, ScalarType::Float);
-    STD_TORCH_CHECK(
-        tensor.is_contiguous() &&
-            reinterpret_cast<std::uintptr_t>(tensor.const_data_ptr()) % alignof(SplatGradient) == 0,
-        "blitzgs::", op, ": a table of v_splats must be contiguous, at a multiple of 16 bytes");
+    check_in_place(op, "a table of v_splats", tensor, ScalarType::Float, {-1, kSplatGradient});
+    STD_TORCH_CHECK(reinterpret_cast<std::uintptr_t>(tensor.const_data_ptr()) % alignof(SplatGradient) == 0,
+                    "blitzgs::", op, ": a table of v_splats must begin at a multiple of 16 bytes");
   }
 
   void hold_ranks(const char* op, std::int64_t splats, const Tensor& places,
@@ -96,9 +93,7 @@ class HeldSplatGradients {
       ranks_.sizes[m] = static_cast<std::int32_t>(held_[m].size(0));
     }
     if (!sums) return;
-    check_shape(op, "means2d_sums", *sums, {splats, 2});
-    check_dtype(op, "means2d_sums", *sums, ScalarType::Float);
-    STD_TORCH_CHECK(sums->is_contiguous(), "blitzgs::", op, ": means2d_sums must be contiguous");
+    check_in_place(op, "means2d_sums", *sums, ScalarType::Float, {splats, 2});
     ranks_.means2d = const_cast<float*>(data<float>(*sums));
   }
 

@@ -152,13 +152,10 @@ struct Composited {
       check_dtype(op, "v_alphas", *v_alphas_in, dtype);
       v_alphas = as_contiguous(*v_alphas_in);
     }
-    check_shape(op, "packed_splats", packed,
-                {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
-    check_dtype(op, "packed_splats", packed, ScalarType::Byte);
-    check_shape(op, "tile_order", order, {-1, kTileOrderClasses});
-    check_dtype(op, "tile_order", order, ScalarType::Int);
+    check_in_place(op, "packed_splats", packed, ScalarType::Byte,
+                   {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
+    check_in_place(op, "tile_order", order, ScalarType::Int, {-1, kTileOrderClasses});
     STD_TORCH_CHECK(packed.size(0) >= splats.n_splats && tiles() >= grid.tile_end - grid.tile_begin &&
-                        packed.is_contiguous() && order.is_contiguous() &&
                         reinterpret_cast<std::uintptr_t>(packed.const_data_ptr()) % 64 == 0,
                     "blitzgs::", op,
                     ": packed_splats and tile_order must be as rasterize_fwd returned them, ", "for ",
@@ -218,11 +215,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
 void check_packed(const char* op, const Splats& splats, const Tensor& packed) {
   STD_TORCH_CHECK(splats.n_channels <= 4, "blitzgs::", op, ": colors must have 1 to 4 channels, got ",
                   splats.n_channels);
-  check_shape(op, "packed", packed, {-1, kSplatGradient});
+  check_in_place(op, "packed", packed, ScalarType::Float, {-1, kSplatGradient});
   STD_TORCH_CHECK(packed.size(0) >= splats.n_splats, "blitzgs::", op, ": packed must have ", splats.n_splats,
                   " splats or more, got ", packed.size(0));
-  check_dtype(op, "packed", packed, ScalarType::Float);
-  STD_TORCH_CHECK(packed.is_contiguous(), "blitzgs::", op, ": packed must be contiguous");
 }
 
 CompositedTensors rasterize_fwd_packed(const Tensor& means2d, const Tensor& conics,

@@ -39,9 +39,7 @@ void report_(const std::optional<Tensor>& parts_in, const std::optional<Tensor>&
   STD_TORCH_CHECK(count > 0 && count <= kMaxReportTargets, "blitzgs::", kOp, ": 1 to ", kMaxReportTargets,
                   " targets are supported, got ", count);
   for (Tensor& target : targets) {
-    check_shape(kOp, "a target", target, {2 * report.views * n_ranks + tiles});
-    check_dtype(kOp, "a target", target, ScalarType::Float);
-    STD_TORCH_CHECK(target.is_contiguous(), "blitzgs::", kOp, ": targets must be contiguous");
+    check_in_place(kOp, "a target", target, ScalarType::Float, {2 * report.views * n_ranks + tiles});
     float* sums = mutable_data<float>(target);
     float* mine = sums + 2 * report.views * rank;
     report.targets[report.n_targets++] = {mine, mine + report.views, sums + 2 * report.views * n_ranks};

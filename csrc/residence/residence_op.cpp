@@ -44,8 +44,7 @@ std::int64_t check_pair(const char* op, const Tensor& pool, const Tensor& table)
                     ": rows of pool and table must be alike, got ", shape_of(pool), " and ", shape_of(table));
     elements *= pool.size(axis);
   }
-  STD_TORCH_CHECK(pool.is_contiguous() && table.is_contiguous(), "blitzgs::", op,
-                  ": columns must be contiguous");
+  for (const Tensor* column : {&pool, &table}) check_contiguous(op, "columns", *column);
   STD_TORCH_CHECK(table.is_cpu(), "blitzgs::", op, ": the table must be in the memory of the host");
   return kBlockRows * elements * static_cast<std::int64_t>(pool.element_size());
 }
@@ -61,9 +60,7 @@ void swap_blocks_(std::vector<Tensor> pool, std::vector<Tensor> table, std::int6
   swap.n = slots.size(0);
   for (const auto& [name, list] :
        {std::pair{"slots", &slots}, std::pair{"leaving", &leaving}, std::pair{"coming", &coming}}) {
-    check_dtype(kOp, name, *list, ScalarType::Int);
-    check_shape(kOp, name, *list, {swap.n});
-    STD_TORCH_CHECK(list->is_contiguous(), "blitzgs::", kOp, ": ", name, " must be contiguous");
+    check_in_place(kOp, name, *list, ScalarType::Int, {swap.n});
   }
   for (std::int64_t c = 0; c < n_columns; ++c) {
     const std::int64_t bytes = check_pair(kOp, pool[c], table[c]);

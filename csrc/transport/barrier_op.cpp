@@ -17,9 +17,7 @@ void device_barrier(std::vector<Tensor> control, std::int64_t rank, std::int64_t
                   rank);
   std::int64_t n_values = 0;
   if (values) {
-    check_shape(kOp, "values", *values, {-1});
-    check_dtype(kOp, "values", *values, ScalarType::Long);
-    STD_TORCH_CHECK(values->is_contiguous(), "blitzgs::", kOp, ": values must be contiguous");
+    check_in_place(kOp, "values", *values, ScalarType::Long, {-1});
     n_values = values->size(0);
   }
   STD_TORCH_CHECK(first >= count && first + (count + 1) * n_values <= control[0].size(0), "blitzgs::", kOp,

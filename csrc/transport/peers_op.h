@@ -12,9 +12,7 @@ inline void check_peers(const char* op, const std::vector<Tensor>& buffers, Scal
   STD_TORCH_CHECK(count >= 1 && count <= kMaxPeers, "blitzgs::", op, ": 1 to ", kMaxPeers,
                   " peers are supported, got ", count);
   for (const Tensor& buffer : buffers) {
-    check_shape(op, "a buffer", buffer, {buffers[0].size(0)});
-    check_dtype(op, "a buffer", buffer, dtype);
-    STD_TORCH_CHECK(buffer.is_contiguous(), "blitzgs::", op, ": buffers must be contiguous");
+    check_in_place(op, "a buffer", buffer, dtype, {buffers[0].size(0)});
   }
 }
 

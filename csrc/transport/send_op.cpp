@@ -31,16 +31,13 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
         "blitzgs::", kOp, ": column ", c, " must be contiguous, of ", words, " words a splat");
     arguments.splats.columns.data[c] = static_cast<const std::int32_t*>(column.const_data_ptr());
   }
-  check_shape(kOp, "rank_masks", rank_masks, {columns[0].size(0)});
-  check_dtype(kOp, "rank_masks", rank_masks, ScalarType::Long);
+  check_in_place(kOp, "rank_masks", rank_masks, ScalarType::Long, {columns[0].size(0)});
   arguments.splats.masks = data<std::int64_t>(rank_masks);
-  check_shape(kOp, "everyone", everyone, {n_ranks, -1});
-  check_dtype(kOp, "everyone", everyone, ScalarType::Long);
+  check_in_place(kOp, "everyone", everyone, ScalarType::Long, {n_ranks, -1});
   const std::int64_t n_views = everyone.size(1) - project_totals(0, n_ranks);
-  STD_TORCH_CHECK(
-      everyone.is_contiguous() && !everyone.is_cpu() && n_views >= 0 && rank >= 0 && rank < n_ranks,
-      "blitzgs::", kOp, ": everyone must be contiguous, on the GPU and the totals of ", n_ranks,
-      " ranks, and rank one of them, got ", rank);
+  STD_TORCH_CHECK(!everyone.is_cpu() && n_views >= 0 && rank >= 0 && rank < n_ranks, "blitzgs::", kOp,
+                  ": everyone must be on the GPU and the totals of ", n_ranks,
+                  " ranks, and rank one of them, got ", rank);
   DeviceScope scope(columns[0]);
   Tensor places = make_places(columns[0], capacity, n_ranks);
   Tensor plan = make_empty(columns[0], {(sizeof(SendPlan) + 7) / 8}, ScalarType::Long);

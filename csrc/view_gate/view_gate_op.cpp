@@ -16,10 +16,7 @@ void gate_views_(const Tensor& ids_in, Tensor views, const std::optional<Tensor>
   check_dtype(kOp, "ids", ids_in, ScalarType::Int);
   check_shape(kOp, "ids", ids_in, {-1});
   const std::int64_t room = ids_in.size(0);
-  check_dtype(kOp, "views", views, ScalarType::Int);
-  check_shape(kOp, "views", views, {room});
-  STD_TORCH_CHECK(views.is_contiguous(), "blitzgs::", kOp,
-                  ": views is updated in place and must be contiguous");
+  check_in_place(kOp, "views", views, ScalarType::Int, {room});
   check_dtype(kOp, "means", means_in, ScalarType::Float);
   check_shape(kOp, "means", means_in, {-1, 3});
   const std::int64_t rows = means_in.size(0);

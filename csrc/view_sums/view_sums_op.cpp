@@ -10,13 +10,6 @@ namespace {
 
 constexpr const char* kOp = "view_sums_";
 
-void check_array(const char* name, const Tensor& tensor, ScalarType dtype,
-                 std::initializer_list<std::int64_t> shape) {
-  check_dtype(kOp, name, tensor, dtype);
-  check_shape(kOp, name, tensor, shape);
-  STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", kOp, ": ", name, " must be contiguous");
-}
-
 // sums: score, seen, counted, cull. splats: visible_ids, splat_offsets, camera_ids, radii.
 void view_sums_(const std::vector<Tensor>& sums, const std::vector<Tensor>& splats, const Tensor& weights,
                 const Tensor& pixels, const Tensor& counts, const std::vector<std::int64_t>& columns,
@@ -27,17 +20,17 @@ void view_sums_(const std::vector<Tensor>& sums, const std::vector<Tensor>& spla
                   sums.size(), " and ", splats.size(), " tensors");
   const std::int64_t n = sums[0].numel(), words = sums[3].dim() == 2 ? sums[3].size(1) : 0;
   const std::int64_t visible = splats[0].numel(), count = weights.numel();
-  check_array("score", sums[0], ScalarType::Long, {n});
-  check_array("seen", sums[1], ScalarType::Int, {n});
-  check_array("counted", sums[2], ScalarType::Int, {n});
-  check_array("cull", sums[3], ScalarType::Int, {n, words});
-  check_array("visible_ids", splats[0], ScalarType::Int, {visible});
-  check_array("splat_offsets", splats[1], ScalarType::Int, {visible + 1});
-  check_array("camera_ids", splats[2], ScalarType::Int, {count});
-  check_array("radii", splats[3], ScalarType::Int, {count, 2});
-  check_array("weights", weights, ScalarType::Long, {count});
-  check_array("pixels", pixels, ScalarType::Int, {count});
-  check_array("counts", counts, ScalarType::Bool, {count});
+  check_in_place(kOp, "score", sums[0], ScalarType::Long, {n});
+  check_in_place(kOp, "seen", sums[1], ScalarType::Int, {n});
+  check_in_place(kOp, "counted", sums[2], ScalarType::Int, {n});
+  check_in_place(kOp, "cull", sums[3], ScalarType::Int, {n, words});
+  check_in_place(kOp, "visible_ids", splats[0], ScalarType::Int, {visible});
+  check_in_place(kOp, "splat_offsets", splats[1], ScalarType::Int, {visible + 1});
+  check_in_place(kOp, "camera_ids", splats[2], ScalarType::Int, {count});
+  check_in_place(kOp, "radii", splats[3], ScalarType::Int, {count, 2});
+  check_in_place(kOp, "weights", weights, ScalarType::Long, {count});
+  check_in_place(kOp, "pixels", pixels, ScalarType::Int, {count});
+  check_in_place(kOp, "counts", counts, ScalarType::Bool, {count});
   STD_TORCH_CHECK(!columns.empty() && columns.size() <= kMostViews, "blitzgs::", kOp, ": 1 to ", kMostViews,
                   " views at once, got ", columns.size());
   for (const std::int64_t column : columns) {
