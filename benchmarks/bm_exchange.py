@@ -116,12 +116,12 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
     capture, lod = load_capture(args.data, downscale=args.downscale), Config().lod
     space = Space.of(capture.offset, capture.extent)
     points = torch.from_numpy(capture.points) / space.unit
-    centres = camera_centres([capture.cameras[i] for i in capture.train], space)
+    centres = camera_centres([capture.cameras[i] for i in capture.train], space).to(device)
     table = octree_gaussians(
         points,
         torch.from_numpy(capture.colors),
         centres,
-        measure_levels(points, centres, lod.fork, lod.base_resolution),
+        measure_levels(points.to(device), centres, lod.fork, lod.base_resolution),
         visible_threshold=lod.visible_threshold,
         sh_degree=3,
         opacity=0.5,
