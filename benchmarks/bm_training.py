@@ -8,8 +8,9 @@ Trains the capture with `--images` images, as `blitzgs train` does, batches load
 checkpoints and evaluations. Then measures, by the host's clock and with the GPU waited for at their ends,
 `--steps` further steps with the density events that fall among them. On CUDA `--profiled` more steps, without
 density events, go under torch's profiler: how long kernels and copies keep the main stream busy (the stream
-that works most), how long the host stands in calls that wait for the GPU, and the longest gaps on the main
-stream by what stands before and after them. The figures are rank 0's; ranks meet in every step.
+that works most), how long the host stands in calls that wait for the GPU, which kernels take the time, and
+the longest gaps on the main stream by what stands before and after them. The figures are rank 0's; ranks meet
+in every step.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -54,12 +56,14 @@ class StreamUse(NamedTuple):
         waiting: share of the same time that the thread which launches kernels waits for the GPU.
         launches: kernels and copies on all streams.
         gaps: (before, after) -> the main stream's gaps between these, in us.
+        kernels: name -> how long each launch of it took, on all streams, in us.
     """
 
     busy: float
     waiting: float
     launches: int
     gaps: dict[tuple[str, str], list[float]]
+    kernels: dict[str, list[float]]
 
 
 class MeasuredTrainer(Trainer):
@@ -135,7 +139,10 @@ def stream_use(trace: Sequence[dict[str, Any]]) -> StreamUse:
             last, before = end, name
     launching = max(calls.values(), key=lambda items: sum("Launch" in name for name, _ in items), default=[])
     waits = sum(length for name, length in launching if "Synchronize" in name)
-    return StreamUse(busy / span, waits / span, sum(map(len, work.values())), dict(gaps))
+    kernels: dict[str, list[float]] = defaultdict(list)
+    for begin, end, name in chain.from_iterable(work.values()):
+        kernels[name].append(end - begin)
+    return StreamUse(busy / span, waits / span, sum(map(len, work.values())), dict(gaps), dict(kernels))
 
 
 def short_name(name: str) -> str:
@@ -168,6 +175,15 @@ def longest_gaps(use: StreamUse, steps: int, count: int = 8) -> list[dict[str, A
     return [
         {"before": before, "after": after, "us a step": sum(gaps) / steps, "times a step": len(gaps) / steps}
         for (before, after), gaps in ordered[:count]
+    ]
+
+
+def longest_kernels(use: StreamUse, steps: int, count: int = 16) -> list[dict[str, Any]]:
+    """Return the rows of the table of kernels and copies, those that take most first."""
+    ordered = sorted(use.kernels.items(), key=lambda item: -sum(item[1]))
+    return [
+        {"kernel": name, "us a step": sum(times) / steps, "times a step": len(times) / steps}
+        for name, times in ordered[:count]
     ]
 
 
@@ -209,6 +225,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 f"{schedule.batch_size} a step"
             )
             report(title, figures(times, args.steps, use, args.profiled), args.json, ranks.device)
+            if use is not None:
+                print(markdown_table(longest_kernels(use, args.profiled)))
             if use is not None and use.gaps:
                 print(markdown_table(longest_gaps(use, args.profiled)))
 

@@ -56,3 +56,6 @@ def test_what_a_trace_says():
     assert use.gaps == {("splats_kernel", "Memcpy DtoH"): [20]}
     (gap,) = bm_training.longest_gaps(use, 2)
     assert gap == {"before": "splats_kernel", "after": "Memcpy DtoH", "us a step": 10, "times a step": 0.5}
+    longest, second = bm_training.longest_kernels(use, 2, count=2)
+    assert {longest["kernel"], second["kernel"]} == {"splats_kernel", "elsewhere"}
+    assert longest["us a step"] == 20 and longest["times a step"] == 0.5
