@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The active set of a step, found over blocks of consecutive rows with conservative bounds."""
+"""Finds the rows that the views of a step may see, block by block, from conservative bounds of each block."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ BLOCK_ROWS = 256
 
 
 class PendingSteps(NamedTuple):
-    """Optimiser state that bounds how far rows may drift when they catch up.
+    """Optimiser state that bounds how far rows may move when their pending steps are applied.
 
     Attributes:
         exp_avg_means: first moment of the means, float32 [N, 3].
         exp_avg_sq_means: second moment of the means, float32 [N, 3].
         exp_avg_scales: first moment of the log scales, float32 [N, 3].
         exp_avg_sq_scales: second moment of the log scales, float32 [N, 3].
-        last_step: int32 [N], step each row's parameters stand at.
-        moment_step: int32 [N], step each row's moments stand at.
+        last_step: int32 [N], step up to which each row's parameters are current.
+        moment_step: int32 [N], step up to which each row's moments are current.
         table: float64 [S + 1, 30], from `blitzgs.ops.lazy_adam.schedule_table`.
     """
 
@@ -36,15 +36,16 @@ class PendingSteps(NamedTuple):
 
 
 class GateRules(NamedTuple):
-    """What B views leave out of a table before projection (paper Eq. 1 and 2, then 5).
+    """Which rows B views leave out before projection: LOD gate (BlitzGS Eq. 1 and 2) and cull mask (Eq. 5).
 
-    A view with an LOD gate leaves out the rows of each level l farther than `reach[l]` from its centre; a
-    view with a column of the cull matrix those whose bit is set.
+    A view with an LOD gate leaves out each row of octree level l that is farther than `reach[l]` from the
+    camera centre. A view with a column of the cull matrix leaves out the rows whose bit in that column is
+    set.
 
     Attributes:
         level: uint8 [N]; a level beyond the last of `reach` counts as the last.
-        reach: for each of 1 to 32 levels the distance up to which it is kept, in the unit of the means, the
-            same or less for finer levels; negative: nowhere.
+        reach: one distance for each of 1 to 32 levels, in the unit of the means: up to it the level is kept.
+            Distances must not increase towards finer levels; a negative one removes the level everywhere.
         lod_views: bit v is set when view v has an LOD gate.
         cull: int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.cull_mask`; None: there is none.
         columns: of `cull`, one for each view; negative: the view has no mask. Empty: no view has one.
@@ -58,16 +59,17 @@ class GateRules(NamedTuple):
 
 
 class ActiveRows(NamedTuple):
-    """The rows that some view may see: the first `length` entries of lists with room for R rows.
+    """The rows that at least one view may see: the first `length` entries of lists with capacity R.
 
-    The length stays on the device, so that the host need not wait; ops that take the lists take it too.
+    `length` stays on the device, so the host need not wait for it; ops that take the lists take `length` too.
 
     Attributes:
         ids: int32 [R], ascending.
         views: int32 [R], bit v set when view v may see the row.
-        length: int32 [1], on the device of the others.
-        blocks: int32 [1], likewise: of how many blocks some view may see a part. Where there is room for
-            fewer, the lists are incomplete and `length` is 0. None: the lists are complete.
+        length: int32 [1], number of valid entries, on the device of the lists.
+        blocks: int32 [1] on the same device, number of blocks of which a view may see a part. If the lists
+            had capacity for fewer blocks, they are incomplete and `length` is 0. None: the lists are
+            complete.
     """
 
     ids: Tensor
@@ -76,7 +78,7 @@ class ActiveRows(NamedTuple):
     blocks: Tensor | None = None
 
     def listed(self) -> tuple[Tensor, Tensor]:
-        """Return the active rows and their views, int32 [A] each; waits for the device."""
+        """Return the A valid entries of `ids` and `views`, int32 [A] each; waits for the device."""
         length = int(self.length)
         return self.ids[:length], self.views[:length]
 
@@ -113,7 +115,7 @@ def update_block_bounds_(
         ids: int32 [U], rows that changed.
         means: float32 [N, 3].
         scales: float32 [N, 3], logarithms of the standard deviations.
-        pending: bounds how far rows may drift when they catch up; None: rows do not drift.
+        pending: bounds how far rows may move when pending steps are applied; None: there are none.
 
     Raises:
         RuntimeError: wrong shapes or dtypes.
@@ -137,10 +139,10 @@ def cull_blocks(
     rules: GateRules | None = None,
     room: int | None = None,
 ) -> ActiveRows:
-    """Return the rows that at least one of B views may see, without reading the rows of blocks outside.
+    """Return the rows that at least one of B views may see; rows of blocks outside all views are not read.
 
-    The set is conservative: it contains every row that projection would project, no matter how many of its
-    pending steps have been applied by then. Only rows that provably miss a view are dropped from it
+    The set is conservative: it contains every row that projection would project, however many of its pending
+    steps have been applied by then. A row is dropped from a view only if it certainly misses that view
     (csrc/blocks/blocks.h).
 
     Args:
@@ -156,10 +158,10 @@ def cull_blocks(
         eps2d: screen-space blur, pixels squared.
         pending: as given to `update_block_bounds_`.
         level_ranges: uint8 [ceil(N / 256), 2], coarsest and finest level of each block; needed for `rules`.
-        rules: rows that the views certainly leave out, wherever their pending steps take them, are dropped
-            too; `blitzgs.ops.view_gate.gate_views_` decides about the rest. None: none are.
-        room: for the rows of how many blocks the lists have room, at least 1. None: as many as some view may
-            see; the host waits for their number.
+        rules: also drop the rows that these rules leave out wherever their pending steps may move them;
+            `blitzgs.ops.view_gate.gate_views_` decides about the remaining rows. None: no rules.
+        room: capacity of the lists, in blocks of 256 rows, at least 1. None: exactly as many blocks as the
+            views may see; the host then waits for this number.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, more than 32 views, or as `gate_views_` says.

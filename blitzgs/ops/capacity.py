@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much memory to give to results whose size only the device knows when they are queued.
+"""Estimates the size of results that only the device knows while the host allocates memory for them.
 
-The host could wait for the size, but the device would have nothing to do meanwhile. So the host estimates the
-size from what the calls of late needed, queues all the work, and learns the true size while the device works.
-Where the estimate was too small, the work is queued once more.
+If the host waited for the size, the device would be idle meanwhile. Instead, the host estimates the size from
+what recent calls needed, queues all the work, and reads the true size while the device works. If the estimate
+was too small, the host queues the work again.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-# An attempt that failed tells what it needs, so the next has it: more attempts than this are an error in the
-# program.
+# A failed attempt reports the sizes that it needs, and the next attempt uses them. More attempts than this
+# mean that the inputs change or that the program is wrong.
 MOST_ATTEMPTS = 4
 
 
 class Sizes(NamedTuple):
-    """How many of each there are, or may be."""
+    """Numbers of Gaussians, splats, tile entries and blocks that a call needs, or has memory for."""
 
     visible: int  # Gaussians seen by at least one view
     splats: int  # pairs of a Gaussian and a view that sees it
@@ -26,58 +26,59 @@ class Sizes(NamedTuple):
     blocks: int = 0  # of rows of the table, of which some view may see a part
 
     def holds(self, needed: Sequence[int]) -> bool:
-        """Tell whether there is room for so many of the first of these."""
+        """Tell whether these sizes suffice for `needed`, which has the first of these fields in order."""
         return all(n <= size for n, size in zip(needed, self, strict=False))
 
 
 class Attempt:
-    """One call with room of some sizes.
+    """One call whose results get memory of given sizes.
 
     Attributes:
-        sizes: to make room for; None: nothing is known yet, so the call has to wait for its sizes.
-        needed: the sizes that turned out to be needed.
-        fits: whether there was room for them.
+        sizes: sizes to allocate; None: no estimate exists yet, so the call must wait for the true sizes.
+        needed: the sizes that the call needed.
+        fits: whether the allocated sizes sufficed.
     """
 
     def __init__(self, sizes: Sizes | None, estimate: CapacityEstimate | None = None) -> None:
-        """Begin; `estimate` learns how it ends."""
+        """Begin an attempt; `end` passes the needed sizes to `estimate`, if there is one."""
         self.sizes, self.fits, self._estimate = sizes, False, estimate
         self.needed: Sequence[int] = ()
 
     def end(self, needed: Sequence[int], fits: bool) -> None:
-        """Say what was needed, and whether there was room for it."""
+        """Note which sizes the call needed, and whether its memory sufficed."""
         self.needed, self.fits = needed, fits
         if self._estimate is not None:
             self._estimate.learn(needed)
 
 
 class CapacityEstimate:
-    """An estimate of the sizes that the next call needs, from the largest of late. Threads may share it."""
+    """Estimates the sizes that the next call needs from the largest recent ones. Threads may share it."""
 
     def __init__(self, sizes: Sizes | None = None) -> None:
-        """Begin with an estimate, or with none: the first attempt then has to wait for its sizes."""
+        """Begin with an estimate, or with none; without one the first attempt waits for its sizes."""
         self._sizes = None if sizes is None else Sizes._make(max(1, size) for size in sizes)
         self._lock = threading.Lock()
 
     @property
     def sizes(self) -> Sizes | None:
-        """The estimate; None: nothing is known yet."""
+        """The present estimate; None before the first call has ended."""
         return self._sizes
 
     def learn(self, needed: Sequence[int]) -> None:
-        """Take note of what a call needed."""
+        """Update the estimate with the sizes that a call needed."""
         with self._lock:
             before = self._sizes or Sizes(0, 0, 0)
-            # Views differ, so some more than the largest; and a large one is forgotten slowly.
+            # Views differ, so the estimate exceeds the largest recent size, and it shrinks slowly.
             self._sizes = Sizes._make(
                 max(1, n * 9 // 8, size - size // 256) for n, size in zip(Sizes(*needed), before, strict=True)
             )
 
     def attempts(self) -> Iterator[Attempt]:
-        """Yield attempts with the estimate until one of them fits; whoever makes one calls its `end`.
+        """Yield attempts until one of them fits; the caller must call `end` of each attempt.
 
         Raises:
-            RuntimeError: the sizes that an attempt asked for were too small for the next one, several times.
+            RuntimeError: `MOST_ATTEMPTS` attempts did not suffice, each with the sizes that the last one
+                needed.
         """
         for _ in range(MOST_ATTEMPTS):
             attempt = Attempt(self._sizes, self)

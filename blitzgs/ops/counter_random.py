@@ -53,5 +53,5 @@ def _mix(value: Tensor) -> Tensor:
 
 
 def _shift_right(value: Tensor, bits: int) -> Tensor:
-    """Shift in zeros, where torch's own shift of int64 repeats the sign."""
+    """Shift right and fill with zeros; torch's own shift of int64 repeats the sign bit."""
     return (value >> bits) & ((1 << (64 - bits)) - 1)

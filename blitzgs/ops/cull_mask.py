@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mask of bits in two layouts: by row, as rows move, and by block and column, as kernels ask for it."""
+"""Converts the cull mask between the layout by row, which moves with rows, and the layout of the kernels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SECTOR_WORDS = BLOCK_ROWS // 32
 
 @torch.no_grad()
 def sectors_of_rows(rows: Tensor) -> Tensor:
-    """Return a mask by block and column, of one by row.
+    """Convert a mask from the layout by row to the layout by block and column (a column is a view).
 
     Args:
         rows: int32 [N, words]; bit v % 32 of word v / 32 is that of column v.
@@ -31,7 +31,7 @@ def sectors_of_rows(rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
-    """Return the mask of N rows from which `sectors_of_rows` made `sectors`, int32 [N, words].
+    """Convert a mask of N rows back to the layout by row, int32 [N, words]; the inverse of `sectors_of_rows`.
 
     Raises:
         RuntimeError: a wrong shape or dtype.

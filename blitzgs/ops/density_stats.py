@@ -35,9 +35,8 @@ def density_stats_(
         grad_count: int32 [N].
         max_radii: [N], pixels, dtype of `grad_sum`.
         visible_ids: int32 [U], Gaussians with splats, each once.
-        splat_offsets: int32 [U + 1], the splats of each.
-        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel; splats may lie apart
-            in memory.
+        splat_offsets: int32 [U + 1]; splats splat_offsets[u] to splat_offsets[u + 1] are of visible_ids[u].
+        v_means2d: [P, 2], gradient of the step's loss by the projected means, per pixel; rows may be strided.
         conics: [P, 3], inverse 2D covariances (a, b, c).
         width: image width in pixels.
         height: image height in pixels.

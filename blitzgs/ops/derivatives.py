@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernels have first derivatives, written by hand. A second one is an error, never silently zero."""
+"""Makes second derivatives an error: the kernels implement first derivatives only."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def first_only(
 ) -> tuple[Tensor | None, ...]:
     """Return gradients that cannot be differentiated again.
 
-    A gradient depends on the op's inputs even where its formula's result shows no trace of them, as under a
-    linear loss. So where torch records the backward pass (`create_graph=True`), the gradients are made to
-    depend on all inputs through a function that raises.
+    Autograd sees no connection between a hand-written gradient and the op's inputs, so a second derivative
+    would silently be zero. When torch records the backward pass (`create_graph=True`), this function
+    therefore connects the gradients with all inputs through a function whose backward pass raises an error.
 
     Args:
         op: name of the op, for the error.
-        gradients: of its inputs, from its formula, which was run without being recorded.
-        inputs: what the gradients depend on: the op's inputs and the gradients of its outputs.
+        gradients: gradients of the op's inputs, computed without recording.
+        inputs: tensors that the gradients depend on: the op's inputs and the gradients of its outputs.
     """
     if not torch.is_grad_enabled():
         return tuple(gradients)
@@ -33,7 +33,7 @@ def first_only(
 
 
 class _FirstOnly(torch.autograd.Function):
-    """Its first tensors, as a function of all of them that has no derivative."""
+    """Returns its first `count` tensors; its backward pass raises an error."""
 
     @staticmethod
     def forward(ctx: Any, op: str, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:

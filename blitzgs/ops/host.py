@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading small tensors on the host, where a size has to be known."""
+"""Copies small tensors to the host, for sizes that the host must know."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 
 
 class HostCopy:
-    """A few numbers on their way to the host. What is queued before `read` runs meanwhile.
+    """Copies a few numbers to the host while the device runs the work that is queued before `read`.
 
-    On CUDA a kernel writes the numbers into the host's memory: a copy would make the stream wait for the
-    copying engine, 15 us. That memory has to live until then, so whoever drops a copy unread waits too.
+    On CUDA a kernel writes the numbers into pinned host memory, because an ordinary copy delays the stream by
+    15 us (it waits for the copy engine). The memory must exist until the kernel has written it, so deleting a
+    copy that was not read waits for the kernel too.
     """
 
     def __init__(self, values: Tensor) -> None:
-        """Start to bring `values`, int64 [n], to the host."""
+        """Start to copy `values`, int64 [n], to the host."""
         self._written: torch.cuda.Event | None = None
         self._host = values
         if values.is_cuda:
@@ -27,7 +28,7 @@ class HostCopy:
             self._written.record(torch.cuda.current_stream(values.device))
 
     def read(self) -> Tensor:
-        """Wait for the numbers and return them, on the CPU."""
+        """Wait for the copy and return the numbers as a CPU tensor."""
         if self._written is not None:
             self._written.synchronize()
             self._written = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each Gaussian contributes to each view: the instrumented rasterisation, without colours."""
+"""Measures what each Gaussian contributes to each view, by a rasterisation that sums weights, not colours."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ def splat_contributions(
 ) -> tuple[Tensor, Tensor]:
     """Sum alpha T over the pixels at which each splat is composited, and count these pixels.
 
-    Pixels are composited as by :func:`blitzgs.ops.rasterize.rasterize`, bit for bit. Sums are of integers, so
-    they do not depend on the order, and partial sums of several tile ranges add up to the whole.
+    Alpha and T have the same bits as in :func:`blitzgs.ops.rasterize.rasterize`. The sums are integers, so
+    they do not depend on the order of addition, and the sums of disjoint tile ranges add up to the sum of all
+    tiles.
 
     Args:
         means2d: [P, 2], pixels, float32 or (CPU) float64.
@@ -47,7 +48,8 @@ def splat_contributions(
         tile_size: edge of a tile in pixels, as given to ``intersect``; 16 on CUDA.
         tile_begin: first tile to composite.
         tile_end: end of the tiles to composite, -1 for all.
-        n_splats: int64 [1] on the device of the splats: only the first so many are there. None: all.
+        n_splats: int64 [1] on the device of the splats: only the first `n_splats` splats are valid. None:
+            all.
 
     Returns:
         Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest), and pixels int32 [P].
@@ -77,10 +79,10 @@ def contributions(
     eps2d: float = 0.3,
     rasterize_mode: str = "classic",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Tell what each Gaussian contributes to each view (paper §3.2), without shading a colour.
+    """Return the weight and the number of pixels of each Gaussian in each view (BlitzGS, section 3.2).
 
-    Over the pixels p of a view at which the renderer composites a Gaussian, with the renderer's own alpha and
-    transmittance T::
+    Both are summed over the pixels p of a view at which the renderer composites the Gaussian; alpha and the
+    transmittance T are the renderer's::
 
         weight = sum of alpha_p T_p;    pixels = their number
 

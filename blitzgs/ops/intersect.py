@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intersection: which projected splats each image tile composites, front to back."""
+"""Tile intersection: lists the projected splats that each image tile composites, front to back."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def intersect(
         splat_opacities: [P], in [0, 1].
         depths: sort keys [P], the z of each splat in its view.
         camera_ids: int32 [P], the view of each splat.
-        ids: int64 [P] that order splats of equal depth; None: the splat order does.
+        ids: int64 [P], persistent ids that order splats of equal depth; None: their index orders them.
         n_cameras: number of views B.
         width: of every view, pixels.
         height: of every view, pixels.
@@ -53,7 +53,7 @@ def intersect(
         tile_begin: first owned tile; tiles outside [tile_begin, tile_end) get empty lists.
         tile_end: end of the owned tiles, -1 for all.
         n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``),
-            -1 to have them counted. On CUDA the check that it is one waits for the device.
+            -1 to have them counted. On CUDA the check of this bound waits for the device.
         n_splats: int64 [1] on the device of the splats: only the first ``n_splats`` of the P are valid, the
             others are never read. With it, the host can queue the CUDA op before it knows the number. None:
             all splats; a number outside [0, P] counts as 0.

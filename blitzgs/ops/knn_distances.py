@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact distances to the k nearest other points of a cloud."""
+"""Computes exact distances from each point of a cloud to its k nearest other points."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dense Adam that pays for the rows with a gradient alone; rows left behind are caught up in O(1)."""
+"""Dense Adam that updates only rows with a gradient and applies a row's missed steps later, in O(1)."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def lazy_adam_step_(
         exp_avg_sqs: second moments, shaped like `params`.
         grads: gradients of the listed rows, shaped like `params` with U rows.
         ids: int32 [U], the rows, each once.
-        last_step: int32 [N], the step that each row's parameters stand at; becomes `step` for `ids`.
-        moment_step: int32 [N], <= `last_step`, the step that its moments stand at; becomes `step` for `ids`.
+        last_step: int32 [N], step up to which each row's parameters are current; becomes `step` for `ids`.
+        moment_step: int32 [N], <= `last_step`, the same of its moments; becomes `step` for `ids`.
         lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
             for every step of the schedule (row 0 unused). Must not change between calls.
         step: 1 <= step <= S.
@@ -88,10 +88,12 @@ def lazy_adam_catch_up_(
     eps: float,
     count: Tensor | None = None,
 ) -> None:
-    """Bring the parameters of the rows `ids` (None: all rows) to where dense Adam has them after ``step``.
+    """Apply the missed zero-gradient steps up to ``step`` to the rows `ids` (None: all), in place.
 
-    In place. Rows that stand at `step` already are left untouched. Moments and `moment_step` stay: the next
-    step with a gradient applies the decay that is pending, beta^(step - moment_step). Arguments as in
+    Only parameters change. Afterwards these parameters are those of dense Adam after ``step``. Rows that are
+    current already do not change.
+    Moments and `moment_step` do not change either: the next step with a gradient applies the pending decay,
+    beta^(step - moment_step). Arguments as in
     `lazy_adam_step_`; ``step`` may be 0 (nothing to do). ``count``, int32 [1]: only the first `count` of
     `ids` are rows; the host does not wait for it.
 
@@ -113,18 +115,18 @@ def lazy_adam_catch_up_(
 
 
 def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
-    """Number of zero-gradient steps after which the drift that is left is below rounding."""
+    """Return the number of zero-gradient steps after which a row's remaining movement is below rounding."""
     ratio = beta1 / math.sqrt(beta2)
     negligible = _NEGLIGIBLE.get(dtype, 2.0**-27)
     return 1 if ratio == 0 else max(1, math.ceil(math.log(negligible) / math.log(ratio)))
 
 
-# Functions of the schedule alone, by lr_table: its version, and what was made of it then.
+# Tables computed from a schedule: for each lr_table, its version at that time and the tables.
 _tables: Any = WeakTensorKeyDictionary()
 
 
 def _once(lr_table: Tensor, key: tuple[object, ...], make: Callable[[], Tensor]) -> Tensor:
-    """Return what `make` made of a schedule first, by `key`; anew once `lr_table` has changed."""
+    """Return the cached result of `make` for `lr_table` and `key`; renew it if `lr_table` has changed."""
     version, made = _tables.get(lr_table, (None, {}))
     if version != lr_table._version:
         made = {}
@@ -146,8 +148,9 @@ def schedule_tables(lr_table: Tensor, beta1: float, beta2: float, eps: float, li
         like: has the dtype of the parameters.
 
     Returns:
-        `schedule_table`, `lr_table`, and what rows owe that have been behind for `explicit_steps` or more, by
-        the step that they stand at: uint8 [max(0, S + 1 - explicit_steps), bytes], for the ops alone.
+        `schedule_table`, `lr_table`, and, for rows that are `explicit_steps` or more steps behind, the rule
+        that applies all their missed steps, indexed by the row's last step: uint8 [max(0, S + 1 -
+        explicit_steps), bytes], in a layout that only the ops read.
 
     Raises:
         ValueError: decay rates outside their range.
@@ -163,7 +166,7 @@ def schedule_tables(lr_table: Tensor, beta1: float, beta2: float, eps: float, li
 
 
 def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
-    """Return the drift of zero-gradient steps from every step to the end of the schedule, made on first use.
+    """Return the table from which the ops compute a row's movement over missed steps; it is cached.
 
     Args:
         lr_table: float32 [S + 1, 6], learning rates per step (row 0 unused).
@@ -180,13 +183,13 @@ def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
 
 
 def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0) -> Tensor:
-    """Return `schedule_table` of a schedule whose learning rates are zero: powers and corrections alone.
+    """Return `schedule_table` for learning rates of zero: only the columns that do not depend on the rates.
 
     Args:
         steps: S + 1.
         beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
         beta2: decay of the second moment, in (0, 1).
-        before: steps that were taken before the table begins: its corrections are those of later steps.
+        before: number of steps taken before the table begins; bias corrections count from there.
 
     Returns:
         float64 [S + 1, 30] on the CPU.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fewest items of each segment that hold a share of its weight, found without sorting."""
+"""Selects, without sorting, the fewest items of each segment that hold a given share of its total weight."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ ROUNDS = 6
 TIES_STEP, CHOICE_STEP = 2 * ROUNDS, 4 * ROUNDS
 STEPS = CHOICE_STEP + 1
 _SEARCH_NUMBERS = 8
-_MISSING_ID = 6  # of a search's numbers: how many items are still to be told by their ids
+_MISSING_ID = 6  # index into a search's 8 numbers: how many items remain to be chosen by their ids
 
 
 class MassCut(NamedTuple):
-    """A search for the thresholds of S segments; see `csrc/mass_cut/mass_cut.h`.
+    """A search for the threshold weight of each of S segments; see `csrc/mass_cut/mass_cut.h`.
 
-    Step 2 r of a search scans this rank's items in round r; the `sums` are then to be added up over the
-    ranks; step 2 r + 1 reads and clears them. Steps from `TIES_STEP` on do nothing unless `has_ties`. The
-    last step fills `chosen`.
+    A search has rounds of two steps. Step 2 r of round r scans this rank's items and fills `sums`. The caller
+    then adds up `sums` over the ranks. Step 2 r + 1 reads and clears them. Steps from `TIES_STEP` on do
+    nothing unless `has_ties` is true. The last step fills `chosen`.
 
     Attributes:
-        items: weights int64 [P] >= 0, segments int32 [P], owners int32 [P] (whose weights they are) and ids
-            int64 [N] of the owners, in [0, 2^63). The sum of a segment must be below 2^62.
+        items: weights int64 [P] >= 0; segments int32 [P]; owners int32 [P], the row that each weight belongs
+            to; and the rows' ids int64 [N], in [0, 2^63). The weights of a segment must add up to less than
+            2^62.
         searches: int64 [S, 8].
         sums: int64 [S, DIGITS].
         listed: int32 [1 + P].
@@ -43,7 +44,7 @@ class MassCut(NamedTuple):
 
     @classmethod
     def begin(cls, weights: Tensor, segments: Tensor, owners: Tensor, ids: Tensor, count: int) -> MassCut:
-        """Prepare a search in `count` segments."""
+        """Allocate a search over `count` segments; the arguments are those of `items`."""
         return cls(
             (weights, segments, owners, ids),
             weights.new_zeros(count, _SEARCH_NUMBERS),
@@ -53,7 +54,7 @@ class MassCut(NamedTuple):
         )
 
     def take_steps(self, share: tuple[int, int], first: int, last: int) -> None:
-        """Take the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9.
+        """Run the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9.
 
         Raises:
             RuntimeError: wrong shapes, dtypes or numbers.
@@ -63,7 +64,7 @@ class MassCut(NamedTuple):
         )
 
     def has_ties(self) -> bool:
-        """Tell, when the rounds for weights are done, whether ids have to decide; waits for the device."""
+        """Tell, at `TIES_STEP`, whether ids must decide between equal weights; waits for the device."""
         return bool(self.searches[:, _MISSING_ID].any())
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fused L1 and SSIM of rendered views, differentiable in the renders."""
+"""Computes L1 and SSIM of rendered views in one kernel, differentiable in the renders."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def ssim(renders: Tensor, targets: Tensor, masks: Tensor | None = None) -> Tenso
 
 
 def pixel_counts(renders: Tensor, masks: Tensor | None = None) -> Tensor:
-    """Return the number of values each view's means are over: 3 x its unmasked pixels, [B], float."""
+    """Return how many values each view's means average: 3 x its unmasked pixels, [B], float."""
     if masks is None:
         views, height, width = renders.shape[:3]
         return renders.new_full((views,), 3.0 * height * width)
@@ -104,10 +104,10 @@ def photometric_fwd_bwd(
     visible: Tensor | None = None,
     scale_weight: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return `photometric_sums` and the gradient of their weighted total in one go, without autograd.
+    """Return the sums of `photometric_sums` and the gradient of their weighted total, without autograd.
 
-    The sums come in parts, which `blitzgs.ops.report` adds up: nothing in a step waits for that. The gradient
-    is that of `photometric_sums`, but only the owned pixels of it are defined.
+    The sums are returned as K partial sums; `blitzgs.ops.report` adds them up later, off the critical path of
+    a step. The gradient equals that of `photometric_sums`, but it is defined only at the owned pixels.
 
     For the loss of `photometric_loss`, summed over views: ``l1_weights = 1 - w``, ``ssim_weights = -w`` and
     ``samples = pixel_counts(renders, masks)``.
@@ -121,9 +121,10 @@ def photometric_fwd_bwd(
         tile_size: as in `photometric_sums`.
         tile_begin: as in `photometric_sums`.
         tile_end: as in `photometric_sums`.
-        samples: [B], what the weights are divided by, dtype of `renders`; None: 1.
-        visible: int64 [B], Gaussians that each view shows.
-        scale_weight: of the smallest axis of a Gaussian that a view shows, summed over those, in the mean.
+        samples: [B], divisors of the weights, dtype of `renders`; None: 1.
+        visible: int64 [B], number of Gaussians visible in each view.
+        scale_weight: weight of L_scale, a view's mean smallest axis of its visible Gaussians; only used to
+            return the weight of a single Gaussian's axis.
 
     Returns:
         (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,

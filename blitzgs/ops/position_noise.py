@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise on the means of almost transparent Gaussians, so that they look for a place where they are needed."""
+"""Adds random noise to the means of almost transparent Gaussians (3DGS-MCMC)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ def position_noise_(
     threshold: float,
     strength: float,
 ) -> None:
-    """Move each listed Gaussian at random along its own axes, in place; the less opaque, the farther.
+    """Add noise to the means of the listed Gaussians, in place; more transparent Gaussians move farther.
 
     ``means += strength * sigmoid(100 (threshold - opacity)) * Sigma n`` with the covariance Sigma and n
-    standard normal (Kheradmand et al. 2024, eq. 8 and 9). The draws depend on (id, seed, step) alone.
+    standard normal (3DGS-MCMC, Kheradmand et al. 2024, eq. 8 and 9). The draws depend on (id, seed, step)
+    alone.
 
     Args:
         means: [N, 3], float32 (CPU also float64).
@@ -37,9 +38,9 @@ def position_noise_(
         opacities: [N], logits.
         ids: int64 [N], persistent.
         visible_ids: int32 [U], the rows to move, each once.
-        seed: of the run.
-        step: of the optimiser; another step draws other numbers.
-        threshold: opacity at which half of the noise is left, in [0, 1].
+        seed: seed of the run.
+        step: optimiser step; each step draws other numbers.
+        threshold: opacity at which the noise falls to a half, in [0, 1].
         strength: inverse length in the unit of the means.
 
     Raises:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projection, intersection and compositing of one call, queued together without waiting in between."""
+"""Queues projection, intersection and compositing of one call without waiting for the device in between."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, capacity_f
 
 
 class Rendered(NamedTuple):
-    """What the ops returned; attributes are theirs."""
+    """The outputs of the three ops; see each op for its fields."""
 
     splats: ProjectedSplats
     isect_splats: Tensor
@@ -30,17 +30,18 @@ def render_queued(
     backward_follows: bool,
     sizes: Sizes | None = None,
 ) -> Rendered:
-    """Render without gradients, for ops that are then given the result to differentiate it.
+    """Render without gradients; the differentiable ops take this result instead of computing it again.
 
-    Where calls of this size were made before, the host learns how many splats there are when all is queued,
-    while the GPU works.
+    If earlier calls had the same size, the host queues all work first and reads the number of splats while
+    the GPU works.
 
     Args:
-        inputs: of `project_splats`.
-        channels: what is composited of the splats, [P, D], whatever their number P; their counts are None.
+        inputs: inputs of `project_splats`.
+        channels: returns the values to composite, [P, D], from P splats. P may exceed the number of valid
+            splats, and `counts` of these splats is None.
         backgrounds: [B, D] or None.
         backward_follows: see the op `rasterize_fwd`.
-        sizes: what is needed, if that is known; None: as much as calls of this size needed before.
+        sizes: the needed sizes, if they are known; None: estimate them from earlier calls of this size.
     """
     options = inputs.options
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a step reports to the host, written in one launch: the loss's sums and the costs of tiles."""
+"""Writes what a step reports to the host, the loss's sums and the tiles' costs, in one kernel launch."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def report_(
     n_ranks: int,
     targets: Sequence[Tensor],
 ) -> None:
-    """Write one rank's report into all targets: the sums of all ranks [M, 2, B], then the tiles' work.
+    """Write this rank's part of the report into all targets.
 
-    Only this rank's part of each target is written.
+    A target has the loss sums of the M ranks, [M, 2, B], and then the work of the T tiles.
 
     Args:
         parts: float64 [B, K, 2], of `blitzgs.ops.photometric.photometric_fwd_bwd`; None: no views.
         tile_work: int32 [T], of `rasterize_fwd`; None: no tiles.
         tiles: this rank's [first, one past last).
-        rank: whose report it is.
+        rank: this rank.
         n_ranks: M.
-        targets: float32 [2 M B + T] each, on this device or in memory of other devices that it can reach.
+        targets: float32 [2 M B + T] each, on this device or in peer-accessible memory of other devices.
 
     Raises:
         RuntimeError: wrong shapes or dtypes.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of a table in the memory of the host: which some views may see, and their way to a pool and back."""
+"""Finds the blocks of a host table that views may see, and moves them to and from a pool on the GPU."""
 
 from __future__ import annotations
 
@@ -53,17 +53,17 @@ def swap_blocks_(
 ) -> None:
     """Move blocks of 256 rows between slots of a pool and a table in the memory of the host, in place.
 
-    Slot `slots[i]` gives what it holds to block `leaving[i]` of the table and takes block `coming[i]`. Both
-    happen at once, so that on CUDA both directions of the bus are in use. All slots, leaving and coming
-    blocks differ, and no block leaves and comes; none of this is checked.
+    The contents of slot `slots[i]` are written to block `leaving[i]` of the table, and block `coming[i]` is
+    read into the slot. One kernel does both at once, so that on CUDA it uses both directions of the bus. All
+    slots must differ, and so must all leaving and coming blocks together; none of this is checked.
 
     Args:
         pool: columns [P, ...].
         table: the same columns [N, ...] in the memory of the host; pinned where the pool is on a GPU.
-        n_written: how many columns, from the first, are written back; the others never change.
+        n_written: only the first `n_written` columns are written back; the others never change on the device.
         slots: int32 [M], on the device of the pool.
-        leaving: int32 [M], likewise; -1: what the slot holds is dropped.
-        coming: int32 [M], likewise; -1: the slot keeps what it holds.
+        leaving: int32 [M], on the same device; -1: the slot's contents are discarded.
+        coming: int32 [M], on the same device; -1: nothing is read into the slot.
 
     Raises:
         RuntimeError: columns that differ in dtype or in the shape of a row, are not contiguous or too many,

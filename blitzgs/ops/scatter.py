@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats, as columns of any dtype, to several ranks, and sums of what comes back."""
+"""Packs splats by destination rank, unpacks received ones, and sums the values that return for each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RUN = 32
 def scatter_splats(
     columns: Sequence[Tensor], masks: Tensor, group_sizes: Sequence[int]
 ) -> tuple[Tensor, Tensor]:
-    """Copy splats into one group per rank.
+    """Copy each splat into the groups of the ranks that it is sent to.
 
     Args:
         columns: [P, ...] each, of any dtype of 2, 4 or 8 bytes; at most 8. Splats of an odd number of 2-byte
@@ -41,7 +41,7 @@ def scatter_splats(
 
 
 def gather_splats(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[int]) -> list[Tensor]:
-    """Take groups apart that `scatter_splats` put together.
+    """Unpack groups that `scatter_splats` packed into columns.
 
     Args:
         packed: int32 [words], groups one after the other.
@@ -62,14 +62,15 @@ def gather_splats(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[
 def sum_splats(
     values: Tensor, places: Tensor, group_sizes: Sequence[int], splats: int, widths: Sequence[int]
 ) -> list[Tensor]:
-    """Add up what came back for each splat, in the order of ranks.
+    """Sum, for each splat, the values that the ranks returned for it, in the order of the ranks.
 
     Args:
-        values: [sum(group_sizes), F], float32 (CPU also float64): splats where `scatter_splats` put them.
+        values: [sum(group_sizes), F], float32 (CPU also float64), in the order in which `scatter_splats`
+            packed them.
         places: from `scatter_splats`.
         group_sizes: as for `scatter_splats`.
         splats: P.
-        widths: of the columns that the F values are; they add up to F.
+        widths: widths of the columns that the F values consist of; they add up to F.
 
     Returns:
         [P, width] each; zero for splats that went nowhere. Deterministic.
@@ -81,12 +82,12 @@ def sum_splats(
 
 
 def runs_of(splats: int) -> int:
-    """Entries of `places` for each rank."""
+    """Return the number of entries of `places` for each rank."""
     return -(-splats // RUN)
 
 
 def words_per_splat(column: Tensor) -> int:
-    """32-bit words that a splat of a column takes."""
+    """Return how many 32-bit words one splat takes in a column."""
     return -(-math.prod(column.shape[1:]) * column.element_size() // 4)
 
 
@@ -96,7 +97,8 @@ def words_of(column: Tensor) -> Tensor:
     if flat.element_size() == 2 and flat.shape[1] % 2:
         flat = torch.nn.functional.pad(flat, (0, 1))
     if flat.stride() != (flat.shape[1], 1):
-        # Stricter than `contiguous`, as viewing dtypes is: even a single splat needs its own stride.
+        # Viewing another dtype needs more than `contiguous`: the strides must be exact even for a single
+        # splat.
         flat = flat.clone(memory_format=torch.contiguous_format)
     return flat.view(torch.int32)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse gradients of tables: some rows, each once. Torch forgets that, and would sort them to make sure."""
+"""Sparse gradients whose rows are unique, without torch's sort that would make sure of it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import torch
 from torch import Tensor
 from torch.multiprocessing.reductions import StorageWeakRef
 
-# Where the indices of the latest gradients lie. Autograd hands a first gradient's indices on as they are, but
-# not the mark that each is there once; those of a sum of gradients lie elsewhere.
+# Storages of the indices of the latest gradients. Autograd passes the indices tensor of a first gradient on
+# unchanged but loses the mark that it is coalesced (each index once). A sum of gradients has an indices
+# tensor of its own.
 _distinct: deque[StorageWeakRef] = deque(maxlen=32)
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
-    """Return a table that is zero but for some rows, as a sparse tensor.
+    """Return a sparse tensor of a table in which only the given rows are not zero.
 
     Args:
         ids: int32 or int64 [U], ascending, each once.
         values: the rows, [U, ...].
-        shape: of the table.
+        shape: shape of the table.
     """
     indices = ids.long()[None]
     _distinct.append(StorageWeakRef(indices.untyped_storage()))
@@ -31,7 +32,7 @@ def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
     """Return the indices int64 [U] and values [U, ...] of a sparse tensor, each index once.
 
     Args:
-        table: sparse in its first dimension alone.
+        table: a tensor whose only sparse dimension is the first.
     """
     if not table.is_coalesced():
         here = table._indices().untyped_storage()._cdata

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gradients of projected splats, in the forms in which they go from compositing to the projection."""
+"""Gradients of projected splats, in the three layouts in which compositing hands them to the projection."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def absolute_column(packed: Tensor) -> Tensor:
 
 
 def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
-    """Return the table that columns are `gradient_columns` of; None: they are not of one table."""
+    """Return the table of which `columns` are the `gradient_columns`; None if they are not of one table."""
     table = None if columns[0] is None else columns[0]._base
     if table is None or table.dim() != 2 or table.shape[1] != SPLAT_GRADIENT or not table.is_contiguous():
         return None
@@ -57,13 +57,13 @@ class SplatGradients(NamedTuple):
     Attributes:
         parts: columns (v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]); or (CUDA) one
             table [P, 12]; or, with `places`, this rank's part of such a table at each of the M ranks that
-            composited splats, in memory that they share. A splat's gradient is then the sum over the ranks,
-            in their order.
-        places: int64 [ceil(P / 32), M], where each splat is among those that a rank had of this one, as
+            composited splats, in memory that the ranks share. A splat's gradient is then the sum over the
+            ranks, in their order.
+        places: int64 [ceil(P / 32), M], the position of each splat in each rank's part of the table, as
             `scatter_splats` returns it. Such gradients are valid until the next frame, or the next backward
             pass of this one.
-        means2d_abs: sums over pixels of the absolute gradients of means2d, [P, 2]; None: they were not asked
-            for, or are at several ranks.
+        means2d_abs: sums over pixels of the absolute gradients of means2d, [P, 2]; None: they were not
+            requested, or their parts are at several ranks.
     """
 
     parts: Sequence[Tensor]
@@ -72,7 +72,7 @@ class SplatGradients(NamedTuple):
 
     @property
     def means2d(self) -> Tensor | None:
-        """The gradient of means2d, [P, 2] per pixel; None: it is at several ranks."""
+        """The gradient of means2d, [P, 2] per pixel; None if its parts are at several ranks."""
         return None if self.places is not None else columns_of(self.parts)[0]
 
 
@@ -82,17 +82,18 @@ def columns_of(parts: Sequence[Tensor]) -> Sequence[Tensor]:
 
 
 class GradientBuffer:
-    """Where the backward pass adds up the gradients of splats on CUDA: zeros that the forward pass wrote.
+    """Memory in which the CUDA backward pass sums the gradients of splats; the forward pass has zeroed it.
 
-    They are good for one backward pass; later ones get others.
+    It serves one backward pass; each later one gets other memory.
     """
 
     def __init__(self, zeros: Tensor | None, others: Callable[[], Tensor | None] | None = None) -> None:
-        """Keep the zeros.
+        """Take over the zeroed memory.
 
         Args:
-            zeros: [P or more, 12], the last output of `rasterize_fwd`, or none, [0, 12] or None.
-            others: makes others; None, or where it returns None: they are allocated.
+            zeros: [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None if there is none.
+            others: returns zeroed memory for later backward passes. If it is None or returns None, memory is
+                allocated instead.
         """
         self._zeros, self._others = zeros, others
 

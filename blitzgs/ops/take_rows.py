@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A new column of a table, made of old and new rows."""
+"""Gathers rows of a column and of new rows behind it into a new column."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 
 @torch.no_grad()
 def take_rows(column: Tensor, rows: Tensor, fresh: Tensor | None = None) -> Tensor:
-    """Return the rows `rows` of a column that is followed by new rows.
+    """Return the rows `rows` of the concatenation of a column and new rows.
 
-    The result is that of `index_select` on both. Torch's op is slower, because it gives each row of a
-    multiple of 16 bytes a whole block of threads.
+    The result equals `torch.cat([column, fresh]).index_select(0, rows)`. Torch's `index_select` is slower,
+    because it uses a whole block of threads for each row whose size is a multiple of 16 bytes.
 
     Args:
         column: [N, ...], any dtype.
         rows: int64 [N'], from 0 to N + M - 1; not checked.
-        fresh: new rows [M, ...], like those of `column`; None: zeros.
+        fresh: new rows [M, ...], of the dtype and row shape of `column`; None: rows of zeros.
 
     Returns:
         [N', ...].

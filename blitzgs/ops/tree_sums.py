@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gradient-boosted trees, evaluated in integers."""
+"""Evaluates gradient-boosted trees with integer sums."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 
 @torch.no_grad()
 def tree_sums(features: Tensor, roots: Tensor, nodes: Tensor, leaves: Tensor, depth: int) -> Tensor:
-    """Sum the leaves that each row of features reaches.
+    """Return, for each row of features, the sum of the leaf values that it reaches in all trees.
 
     Args:
         features: float32 [M, F], F <= 32; NaN: unknown.
@@ -20,7 +20,7 @@ def tree_sums(features: Tensor, roots: Tensor, nodes: Tensor, leaves: Tensor, de
             of the feature that is compared, plus 1 where NaN goes left; the left child, -1 for a leaf; and
             the right one. Children and features must be in range: the kernel does not check them.
         leaves: int64 [n]; read at leaves.
-        depth: no path has more comparisons.
+        depth: largest number of comparisons on a path from a root to a leaf.
 
     Returns:
         int64 [M], the same bits on every device.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The view level: what views leave out of an active set before projection."""
+"""The view level: removes (row, view) pairs from an active set before projection."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from blitzgs.ops.blocks import ActiveRows, GateRules
 
 @torch.no_grad()
 def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: GateRules) -> None:
-    """Clear, in `active.views`, the bits of the pairs that B views leave out. The rows stay listed.
+    """Clear the bits of `active.views` for the (row, view) pairs that B views leave out; no row is removed.
 
     Args:
         active: rows of the table; their views are changed in place.
         means: float32 [N, 3], of which the listed rows are caught up.
         viewmats: float32 [B, 4, 4], rigid, world to camera, B <= 32.
-        rules: what is left out.
+        rules: which rows each view leaves out.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, more than 32 views, no level, finer levels that reach farther,

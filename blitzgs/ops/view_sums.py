@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an importance sweep keeps of a batch of views: scores, counts and the cull matrix."""
+"""Accumulates what an importance sweep needs from each batch of views: scores, counts and the cull matrix."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# How often a weight is divided by the root of its pixels.
+# How many times a weight is divided by the square root of its number of pixels, for each score rule.
 DIVISIONS = {"weight": 0, "root": 1, "density": 2}
 
 
@@ -20,8 +20,8 @@ class ViewSums(NamedTuple):
 
     Attributes:
         score: int64 [N].
-        seen: int32 [N], views in which the Gaussian has a radius.
-        counted: int32 [N], those in which it counts.
+        seen: int32 [N], number of views in which the Gaussian is visible (radius > 0).
+        counted: int32 [N], number of views in which it counts (it is in the top 99 % of the view's weight).
         cull: int32 [N, words], bit v % 32 of word v / 32 set where it does not count in view v.
     """
 
@@ -44,10 +44,10 @@ def view_sums_(
     eps: float,
     unit: float,
 ) -> None:
-    """Add the splats of at most 32 views.
+    """Add the splats of at most 32 views to the sums.
 
-    A splat adds ``round(w / (pixels + eps)^p / unit)`` to its Gaussian's score, where w is its weight in ones
-    and p is 1 for "density", 1/2 for "root" and 0 for "weight" (paper §3.2).
+    A splat adds ``round(w / (pixels + eps)^p / unit)`` to its Gaussian's score, where w is its weight (in
+    units of 1) and p is 1 for "density" (BlitzGS, section 3.2), 1/2 for "root" and 0 for "weight".
 
     Args:
         sums: changed in place.
@@ -55,11 +55,11 @@ def view_sums_(
             splats of each), camera_ids int32 [P], radii int32 [P, 2].
         weights: int64 [P], in units of 2^-32.
         pixels: int32 [P].
-        counts: bool [P].
-        columns: of the cull matrix, one for each view.
-        rule: of the score.
-        eps: added to the pixels.
-        unit: of the score; a power of two leaves the quotient exact.
+        counts: bool [P], whether the Gaussian counts in the splat's view.
+        columns: the views' columns in the cull matrix.
+        rule: score rule, a key of `DIVISIONS`.
+        eps: added to the number of pixels.
+        unit: unit of the score; division by a power of two is exact.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, too many views, or a column outside the matrix.

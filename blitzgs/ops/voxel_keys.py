@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voxel keys: the cell of each point in a regular grid, as one sortable integer."""
+"""Computes, for each point, its cell in a regular grid as one sortable integer."""
 
 from __future__ import annotations
 
