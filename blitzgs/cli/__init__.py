@@ -23,7 +23,8 @@ from blitzgs.training.guard import ModelLostError, NonFiniteError
 from blitzgs.view.host_table import HostMemoryError
 from blitzgs.view.residence import ResidenceError
 
-# What a user can cause and mend: reported as a message. Anything else is ours and keeps its traceback.
+# Errors that a user can cause and correct: they are reported as a message. Any other error is a fault of the
+# program and keeps its traceback.
 USER_ERRORS = (
     ValueError,
     OSError,
@@ -41,7 +42,7 @@ USER_ERRORS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status (1: failed, 2: wrong usage, 130: Ctrl-C)."""
-    # A file name may hold bytes that are no UTF-8: they are printed escaped.
+    # File names may contain bytes that are not UTF-8; print them escaped.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     parser = _parser()
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = " (configuration fields are written --section.field=value)" if args.command == "train" else ""
         args.parser.error(f"unrecognized arguments: {' '.join(rest)}{hint}")
     args.overrides = rest
-    # A warning of ours is about the user's data, not about the line of code that noticed.
+    # Our warnings are about the user's data, so they are shown without the line of code that raised them.
     warnings.formatwarning = lambda message, *_, **__: f"blitzgs {args.command}: warning: {message}\n"
     try:
         status: int = args.run(args)
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _message(error: Exception) -> str:
-    """The error's text; for one of the operating system, the file and what is wrong with it."""
+    """Return the error's text; for an error of the operating system, the file and the reason."""
     if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
         return str(error)
     if isinstance(error, FileExistsError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands' parsers have in common."""
+"""Arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ def add_command(
 
 
 def named_path(text: str) -> Path:
-    """Read a path that must not be empty: `--out "$UNSET"` would otherwise mean the folder one is in."""
+    """Return a path; refuse an empty one, because `--out "$UNSET"` would mean the current folder."""
     if not text:
         raise argparse.ArgumentTypeError("the path is empty")
     return Path(text)
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
-    """Add the folder of a run."""
+    """Add the argument RUN, the folder of a run."""
     parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a run")
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
-    """Add where the capture of a run is now."""
+    """Add the flag --data, the present folder of a run's capture."""
     parser.add_argument("--data", metavar="DIR", help="where the capture is now (default: where it was)")
 
 
 def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> None:
-    """Add the choice of a device."""
+    """Add the flag --device and, if `shares_gpus`, --share-gpus."""
     parser.add_argument(
         "--device", default="auto", help="auto (a GPU when there is one), cpu, cuda or cuda:N (%(default)s)"
     )
     if shares_gpus:
         parser.add_argument(
-            "--share-gpus", action="store_true", help="with torchrun: let ranks share too few GPUs (slow)"
+            "--share-gpus", action="store_true", help="with torchrun: let several ranks use one GPU (slow)"
         )

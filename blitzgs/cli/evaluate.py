@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs eval`."""
+"""The command `blitzgs eval`: measure the held-out views of a run."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs export`."""
+"""The command `blitzgs export`: write the model of a run as PLY."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ HELP = """\
 Write the model of a run as a PLY file in INRIA's layout, which most viewers read.
 
 Georeferenced models are written around their own origin, because the file's float32 numbers cannot hold large
-coordinates; the offset is in the header (`comment offset X Y Z`) and in FILE.offset.json.
+coordinates. The offset is in the header (`comment offset X Y Z`) and in FILE.offset.json.
 
-A model trained with view.lod has all its Gaussians in the file, and most viewers show them all. Their octree
-levels are the property `level`, behind the others. The line
+The file of a model trained with view.lod has all its Gaussians, and most viewers show them all. The last
+property, `level`, is their octree level. The line
 `comment lod reference_distance D fork F levels K finest L` tells a viewer what a view keeps: level l up to
-the distance D * F^(1/2 - l), none beyond L, level 0 everywhere.
+the distance D * F^(1/2 - l), no level above L, and level 0 at any distance.
 
 A model trained with model.antialiased is marked `comment SplatRenderMode: mip`. For a viewer that does not
 know the mark, --classic bakes the compensation into the opacities as far as that is possible.
@@ -39,8 +39,8 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "--coordinates",
         choices=COORDINATES,
         default="auto",
-        help="the capture's coordinates, or those around the model's origin; auto: the former where float32 "
-        "holds them (%(default)s)",
+        help="the capture's coordinates, or centred ones around the model's origin; auto: the capture's if "
+        "float32 can hold them (%(default)s)",
     )
     parser.add_argument(
         "--classic", action="store_true", help="for viewers without antialiasing: bake what can be baked"
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _explain(exported: Exported, antialiased: bool, args: argparse.Namespace) -> None:
-    """Say what a viewer has to know."""
+    """Print what a user of the file must know: offset, rounding, antialiasing."""
     if exported.offset is not None:
         x, y, z = exported.offset
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {exported.sidecar} says")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs gate fit | evaluate | replay`."""
+"""The command `blitzgs gate`: fit, sample, evaluate and replay spawn gates."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from blitzgs.training.inputs import open_capture
 from blitzgs.training.schedule import Schedule
 
 HELP = """\
-The spawn gate: a predictor, fitted on the lineage of finished runs, that withholds candidates of
-densification which are not going to survive.
+The spawn gate: a predictor, fitted on the lineage of finished runs, that withholds densification candidates
+whose children would probably not survive.
 
   blitzgs train ... --population.lineage=true       log births and deaths (for each scene)
-  blitzgs gate fit RUN RUN RUN --out gate.json      fit on them; figures of scenes left out
+  blitzgs gate fit RUN RUN RUN --out gate.json      fit on them; prints figures for scenes left out
   blitzgs gate sample RUN --out NAME.parquet        a run's lineage in one small file, to fit elsewhere
   blitzgs gate evaluate gate.json RUN --out DIR     judge it on a scene that it has not seen
   blitzgs gate replay gate.json RUN --out DIR       compare it with an oracle and with chance
@@ -55,7 +55,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     again.add_argument("gate", type=gate_file, metavar="GATE", help="model file, or default")
     again.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
     again.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a run for each veto")
-    again.add_argument("--rate", type=float, default=0.6, help="share that is vetoed (%(default)s)")
+    again.add_argument("--rate", type=float, default=0.6, help="share to veto (%(default)s)")
     add_capture(again)
     add_device(again)
 
@@ -140,13 +140,13 @@ def _lineage(folder: Path) -> Path:
     """Return where the lineage of a finished run lies.
 
     Raises:
-        ValueError: the run is not finished, so that what is alive has not survived yet.
+        ValueError: the run is not finished, so it is not known which Gaussians survive.
     """
     lineage = folder / run_folder.LINEAGE
     if lineage.is_dir() and not (folder / run_folder.SUMMARY).exists():
         raise ValueError(
-            f"{folder} is not finished (it has no {run_folder.SUMMARY}): what is alive in the middle of a "
-            "run need not survive; finish it with blitzgs train ... --resume"
+            f"{folder} is not finished (it has no {run_folder.SUMMARY}), so it is not known which Gaussians "
+            "survive; finish it with blitzgs train ... --resume"
         )
     return lineage
 
@@ -159,7 +159,7 @@ def _judgement(entry: dict[str, Any]) -> str:
 
 
 def _table(results: Sequence[dict[str, Any]]) -> str:
-    """Return the arms as a Markdown table, against the first."""
+    """Return a Markdown table of the arms, with differences from the first."""
     first = results[0]
     lines = ["| arm | PSNR | difference | SSIM | peak | difference | final | s | known |", "|---" * 9 + "|"]
     for row in results:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs render`."""
+"""The command `blitzgs render`: render the views of a run to files."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         scene = model.scene(ranks.device)
         owners, lod = TileOwners(ranks), scene_gate(model.config, model.progress, model.table, ranks)
         output = OutputFolder(args.out, stored.inputs)
-        # Of all views, so that a view's file has the same name whichever split is rendered.
+        # Names for all views, so that a view's file has the same name whichever split is rendered.
         paths = output.paths([camera.name for camera in cameras], ".npy" if args.raw else ".png")
         args.out.mkdir(parents=True, exist_ok=True)
         with image_progress("Rendering", ranks.rank == 0) as report:
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _cameras(args: argparse.Namespace, model: run_folder.TrainedModel, ranks: Ranks) -> RunCameras:
-    """The cameras that the run has stored; those of the capture where one is given or none are stored."""
+    """Return the cameras of the given capture; without one, those that the run stored, else its capture's."""
     if args.data is None and (args.folder / CAMERAS).exists():
         return load_cameras(args.folder)
     capture, images = open_capture(model.config, ranks)

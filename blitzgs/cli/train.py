@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs train`."""
+"""The command `blitzgs train`: train a model of a capture."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ the resolved configuration and stops. With --minutes=M the run measures its spee
 
 RUN gets config.yaml, cameras.json, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. A
 checkpoint is written every 10 minutes (log.checkpoint_seconds) and when the run is interrupted (Ctrl-C,
-SIGTERM or SIGHUP); the same command with --resume continues from the newest, or starts anew and says so where
-there is none.
+SIGTERM or SIGHUP). The same command with --resume continues from the newest checkpoint; without any
+checkpoint it starts a new run and says so.
 
 Several processes share the work with torchrun --nproc-per-node=M train.py (the same flags). With --resume and
 --max-restarts=K, a job that loses a process continues from its last checkpoint.
@@ -101,7 +101,7 @@ def _config(args: argparse.Namespace) -> Config:
     )
     config = load_config(source, overrides)
     if args.data is not None:
-        # Not by way of YAML, which knows only some of the characters that a path may have.
+        # Set the path directly: YAML does not allow all characters that a path may have.
         config = dataclasses.replace(
             config, data=dataclasses.replace(config.data, path=os.path.realpath(args.data))
         )
@@ -110,7 +110,7 @@ def _config(args: argparse.Namespace) -> Config:
 
 def _print_summary(summary: dict[str, object], folder: Path) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
-    # A path as it is: brackets and colons in it mean nothing.
+    # Print the path verbatim: rich must not interpret brackets and colons in it.
     console.print(str(folder), markup=False, highlight=False, soft_wrap=True)
     if summary.get("split") == "train":
         console.print("no view is held out: the figures are those of the training views", style="yellow")

@@ -4,8 +4,8 @@
 The INRIA layout is binary little endian, every property a float32 in this order: x y z nx ny nz f_dc_0..2
 f_rest_0.. opacity scale_0..2 rot_0..3. f_rest is channel-major: all coefficients of red, then green, then
 blue. Values are pre-activation (log scales, logit opacities, unnormalised quaternions w x y z). A model whose
-views leave out Gaussians by their octree levels has one property more, `level`, behind the others. A file in
-this layout that is read and written again is the same, byte for byte.
+views leave out Gaussians by their octree levels has one further property, `level`, at the end. Reading a file
+of this layout and writing it again gives the same bytes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class GaussianPly:
     sh: Tensor
     """[N, K, 3], K = (degree + 1)^2; coefficient 0 is the DC."""
     normals: Tensor
-    """[N, 3]; not used by anything, kept for the round trip."""
+    """[N, 3]; not used, kept so that a file can be written again unchanged."""
     comments: list[str]
     """Header lines "comment ..." and "obj_info ..."."""
     levels: Tensor | None = None
@@ -128,7 +128,7 @@ def write_ply(
 
     Raises:
         ValueError: shapes disagree.
-        OSError: the file cannot be written, or `path` is no regular file; what was there is still there.
+        OSError: the file cannot be written, or `path` is no regular file; an existing file is unchanged.
     """
     n, k = len(means), sh.shape[1] if sh.ndim == 3 else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optimisers of `torch.optim`'s kind for Gaussians."""
+"""Optimisers for Gaussians with the interface of `torch.optim`."""
 
 from blitzgs.optim.lazy_adam import LazyAdam
 

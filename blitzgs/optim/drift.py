@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a parameter's rows owe for steps without a gradient, where learning rates are known step by step."""
+"""Tables of the steps that rows without a gradient missed; learning rates become known step by step."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ from blitzgs.ops.lazy_adam import explicit_steps, table_without_rates
 # csrc/lazy_adam/lazy_adam.h: a row has 4 orders of 6 groups, then powers and corrections. A parameter that
 # is stepped alone takes the place of SH, whose first three values have a group and the rest another.
 _ORDERS, _GROUPS, _OWN = 4, 6, (4, 5)
-# Steps that the tables hold. Then all rows settle and the tables begin anew, so that they do not grow.
+# Number of steps that the tables hold. When they are full, all rows are brought up to date and the tables
+# begin again, so that they do not grow.
 CAPACITY = 4096
 
 
 class Drift:
-    """The tables of one parameter for the op, from the step at which they began to that taken last.
+    """The tables of one parameter that the op takes, for the steps from `begin` to the latest one.
 
-    The drift of a row from step p to step s is a sum over the steps between, so each step adds its term to
-    the rows of the steps before: as many as matter, after which the moments have decayed below rounding.
-    Steps are counted from `begin` in the tables, and in the columns that say where rows stand.
+    A row without a gradient moves between step p and step s by a sum over the steps between them. Each new
+    step therefore adds its term to the table rows of earlier steps; those before the last `reach` steps need
+    no term, because moments of that age have decayed below rounding. Steps are counted from `begin`, in the
+    tables and in the optimiser's columns of steps.
 
     Attributes:
         begin: the step at which the tables begin.
         table: float64 [CAPACITY + 1, 30], see csrc/lazy_adam/lazy_adam.h.
         lr_table: float32 [CAPACITY + 1, 6].
-        reach: for how many steps a row without a gradient moves.
+        reach: number of steps for which a row without a gradient still moves.
     """
 
     def __init__(
         self, betas: tuple[float, float], dtype: torch.dtype, device: torch.device, begin: int
     ) -> None:
-        """Start without any step.
+        """Begin with empty tables.
 
         Args:
             betas: decay rates of the moments.
-            dtype: of the parameter.
-            device: likewise.
-            begin: steps that were taken before; all rows stand there.
+            dtype: dtype of the parameter.
+            device: device of the parameter.
+            begin: number of steps taken before; all rows must be up to date with it.
 
         Raises:
             ValueError: decay rates outside their range.
@@ -55,11 +57,11 @@ class Drift:
         self.restart(begin)
 
     def restart(self, begin: int) -> None:
-        """Begin anew at a step at which all rows and their moments stand."""
+        """Empty the tables at step `begin`, with which all rows and their moments must be up to date."""
         self.begin = begin
         table = table_without_rates(len(self.lr_table), *self.betas, begin)
         first, second = table[:, 28], table[:, 29]
-        # What a step adds to the steps before it, for a learning rate of 1.
+        # The terms that a step with learning rate 1 adds to the rows of earlier steps.
         shares = torch.stack([first * second ** (order - 1) for order in range(_ORDERS)], dim=1)
         shares[0] = 0
         self._shares = shares.to(self.lr_table.device)[:, :, None]
@@ -71,12 +73,12 @@ class Drift:
         return step - self.begin >= len(self.lr_table) - 1
 
     def add(self, step: int, lr: float, lr_rest: float) -> None:
-        """Take note of a step; queues a few small kernels and copies nothing to the device.
+        """Add a step to the tables; this queues a few small kernels and copies nothing to the device.
 
         Args:
-            step: its number, from 1.
+            step: number of the step, from 1.
             lr: learning rate of the first three values of a row.
-            lr_rest: of the others.
+            lr_rest: learning rate of the other values.
         """
         place = step - self.begin
         first = max(0, place - self.reach)

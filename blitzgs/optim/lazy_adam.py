@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam for parameters of which each step gives a gradient to some rows: as cheap as these, exact for all."""
+"""Dense Adam for parameters of which each step gives a gradient to few rows; its cost follows these rows."""
 
 from __future__ import annotations
 
@@ -13,20 +13,22 @@ from torch.nn import Parameter
 from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
 
-# Of the state of a parameter: the step that its rows' parameters, and their moments, stand at, counted from
-# `Drift.begin`.
+# Entries of a parameter's state: the step up to which each row's values, and its moments, are current,
+# counted from `Drift.begin`.
 _STEPS = ("last_step", "moment_step")
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class LazyAdam(torch.optim.Optimizer):
-    """`torch.optim.Adam` for tables of rows, at the cost of the rows that have a gradient.
+    """`torch.optim.Adam` for tables of rows, whose cost follows the rows that have a gradient.
 
-    A sparse gradient (`rasterization(..., sparse_grad=True)`) counts as zero in the rows it does not have.
-    Those rows are left behind: `catch_up` brings them, in closed form and whatever the number of steps, to
-    where `torch.optim.Adam` has them (csrc/lazy_adam/lazy_adam.h). It has to be called before they are read:
-    before a view is rendered, before a strategy looks at the parameters, and before evaluation. A dense
-    gradient has all rows, and the step is plain Adam's.
+    Rows that are missing in a sparse gradient (`rasterization(..., sparse_grad=True)`) have the gradient
+    zero. `step` does not touch them, so they fall behind. `catch_up` applies the steps that they missed, in
+    closed form whatever their number, and gives them the values of `torch.optim.Adam` to rounding
+    (csrc/lazy_adam/lazy_adam.h). Call it
+    before the parameters are read: before a view is rendered, before a strategy reads the parameters, and
+        before
+    evaluation. With a dense gradient, `step` is a step of plain Adam.
 
     Parameters are [N, ...], contiguous, float32, or float64 on the CPU. Learning rates are rounded to
     float32. A parameter of SH coefficients may give its first coefficient (three values a row) another
@@ -61,9 +63,10 @@ class LazyAdam(torch.optim.Optimizer):
             eps: added to the root of the second moment.
 
         Raises:
-            ValueError: an option outside its range.
+            ValueError: an option is outside its range.
         """
-        # By places of group and parameter: strategies replace parameters and rework all else of their state.
+        # Keyed by the indices of group and parameter, because strategies replace the parameters and their
+        # state.
         self._drifts: dict[tuple[int, int], Drift] = {}
         super().__init__(params, {"lr": lr, "lr_rest": None, "betas": betas, "eps": eps})
 
@@ -80,13 +83,13 @@ class LazyAdam(torch.optim.Optimizer):
         """Take a step for the rows that have a gradient, which first catch up with the step before.
 
         Args:
-            closure: computes the loss anew.
+            closure: computes the loss again and returns it.
 
         Returns:
             What the closure returned.
 
         Raises:
-            ValueError: a parameter or its state is not as the class says.
+            ValueError: a parameter, its gradient or its state has a form that the class does not support.
         """
         loss = None
         if closure is not None:
@@ -131,13 +134,14 @@ class LazyAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def catch_up(self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None) -> None:
-        """Bring rows that had no gradient of late to where Adam has them, to be read.
+        """Apply the steps that rows missed, so that the parameters can be read.
 
-        Costs a look at the steps the rows stand at, and work for those that are behind and still move.
+        The cost is one reading of the rows' step numbers, and work for the rows that are behind and still
+        move.
 
         Args:
-            params: which of the parameters; None: all.
-            rows: int32 [A], which of their rows, each once; None: all.
+            params: the parameters to update; None: all.
+            rows: int32 [A], the rows to update, each once; None: all.
         """
         chosen = None if params is None else {id(param) for param in params}
         for place, group, param in self._placed():
@@ -158,7 +162,7 @@ class LazyAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Bring all rows and their moments to where `torch.optim.Adam` has them."""
+        """Bring all rows and their moments up to date; afterwards the state is that of `torch.optim.Adam`."""
         for place, group, param in self._placed():
             if self.state.get(param):
                 self._settle_one(group, param, self._state_of(param), self._drift_of(place, group, param))
@@ -175,7 +179,7 @@ class LazyAdam(torch.optim.Optimizer):
             state[name].fill_(place)
 
     def state_dict(self) -> dict[str, Any]:
-        """Settle all rows and return the state as `torch.optim.Adam` has it: step, exp_avg, exp_avg_sq."""
+        """Bring all rows up to date and return the state of `torch.optim.Adam`: step, exp_avg, exp_avg_sq."""
         self.settle()
         packed = super().state_dict()
         packed["state"] = {
@@ -185,7 +189,9 @@ class LazyAdam(torch.optim.Optimizer):
         return packed
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over a state of this class or of `torch.optim.Adam`; parameters as they were then.
+        """Load a state of this class or of `torch.optim.Adam`.
+
+        The parameters must have the values that they had when the state was saved.
 
         Raises:
             ValueError: the state does not fit, or is of an Adam with weight decay, AMSGrad or maximize.
@@ -209,10 +215,10 @@ class LazyAdam(torch.optim.Optimizer):
             rows: [M, ...] for the `name` of every group.
 
         Returns:
-            The new parameters by name, which take the place of the old ones here.
+            The new parameters by name. They replace the old ones in this optimiser.
 
         Raises:
-            ValueError: names or shapes that do not fit.
+            ValueError: names or shapes do not fit.
         """
         named = self._named()
         if rows.keys() != named.keys():
@@ -231,13 +237,13 @@ class LazyAdam(torch.optim.Optimizer):
         return self._renew(named, grow, grow_state)
 
     def keep(self, mask: Tensor) -> dict[str, Parameter]:
-        """Keep the rows where `mask`, bool [N], is true; returns as `append`."""
+        """Keep the rows where `mask`, bool [N], is true; return the new parameters as `append` does."""
         if mask.dtype != torch.bool:
             raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
         return self.permute(mask.nonzero()[:, 0])
 
     def permute(self, order: Tensor) -> dict[str, Parameter]:
-        """Reorder rows: row i becomes the old row `order[i]`, int64 [N'], each at most once; as `append`."""
+        """Make row i the old row `order[i]` (int64 [N'], each at most once); return as `append` does."""
         return self._renew(self._named(), lambda _, old: old[order], lambda old: old[order])
 
     @torch.no_grad()
@@ -275,13 +281,13 @@ class LazyAdam(torch.optim.Optimizer):
         return named  # type: ignore[return-value]
 
     def _placed(self) -> Iterator[tuple[tuple[int, int], dict[str, Any], Tensor]]:
-        """Iterate over parameters with their places and groups."""
+        """Iterate over all parameters with their indices (group, parameter) and their groups."""
         for g, group in enumerate(self.param_groups):
             for p, param in enumerate(group["params"]):
                 yield (g, p), group, param
 
     def _drift_of(self, place: tuple[int, int], group: dict[str, Any], param: Tensor) -> Drift:
-        """Return the drift of the rows of the parameter at a place, made on first use."""
+        """Return the `Drift` of the parameter at these indices; make it on first use."""
         betas = tuple(group["betas"])
         drift = self._drifts.get(place)
         if drift is None:
@@ -292,7 +298,7 @@ class LazyAdam(torch.optim.Optimizer):
         return drift
 
     def _state_of(self, param: Tensor) -> dict[str, Any]:
-        """Return the state of a parameter, made on first use, mended where a strategy has added rows."""
+        """Return the state of a parameter; make it on first use, and correct a strategy's dtypes."""
         state: dict[str, Any] = self.state[param]
         if not param.is_contiguous():
             raise ValueError(
@@ -304,7 +310,7 @@ class LazyAdam(torch.optim.Optimizer):
             steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
             state.update({name: steps.clone() for name in _STEPS})
         for name in _STEPS:
-            # gsplat's strategies append zeros in float, which is right for rows whose moments are zero.
+            # gsplat's strategies append float zeros. The value is right for rows whose moments are zero.
             if state[name].dtype != torch.int32:
                 state[name] = state[name].int()
         for name in (*_MOMENTS, *_STEPS):
@@ -320,7 +326,7 @@ def _check_group(group: dict[str, Any]) -> None:
     """Check the options of a group.
 
     Raises:
-        ValueError: one outside its range, or an option of `torch.optim.Adam` that there is not here.
+        ValueError: an option is outside its range, or is one of `torch.optim.Adam` that is not supported.
     """
     beta1, beta2 = group["betas"]
     if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 * beta1 < beta2):
@@ -334,7 +340,7 @@ def _check_group(group: dict[str, Any]) -> None:
 
 
 def _alone(param: Tensor, state: dict[str, Any]) -> tuple[list[Tensor], ...]:
-    """Return a parameter and its moments as the op takes tables: as SH, without the other columns."""
+    """Return a parameter and its moments as the op's SH column, with all its other columns empty."""
     nothing = param.new_empty(len(param), 0)
     tensors = (param.detach(), *(state[name] for name in _MOMENTS))
     return tuple([nothing] * 4 + [values] for values in tensors)

@@ -19,7 +19,7 @@ class Composite:
 
     values: Tensor  # [H, W, D]
     transmittances: Tensor  # [H, W]: what reaches the background
-    cut: Tensor  # bool [H, W]: a decision here falls within the tolerance, so rounding may change it
+    cut: Tensor  # bool [H, W]: a comparison here is within the tolerance, so rounding may change its outcome
 
 
 def composite(

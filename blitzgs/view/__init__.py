@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which Gaussians a view needs."""
+"""The view level: which Gaussians a view needs, and where they are in memory."""

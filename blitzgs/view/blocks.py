@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work follows the active set: the rows of a table that a batch of views may see."""
+"""The active set: the rows of a table that a batch of views may see, found from the bounds of blocks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from blitzgs.ops.blocks import (
 def morton_order(means: Tensor) -> Tensor:
     """Return the permutation (int64 [N]) that puts neighbours in space next to each other.
 
-    Rows on the same spot of the curve keep their order; rows that are not finite come last.
+    Rows with the same Morton key keep their order; rows that are not finite come last.
 
     Args:
         means: float32 [N, 3].
@@ -30,19 +30,20 @@ def morton_order(means: Tensor) -> Tensor:
 
 
 class BlockIndex:
-    """Bounds of blocks of 256 consecutive rows of one table, kept up to date while an optimiser moves them.
+    """Bounds of blocks of 256 consecutive rows of one table, updated as an optimiser moves rows.
 
-    Build a new index whenever rows were added, removed or reordered; sort the table by `morton_order` first,
-    or blocks are large and save no work (the active set is right in any order).
+    Build a new index whenever rows were added, removed or reordered. Sort the table by `morton_order` first:
+        the
+    active set is right in any order, but in a random order blocks are large and no block is skipped.
     """
 
     def __init__(self, table: GaussianTable, schedule: Tensor | None = None) -> None:
-        """Bound every block of the table.
+        """Compute the bounds of every block of the table.
 
         Args:
             table: the rows.
-            schedule: of the lazy optimiser, from `blitzgs.ops.lazy_adam.schedule_table`, when steps may be
-                pending; None: rows do not move by themselves.
+            schedule: table of the lazy optimiser's schedule, from `blitzgs.ops.lazy_adam.schedule_table`, if
+                rows may have pending steps; None: they have none.
         """
         self._schedule = schedule
         count = -(-len(table) // BLOCK_ROWS)
@@ -52,14 +53,14 @@ class BlockIndex:
 
     @classmethod
     def of_bounds(cls, bounds: Tensor, level_ranges: Tensor, schedule: Tensor | None) -> BlockIndex:
-        """Return an index of blocks whose `bounds` and `level_ranges` are known."""
+        """Make an index from `bounds` and `level_ranges` that are known already."""
         index = cls.__new__(cls)
         index._schedule, index._bounds, index._level_ranges = schedule, bounds, level_ranges
         return index
 
     @property
     def bounds(self) -> Tensor:
-        """What holds all places and sizes of each block's rows, float32 [blocks, 8]; see `cull_blocks`."""
+        """The bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout."""
         return self._bounds
 
     @property
@@ -80,10 +81,10 @@ class BlockIndex:
         rules: GateRules | None = None,
         room: int | None = None,
     ) -> ActiveRows:
-        """Return the rows that the views may see, and the views of each.
+        """Return the rows that the views may see, and for each row the views that may see it.
 
-        The result depends on each row's own state alone, neither on the order of the rows nor on how they are
-        divided among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
+        Whether a row is in the result depends on that row alone, not on the order of the rows or on their
+        division among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
         """
         pending = self._pending(table)
         return cull_blocks(
@@ -92,9 +93,9 @@ class BlockIndex:
         )  # fmt: skip
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:
-        """Take note that the optimiser stepped the rows `ids` (int32 [U]; None: any row may have changed).
+        """Recompute the bounds after an optimiser step of the rows `ids` (int32 [U]; None: of any rows).
 
-        Catching up needs no update, because the bounds contain the whole drift of rows that are behind.
+        No update is needed after `catch_up`, because the bounds contain all movement by pending steps.
         """
         update_block_bounds_(self._bounds, ids, table["means"], table["scales"], self._pending(table))
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a view leaves out before projection: the LOD gate (paper Eq. 1 and 2) and the cull mask (Eq. 5).
+"""Leaves Gaussians out of views before projection: LOD gate (BlitzGS Eq. 1 and 2) and cull mask (Eq. 5).
 
-The gate belongs to the model: it depends on distances alone, so training, evaluation and rendering apply it
-alike. The mask belongs to the training views, which alone have columns in it.
+The gate is part of the model: it depends only on distances, so training, evaluation and rendering all apply
+it. The mask exists only for training views.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.view.levels import farthest
 
-# Gaussians by which the share that a view keeps is predicted: its standard error is 0.4 % at most.
+# Number of sampled Gaussians that predict the share that a view keeps; the standard error is at most 0.4 %.
 SAMPLE = 16_384
-# Sets the draws of the sample apart from others of the same ids.
+# Key of the sample's random draws, so that they differ from other draws for the same ids.
 _SAMPLE_KEY = 0x1EAF
-# Distances in memory at once.
+# Largest number of distances that are in memory at once.
 _MOST_DISTANCES = 1 << 24
 
 
 @dataclass(frozen=True)
 class LodGate:
-    """The distances up to which views keep the Gaussians of each level.
+    """The LOD gate: the distance up to which views keep the Gaussians of each octree level.
 
     Attributes:
         reference_distance: d_0, in the unit of the means.
         fork: f, ratio of neighbouring levels.
         count: number of levels K.
-        finest: the finest level that is kept at all, L_max in 0..K - 1.
-        smooth: opacities fade out over half a level around these distances, a quarter to each side.
+        finest: the finest level that views keep, L_max in 0..K - 1.
+        smooth: opacities fade out over half a level, centred at these distances, instead of being cut off.
     """
 
     reference_distance: float
@@ -47,17 +47,17 @@ class LodGate:
     smooth: bool = False
 
     def reach(self) -> list[float]:
-        """Return the distance up to which each of the K levels is kept; -1: nowhere."""
+        """Return for each of the K levels the distance up to which views keep it; -1: no view keeps it."""
         longer = self.fork**0.25 if self.smooth else 1.0
         distances = (farthest(level, self.reference_distance, self.fork) for level in range(self.finest + 1))
         kept = [longer * distance for distance in distances]
         return kept + [-1.0] * (self.count - len(kept))
 
     def fade(self) -> tuple[float, ...]:
-        """Return what the projection fades opacities by; empty: they do not fade.
+        """Return the numbers by which the projection fades opacities; empty: they do not fade.
 
-        With r the reach of its level, the opacity of a Gaussian at distance d has the weight
-        clamp((1 - d^2 / r^2) f / (f - 1), 0, 1): it is whole up to r / sqrt(f), and gone at r.
+        Let r be the reach of a Gaussian's level and d its distance from the camera. Its opacity is multiplied
+        by clamp((1 - d^2 / r^2) f / (f - 1), 0, 1), which is 1 up to r / sqrt(f) and 0 from r on.
 
         Returns:
             f / (f - 1), then `reach`.
@@ -65,12 +65,12 @@ class LodGate:
         return (self.fork / (self.fork - 1), *self.reach()) if self.smooth else ()
 
     def weights(self, means: Tensor, level: Tensor, centre: Tensor) -> Tensor:
-        """Return the weights of `fade` that a camera gives the opacities of Gaussians, float64 [N].
+        """Return the factors of `fade` for the opacities of Gaussians in one view, float64 [N].
 
         Args:
             means: [N, 3].
             level: uint8 [N].
-            centre: of the camera, float64 [3].
+            centre: position of the camera, float64 [3].
         """
         slope, *reach = self.fade()
         reaches = torch.tensor(reach, dtype=torch.float64, device=means.device)
@@ -81,12 +81,12 @@ class LodGate:
 
 @dataclass(frozen=True)
 class ViewGate:
-    """What the views of one batch leave out.
+    """LOD gate and cull mask of the views of one batch.
 
     Attributes:
         reach: `LodGate.reach`.
         lod_views: bit v is set when view v has an LOD gate.
-        columns: of the cull matrix, one for each view; empty: no view has a mask.
+        columns: the views' columns in the cull matrix; empty: no view has a mask.
     """
 
     reach: Sequence[float]
@@ -94,26 +94,26 @@ class ViewGate:
     columns: Sequence[int] = ()
 
     def rules(self, table: GaussianTable) -> GateRules:
-        """Return what the views leave out of a table, as the ops take it."""
+        """Return the rules for a table, as the ops take them."""
         return GateRules(table["level"], list(self.reach), self.lod_views, table.cull, list(self.columns))
 
 
 class SceneGate:
-    """The LOD gate of a model, without the views for which it would leave out too little to pay.
+    """The LOD gate of a model, applied only to views for which it leaves out enough Gaussians to pay.
 
-    What a view would keep is predicted from a sample of the Gaussians of all ranks, drawn by their ids: the
-    prediction does not depend on the number of ranks. Views that would keep at least `most_kept` of all have
-    no gate.
+    A sample of the Gaussians of all ranks, drawn by their ids, predicts the share that each view would keep;
+    the prediction does not depend on the number of ranks. A view that would keep at least `most_kept` of all
+    Gaussians is rendered without the gate.
 
     Attributes:
         gate: the distances.
-        most_kept: that share.
+        most_kept: share of all Gaussians from which on a view has no gate.
     """
 
     def __init__(self, gate: LodGate, most_kept: float, table: GaussianTable, ranks: Ranks) -> None:
         """Draw the sample. Collective: every rank calls this with its share of the Gaussians, caught up."""
         self.gate, self.most_kept, self._ranks = gate, most_kept, ranks
-        device = ranks.device  # which need not be that of the table
+        device = ranks.device  # the table may be on another device
         count = int(ranks.all_reduce(torch.tensor([len(table)], device=device)).item())
         chosen = uniform(table["id"], _SAMPLE_KEY) < SAMPLE / max(count, 1)
         reach = torch.tensor(gate.reach(), dtype=torch.float64, device=device)
@@ -122,10 +122,10 @@ class SceneGate:
         self._size = int(ranks.all_reduce(torch.tensor(len(level), device=device)).item())
 
     def kept(self, centres: Tensor) -> list[float]:
-        """Predict the share of all Gaussians that views keep. Collective.
+        """Predict the share of all Gaussians that each view keeps. Collective.
 
         Args:
-            centres: of the cameras, float64 [V, 3].
+            centres: positions of the cameras, float64 [V, 3].
         """
         counts = torch.zeros(len(centres), dtype=torch.int64, device=self._means.device)
         length = max(1, _MOST_DISTANCES // max(1, len(self._means)))
@@ -137,7 +137,7 @@ class SceneGate:
         return (counts.double() / max(1, self._size)).tolist()
 
     def active(self, table: GaussianTable, viewmats: Tensor) -> ActiveRows | None:
-        """Return the rows that each of some views keeps; None: all of them all. Collective.
+        """Return the rows that each of B views keeps; None if every view keeps every row. Collective.
 
         Args:
             table: this rank's Gaussians, caught up.
@@ -146,7 +146,7 @@ class SceneGate:
         return self._gated(table["means"], table["level"], viewmats)
 
     def rows(self, means: Tensor, level: Tensor, viewmat: Tensor) -> Tensor:
-        """Return which of a single process's Gaussians a view keeps, bool [N].
+        """Return which Gaussians a view keeps, bool [N]; only for a single process.
 
         Args:
             means: float32 [N, 3].
@@ -157,7 +157,7 @@ class SceneGate:
         return torch.ones_like(level, dtype=torch.bool) if active is None else active.views != 0
 
     def rules(self, level: Tensor, viewmats: Tensor) -> GateRules | None:
-        """Return what some views leave out of rows with these levels; None: nothing. Collective."""
+        """Return the rules of B views for these levels; None if no view leaves a row out. Collective."""
         shares = self.kept(centres_of(viewmats))
         lod_views = lod_bits([share < self.most_kept for share in shares])
         return None if lod_views == 0 else GateRules(level, self.gate.reach(), lod_views)
@@ -172,18 +172,18 @@ class SceneGate:
 
 
 def lod_bits(gated: Sequence[bool]) -> int:
-    """Return the bits of the views that have an LOD gate."""
+    """Return an integer whose bit v is set if `gated[v]`."""
     return sum(1 << view for view, has_gate in enumerate(gated) if has_gate)
 
 
 def centres_of(viewmats: Tensor) -> Tensor:
-    """Return where cameras of rigid poses [V, 4, 4] are, float64 [V, 3]."""
+    """Return the camera positions of rigid poses [V, 4, 4], float64 [V, 3]."""
     poses = viewmats.double()
     return -(poses[:, :3, :3].mT @ poses[:, :3, 3:]).squeeze(2)
 
 
 def _all_rows(count: int, views: int, device: torch.device) -> ActiveRows:
-    """Return the set in which each of some views may see every row."""
+    """Return the active set in which every view may see every row."""
     bits = (1 << views) - 1
     return ActiveRows(
         torch.arange(count, dtype=torch.int32, device=device),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A table in the memory of the host, where a GPU can reach its columns."""
+"""A table of Gaussians in host memory, whose columns a GPU can read and write."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from torch import Tensor
 
 from blitzgs.model import GaussianTable
 
-# Room for so many times the rows that there are, so that a growing table is not moved each time.
+# Memory is allocated for this many times the present rows, so that a growing table is rarely moved.
 _ROOM = 1.25
 _MEMORY = Path("/proc/meminfo")
 
 
 class HostMemoryError(RuntimeError):
-    """The host has too little memory for the table; names the sizes and what to do."""
+    """The host has too little memory for the table; the message names the sizes and a remedy."""
 
 
 class HostTable(GaussianTable):
-    """Columns in memory that stays where it is while rows come and go, pinned where a GPU reads it.
+    """Columns in host memory that is reused while rows are added and removed; pinned if a GPU reads it.
 
-    To pin memory takes longer than to fill it, so new columns are copied into the room of the old ones.
+    Pinning memory takes longer than filling it, so a changed column is copied into the memory of the old one.
     """
 
     def __init__(self, columns: dict[str, Tensor], pinned: bool) -> None:
-        """Move the given columns into memory of the table's own, one by one.
+        """Move the given columns, one by one, into memory that the table owns.
 
         Args:
-            columns: as for `GaussianTable`, on the CPU; left empty.
-            pinned: whether a GPU will read and write them.
+            columns: as for `GaussianTable`, on the CPU; the dictionary is emptied.
+            pinned: whether a GPU will read and write the columns.
 
         Raises:
-            HostMemoryError: they do not fit.
+            HostMemoryError: the columns do not fit into the host's memory.
         """
         super().__init__(columns)
         self._pinned = pinned
@@ -56,7 +56,7 @@ class HostTable(GaussianTable):
             and room.shape[1:] == tensor.shape[1:]
             and len(room) >= len(tensor)
         ):
-            # The old room goes first: the host need not have space for both.
+            # Free the old memory first, so that the host never holds both.
             self._rooms.pop(name, None)
             self.columns[name] = tensor
             del room
@@ -65,7 +65,7 @@ class HostTable(GaussianTable):
 
 
 def available_bytes() -> int | None:
-    """Return how much memory the host can still give without swapping; None: it does not say."""
+    """Return how many bytes the host can allocate without swapping; None if the system does not tell."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         for line in _MEMORY.read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -74,7 +74,7 @@ def available_bytes() -> int | None:
 
 
 def _new_room(like: Tensor, pinned: bool) -> Tensor:
-    """Return memory for `_ROOM` times the rows of a tensor, on pages of its own."""
+    """Allocate memory for `_ROOM` times the rows of a tensor, on separate pages."""
     rows = max(1, int(_ROOM * len(like)))
     size = rows * like.element_size() * math.prod(like.shape[1:])
     available = available_bytes()
@@ -84,7 +84,7 @@ def _new_room(like: Tensor, pinned: bool) -> Tensor:
             f"has {available / 1e9:.2f} GB left: use more memory or hosts, or cap population.max_gaussians"
         )
     pages = mmap.mmap(-1, max(1, size), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    for advice in ("MADV_HUGEPAGE", "MADV_DONTFORK"):  # fewer pages to pin, none of which a fork takes away
+    for advice in ("MADV_HUGEPAGE", "MADV_DONTFORK"):  # fewer pages to pin; a fork must not copy them
         with contextlib.suppress(AttributeError, OSError):
             pages.madvise(getattr(mmap, advice))
     view = memoryview(pages)
@@ -102,5 +102,5 @@ def _new_room(like: Tensor, pinned: bool) -> Tensor:
 
 
 def _unpin(address: int, _pages: mmap.mmap) -> None:
-    """Unpin memory when its last tensor has gone. Its pages are an argument, so they are unmapped later."""
+    """Unpin memory after its last tensor is deleted. Holding `_pages` keeps them mapped until then."""
     torch.cuda.cudart().cudaHostUnregister(address)

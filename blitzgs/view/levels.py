@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Octree levels: how fine a Gaussian may be to be resolvable from a distance (paper Eq. 1)."""
+"""Octree levels: which level of detail is resolvable from which distance (BlitzGS Eq. 1)."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Voxel keys hold 21 bits per axis; with the levels of `measure_levels` the finest grid of this many levels
-# uses them all.
+# Voxel keys have 21 bits per axis. With this many levels, the finest grid of `measure_levels` uses all of
+# them.
 MAX_LEVELS = 22
 
 
 @dataclass(frozen=True)
 class Levels:
-    """The levels of a scene: level l is for distances around `reference_distance` / `fork`^l.
+    """The octree levels of a scene: level l is meant for distances around `reference_distance` / `fork`^l.
 
     Attributes:
         count: number of levels K.
         fork: ratio f of neighbouring levels.
-        reference_distance: d_0, in the scene's unit; the distance that level 0 is made for.
+        reference_distance: d_0, the distance that level 0 is meant for, in the scene's unit.
         voxel_size: edge of a level-0 voxel, in the scene's unit.
     """
 
@@ -42,8 +42,8 @@ class Levels:
 def farthest(level: int, reference_distance: float, fork: float) -> float:
     """Return the largest distance from which a level is resolvable, in the unit of `reference_distance`.
 
-    Eq. 1 rounds log_f(d_0 / d) to the nearest integer, which reaches l up to d = d_0 f^(1/2 - l). Level 0 is
-    resolvable from any distance.
+    BlitzGS Eq. 1 rounds log_f(d_0 / d) to the nearest integer, so level l is resolvable up to
+    d = d_0 f^(1/2 - l). Level 0 is resolvable from any distance.
 
     Args:
         level: l.

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Beyond the memory of a GPU: which blocks of a table in the memory of the host are on the device, and when.
+"""Training beyond the memory of a GPU: keeps the blocks that views need in a pool on the device.
 
-A `Residence` keeps a pool on the device, a smaller table with the same columns, in whose slots blocks of 256
-rows of the host's table live for a while. Nothing about a row depends on its place, so the ops work on the
-pool as they would on the table, and give the same result.
+The whole table is in host memory. A `Residence` has a pool on the device: a smaller table with the same
+columns, whose slots hold blocks of 256 rows of the host's table for a while. No result depends on a row's
+position, so the ops work on the pool as they would on the table.
 
 The order of the training views is known. Before a step begins, the bounds of all blocks, which stay on the
-device, are tested against the views of that step and of the next ones (`seen_blocks`). While the step runs,
-the blocks that the next step sees take the slots of blocks that are needed farthest in the future, on a
-stream of their own. The bounds of a block change only when a step moves its rows, and blocks of the present
-step keep their slots until it has ended; so what was found before the step is still right after it. Where
-both steps together do not fit, the next one waits for the rest of its blocks.
+device, are tested against the views of that step and of the next ones (`seen_blocks`). While the step runs, a
+second stream loads the blocks that the next step sees into the slots of the blocks that are needed last. The
+bounds of a block change only when a step moves its rows, and the blocks of the present step keep their slots
+until it has ended. The result of the test is therefore still right after the step. If the blocks of both
+steps do not fit together, the next step loads its remaining blocks when it begins.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostTable
 from blitzgs.view.sight import Cameras, Sight, culled_blocks
 
-# What steps change, and what is therefore written back.
+# Columns that steps change and that are therefore written back to the host.
 _WRITTEN = (
     *PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step", "grad_sum", "grad_count", "max_radii",
 )  # fmt: skip
@@ -38,18 +38,18 @@ _FREE = -1
 
 
 class ResidenceError(RuntimeError):
-    """What views see does not fit into the pool; names the sizes and what to do."""
+    """The blocks that views see do not fit into the pool; the message names the sizes and a remedy."""
 
 
 class Traffic(NamedTuple):
-    """What moved between host and device.
+    """Counts of what moved between host and device.
 
     Attributes:
-        steps: of training.
-        needed: blocks that views saw.
-        loaded: blocks that came because views see them.
-        bytes_in: that came, for whatever reason.
-        bytes_out: that went back.
+        steps: training steps.
+        needed: blocks that the views of these steps see.
+        loaded: blocks that were copied to the device because views see them.
+        bytes_in: bytes copied to the device, for any reason.
+        bytes_out: bytes written back to the host.
     """
 
     steps: int = 0
@@ -59,11 +59,11 @@ class Traffic(NamedTuple):
     bytes_out: int = 0
 
     def since(self, earlier: Traffic) -> Traffic:
-        """Return what moved since an earlier count."""
+        """Return the difference from an earlier count."""
         return Traffic(*(now - then for now, then in zip(self, earlier, strict=True)))
 
     def values(self) -> dict[str, float]:
-        """Return the share of blocks that were there already, and megabytes a step, for a log."""
+        """Return, for the log, the share of needed blocks that were on the device, and megabytes per step."""
         return {
             "resident_hits": max(0.0, 1.0 - self.loaded / max(1, self.needed)),
             "moved_mb_per_step": (self.bytes_in + self.bytes_out) / 1e6 / max(1, self.steps),
@@ -71,25 +71,26 @@ class Traffic(NamedTuple):
 
 
 class Residence:
-    """A pool on the device for blocks of a table in the memory of the host.
+    """A pool on the device for blocks of a table in host memory.
 
-    Between `bring` and `collect` the table on the host is out of date; `collect` empties the pool.
+    Between `bring` and `collect` the table on the host is out of date; `collect` writes back and empties the
+    pool.
 
     Attributes:
-        table: on the host.
-        pool: on the device; its rows that are in no block of `bring`'s index mean nothing.
-        traffic: so far.
+        table: the table on the host.
+        pool: the table on the device; rows outside the blocks of `bring`'s index are undefined.
+        traffic: counts since the beginning.
     """
 
     def __init__(
         self, table: HostTable, device: torch.device, budget_bytes: int, schedule: Tensor | None
     ) -> None:
-        """Make a pool.
+        """Allocate the pool.
 
         Args:
-            table: on the host, pinned where `device` is a GPU.
-            device: of the pool.
-            budget_bytes: memory that the pool may take.
+            table: the table on the host; pinned if `device` is a GPU.
+            device: device of the pool.
+            budget_bytes: bytes of the device that the pool may take.
             schedule: as for `BlockIndex`, on the device.
 
         Raises:
@@ -97,7 +98,7 @@ class Residence:
         """
         self.table, self._device, self._budget = table, device, budget_bytes
         self.traffic = Traffic()
-        # First in line for multiprocessors: it needs few of them, and the next step waits for it.
+        # High priority: its kernels need few multiprocessors, and the next step waits for them.
         self._stream = torch.cuda.Stream(device, priority=-1) if device.type == "cuda" else None
         self._storage: dict[str, Tensor] = {}
         self.pool = self._pool_of({name: column[:0] for name, column in table.columns.items()}, 0)
@@ -107,13 +108,13 @@ class Residence:
     # --- The pool -----------------------------------------------------------------------------------------
 
     def reindex(self, schedule: Tensor | None) -> None:
-        """Take note that rows of the table were added, removed or reordered, or that the schedule changed."""
+        """Rebuild the index after rows were added, removed or reordered, or the schedule changed."""
         self.collect()
         self._schedule = schedule
         self._blocks, self._rest = divmod(len(self.table), BLOCK_ROWS)
         self._make_pool()
         index = BlockIndex(self.table, None if schedule is None else schedule.cpu())
-        # The last entry is that of slots without a block: a box that no view sees.
+        # The last entry is used for slots without a block: a box that no view sees.
         nothing = torch.full((1, 8), torch.finfo(torch.float32).max)
         nothing[:, 3:6] *= -1
         nothing[:, 6:] = 0
@@ -124,7 +125,7 @@ class Residence:
         self._culled = None if cull is None else culled_blocks(cull[: self._blocks]).to(self._device)
 
     def _make_pool(self) -> None:
-        """Make room for as many blocks as the budget has; a block of fewer than 256 rows has its own slot."""
+        """Allocate as many slots as the budget allows; a last, partial block has its own slot."""
         table = self.table
         names = [*_WRITTEN, *(name for name in table if name not in _WRITTEN)]
         sizes = {name: BLOCK_ROWS * table.row_bytes[name] for name in names}
@@ -140,7 +141,7 @@ class Residence:
         rows = slots * BLOCK_ROWS + self._rest
         room = (slots + has_rest) * BLOCK_ROWS
         if any(not _fits(self._storage.get(name), table.columns[name], room) for name in names):
-            # The old pool goes before the new one comes.
+            # Free the old pool before allocating the new one.
             self.pool.columns.clear()
             self._storage.clear()
             self._storage = {
@@ -157,17 +158,17 @@ class Residence:
 
     @staticmethod
     def _pool_of(columns: Mapping[str, Tensor], rows: int) -> GaussianTable:
-        """Return a table of the first rows of columns, as tables store them."""
+        """Return a table of the first `rows` rows of columns in their stored form."""
         pool = GaussianTable({name: column[:rows] for name, column in columns.items() if name != CULL})
         if CULL in columns:
             pool.columns[CULL] = columns[CULL][: -(-rows // BLOCK_ROWS) * BLOCK_ROWS]
         return pool
 
     def _open(self) -> None:
-        """Begin to use the pool: the last, partial block comes to stay."""
+        """Begin to use the pool: load the last, partial block, which stays."""
         if not self._is_open and self._rest:
             for name, column in self.pool.columns.items():
-                # The mask of the last block is as long as that of any.
+                # The mask of the last block has the length of a full block.
                 count = BLOCK_ROWS if name == CULL else self._rest
                 column[-count:].copy_(self.table.columns[name][-count:])
         self._is_open = True
@@ -185,10 +186,10 @@ class Residence:
         self._is_open, self._rest_changed, self._ready_for = False, False, None
 
     def catch_up(self, function: Callable[[GaussianTable], None]) -> None:
-        """Bring every block through the pool and change its rows there.
+        """Load every block of the table into the pool, one part after the other, and change its rows there.
 
         Args:
-            function: changes a pool in place; some rows come twice.
+            function: changes the pool in place, and must tolerate that some rows are passed to it twice.
         """
         self.collect()
         self._open()
@@ -205,34 +206,35 @@ class Residence:
     # --- Blocks for views ---------------------------------------------------------------------------------
 
     def bring(self, step: int, cameras: Cameras, batch_size: int) -> BlockIndex:
-        """Have the blocks that the views of a step see in the pool.
+        """Load the blocks that the views of a step see into the pool.
 
         Args:
-            step: its number.
-            cameras: views of the step and of those that follow, in their order, at most 32.
-            batch_size: views of a step.
+            step: number of the step.
+            cameras: views of this step and of the following steps, in order, at most 32.
+            batch_size: views per step.
 
         Returns:
-            Where the pool's blocks are. It changes with the step, and `note` takes it back.
+            The index of the pool's blocks. The step updates its bounds; pass it to `note` afterwards.
 
         Raises:
-            ResidenceError: they do not fit.
+            ResidenceError: the blocks do not fit into the pool.
         """
         self._open()
         self._begun = self._mark()
         self._sight = Sight(self._bounds[: self._blocks], cameras, batch_size, self._culled)
         if self._ready_for != step:
-            # They have not come ahead, or not all of them.
+            # `prefetch` has not loaded all of them.
             self._load(self._sight.by(0), self._begun, required=True)
         self._ready_for = None
         self._wait()
         return self._index()
 
     def prefetch(self, step: int) -> None:
-        """While the step of `bring` runs, load the blocks of the next one, `step`.
+        """Load the blocks of the next step, number `step`, while the step of `bring` runs.
 
-        The host has waited for the step's number of splats by now, so its active set has been found: until
-        then the masks of blocks that they leave out wholly are read, whose slots may be given away here.
+        Call this after the host has waited for the running step's number of splats. Its active set is then
+        complete. Before that, the device may still read the cull masks of blocks that the step leaves out as
+        a whole, and this method may reuse their slots.
         """
         now = self._sight.by(0)
         slots = self._slot_of[now.nonzero()[0]]
@@ -243,16 +245,17 @@ class Residence:
         self._is_changed[slots] = True
         self._rest_changed = self._rest > 0
         self._count(steps=1, needed=len(slots))
-        # Batches of more than half of what can be looked at together show no more than the present one.
+        # If a batch has more than half of the 32 views that are tested together, only the present batch is
+        # known.
         if self._sight.batches > 1 and self._load(self._sight.by(1), self._begun, kept=now):
             self._ready_for = step
 
     def note(self, index: BlockIndex) -> None:
-        """Take back what `bring` returned, after a step has moved rows."""
+        """Store the bounds of the index that `bring` returned, after a step has moved rows."""
         self._bounds[self._places] = index.bounds
 
     def visit(self, cameras: Cameras) -> BlockIndex:
-        """Have the blocks that some views see in the pool, to look at them; as `bring`."""
+        """Load the blocks that views see, for rendering without a training step; otherwise as `bring`."""
         self._open()
         self._ready_for = None
         self._sight = Sight(self._bounds[: self._blocks], cameras, len(cameras.viewmats))
@@ -263,7 +266,7 @@ class Residence:
         return self._index()
 
     def rows_of(self, rows: Tensor) -> Tensor:
-        """Return the rows of the table that are in rows of the pool, both int32."""
+        """Map rows of the pool to rows of the table, both int32."""
         blocks = self._places[rows.long() // BLOCK_ROWS].int()
         return blocks * BLOCK_ROWS + rows % BLOCK_ROWS
 
@@ -284,7 +287,7 @@ class Residence:
         kept: npt.NDArray[np.bool_] | None = None,
         required: bool = False,
     ) -> bool:
-        """Let blocks come, as many as there is room for; return whether all are there or on their way."""
+        """Start to load as many blocks as fit; return whether that is all of the wanted blocks."""
         missing = (wanted & (self._slot_of < 0)).nonzero()[0]
         free = (self._block_in < 0).nonzero()[0]
         if len(missing) > len(free):
@@ -308,7 +311,7 @@ class Residence:
         )
 
     def _first_to_go(self, slots: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
-        """Choose slots whose blocks are needed last, and among equals those that were needed longest ago."""
+        """Choose the slots whose blocks are needed last; among equals, those that were used longest ago."""
         if len(slots) <= count:
             return slots
         rank = self._sight.next_use(self._block_in[slots]) * (self._clock + 1) - self._last_use[slots]
@@ -322,7 +325,7 @@ class Residence:
         coming: npt.NDArray[np.int64],
         after: torch.cuda.Event | None,
     ) -> None:
-        """Let blocks come into slots, whose own blocks go back; -1: none comes. Queued behind an event."""
+        """Queue a swap behind an event: write the slots' blocks back and load `coming`; -1: load none."""
         if len(slots) == 0:
             return
         old, is_changed = self._block_in[slots], self._is_changed[slots]
@@ -350,11 +353,11 @@ class Residence:
         self.traffic = self.traffic._replace(**counts)
 
     def _mark(self) -> torch.cuda.Event | None:
-        """Return an event behind all that is queued for the device by now; None on the CPU."""
+        """Record an event after all work queued so far; None on the CPU."""
         return None if self._stream is None else torch.cuda.current_stream(self._device).record_event()
 
     def _wait(self) -> None:
-        """Let the device's work wait for the moves."""
+        """Make the current stream wait for the swaps."""
         if self._stream is not None:
             torch.cuda.current_stream(self._device).wait_stream(self._stream)
 

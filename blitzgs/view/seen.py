@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What views see of a model, wherever its table is."""
+"""Finds what views see of a model, whether its table is on the device or on the host."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from blitzgs.view.gate import SceneGate
 from blitzgs.view.residence import Residence
 from blitzgs.view.sight import Cameras
 
-# What views are rendered from: a table on their device, or one on the host with its pool.
+# The Gaussians that views are rendered from: a table on the device, or a table on the host with its pool.
 Scene = GaussianTable | Residence
 
 
 class Seen(NamedTuple):
-    """What some views see.
+    """The Gaussians to render for a batch of views.
 
     Attributes:
-        table: on the device of the views.
-        active: its rows to render, and the views of each; None: all.
-        rows_of: tells which rows of the model some rows of `table` are, both int32.
+        table: a table on the device of the views.
+        active: rows of `table` to render, and the views of each; None: all rows in all views.
+        rows_of: maps rows of `table` to rows of the model, both int32.
     """
 
     table: GaussianTable
@@ -35,7 +35,7 @@ class Seen(NamedTuple):
 
 
 def table_of(scene: Scene) -> GaussianTable:
-    """Return all Gaussians of a scene on this rank."""
+    """Return the table of all of this rank's Gaussians in a scene."""
     return scene.table if isinstance(scene, Residence) else scene
 
 
@@ -48,16 +48,16 @@ def seen(
     limits: tuple[float, float, float],
     lod: SceneGate | None,
 ) -> Seen:
-    """Find what views are rendered from; collective with `lod`.
+    """Find the Gaussians to render for a batch of views. Collective if `lod` is given.
 
     Args:
-        scene: all rows caught up.
+        scene: the Gaussians, without pending optimiser steps.
         viewmats: float32 [B, 4, 4], world to camera, B <= 32.
         Ks: float32 [B, 3, 3], pixels.
         width: pixels.
         height: pixels.
         limits: near plane, far plane and eps2d.
-        lod: leaves out rows that are too fine for their distance; None: none are left out.
+        lod: leaves out rows whose octree level is too fine for their distance; None: no gate.
 
     Raises:
         ResidenceError: the pool is too small for the views.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which blocks the views of this step and of steps to come may see."""
+"""Finds which blocks the views of the present and of the next steps may see."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor
 
 from blitzgs.ops.residence import seen_blocks
 
-MOST_VIEWS = 32  # that are looked at together
+MOST_VIEWS = 32  # tested together
 _WORD = 32
-_MOST_WORDS = 1 << 26  # of a mask that are looked at together
+_MOST_WORDS = 1 << 26  # words of a mask that are processed together
 
 
 class Cameras(NamedTuple):
@@ -25,7 +25,7 @@ class Cameras(NamedTuple):
         Ks: float32 [V, 3, 3], pixels.
         sizes: int32 [V, 2], width and height, pixels.
         limits: near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
-        columns: of the cull matrix, int64 [V]; None: the views have no mask.
+        columns: the views' columns in the cull matrix, int64 [V]; None: the views have no mask.
     """
 
     viewmats: Tensor
@@ -36,22 +36,22 @@ class Cameras(NamedTuple):
 
 
 class Sight:
-    """Which blocks the views of some batches see; the numbers travel to the host in the background.
+    """Tests which blocks the views of several batches may see; copies the result to the host asynchronously.
 
     Attributes:
-        batches: how many.
+        batches: number of batches.
     """
 
     def __init__(
         self, bounds: Tensor, cameras: Cameras, batch_size: int, culled: Tensor | None = None
     ) -> None:
-        """Begin to look.
+        """Queue the test.
 
         Args:
-            bounds: of N blocks, float32 [N, 8].
-            cameras: views of some batches, in their order, at most 32.
-            batch_size: views of a batch.
-            culled: of the same blocks, from `culled_blocks`.
+            bounds: bounds of N blocks, float32 [N, 8].
+            cameras: views of consecutive batches, at most 32.
+            batch_size: views per batch.
+            culled: result of `culled_blocks` for the same blocks; None: there is no cull mask.
         """
         self._batch_size = batch_size
         self.batches = len(cameras.viewmats) // batch_size
@@ -73,20 +73,20 @@ class Sight:
         return self._seen.numpy().view(np.uint32)
 
     def by(self, batch: int) -> npt.NDArray[np.bool_]:
-        """Return the blocks that a batch (0 is the first) sees, bool [N]; waits for the device."""
+        """Return which blocks a batch (0 is the first) may see, bool [N]; waits for the device."""
         bits = ((1 << self._batch_size) - 1) << batch * self._batch_size
         found: npt.NDArray[np.bool_] = (self._read() & np.uint32(bits & 0xFFFFFFFF)) != 0
         return found
 
     def next_use(self, blocks: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the number of the first batch that sees each block; more than any where none does."""
+        """Return the first batch that may see each block; a number above all batches if none may."""
         seen = self._read()[blocks].astype(np.int64)
         first_view = np.frexp((seen & -seen).astype(np.float64))[1] - 1
         return np.where(seen == 0, MOST_VIEWS, first_view // self._batch_size).astype(np.int64)
 
 
 def culled_blocks(cull: Tensor) -> Tensor:
-    """Return the views that leave out all rows of each block, int32 [N, columns / 32].
+    """Return, as bits, the views that leave out all rows of each block, int32 [N, columns / 32].
 
     Args:
         cull: int32 [N, columns, 8], see `blitzgs.ops.cull_mask`; of whole blocks.
