@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop and what it needs: schedule, loss, checkpoints, logging, configuration."""
+"""The training loop with its schedule, loss, checkpoints, logging and configuration."""

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run with `schedule.adaptive` measures, and where it places T1, the end of densification and T2.
+"""`schedule.adaptive`: measures a run and places T1, the end of densification and T2 by what it measures.
 
-Two signals are looked at, each the same on every rank because it is made of sums over all ranks:
+Two signals decide. Each is the same on every rank, because it is computed from sums over all ranks:
 
 - the demand of density control: the share of the Gaussians that an event would clone or split, those included
-  that a limit of the population or the spawn gate held back. It is the mean over the last events that counts,
-  relative to the highest such mean; early in a run it is high;
-- the loss, mean |render - photograph| over whole epochs, in which all views count alike. Its relative fall
-  per share of the schedule says what more of the same would still bring.
+  that a limit of the population or the spawn gate held back. The rules below compare the mean over the last
+  events with the highest such mean so far;
+- the loss, mean |render - photograph| over whole epochs, so that every view has the same weight. How fast it
+  falls, relative to the length of the schedule, tells how much further training would still improve the
+  model.
 
-T1 comes when demand has fallen, densification ends when demand has all but gone or the loss no longer falls,
-and T2 comes when the loss has settled after that. Each of them lies within `schedule.adaptive_limit` of where
-the fixed schedule has it, and all three in this order.
+T1 is placed when demand has fallen to `FALLEN`. Densification ends when demand has fallen to `GONE` or the
+loss has settled. T2 is placed when the loss has settled after that. Each time differs from the fixed
+schedule's by at most `schedule.adaptive_limit` of it, and the three times keep this order.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.pace import Pace
 from blitzgs.training.schedule import PLACED, latest_times
 
-# Demand is the mean over so many events.
+# Number of events over which demand is averaged.
 EVENTS = 3
-# Demand relative to its highest: fallen, and all but gone.
+# Demand relative to its highest value: at T1, and at the end of densification.
 FALLEN, GONE = 0.5, 0.1
 # The loss is compared between neighbouring spans of whole epochs, each at least this share of the schedule.
 SPAN = 1 / 60
@@ -40,13 +41,13 @@ SETTLED = 0.5
 
 @dataclass
 class Signals:
-    """What has been measured so far; saved with every checkpoint.
+    """The measurements of a run so far; saved with every checkpoint.
 
     Attributes:
-        loss: sum of the views' mean losses in this epoch, and how many views these are.
-        epochs: pairs (images of the run at the end, mean loss), oldest first.
-        demand: share of the Gaussians that each density event wanted to clone or split.
-        reasons: for each of the times that are placed.
+        loss: sum of the views' mean losses in the present epoch, and the number of these views.
+        epochs: for each finished epoch (images seen at its end, mean loss), oldest first.
+        demand: for each density event, the share of the Gaussians that it would clone or split.
+        reasons: for each placed time, why it was placed there.
     """
 
     loss: tuple[float, int] = (0.0, 0)
@@ -57,24 +58,24 @@ class Signals:
 
     @classmethod
     def of(cls, saved: dict[str, Any]) -> Signals:
-        """Go on from what `saved` returned; anew from an empty dictionary."""
+        """Restore the signals from what `saved` returned; an empty dictionary gives new ones."""
         return cls(**saved | ({"loss": tuple(saved["loss"])} if saved else {}))
 
     def saved(self) -> dict[str, Any]:
-        """Return everything that is known, of the last step too, as JSON holds it."""
+        """Return all measurements, the last step's included, as JSON values."""
         self._read()
         names = [entry.name for entry in dataclasses.fields(self) if entry.name != "_pending"]
         return {name: list(x) if isinstance(x := getattr(self, name), (list, tuple)) else x for name in names}
 
     def add(self, sums: HostSum, views: int, pixels: int, images: int, epoch: int) -> None:
-        """Note a step's loss, to be read with the next step's, when nothing has to be waited for.
+        """Store a step's loss; it is read together with the next step's, when that needs no wait.
 
         Args:
-            sums: of the step.
-            views: B.
-            pixels: of each view.
-            images: of the run, at the end of the step.
-            epoch: training views.
+            sums: loss sums of the step.
+            views: views of the step, B.
+            pixels: pixels of each view.
+            images: images that the run has seen at the end of the step.
+            epoch: number of training views.
         """
         self._read()
         self._pending = sums, [views, pixels, images, epoch]
@@ -91,18 +92,18 @@ class Signals:
         self.loss = total, count
 
     def densified(self, counts: Mapping[str, int]) -> None:
-        """Note a density event: its `DensityReport` over all ranks, and the "gaussians" after it."""
+        """Store a density event: its `DensityReport` of all ranks, and "gaussians", the number after it."""
         grown = counts["cloned"] + counts["split"] - counts["relocated"]
         before = counts["gaussians"] + counts["pruned"] - grown
         self.demand.append((grown + counts["held_back"] + counts["vetoed"]) / max(1, before))
 
     def next_place(self, config: ScheduleConfig, pace: Pace, images: int) -> tuple[int, str] | None:
-        """Return where the next of the three times lies, and why; None: not yet, or all are placed.
+        """Return the place of the next of the three times and the reason; None: not yet, or all are placed.
 
         Args:
-            config: with the times that are placed.
-            pace: between times of the configuration and images of the run.
-            images: of the run, now.
+            config: the schedule with the times placed so far.
+            pace: maps times of the configuration to images of the run.
+            images: images that the run has seen.
         """
         self._read()
         time = pace.time(images)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What interrupts the loop between two steps: a signal, the clock that asks to save, a lost photograph.
+"""Agreement of the ranks on what interrupts training: a signal, a checkpoint that is due, a lost photograph.
 
-Ranks may only act on these after the same step, so they agree on it: by one small reduction every few steps.
-torchrun kills a process 30 seconds after SIGTERM, so the number of steps follows from how long they take.
+All ranks must act on these after the same step, so every few steps one small reduction tells each rank the
+requests of all. torchrun kills a process 30 seconds after SIGTERM, so the number of steps depends on their
+duration.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class StopRequest:
-    """Turns SIGTERM, SIGINT and SIGHUP into a request that the loop honours between two steps.
+    """Turns SIGTERM, SIGINT and SIGHUP into a request that the loop handles between two steps.
 
-    A second SIGINT raises KeyboardInterrupt at once. Where SIGHUP is ignored (`nohup`), it stays so.
+    A second SIGINT raises KeyboardInterrupt at once. If SIGHUP was ignored before (`nohup`), it stays
+    ignored.
     """
 
     def __init__(self) -> None:
@@ -47,38 +49,38 @@ class StopRequest:
             signal.signal(number, handler)  # type: ignore[arg-type]
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        # A closing session sends SIGHUP and SIGTERM together: only a key pressed twice means "at once".
+        # A closing terminal sends SIGHUP and SIGTERM together, so only a second SIGINT means "at once".
         if number == signal.SIGINT and self.number == signal.SIGINT:
             raise KeyboardInterrupt
         self.number = number
 
 
 class SaveClock:
-    """Says when the next checkpoint by wall time is due."""
+    """Tells when the next checkpoint by wall time is due."""
 
     def __init__(self, seconds: float) -> None:
-        """Start; `seconds` between two checkpoints, 0 for none."""
+        """Start the clock; `seconds` is the time between two checkpoints, 0: none by wall time."""
         self._seconds = seconds or math.inf
         self.restart()
 
     def restart(self, seconds: float | None = None) -> None:
-        """Count from now on, to the usual time or another one."""
+        """Restart the clock, for the usual number of seconds or another one."""
         self._at = time.monotonic() + (self._seconds if seconds is None else seconds)
 
     @property
     def is_due(self) -> bool:
-        """Whether the time is over."""
+        """Tell whether the time has passed."""
         return time.monotonic() >= self._at
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What all ranks do after a step.
+    """What all ranks must do after a step.
 
     Attributes:
         signal: name of the signal that ends the run, or None.
         save: whether a checkpoint is due.
-        lost: whether a rank goes on without a photograph that it could not read.
+        lost: whether a rank could not read a photograph and continues without it.
     """
 
     signal: str | None
@@ -87,30 +89,30 @@ class Decision:
 
 
 class Agreement:
-    """Tells every rank the same after the same step."""
+    """Gives every rank the same decision after the same step."""
 
     def __init__(self, ranks: Ranks, stop: StopRequest, clock: SaveClock) -> None:
-        """Agree among `ranks` about the requests that any of them has noted."""
+        """Prepare to collect the requests that `stop` and `clock` note on each of `ranks`."""
         self._ranks, self._stop, self._clock = ranks, stop, clock
         self._next = 0
         self._last: tuple[int, float] | None = None
         self._agreed_to_stop = False
 
     def after(self, step: int, lost: bool = False) -> Decision:
-        """Return what happens after `step`; every rank calls this after every step.
+        """Return the decision for `step`; every rank calls this after every step.
 
-        `lost`: whether this rank goes on without a photograph.
+        `lost`: whether this rank continues without a photograph that it could not read.
         """
         if self._ranks.world_size > 1 and step < self._next and not self._agreed_to_stop:
             return Decision(None, False)
         return self.now(step, lost)
 
     def now(self, step: int, lost: bool = False) -> Decision:
-        """Agree at once, whatever the step; every rank calls this."""
+        """Return a decision at once, whatever the step; every rank calls this."""
         if self._ranks.world_size == 1:
             return self._decision(self._stop.number, self._clock.is_due, lost)
         now = time.monotonic()
-        # Unknown at first: the ranks agree again after the next step.
+        # The duration of a step is not known at first, so the ranks agree again after the next one.
         seconds = MOST_SECONDS
         if self._last is not None and step > self._last[0]:
             seconds = (now - self._last[1]) / (step - self._last[0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The photographs of each step's batch, decoded and uploaded ahead of the step that needs them."""
+"""Decodes and uploads the photographs of each batch ahead of the step that needs them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from blitzgs.training.views import VIEW_NUMBERS, ViewSet, unpack_views
 
 
 class PhotographError(RuntimeError):
-    """A photograph cannot be read; names the file."""
+    """A photograph cannot be read; the message names the file."""
 
 
 class Images(Protocol):
@@ -30,13 +30,13 @@ class Images(Protocol):
         """Return an image, uint8 [H, W, 3]."""
 
     def mask(self, index: int) -> Tensor | None:
-        """Return the image's mask, uint8 [H, W] with 0 = excluded; None: there is none."""
+        """Return the image's mask, uint8 [H, W] with 0 = excluded, or None."""
 
     def prefetch(self, indices: list[int]) -> None:
         """Decode images in the background."""
 
     def memory(self) -> ImageMemory:
-        """Return what images have taken of the host's memory."""
+        """Return how much host memory the images have taken."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,13 @@ class Batch:
     """One step's views and photographs on the device.
 
     Attributes:
-        indices: cameras of the capture, B of them.
-        views: the same as the renderer takes them.
-        targets: uint8 [B, H, W, 3]; on several ranks, anything beyond what this rank's loss reads.
-        masks: uint8 [B, H, W], 0 = pixel left out; None when no view of the batch has a mask.
-        samples: float32 [B], values that a view's mean is over: 3 x its pixels that count, at least 1.
-        ranges: who composites which tiles; None on one rank.
+        indices: the B cameras of the batch, as indices into the capture.
+        views: the same cameras as the renderer takes them.
+        targets: uint8 [B, H, W, 3]; on several ranks, undefined outside the pixels that this rank's loss
+            reads.
+        masks: uint8 [B, H, W], 0 = excluded pixel; None when no view of the batch has a mask.
+        samples: float32 [B], number of values in a view's mean: 3 x its pixels that count, at least 1.
+        ranges: the tiles of each rank; None on one rank.
     """
 
     indices: list[int]
@@ -61,7 +62,7 @@ class Batch:
 
 
 class _Photograph(NamedTuple):
-    """What a batch takes of a view's photograph."""
+    """The part of a view's photograph that a batch needs."""
 
     strip: np.ndarray | None  # the pixel rows that this rank needs
     mask: Tensor | None
@@ -69,14 +70,15 @@ class _Photograph(NamedTuple):
 
 
 class _Memory:
-    """Where batches of one shape are put together and uploaded from; one and the same memory on the CPU.
+    """Memory in which batches of one shape are assembled and from which they are uploaded.
 
-    Everything lies in one piece, so that few calls fill and upload it: at each of them this thread and that
-    which launches kernels may have to wait for one another.
+    On the CPU, host memory and device memory are the same. All parts of a batch are in one allocation, so
+    that few
+    calls upload it: during each call, this thread and the thread that launches kernels may block each other.
 
     Attributes:
         shape: views, height, width, and whether there are masks.
-        numbers: on the host, float32: `ViewSet.write`'s, then the samples of each view.
+        numbers: on the host, float32: the views as `ViewSet.write` writes them, then each view's samples.
         pixels: on the host, uint8 [B, H, W, 3].
         counted: on the host, uint8 [B, H, W]; None without masks.
     """
@@ -85,7 +87,7 @@ class _Memory:
         self.shape = shape
         count, height, width, masked = shape
         area, on_gpu = count * height * width, device.type == "cuda"
-        # Each part begins where a tensor of its own would: at a multiple of 256 bytes.
+        # Each part begins at a multiple of 256 bytes, as a separate tensor would.
         self._begin = _aligned(4 * count * (VIEW_NUMBERS + 1))
         self._end = _aligned(self._begin + 3 * area)
         size = self._end + masked * area
@@ -105,7 +107,10 @@ class _Memory:
         return numbers, pixels, memory[self._end :].view(count, height, width) if masked else None
 
     def upload(self, rows: list[tuple[int, int]]) -> None:
-        """Start to upload all but the pixel rows before the first and after the last of `rows`."""
+        """Start to upload all but the pixel rows before the first and after the last needed one.
+
+        `rows` has the needed rows [y0, y1) of each view.
+        """
         if self._device is self._host:
             return
         count, height, width, _ = self.shape
@@ -119,16 +124,16 @@ class _Memory:
             self._device[begin:end].copy_(self._host[begin:end], non_blocking=True)
 
     def batch(self, indices: list[int], ranges: TileRanges | None) -> Batch:
-        """Return the batch that is uploaded here."""
+        """Return the batch that was assembled in this memory."""
         return Batch(indices, self._views, self._targets, self._masks, self._samples, ranges)
 
 
 class _Slot:
-    """The memory of one batch; on CUDA it is used again and again.
+    """The memory of one batch; on CUDA later batches use it again.
 
     Attributes:
-        uploaded: on CUDA, the upload of the newest batch.
-        read: on CUDA, the end of the work that reads that batch.
+        uploaded: on CUDA, the event after the upload of the newest batch.
+        read: on CUDA, the event after all work that reads that batch.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -138,7 +143,7 @@ class _Slot:
             self.uploaded, self.read = torch.cuda.Event(), torch.cuda.Event()
 
     def reserve(self, shape: tuple[int, int, int, bool]) -> _Memory:
-        """Return memory for a batch of a shape."""
+        """Return memory for a batch of this shape."""
         if self._device.type != "cuda":
             return _Memory(shape, self._device)
         if self._memory is None or self._memory.shape != shape:
@@ -147,15 +152,15 @@ class _Slot:
 
 
 class BatchLoader:
-    """Serves the batches of consecutive steps; a thread stays some batches ahead.
+    """Returns the batches of consecutive steps; a thread prepares some batches ahead.
 
-    On CUDA, images go through pinned memory and a stream of their own, so that uploads overlap the kernels. A
-    batch is overwritten some steps later: it is valid until the next one is asked for.
+    On CUDA, images are uploaded from pinned memory on a separate stream, so that uploads overlap the kernels.
+    A batch is valid until the next one is requested; its memory is then used again.
 
     Attributes:
-        lost: on several ranks, why this one could not read the first of the photographs that it goes on
-            without: all their pixels count as masked. The others are in the middle of a step, so that it
-            cannot stop alone. None: it has read all.
+        lost: on several ranks, why this rank could not read a photograph (the first one, if there are
+            several). The rank cannot stop alone in the middle of a step, so it continues and treats all
+            pixels of such photographs as masked. None: it has read all photographs.
     """
 
     def __init__(
@@ -168,17 +173,18 @@ class BatchLoader:
         ahead: int,
         owners: TileOwners | None = None,
     ) -> None:
-        """Prepare to serve.
+        """Prepare the loader.
 
         Args:
             images: the photographs.
             views: all cameras.
-            train: camera of each of the sampler's views.
+            train: for each of the sampler's views, its camera in the capture.
             sampler: chooses the views of each step.
-            device: where the batches go.
-            ahead: batches to prepare beyond the one asked for; 0 works in the calling thread's time.
+            device: device of the batches.
+            ahead: number of batches to prepare beyond the requested one; 0: the calling thread prepares each
+                batch when it is requested.
             owners: divides the tiles of each batch; this rank then decodes and uploads only the pixel rows
-                that its tiles' loss reads. None: everything.
+                that its tiles' loss reads. None: whole photographs.
         """
         self._images = images
         self._views = views
@@ -191,13 +197,13 @@ class BatchLoader:
         self._ahead = ahead
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._pending: dict[int, Future[tuple[Batch, _Slot]]] = {}
-        # One that is in use, and those that are ready or being made.
+        # One slot is in use; the others hold batches that are ready or being prepared.
         self._free = deque(_Slot(device) for _ in range(ahead + 2))
         self._used: _Slot | None = None
         self._worker = ThreadPoolExecutor(1, "batches", self._enter)
 
     def get(self, step: int, last: int) -> Batch:
-        """Return the batch of a step (0-based) and start on those that follow it, up to step `last` - 1."""
+        """Return the batch of a step (0-based) and start to prepare the next ones, up to step `last` - 1."""
         stream = None if self._stream is None else torch.cuda.current_stream(self._device)
         if self._used is not None:
             if stream is not None:
@@ -209,7 +215,8 @@ class BatchLoader:
         for ahead in range(step, max(step + 1, min(step + self._ahead + 1, last))):
             if ahead not in self._pending:
                 indices = [self._train[view] for view in self._sampler.batch(ahead)]
-                # Divided here and not in the thread: all ranks must know the same costs at this moment.
+                # Divide the tiles in this thread and not in the other one: at this point all ranks know the
+                # same costs.
                 ranges = self._divide(ahead, indices)
                 rows = self._rows(indices, ranges)
                 self._images.prefetch(
@@ -227,7 +234,7 @@ class BatchLoader:
         self._worker.shutdown(wait=True, cancel_futures=True)
 
     def _enter(self) -> None:
-        """Have the thread's calls run on its stream."""
+        """Make the loader's stream the current stream of its thread."""
         if self._stream is not None:
             torch.cuda.set_stream(self._stream)
 
@@ -237,7 +244,7 @@ class BatchLoader:
         return self._owners.plan(step, indices, *self._views.size(indices), halo=LOSS_HALO)
 
     def _rows(self, indices: list[int], ranges: TileRanges | None) -> list[tuple[int, int]]:
-        """Pixel rows [y0, y1) of each view that this rank needs."""
+        """Return the pixel rows [y0, y1) of each view that this rank needs."""
         if ranges is None or self._owners is None:
             return [(0, self._views.size([index])[1]) for index in indices]
         return [ranges.pixel_rows(self._owners.ranks.rank, view) for view in range(len(indices))]
@@ -245,17 +252,17 @@ class BatchLoader:
     def _load(
         self, indices: list[int], ranges: TileRanges | None, rows: list[tuple[int, int]]
     ) -> tuple[Batch, _Slot]:
-        # Images that cannot be read must not keep a slot.
+        # Read before taking a slot, so that an unreadable image does not occupy one.
         photographs = [self._read(index, *needed) for index, needed in zip(indices, rows, strict=True)]
         slot = self._free.popleft()
         try:
             return self._fill(slot, indices, ranges, rows, photographs), slot
-        except BaseException:  # one that is not given back would be missing from then on
+        except BaseException:  # give the slot back, or it would be missing from then on
             self._free.append(slot)
             raise
 
     def _read(self, index: int, y0: int, y1: int) -> _Photograph:
-        """Return what a batch needs of a view."""
+        """Read pixel rows [y0, y1) and the mask of a view."""
         try:
             mask = self._images.mask(index)
             strip = self._images.get(index).numpy()[y0:y1] if y0 < y1 else None
@@ -275,11 +282,11 @@ class BatchLoader:
         rows: list[tuple[int, int]],
         photographs: list[_Photograph],
     ) -> Batch:
-        """Put a batch together in a slot and start to upload it."""
+        """Assemble a batch in a slot and start to upload it."""
         count, (width, height) = len(indices), self._views.size(indices)
         strips, masks, samples = zip(*photographs, strict=True)
         if self._stream is not None:
-            slot.uploaded.synchronize()  # the pinned memory is free, long since
+            slot.uploaded.synchronize()  # returns at once: this upload ended long ago
             self._stream.wait_event(slot.read)
         memory = slot.reserve((count, height, width, any(mask is not None for mask in masks)))
         for view, (strip, (y0, y1)) in enumerate(zip(strips, rows, strict=True)):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits a schedule into a wall time (`schedule.minutes`) by changing the pace of a run while it trains.
 
-Nothing is known before the first step, and a step becomes slower as the population grows. So the run begins
-at `scale` 1, measures the time of an image, and chooses the pace at which what is left of the schedule takes
-what is left of the time. It does so again after each eighth of what is left, so that the error shrinks with
-what is left. No step is lost to a trial run.
+The time of a step is not known before the run begins, and it grows with the population. The run therefore
+begins with `scale` 1, measures the time per image, and chooses the pace at which the rest of the schedule
+takes the rest of the time. It repeats this after each eighth of the rest, so the error shrinks towards the
+end. No trial run is needed.
 """
 
 from __future__ import annotations
@@ -15,19 +15,24 @@ from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_ranges import MOST_IMAGES, SCALE
 from blitzgs.training.state import TrainingState
 
-# The first steps of a process are slow (memory, kernels, photographs): they are not measured. Nor is an
-# interval shorter than these, which one slow step would spoil.
+# The first steps of a process are slow (memory, kernels, photographs), so they are not measured. Intervals
+# shorter than the following limits are not used either, because one slow step would distort them.
 WARM_UP_STEPS = 4
-# The pace is looked at after this share of what is left, and before that after twice as many steps each time.
+# The pace is reconsidered after this share of the remaining run; at the beginning, after a number of steps
+# that doubles each time.
 SHARE = 1 / 8
-# Beyond this share of the schedule the pace stays: the error is a few percent of it.
+# When less than this share of the schedule remains, the pace no longer changes: the error is a few percent of
+# the remainder.
 LAST_SHARE = 0.03
-# At time 0, an image is taken to cost this many times less than those that follow on average, because the
-# population grows; at the end of densification, the same. That half then takes about 40 % of the time.
+# The population grows until the end of densification. The average image after time 0 is assumed to take this
+# many times as long as an image at time 0; the factor falls to 1 at the end of densification. The run up to
+# there then takes about 40 % of the time, if densification covers half of it.
 GROWTH = 2.0
-# A plan that ends so much of the budget beside it stays: each change costs some milliseconds.
+# A plan whose end misses the budget by less than this share is kept, because each change costs some
+# milliseconds.
 TOLERANCE = 0.005
-# One measurement may be spoilt by a disk or another process: it changes the pace by at most this factor.
+# One measurement may be distorted by a disk or another process, so it changes the pace by at most this
+# factor.
 MOST_CHANGE = 16.0
 # A plan is shown when the run's length has changed by more than this share of it.
 SHOWN_CHANGE = 0.1
@@ -35,13 +40,13 @@ SHOWN_CHANGE = 0.1
 
 @dataclass(frozen=True)
 class Plan:
-    """What rank 0 has decided after a step.
+    """What rank 0 decides after a step.
 
     Attributes:
-        next: step after which the pace is looked at again.
-        factor: of `schedule.scale`, which is 1, from here on; None: as before.
+        next: step after which the pace is reconsidered.
+        factor: factor of `schedule.scale` (which is 1) from this step on; None: unchanged.
         images_per_second: the measured speed.
-        seconds: of training at the end of the run, as foreseen.
+        seconds: predicted training time of the whole run.
     """
 
     next: int
@@ -51,10 +56,10 @@ class Plan:
 
 
 class Budget:
-    """Keeps a run to its time; does nothing for one without."""
+    """Keeps a run within `schedule.minutes`; does nothing if that is 0."""
 
     def __init__(self, state: TrainingState) -> None:
-        """Begin to measure after the run's next few steps."""
+        """Begin; the next few steps are not measured."""
         self._state = state
         self._seconds = 60 * state.config.schedule.minutes
         self._interval = WARM_UP_STEPS
@@ -63,11 +68,11 @@ class Budget:
         self._shown = 0
 
     def after(self, step: int) -> None:
-        """Change the pace after a step, where that is due; every rank calls this after each step's events."""
+        """Change the pace after a step if that is due; every rank calls this after each step's events."""
         state = self._state
         if self._seconds == 0 or step < self._next or step >= state.schedule.steps:
             return
-        # The clocks of the ranks differ, and all must take the same steps.
+        # Rank 0 decides, because the clocks of the ranks differ and all ranks must take the same steps.
         plan = state.ranks.broadcast_object(self._plan(step) if state.ranks.rank == 0 else None)
         assert plan is not None
         self._next = plan.next
@@ -76,7 +81,7 @@ class Budget:
             self._report(plan)
 
     def _plan(self, step: int) -> Plan:
-        """Decide on rank 0, by its clock."""
+        """Decide on rank 0, from its clock."""
         images, seconds = self._state.images_seen, self._state.progress.seconds
         mark, self._mark = self._mark, (images, seconds)
         if mark is None:
@@ -85,7 +90,7 @@ class Budget:
         config, schedule = self._state.config.schedule, self._state.schedule
         time, old = schedule.pace.time(images), schedule.pace.scale
         rest, left = config.iterations - time, self._seconds - seconds
-        # What is left of the run takes this long at a scale of 1.
+        # Time that the rest of the run would take at a scale of 1.
         at_one = rest * cost * _growth(config, time)
         wanted = old if abs(at_one * old - left) <= TOLERANCE * self._seconds else left / at_one
         most = min(SCALE.high, MOST_IMAGES / config.iterations, old * MOST_CHANGE)
@@ -98,7 +103,7 @@ class Budget:
         return Plan(following, None if new == old else new, 1 / cost, seconds + at_one * new)
 
     def _report(self, plan: Plan) -> None:
-        """Log a change of pace, and show it when the run has become clearly shorter or longer."""
+        """Log a change of pace; print it too if the length of the run has changed by `SHOWN_CHANGE`."""
         state = self._state
         total = state.schedule.iterations
         values = {
@@ -119,7 +124,7 @@ class Budget:
 
 
 def _growth(config: ScheduleConfig, time: float) -> float:
-    """Return how much longer than now an image will take from `time` on, on average."""
+    """Return by which factor an average image after `time` takes longer than an image at `time`."""
     if config.densify_from >= config.densify_until:
         return 1.0
     return 1 + (GROWTH - 1) * max(0.0, 1 - time / config.densify_until)

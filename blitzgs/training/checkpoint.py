@@ -3,9 +3,8 @@
 
 A checkpoint is a folder: one safetensors file per rank with the columns of its shard, and `manifest.json`
 with the training state, the size and SHA-256 of each file, and the SHA-256 of its own content. It is written
-to a temporary folder, synced to disk, and renamed, so a folder with the final name is complete; whether its
-bytes are still right is checked against the digests on loading. The folder must be on a file system that
-every rank sees.
+to a temporary folder, synced to disk, and renamed, so a folder with the final name is complete. Loading
+compares the files with the digests. The folder must be on a file system that every rank sees.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _UNFINISHED = ".unfinished_"
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint could not be written or read; says which and why."""
+    """A checkpoint could not be written or read; the message names the checkpoint and the reason."""
 
 
 @dataclass
@@ -60,21 +59,21 @@ def save(
     keep: int = 3,
     shared: Mapping[str, Tensor] | None = None,
 ) -> Path:
-    """Write a checkpoint; returns on every rank when it is safely on disk.
+    """Write a checkpoint; return on every rank when it is on disk.
 
     Args:
         directory: folder of checkpoints, made if missing.
         columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every rank.
-        state: what else a resume needs, as JSON values; rank 0's is stored.
+        state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
         ranks: the job.
         keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
-        shared: tensors that all ranks have alike; rank 0's are stored, in a file of their own.
+        shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
 
     Returns:
         The folder of the new checkpoint, `directory/checkpoint_NNNNNN`.
 
     Raises:
-        CheckpointError: on every rank, when any of them could not write; earlier checkpoints are untouched.
+        CheckpointError: on every rank, if any rank could not write; earlier checkpoints are unchanged.
         ValueError: the columns differ in length, or `keep` < 1.
     """
     if keep < 1:
@@ -127,11 +126,11 @@ class Loaded:
     """A checkpoint in memory.
 
     Attributes:
-        columns: of this rank's shard.
-        state: what was saved with them.
-        shared: what all ranks have alike; empty where nothing was stored.
-        name: of the checkpoint.
-        refused: why each newer one was not taken.
+        columns: columns of this rank's shard.
+        state: the state that was saved with them.
+        shared: tensors that are the same on all ranks; empty if none were stored.
+        name: name of the checkpoint.
+        refused: for each newer checkpoint, why it was not used.
     """
 
     columns: dict[str, Tensor]
@@ -149,17 +148,17 @@ def load_latest(
 ) -> Loaded | None:
     """Load this rank's share of the newest sound checkpoint.
 
-    A damaged one is refused and the one before it tried; a warning then names each refused, why, and the one
-    that is used.
+    A damaged checkpoint is refused, and the one before it is tried. A warning names the refused checkpoints,
+    the reasons, and the checkpoint that is used.
 
     Args:
         directory: folder given to `save`.
         ranks: the job, of any world size.
         device: where the columns go.
-        problem: says what is wrong with a shard's content, or None.
+        problem: returns what is wrong with a shard's columns, or None.
 
     Returns:
-        The checkpoint; None when there is none at all.
+        The checkpoint; None if the folder has none.
 
     Raises:
         CheckpointError: checkpoints exist, but none is sound.
@@ -188,9 +187,11 @@ def load(
 ) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Tensor]]:
     """Load this rank's share of one checkpoint.
 
-    At the world size it was saved at, each rank gets its shard back as it was. At another one the rows are
-    dealt anew: rank m gets the positions = m (mod M) of the global order (`sharding.global_positions`), and
-    opens only the files that hold some of them.
+    With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
+    rows are
+    redistributed: rank m gets the positions = m (mod M) of the global order (`sharding.global_positions`),
+        and opens
+    only the files that hold some of these rows.
 
     Args:
         path: folder returned by `save`.
@@ -198,8 +199,8 @@ def load(
         device: where the columns go.
 
     Returns:
-        The columns of this rank's shard, name -> [N_rank, ...], the state, and what all ranks have alike, on
-        the CPU.
+        The columns of this rank's shard, name -> [N_rank, ...]; the state; and the tensors that are the same
+        on all ranks, on the CPU.
 
     Raises:
         CheckpointError: on every rank, when a file is missing, torn or altered.
@@ -208,7 +209,7 @@ def load(
     manifest, problem = None, None
     try:
         manifest = _read_manifest(path)
-        # The files are shared out for checking, so that each is read for its digest once.
+        # Each rank checks some of the files, so that every file is read for its digest once.
         with ranks.working("reading a checkpoint"):
             files = [*manifest.shards, *([manifest.shared] if manifest.shared else [])]
             for shard in files[ranks.rank :: ranks.world_size]:
@@ -233,7 +234,7 @@ class _Manifest:
 
 
 def _reached(point: str) -> None:
-    """Mark a labelled point of a save; crash tests stop the process here."""
+    """Mark a labelled point of a save; crash tests replace this function and stop the process here."""
 
 
 def _read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
@@ -260,10 +261,10 @@ def _read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.dev
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a safetensors file, whatever bytes its path is made of."""
+    """Open a safetensors file, also if its path is not valid UTF-8."""
     with open(path, "rb") as file:
         is_text = os.fsencode(path).decode(errors="replace") == str(path)
-        # The package takes UTF-8 alone.
+        # The package accepts only UTF-8 paths.
         with safe_open(path if is_text else f"/proc/self/fd/{file.fileno()}", "pt") as shard:
             yield shard
 
@@ -338,14 +339,14 @@ def _finish(
 def _delete_old(directory: Path, keep: int) -> None:
     """Delete all but the newest `keep`."""
     for name in _names(directory)[:-keep]:
-        # Renamed first: a deletion cut short must not leave half a checkpoint under a final name.
+        # Rename first: an interrupted deletion must not leave half a checkpoint under a final name.
         (directory / name).rename(directory / (_UNFINISHED + name))
         _reached("old one renamed")
     _delete_unfinished(directory)
 
 
 def _delete_unfinished(directory: Path) -> None:
-    """Delete what interrupted saves and deletions left behind."""
+    """Delete the files that interrupted saves and deletions have left."""
     for leftover in directory.glob(_UNFINISHED + "*"):
         shutil.rmtree(leftover, ignore_errors=True)
 

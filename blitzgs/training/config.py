@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The configuration of a run: nested dataclasses, one per concern, with the defaults of the method.
+"""The configuration of a run: one dataclass per section, with its fields' meaning and defaults.
 
-Times are counted in images and are multiplied by `schedule.scale`; lengths are relative to the scene's
-`extent` (1.1 x the largest distance of a camera from their mean centre), never absolute.
+Times are counted in images and are multiplied by `schedule.scale`. Lengths are relative to the scene's
+`extent` (1.1 x the largest distance of a training camera from the mean camera centre), never absolute.
 """
 
 from __future__ import annotations
@@ -12,23 +12,25 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Where images come from and which are held out.
+    """Which capture is trained on, how its images are read, and which views are held out.
 
     Attributes:
         path: folder of the capture.
         images: image folder inside the capture.
-        downscale: integer factor by which images are reduced (1: as they are).
+        downscale: integer factor by which images are reduced (1: original size).
         masks: mask folder inside the capture; null uses `masks/` where there is one, true requires it, false
             uses none.
         split: which views are held out: a number n (every n-th), "val" (Mega-NeRF's `val/` layout), a text
             file with one image name a line, or "auto": `val/` where there is one, else every 8th.
-        undistort: where a distorted image does not fill its pinhole image: "crop" or "mask".
-        exif: "auto" turns an image by its EXIF tag where only that fits its camera; or "apply", "ignore".
+        undistort: what happens to the part of a pinhole image that the distorted image does not cover: "crop"
+            cuts it off, "mask" masks it.
+        exif: "auto" turns an image by its EXIF tag if only the turned image fits its camera; "apply" always
+            turns it, "ignore" never.
         allow_missing: drop views whose image is missing instead of failing.
-        cache_bytes: budget for the compressed images held in memory, of all ranks of a host together; decoded
-            ones take a quarter of it beside.
+        cache_bytes: memory for compressed images, of all ranks of a host together; decoded images take up to
+            a quarter of it in addition.
         threads: decoder threads.
-        prefetch: batches decoded and uploaded ahead.
+        prefetch: number of batches to decode and upload ahead.
     """
 
     path: str = ""
@@ -46,17 +48,17 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """What is rendered.
+    """How Gaussians are rendered, and how they begin.
 
     Attributes:
         sh_degree: highest spherical-harmonics degree, 0..3.
         background: colour behind everything, RGB in [0, 1].
-        antialiased: compensate the screen-space blur (Mip-Splatting's 2D filter) instead of the classic
-            image.
+        antialiased: scale opacities to compensate the screen-space blur (Mip-Splatting's 2D filter); false:
+            classic 3DGS.
         near: near plane, relative to extent.
         far: far plane, relative to extent.
         eps2d: screen-space blur added to the projected covariance, pixels squared.
-        deterministic: repeat a run bit for bit on CUDA too (the CPU always does), at some cost.
+        deterministic: make a run repeat bit for bit on CUDA too, at some cost in time (the CPU always does).
         initial_opacity: opacity of the initial Gaussians.
         scale_floor: smallest standard deviation of a Gaussian, in pixels of the training view that samples it
             most finely, which is found anew at every tenth density event; 0: none. Mip-Splatting's 3D filter
@@ -92,34 +94,36 @@ class LodConfig:
 
 @dataclass(frozen=True)
 class ScheduleConfig:
-    """When things happen, in images; `scale` multiplies every time below.
+    """The times of all events, counted in images; `scale` multiplies every time below.
 
     Attributes:
         iterations: length of the run.
         scale: stretches or compresses the whole schedule without changing its shape.
-        minutes: fits the schedule into so much wall time of training (`blitzgs train --minutes`): the run
-            measures how fast it is and changes its pace accordingly; `scale` stays 1. 0: no such limit.
-        pace: pairs (image of the run, factor): from that image on, `scale` counts times the factor. A run
-            with `minutes` notes its changes of pace here; without `minutes` they are followed as they are.
-        adaptive: places `t1`, `densify_until` and `t2`, in this order, where the run's own growth and loss
-            say, at most `adaptive_limit` of each earlier or later (`blitzgs/training/adaptive.py`).
-        adaptive_limit: that share.
-        placed: the places found so far, up to three times. A run with `adaptive` notes them here; without it
-            they are followed as they are.
-        batch_size: views per optimiser step B; one step advances the clock by B.
-        densify_from, densify_until, densify_every: density-control events at from, from + every, ... < until.
+        minutes: wall time of training that the schedule is fitted into (`blitzgs train --minutes`): the run
+            measures its speed and changes its pace; `scale` stays 1. 0: no limit.
+        pace: pairs (image of the run, factor): from that image on, `scale` is multiplied by the factor. A run
+            with `minutes` writes its changes of pace here; a run without `minutes` repeats them.
+        adaptive: the run places `t1`, `densify_until` and `t2`, in this order, by its growth and its loss
+            (`blitzgs/training/adaptive.py`).
+        adaptive_limit: largest change of these times by `adaptive`, earlier or later, as a share of each.
+        placed: the times placed so far, up to three. A run with `adaptive` writes them here; a run without it
+            repeats them.
+        batch_size: B, views per optimiser step; a step advances the clock by B images.
+        densify_from, densify_until, densify_every: density events happen at from, from + every, ... < until.
         size_prune_after: density events later than this also prune by size.
         reset_every: all opacities are capped at `population.reset_opacity` at every multiple of this before
             `densify_until`; 0: never.
-        gate_from: density events from here on go through `population.gate`.
-        t1, t2: the first and the second importance pass, where `population.importance` is set; 0: none. A
-            pass follows the density event of the same image.
-        levels_until: from here on `view.lod` may keep all octree levels; it begins with those that
-            `view.first_levels` says. 0: `densify_until`.
-        sh_every: the spherical-harmonics degree grows by one each time.
+        gate_from: from here on `population.gate` judges the candidates of density events.
+        t1, t2: times of the first and the second importance pass, if `population.importance` is set; 0: no
+            pass. A pass happens after the density event of the same time.
+        levels_until: from here on `view.lod` may keep all octree levels; at the start it keeps those up to
+            `view.first_levels`. 0: `densify_until`.
+        sh_every: the spherical-harmonics degree grows by one at every multiple of this.
         position_decay: length of the exponential decay of the position learning rate.
-        checkpoint_every: checkpoints at these times, besides those of `log.checkpoint_seconds`. 0: none.
-        evaluate_every: 0 evaluates at the end only.
+        checkpoint_every: a checkpoint is written at every multiple of this, in addition to those by
+            `log.checkpoint_seconds`. 0: none.
+        evaluate_every: the held-out views are measured at every multiple of this, and at the end. 0: only at
+            the end.
     """
 
     iterations: int = 30_000
@@ -153,13 +157,13 @@ class OptimiserConfig:
         position, position_final: learning rates of the means, relative to extent, at the start and after
             `schedule.position_decay`.
         sh_dc, sh_rest, opacity, scale, rotation: learning rates.
-        position_noise: random steps of almost transparent Gaussians along their own axes, relative to the
-            position rate (3DGS-MCMC's noise, whose lengths are relative to extent here); 0: none.
-        final_share: the share of these five rates that is left at the end of the run, reached exponentially;
-            1 keeps them constant.
+        position_noise: strength of the random steps of almost transparent Gaussians, relative to the position
+            rate (3DGS-MCMC's noise, with lengths relative to extent); 0: none.
+        final_share: sh_dc, sh_rest, opacity, scale and rotation fall exponentially to this share of
+            themselves at the end of the run; 1: they stay constant.
         beta1, beta2, eps: Adam's constants for B = 1.
-        sparse: leave the rows outside a step's active set alone (no decay, no drift) instead of repaying the
-            steps they missed.
+        sparse: ordinary sparse Adam: rows outside a step's active set keep their moments and do not move.
+            False: the steps that they miss are applied later, as in dense Adam.
     """
 
     position: float = 1.6e-4
@@ -183,8 +187,8 @@ class LossConfig:
 
     Attributes:
         ssim: weight of the SSIM term.
-        opacity: weight of the mean opacity of the visible Gaussians (3DGS-MCMC has that of all Gaussians;
-            those that a step does not see are left alone here).
+        opacity: weight of the mean opacity of the visible Gaussians (3DGS-MCMC takes the mean of all
+            Gaussians; here the term does not act on Gaussians that a step does not see).
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.
     """
@@ -201,44 +205,47 @@ class PopulationConfig:
 
     Attributes:
         strategy: what a density event does: "density" (clone and split by gradients, prune) or "relocation"
-            (3DGS-MCMC: Gaussians that would be pruned become copies of others, drawn by opacity, and the
-            population grows by `growth`).
-        relocate: with "density", Gaussians that would be pruned become copies of others, too.
+            (3DGS-MCMC: Gaussians that would be pruned are replaced by copies of others, drawn by opacity, and
+            the population grows by `growth`).
+        relocate: with "density" too, replace Gaussians that would be pruned by copies of others.
         growth: share of the population that "relocation" adds at each event.
         grad_threshold: mean norm of the 2D-mean gradient (half-image units) above which a Gaussian is
             densified.
-        absolute_gradients: take the sum over pixels of the absolute gradients in its place (AbsGS), in which
-            those of a Gaussian's two halves do not cancel.
-        absolute_threshold: in the place of `grad_threshold` with `absolute_gradients`.
+        absolute_gradients: use the sum over pixels of the absolute gradients instead (AbsGS), in which
+            opposite gradients of a Gaussian's two halves do not cancel.
+        absolute_threshold: replaces `grad_threshold` with `absolute_gradients`.
         clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split.
-        min_opacity: Gaussians below are pruned.
-        reset_opacity: what `schedule.reset_every` caps the opacities at.
+        min_opacity: Gaussians of lower opacity are pruned.
+        reset_opacity: cap of the opacities at each `schedule.reset_every`.
         opacity_decay: share of its opacity that every Gaussian loses at each density event.
-        prune_screen_radius: pixels; larger Gaussians are pruned after `schedule.size_prune_after`.
+        prune_screen_radius: pixels; Gaussians with a larger radius are pruned after
+            `schedule.size_prune_after`.
         prune_world_scale: relative to extent; Gaussians with a larger axis are pruned after the same time.
-        max_gaussians: the population never exceeds this; the strongest candidates come first. 0: no cap.
-        importance: at `schedule.t1` and `schedule.t2` score all Gaussians by what they contribute to the
-            training views, and keep those that matter.
-        score: what the passes score by, summed over the views: "density" (the paper's: contribution per
-            pixel), "weight" (contribution) or "root" (contribution over the root of the pixels).
-        pass1_keep: share of the Gaussians that the first pass keeps, drawn by their scores; 1: all, the pass
-            then makes its signals alone.
-        pass2_mass: share of the total score that the second pass keeps, by the fewest Gaussians, of which
-            those below `min_opacity` go too; 1: all, as above.
-        pass2_keep: share of the Gaussians that the second pass keeps at most, those of the highest scores;
-            1: as many as `pass2_mass` says.
-        phi: from the first pass on, weigh the gradients that density control adds up with phi, the share of
-            the views seeing a Gaussian in which it counts.
+        max_gaussians: limit of the population; the candidates with the largest gradients are densified first.
+            0: no limit.
+        importance: at `schedule.t1` and `schedule.t2` score all Gaussians by their contributions to the
+            training views, and prune those of low score.
+        score: the score of the passes, summed over the views: "density" (BlitzGS: contribution per pixel),
+            "weight" (contribution) or "root" (contribution over the square root of the number of pixels).
+        pass1_keep: share of the Gaussians that the first pass keeps, drawn in proportion to their scores; 1:
+            it keeps all and only computes phi and the cull matrix.
+        pass2_mass: the second pass keeps the fewest Gaussians that hold this share of the total score,
+            without those below `min_opacity`; 1: it keeps all and only computes phi and the cull matrix.
+        pass2_keep: largest share of the Gaussians that the second pass keeps, those of the highest scores; 1:
+            no such limit.
+        phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
+            views that see a Gaussian, the share of those in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
             BlitzGS and suits configs/compact.yaml; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).
-        pixels_per_gaussian: nor does it exceed the pixels of all training photographs over this. 0: no cap.
-        gaussians_per_point: nor the points of the reconstruction times this, whose number follows the detail
-            that photographs share. 0: no cap.
-        min_observations: a Gaussian is densified by the mean of at least so many gradients, one for each view
-            of a step that sees it; they are gathered over as many density events as that takes.
+        pixels_per_gaussian: limits the population to the pixels of all training photographs divided by this.
+            0: no limit.
+        gaussians_per_point: limits the population to the points of the reconstruction times this; there are
+            more points where photographs show more detail. 0: no limit.
+        min_observations: a Gaussian is judged by the mean of at least this many gradients, one for each view
+            of a step that sees it. With fewer, its gradients are kept for the next density event.
     """
 
     strategy: str = "density"
@@ -270,19 +277,20 @@ class PopulationConfig:
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """What a view leaves out before it is projected.
+    """Which Gaussians a view leaves out before projection.
 
     Attributes:
         lod: from `schedule.densify_until` on, views leave out Gaussians whose octree level is too fine for
-            their distance. The trained model is evaluated and rendered so, too.
-        first_levels: the finest level that this may keep at the start of the run, relative to their number.
-        level_ratio: the others come one by one until `schedule.levels_until`, each after a wait shorter by
-            this factor than the one before.
+            their distance. The trained model is evaluated and rendered in the same way.
+        first_levels: finest level that views may keep at the start of the run, as a share of the number of
+            levels.
+        level_ratio: the finer levels are added one by one until `schedule.levels_until`; each wait is shorter
+            than the one before by this factor.
         most_kept: views that would keep at least this share of all Gaussians are rendered with all of them.
         smooth: opacities fade out over half a level around the distance at which `lod` would cut them off.
-            All views then have the gate, whatever `most_kept` says. Needs `lod`.
+            All views then have the gate, and `most_kept` is ignored. Needs `lod`.
         cull: from the first importance pass on, a training view leaves out the Gaussians that did not count
-            in it at the last pass, until half of the images after the last pass are trained on. Needs
+            in it at the last pass. This ends halfway between the last pass and the end of the run. Needs
             `population.importance`.
     """
 
@@ -296,11 +304,11 @@ class ViewConfig:
 
 @dataclass(frozen=True)
 class MemoryConfig:
-    """Where the Gaussians are while they train; nothing here changes the result beyond rounding.
+    """Where the Gaussians are stored during training; no field changes the result beyond rounding.
 
     Attributes:
-        resident_gb: gigabytes of each rank's device for Gaussians. The others wait in the memory of the host
-            and come when the views of a step are about to need them. 0: all are on the device.
+        resident_gb: gigabytes of each rank's device for Gaussians. All Gaussians are stored in host memory,
+            and those that the next views may see are copied to the device. 0: all are stored on the device.
     """
 
     resident_gb: float = 0.0
@@ -308,18 +316,16 @@ class MemoryConfig:
 
 @dataclass(frozen=True)
 class RanksConfig:
-    """How several processes share a run; nothing here changes its result beyond rounding.
+    """How several processes share a run; only `half_exchange` changes the result beyond rounding.
 
     Attributes:
-        timeout_seconds: a rank that does not show up at a collective for this long ends the job.
-        transport: how Gaussians travel: "peer" (written to the other GPUs' memory), "collective" (NCCL or
-            Gloo) or "auto" (the former where it works).
-        share_gpus: where a host has fewer GPUs than ranks, let ranks share them, for development: a step
-            then waits for each rank's turn on the GPU.
-        half_exchange: exchange projected Gaussians in half precision (for slow links, less exact; always
-            collective).
-        max_imbalance: Gaussians move between ranks when the largest shard exceeds the smallest by this
-            factor.
+        timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
+        transport: how splats are sent: "peer" (written to the other GPUs' memory), "collective" (by NCCL or
+            Gloo) or "auto" ("peer" if it works, else "collective").
+        share_gpus: if a host has fewer GPUs than ranks, let several ranks use one GPU, in turns; slow, for
+            development.
+        half_exchange: send splats and their gradients in half precision, by collectives; for slow links.
+        max_imbalance: Gaussians are redistributed when the largest shard exceeds the smallest by this factor.
     """
 
     timeout_seconds: float = 120.0
@@ -331,16 +337,16 @@ class RanksConfig:
 
 @dataclass(frozen=True)
 class LogConfig:
-    """What a run reports.
+    """What a run logs and saves.
 
     Attributes:
         every: images between two log records.
-        tensorboard: also write TensorBoard events (when the package is installed).
-        pictures: side-by-side pictures written by an evaluation.
-        checkpoint_seconds: a checkpoint is written this long after the last one, so that whatever ends a run
-            costs no more than this. 0: never by the clock.
-        keep_checkpoints: how many checkpoints stay on disk.
-        lpips_weights: path of LPIPS weights for the evaluation, or null.
+        tensorboard: also write TensorBoard events, if the package is installed.
+        pictures: number of side-by-side pictures that an evaluation writes.
+        checkpoint_seconds: seconds between two checkpoints; a crash loses at most this much training. 0: no
+            checkpoints by wall time.
+        keep_checkpoints: number of checkpoints that are kept on disk.
+        lpips_weights: path of a TorchScript module of LPIPS for the evaluation, or null.
     """
 
     every: int = 100
@@ -356,7 +362,7 @@ class Config:
     """Everything that decides what a run computes.
 
     Attributes:
-        seed: of the batch order and of every random draw.
+        seed: seed of the batch order and of every random draw.
     """
 
     data: DataConfig = field(default_factory=DataConfig)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configurations from YAML files and `--section.field=value` overrides, checked against the dataclasses."""
+"""Reads configurations from YAML files and `--section.field=value` overrides, and checks them."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class ConfigError(ValueError):
 
 
 def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -> Config:
-    """Build a configuration from the defaults, a YAML file and overrides, in this order.
+    """Build a configuration from the defaults, then a YAML file, then overrides.
 
     Args:
         path: YAML file with sections as in `Config`, or None. A file may name another one under `base`
-            (relative to itself) whose values it changes.
+            (relative to itself); it then changes the values of that file.
         overrides: "section.field=value" with a YAML value; leading dashes are allowed.
 
     Raises:
@@ -76,20 +76,20 @@ def config_hash(config: Config) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML without the trap that of two equal keys the first is silently forgotten."""
+    """A YAML loader that refuses duplicate keys, of which PyYAML silently keeps the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Build a mapping as the parent class does; a key that is there twice is an error."""
+        """Build a mapping as the parent class does; a duplicate key is an error."""
         seen: set[str] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                text = f"'{key.value}' is there twice"
+                text = f"the key '{key.value}' is given twice"
                 raise yaml.MarkedYAMLError(problem=text, problem_mark=key.start_mark)
             seen.add(str(key.value))
         return super().construct_mapping(node, deep)
 
 
-# What PyYAML raises for text that is no YAML, or that no Python value can hold.
+# Errors that PyYAML raises for text that is not YAML or has a value that Python cannot represent.
 _UNREADABLE = (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError)
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The values that every field of a configuration may have; checked when it is read.
+"""The allowed values of every configuration field; they are checked when a configuration is read.
 
-A field without an entry here is refused by a test. The limits keep out what cannot work (a rate of infinity,
-an opacity of 2) and what would only exhaust memory or never end; they are far from any sensible value.
+A test checks that every field has an entry. The limits exclude values that cannot work (an infinite rate, an
+opacity of 2) or that would exhaust memory or never end; they are far from any sensible value.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from blitzgs.training.config import Config, ScheduleConfig
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers from `low` to `high`, without those two where they are open."""
+    """The numbers from `low` to `high`; an end that is open is excluded."""
 
     low: float
     high: float
@@ -171,7 +171,7 @@ def _numbers(value: Any) -> list[Any]:
 
 
 def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
-    """Say what is wrong with how long a run is."""
+    """Name the problems with the length of a run."""
     images = [image for image, _ in schedule.pace]
     if any(image >= after for image, after in itertools.pairwise([0, *images])):
         yield f"schedule.pace: its images must be above 0 and increase, got {images}"
@@ -192,7 +192,7 @@ def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
 
 
 def _problems_of_places(schedule: ScheduleConfig) -> Iterator[str]:
-    """Say what is wrong with where T1, the end of densification and T2 are."""
+    """Name the problems with the times of T1, the end of densification and T2."""
     placed = [time for time in schedule.placed if time > 0]
     if len(schedule.placed) > 3 or placed != sorted(placed):
         yield f"schedule.placed: must be up to 3 times, none before the last, got {list(schedule.placed)}"
@@ -205,7 +205,7 @@ def _problems_of_places(schedule: ScheduleConfig) -> Iterator[str]:
 
 
 def flat_fields(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """All fields of a configuration as (dotted name, value)."""
+    """Yield all fields of a configuration as (dotted name, value)."""
     for entry in fields(section):
         value = getattr(section, entry.name)
         if is_dataclass(value):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good the images are: PSNR, SSIM and (given weights) LPIPS of held-out views, and pictures."""
+"""Measures renders against their photographs: PSNR, SSIM and, given weights, LPIPS; writes pictures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[s
     Args:
         render: float [H, W, 3]; clamped to [0, 1] and not quantised.
         target: uint8 [H, W, 3].
-        mask: uint8 [H, W], pixels with 0 are left out of all; or None.
+        mask: uint8 [H, W]; pixels with 0 are left out of all metrics; None: no mask.
     """
     render = render.clamp(0.0, 1.0)
     counted = torch.ones_like(target[..., 0]) if mask is None else mask
@@ -55,10 +55,10 @@ def image_metrics(render: Tensor, target: Tensor, mask: Tensor | None) -> dict[s
 
 
 def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
-    """Return colours changed by the affine map (a 3 x 4 matrix) that brings them closest to those wanted.
+    """Apply the affine colour map (a 3 x 4 matrix) that brings `pixels` closest to `wanted`.
 
-    A photograph's exposure and white balance are no property of the scene. Least squares over the pixels of
-    one view find the map, so that what is left of the error is a matter of neither.
+    The map is fitted by least squares over the pixels of one view. It removes differences of exposure and
+    white balance, which are properties of the photograph and not of the scene.
 
     Args:
         pixels: float64 [P, 3].
@@ -68,13 +68,13 @@ def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
         float64 [P, 3], clamped to [0, 1].
     """
     known = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
-    # The pseudo-inverse serves a view of a single colour, too, for which many maps are equally good.
+    # The pseudo-inverse also handles a view of a single colour, for which many maps are equally good.
     inverse = torch.linalg.pinv(known.T @ known, hermitian=True)
     return (known @ (inverse @ (known.T @ wanted))).clamp(0.0, 1.0)
 
 
 def _psnr(pixels: Tensor, wanted: Tensor) -> float:
-    """Return the PSNR in dB of colours [P, 3]; 120 where they are equal or there are none."""
+    """Return the PSNR in dB of colours [P, 3]; 120 if they are equal or P is 0."""
     mse = ((pixels - wanted) ** 2).sum().item() / max(1, pixels.numel())
     return -10.0 * math.log10(max(mse, 1e-12))
 
@@ -108,13 +108,13 @@ def render_view(
     """Render camera `index` with the Gaussians of all ranks; every rank calls this.
 
     Args:
-        scene: this rank's Gaussians, caught up.
+        scene: this rank's Gaussians, without pending optimiser steps.
         views: all cameras.
-        index: of the camera.
+        index: the camera to render.
         options: how to render.
         owners: divides the tiles among the ranks.
         destination: rank that gets the image.
-        lod: leaves out Gaussians too fine for their distance; None: none are left out.
+        lod: leaves out Gaussians whose octree level is too fine for their distance; None: no gate.
 
     Returns:
         float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
@@ -162,32 +162,33 @@ def evaluate(
     """Render views and compare them with their photographs; the ranks take turns at comparing.
 
     Args:
-        scene: this rank's Gaussians, caught up.
-        views: all cameras on the device.
-        cameras: the same, for their names.
-        images: photographs.
+        scene: this rank's Gaussians, without pending optimiser steps.
+        views: all cameras, on the device.
+        cameras: the same cameras, for their names.
+        images: the photographs.
         indices: cameras to evaluate.
         options: how to render.
-        folder: gets `metrics.json` and the pictures; None: nothing is written.
-        owners: divides the tiles among the ranks; all of them call this.
-        pictures: evenly spaced views of which to write render | photograph | error side by side.
+        folder: folder for `metrics.json` and the pictures; None: nothing is written.
+        owners: divides the tiles among the ranks; every rank calls this function.
+        pictures: number of evenly spaced views for which render | photograph | error are written side by
+            side.
         lpips: from `load_lpips`.
-        report: is told (views rendered, all of them) after each.
-        inputs: files that must stay as they are, wherever `folder` is.
-        optional_files: warn instead of failing when a file cannot be written, as while training.
+        report: called with (views rendered, number of views) after each view.
+        inputs: files that must not be overwritten.
+        optional_files: if a file cannot be written, warn instead of raising an error; used during training.
         lod: as for `render_view`.
-        stops: whether to give up, asked whenever each rank has compared one view more; the same answer on
-            every rank. None: never.
+        stops: asked after each round in which every rank compares one view; if it returns True, the
+            evaluation ends. It must return the same on every rank. None: never stop.
 
     Returns:
-        {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}; the
-        means are absent without views, and a view that is masked all over is left out. The same on every
-        rank.
+        {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}, the
+        same on every rank. Views whose pixels are all masked are left out; the means are absent if no view
+        remains.
 
     Raises:
         OSError: a file cannot be written, and `optional_files` is not set.
-        PhotographError: a photograph cannot be read; on every rank, once the others are measured.
-        EvaluationStoppedError: `stops` said so.
+        PhotographError: a photograph cannot be read; raised on every rank after the other views are measured.
+        EvaluationStoppedError: `stops` returned True.
     """
     ranks = owners.ranks
     files = None if folder is None else _Files(folder, inputs, optional_files)
@@ -210,7 +211,7 @@ def evaluate(
             try:
                 target, mask = images.get(index).to(render.device), images.mask(index)
             except (OSError, ValueError) as error:
-                lost = lost or str(error)  # the other ranks go on: they learn of it at the end
+                lost = lost or str(error)  # the other ranks continue and learn of this at the end
                 continue
             if mask is not None and not bool(mask.any()):
                 continue  # nothing to compare
@@ -225,7 +226,7 @@ def evaluate(
     names = [cameras[index].name for index in indices]
     masked = [name for name in names if name not in found]
     if masked and ranks.rank == 0:
-        text = f"{len(masked)} views are masked all over and count for nothing: {', '.join(masked[:5])}"
+        text = f"{len(masked)} views are left out, as all their pixels are masked: {', '.join(masked[:5])}"
         warnings.warn(text, stacklevel=2)
     per_view = {name: found[name] for name in names if name in found}
     result: dict[str, Any] = {}
@@ -240,14 +241,14 @@ def evaluate(
 
 
 class _Files:
-    """What an evaluation leaves in its folder."""
+    """The files that an evaluation writes into its folder."""
 
     def __init__(self, folder: Path, inputs: Iterable[Path], optional: bool) -> None:
         self.output = OutputFolder(folder, inputs)
         self._optional = optional
 
     def plan(self, indices: Sequence[int], cameras: Sequence[CameraLike], pictures: int) -> dict[int, Path]:
-        """The cameras of evenly spaced views, and where their pictures go."""
+        """Choose evenly spaced views; return their cameras and the paths of their pictures."""
         count = min(pictures, len(indices))
         chosen = [indices[k * len(indices) // count] for k in range(count)]
         try:

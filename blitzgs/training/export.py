@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained model as a PLY file: in which coordinates, and for which kind of viewer."""
+"""Writes a trained model as a PLY file, with a choice of coordinates and of the kind of viewer."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from blitzgs.training.run_folder import Model
 from blitzgs.training.views import CameraLike
 
 COORDINATES = ("auto", "capture", "centred")
-# A position may be rounded by this share of a Gaussian's middle axis, for the median Gaussian.
+# Positions may be rounded by this share of the median Gaussian's middle axis.
 _MOST_ROUNDING = 0.01
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written.
+    """What a caller has to tell the user about a written file.
 
     Attributes:
-        offset: what must be added to x, y, z to come back to the capture's world; None: nothing.
-        sidecar: file that says so.
-        rounding: largest error of a coordinate by its storage as float32, in the capture's unit.
+        offset: add this to x, y, z to get coordinates of the capture's world; None: they are already.
+        sidecar: file that has the offset.
+        rounding: largest rounding error of a coordinate in float32, in the capture's unit.
     """
 
     offset: tuple[float, float, float] | None
@@ -48,11 +48,11 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
     Args:
         model: to write.
         path: file to write.
-        coordinates: "capture" writes the capture's coordinates, "centred" the re-centred ones; "auto" the
-            former where float32 can tell its Gaussians apart.
+        coordinates: "capture" writes the capture's coordinates, "centred" the re-centred ones; "auto" writes
+            the capture's if float32 resolves them finely enough.
 
     Raises:
-        ValueError: coordinates are of another kind.
+        ValueError: `coordinates` has another value.
         OSError: the file cannot be written, or is no regular file.
     """
     if coordinates not in COORDINATES:
@@ -106,15 +106,15 @@ def _rounding(means: Tensor, offset: np.ndarray) -> float:
 
 @torch.no_grad()
 def without_antialiasing(model: Model, cameras: Sequence[CameraLike]) -> Model:
-    """Return a model for viewers that know only the classic blur: compensation baked into the opacities.
+    """Return a model for viewers without antialiasing: its opacities contain the compensation.
 
     The antialiased mode scales a splat's opacity by rho = sqrt(det(cov) / det(cov + eps2d I)), which depends
-    on the view. What can be baked is its mean over the views, weighted with the splat's area in pixels; near
-    and far views keep an error of opposite sign.
+    on the view. This function multiplies each opacity by the mean of rho over the given views, weighted with
+    the splat's area in pixels. Nearer and farther views keep errors of opposite sign.
 
     Args:
         model: trained with `model.antialiased`.
-        cameras: views that the model should look right from, such as those it was trained on.
+        cameras: views from which the model should look right, for example the training views.
     """
     opacities = model.opacities.sigmoid()
     areas = torch.zeros_like(opacities, dtype=torch.float64)

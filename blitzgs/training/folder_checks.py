@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Before a run starts: every rank can write to its folder, there is room, and no other run is using it."""
+"""Checks a run's folder before training: all ranks can write to it, it has space, no other run uses it."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
 
 LOCK = ".lock"
-# A rank that torchrun restarts may come before the system has ended the one that it replaces.
+# A rank that torchrun restarts may begin before the process that it replaces has ended.
 _LOCK_SECONDS = 5.0
 _PROBE_BYTES = 4096
 
 
 class FolderError(RuntimeError):
-    """The folder of a run cannot be used; says which rank found what."""
+    """The folder of a run cannot be used; the message names the ranks and the reason."""
 
 
 @contextlib.contextmanager
 def locked(folder: Path, ranks: Ranks) -> Iterator[None]:
-    """Keep other runs out of a folder while the context lasts; every rank calls this.
+    """Lock a folder against other runs while the context lasts; every rank calls this.
 
-    The operating system drops the lock when the process ends, however it ends.
+    The operating system releases the lock when the process ends, also after a crash.
 
     Raises:
         FolderError: on every rank, when another process is training in the folder.
@@ -121,16 +121,16 @@ def check_writable(folder: Path, ranks: Ranks) -> None:
 
 
 def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians: int) -> None:
-    """Check that a checkpoint fits on the disk, and warn when a full-grown one will not.
+    """Check that a checkpoint fits on the disk, and warn if one of the largest population will not fit.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         table: this rank's Gaussians.
         ranks: the job.
-        most_gaussians: cap of the population; 0: none is known.
+        most_gaussians: limit of the population; 0: none is known.
 
     Raises:
-        FolderError: on every rank, when there is no room for a checkpoint even now.
+        FolderError: on every rank, if not even a checkpoint of the present population fits.
     """
     row = sum(table.row_bytes.values())
     parts = ranks.all_gather_object((len(table), row))

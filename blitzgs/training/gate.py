@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spawn gate of a run: opened, and compared with what the run is."""
+"""Opens the spawn gate of a run and compares it with the run's configuration and capture."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import to_dict
 from blitzgs.training.inputs import capture_fingerprint
 
-# What decides how long Gaussians live: these sections, but for the fields named here. What `schedule.minutes`
-# does is in `schedule.pace`, once it is measured.
+# The sections whose fields decide how long Gaussians live, each with the fields that do not. The effect of
+# `schedule.minutes` is in `schedule.pace`, once it is measured.
 _IDLE: dict[str, tuple[str, ...]] = {
     "schedule": ("checkpoint_every", "evaluate_every", "gate_from", "minutes", "adaptive_limit", "placed"),
     "population": ("lineage", "gate", "gate_rate"),
@@ -40,7 +40,7 @@ def life_fields(config: Config) -> dict[str, Any]:
 
 
 def lineage_subject(config: Config, capture: Capture) -> dict[str, Any]:
-    """Return what a lineage says about the run that it is of, see `blitzgs.population.lineage.ABOUT`."""
+    """Return the description of a run for its lineage's file `blitzgs.population.lineage.ABOUT`."""
     return {
         "name": Path(config.data.path).resolve().name,
         "scene": capture_fingerprint(capture),
@@ -49,19 +49,19 @@ def lineage_subject(config: Config, capture: Capture) -> dict[str, Any]:
 
 
 def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tuple[RankVeto | None, str]:
-    """Open the gate that a configuration names, and warn where it does not suit the run. Collective.
+    """Open the gate that a configuration names, and warn if it does not suit the run. Collective.
 
     Args:
-        config: of the run.
-        capture: of the run.
+        config: configuration of the run.
+        capture: capture of the run.
         ranks: the job.
-        known: digest of the gate that the run has used so far; empty: none is known.
+        known: digest of the gate that the run has used so far; empty: not known.
 
     Returns:
-        The gate, and the digest of its files; None and "" where none is named.
+        The gate and the digest of its files; None and "" if the configuration names no gate.
 
     Raises:
-        GateError: its files are missing, damaged, of another kind, or others than those of `known`.
+        GateError: its files are missing, damaged, of another kind, or do not have the digest `known`.
         MismatchError: the ranks read different files.
     """
     population = config.population
@@ -83,12 +83,12 @@ def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tup
 
 
 def misfits(gate: SpawnGate, config: Config, capture: Capture) -> list[str]:
-    """Say in what a gate does not suit a run."""
+    """List the reasons why a gate does not suit a run."""
     found = []
     scene = capture_fingerprint(capture)
     if known := [name for name, other in gate.info.scenes.items() if other == scene]:
         found.append(f"it was fitted on this very capture ({', '.join(known)}): its figures say nothing here")
-    # A field that the gate's file lacks came later; its default is what runs did before.
+    # A field that the gate's file lacks is newer than the file; its default is the earlier behaviour.
     fields, fitted = life_fields(config), life_fields(Config()) | gate.info.schedule
     if different := sorted(name for name in fields | fitted if fields.get(name) != fitted.get(name)):
         listed = ", ".join(f"{name} ({fitted.get(name)}, here {fields.get(name)})" for name in different)

@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a gate is worth: arms that all go on from one checkpoint before its onset (paper, oracle analysis).
+"""Measures a gate's worth by continuing one checkpoint with different vetoes (BlitzGS, oracle analysis).
+
+All arms continue the same checkpoint, from before the gate's onset:
 
 - reference: no veto. Its lineage labels each spawn event, (parent, time, clone or split): non-surviving if
   and only if none of its children is in the final model.
-- oracle: vetoes exactly the candidates so labelled; oracle_rate: of these, no more than the gate's share.
-- gate: the learned ranking; random: as many at random.
+- oracle: vetoes exactly the candidates labelled non-surviving; oracle_rate: of these, at most the gate's
+  share.
+- gate: vetoes by the learned ranking; random: vetoes as many at random.
 
-Where training repeats bit for bit (on the CPU, or with model.deterministic), the first vetoes of the oracle
-meet exactly the events of the reference; later ones may differ, because what is withheld changes the rest.
-Candidates that the reference did not have are never vetoed by an oracle, and `matched` says how many it knew.
+If training repeats bit for bit (on the CPU, or with model.deterministic), the oracle's first event has the
+same candidates as the reference's. Later events may differ, because each veto changes the rest of the run. An
+oracle never vetoes a candidate that the reference did not have; `matched` is the share of candidates that it
+did have.
 """
 
 from __future__ import annotations
@@ -43,21 +47,21 @@ REFERENCE = "reference"
 
 
 class OracleVeto:
-    """Vetoes candidates that did not survive in another run.
+    """Vetoes candidates whose children did not survive in a reference run.
 
     Attributes:
-        seen: candidates so far, on this rank.
-        matched: those that the other run had, too.
+        seen: number of candidates so far, on this rank.
+        matched: number of those that the reference run had too.
     """
 
     def __init__(self, known: Tensor, dead: Tensor, rate: float | None, seed: int) -> None:
-        """Remember a run.
+        """Store the reference run's events.
 
         Args:
             known: int64 [K], `event_keys` of its spawn events.
-            dead: int64 [D], those of its non-surviving ones.
-            rate: of the candidates, clones and splits apart, veto at most this share; None: any number.
-            seed: of the draws among the dead where there are more.
+            dead: int64 [D], `event_keys` of its non-surviving spawn events.
+            rate: veto at most this share of the clones and of the splits; None: no limit.
+            seed: seed of the draw among non-surviving candidates if there are more.
         """
         self._known, self._dead, self._rate, self._seed = known, dead, rate, seed
         self.seen = self.matched = 0
@@ -87,7 +91,7 @@ def event_keys(parents: Tensor, times: Tensor | int, is_split: Tensor) -> Tensor
 
 
 def label_events(lineage: Path) -> tuple[Tensor, Tensor]:
-    """Read the spawn events of a run: the keys of all, and of those none of whose children survived."""
+    """Return the keys of all spawn events of a run, and of those whose children all died."""
     tables = read_lineage(lineage)
     births, deaths = tables["births"], tables["deaths"]
     spawned = births["parent"] >= 0
@@ -163,7 +167,7 @@ def replay(
             f"{source} was trained with schedule.minutes ({config.schedule.minutes:g}): its arms would "
             "differ in length, and could not be compared. Train it with schedule.scale instead"
         )
-    # As rank 0 finds it: others might come when it has begun to write.
+    # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
     if ranks.broadcast_object((out / REFERENCE).exists()):
         raise FileExistsError(f"{out} already holds a replay: choose another --out, or delete it")
     point = branch_point(source, config)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stops a run that went wrong, saying where: non-finite losses and parameters."""
+"""Stops a run whose losses or parameters are not finite, and names where the first such value is."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from blitzgs.pipeline import Frame
 
 
 class NonFiniteError(RuntimeError):
-    """NaN or infinity appeared; the message names the step, the view and the op or column it came from."""
+    """A value is NaN or infinite; the message names the step, the view, and the op or column."""
 
 
 class ModelLostError(RuntimeError):
-    """No Gaussian is left; says what to do."""
+    """No Gaussian is left; the message names a remedy."""
 
 
 class LossGuard:
-    """Looks at every step's loss: at once on the CPU, one step late on CUDA, where looking means waiting."""
+    """Checks every step's loss: at once on the CPU, one step later on CUDA, to avoid a wait."""
 
     def __init__(self) -> None:
         self._pending: tuple[int, Sequence[str], HostSum] | None = None
@@ -35,10 +35,10 @@ class LossGuard:
 
         Args:
             step: number of the step.
-            names: of its views.
-            sums: their `LossTerms.parts` over all ranks; [2 B], and more that is not looked at.
+            names: names of its views.
+            sums: their `LossTerms.parts` over all ranks, [2 B]; further values are ignored.
             table: this rank's Gaussians.
-            frame: what was rendered.
+            frame: the rendered frame.
 
         Raises:
             NonFiniteError: this loss (or, on CUDA, the previous step's) is not finite.
@@ -52,7 +52,7 @@ class LossGuard:
 
 
 def _check_loss(step: int, names: Sequence[str], sums: HostSum, origin: Callable[[], str]) -> None:
-    # Plain numbers: every step comes here while the GPU waits, and an op takes longer than they all.
+    # Plain Python numbers: this runs in every step while the GPU waits, and one torch op would take longer.
     finite = [math.isfinite(value) for value in sums.read().numpy()[: 2 * len(names)].tolist()]
     if not all(finite):
         l1, ssim = finite[: len(names)], finite[len(names) :]
@@ -61,20 +61,20 @@ def _check_loss(step: int, names: Sequence[str], sums: HostSum, origin: Callable
 
 
 def _origin(table: GaussianTable, frame: Frame, names: Sequence[str]) -> str:
-    """Say where the first non-finite value sits, walking from the parameters to the image."""
+    """Describe where the first non-finite value is, searching from the parameters to the image."""
     found = _first_in(table, frame, names)
     return found or "parameters, projected Gaussians and images are finite: it comes from op photometric"
 
 
 def _later_origin(step: int, later: int, table: GaussianTable, frame: Frame, names: Sequence[str]) -> str:
-    """The same where what `step` rendered is gone, and the table and the frame of step `later` are there."""
+    """Describe the origin from the table and the frame of a later step, `later`."""
     if (found := _first_in(table, frame, names)) is not None:
-        return f"looked at in step {later}: {found}"
+        return f"found in step {later}: {found}"
     views = ", ".join(f"'{name}'" for name in names)
     return (
-        f"of step {step} nothing is left to look at; in step {later} the parameters are finite, and so are "
+        f"the data of step {step} no longer exist; in step {later} the parameters are finite, and so are "
         f"the projected Gaussians and images of view {views}. It came from op photometric or from a Gaussian "
-        "that these views do not see: train on the CPU, where every step is looked at at once"
+        "that these views do not see: train on the CPU, where every step is checked at once"
     )
 
 
@@ -104,7 +104,7 @@ def _first_in(table: GaussianTable, frame: Frame, names: Sequence[str]) -> str |
 def bad_column(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> str | None:
     """Name the first of some columns with a value that is not finite, and its Gaussians; None: all are."""
     names = list(names)
-    # A value that is not finite makes its column's sum so too: one pass, then a closer look if need be.
+    # The sum of a column is not finite if one of its values is not. So one pass suffices if all are finite.
     if bool(torch.stack([table[name].sum() for name in names]).isfinite().all()):
         return None
     for name in names:

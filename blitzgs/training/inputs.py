@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run is made from: the capture, and the check that all ranks have the same one."""
+"""Opens the capture of a run, and checks that all ranks have the same capture, code and configuration."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ def open_capture(
     The processes of one host share the budget for images in memory.
 
     Args:
-        config: of the run.
+        config: configuration of the run.
         ranks: the job.
-        remedy: the caller's flag that leaves out views without a photograph.
+        remedy: the flag of the caller's command that leaves out views without a photograph, for the error
+            message.
 
     Raises:
         ConfigError: `data.path` is not set.
@@ -59,7 +60,7 @@ def check_capture(space: Space, capture: Capture, folder: Path) -> None:
     """Check that a capture is the one that the run in `folder` was trained on.
 
     Raises:
-        ValueError: its cameras lie elsewhere.
+        ValueError: its cameras are elsewhere.
     """
     if Space.of(capture.offset, capture.extent) != space:
         raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
@@ -85,7 +86,7 @@ def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) ->
 
 
 def code_fingerprint() -> str:
-    """Version of the package and a digest of its sources and kernels."""
+    """Return the version of the package with a digest of its sources and kernels."""
     digest = hashlib.sha256()
     root = Path(blitzgs.__file__).parent
     for path in sorted([*root.rglob("*.py"), *root.glob("_lib/libblitzgs_*.so")]):
@@ -95,7 +96,7 @@ def code_fingerprint() -> str:
 
 
 def capture_fingerprint(capture: Capture) -> str:
-    """Digest of the cameras, the points and the split."""
+    """Return a digest of the cameras, the points and the split."""
     digest = hashlib.sha256()
     for camera in capture.cameras:
         digest.update(f"{camera.name} {camera.width} {camera.height}".encode())
@@ -106,7 +107,7 @@ def capture_fingerprint(capture: Capture) -> str:
 
 
 def train_views_fingerprint(capture: Capture) -> str:
-    """Digest of the names of the training views, in their order."""
+    """Return a digest of the names of the training views, in their order."""
     names = [capture.cameras[index].name for index in capture.train]
     return hashlib.sha256(repr(names).encode()).hexdigest()[:12]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The LOD gate that a run, or the model it made, has at some point."""
+"""Makes the LOD gate of a run, or of its model, from its configuration and progress."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from blitzgs.view.gate import LodGate, SceneGate
 
 
 def lod_gate(config: Config, progress: Progress) -> LodGate | None:
-    """Return the LOD gate of a run at some point; None: it is not open."""
+    """Return the LOD gate at a point of a run; None if it is not open."""
     if progress.finest_level is None:
         return None
     return LodGate(
@@ -26,17 +26,18 @@ def lod_gate(config: Config, progress: Progress) -> LodGate | None:
 
 
 def scene_gate(config: Config, progress: Progress, table: GaussianTable, ranks: Ranks) -> SceneGate | None:
-    """Return the LOD gate of a model for any camera; None: it is not open. Collective.
+    """Return the LOD gate of a model for any camera; None if it is not open. Collective.
 
     Args:
-        config: of the run.
-        progress: where the run stands.
-        table: this rank's Gaussians, caught up.
+        config: configuration of the run.
+        progress: progress of the run.
+        table: this rank's Gaussians, without pending optimiser steps.
         ranks: the job.
     """
     gate = lod_gate(config, progress)
     if gate is None:
         return None
-    # A view without the gate beside one with it would be the jump that smooth levels are to avoid.
+    # With smooth levels every view has the gate: a change from a view with it to one without would be a
+    # visible jump.
     most_kept = math.inf if gate.smooth else config.view.most_kept
     return SceneGate(gate, most_kept, table, ranks)

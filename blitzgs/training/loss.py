@@ -18,15 +18,16 @@ from blitzgs.training.config import LossConfig
 
 
 class LossTerms(NamedTuple):
-    """A batch's loss and where its gradients enter.
+    """A batch's loss and its gradients by the images and by the Gaussians' axes and opacities.
 
     Attributes:
         parts: sums of |render - photograph| and of the SSIM map over this rank's pixels and the channels,
             float64 [B, K, 2], in K parts; see `photometric`.
         v_renders: gradient of the batch's mean loss by the images, [B, H, W, 3].
-        scale_reg: weight of the smallest axis of each visible Gaussian, per view [B]; None when the term is
-            off.
-        opacity_reg: the same of its opacity.
+        scale_reg: gradient of the loss by the smallest axis of each visible Gaussian, per view [B]; None if
+            `loss.scale` is 0.
+        opacity_reg: gradient of the loss by the opacity of each visible Gaussian, per view [B]; None if
+            `loss.opacity` is 0.
     """
 
     parts: Tensor
@@ -47,7 +48,7 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: floa
         length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
 
     Raises:
-        ValueError: the ranks composited less than their losses read.
+        ValueError: a rank has not composited all pixels that its loss reads.
     """
     count, assignment = len(frame.views), frame.assignment
     if assignment is not None and assignment.ranges.halo < LOSS_HALO:
@@ -69,7 +70,7 @@ def loss_terms(frame: Frame, batch: Batch, config: LossConfig, length_unit: floa
 
 @lru_cache(maxsize=64)
 def _weights(ssim: float, count: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Weights of each view's sums, [B] each, uploaded once."""
+    """Return the weights of each view's L1 and SSIM sums, [B] each; they are uploaded once."""
     weights = torch.tensor([[(1.0 - ssim) / count], [-ssim / count]], dtype=torch.float32, device=device)
     l1_weights, ssim_weights = weights.repeat(1, count)
     return l1_weights, ssim_weights
@@ -99,7 +100,7 @@ def opacity_term(frame: Frame, table: GaussianTable) -> Tensor:
 
 
 def _mean_over_visible(frame: Frame, values: Tensor) -> Tensor:
-    """Return the mean of a value of each splat over each view's splats at all ranks, [B]."""
+    """Return, for each view, the mean of a per-splat value over the view's splats of all ranks, [B]."""
     views = torch.arange(len(frame.views), device=values.device)
     sums = (values[:, None] * (frame.projected.camera_ids[:, None] == views)).sum(dim=0)
     if frame.assignment is not None:
@@ -108,7 +109,7 @@ def _mean_over_visible(frame: Frame, values: Tensor) -> Tensor:
 
 
 def batch_psnr(frame: Frame, batch: Batch) -> Tensor:
-    """Return the PSNR of a batch over all its pixels that count, in dB."""
+    """Return the PSNR of a batch in dB, over all pixels that are not masked."""
     error = ((frame.renders.clamp(0, 1) - batch.targets.float() / 255.0) ** 2).sum(-1)
     if batch.masks is not None:
         error *= batch.masks != 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training beyond the memory of a GPU: the Gaussians of a step come from the memory of the host in time."""
+"""Training beyond the memory of a GPU: copies the Gaussians of a step from host memory in time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from blitzgs.view.sight import MOST_VIEWS, Cameras
 
 
 class Course:
-    """The cameras of the steps to come.
+    """The cameras of the present and the next steps.
 
     Attributes:
         batch_size: views of a step.
@@ -38,7 +38,7 @@ class Course:
 
         Args:
             sampler: chooses the views of each step.
-            train: camera of each of the sampler's views.
+            train: for each of the sampler's views, its camera in the capture.
             views: all cameras.
         """
         self.batch_size = sampler.batch_size
@@ -49,9 +49,9 @@ class Course:
         return tuple(column[self._train] for column in self._views.columns())
 
     def cameras(self, step: int, limits: tuple[float, float, float]) -> Cameras:
-        """Return the views of a step (from 1) and of those that follow, as far as one looks ahead."""
+        """Return the views of a step (from 1) and of the following ones, at most 32 views."""
         batches = [self._sampler.batch(step - 1 + ahead) for ahead in range(MOST_VIEWS // self.batch_size)]
-        # A view's place among the training views is its column of the cull matrix, too.
+        # A view's index among the training views is also its column in the cull matrix.
         columns = torch.tensor([view for batch in batches for view in batch])
         device = self._columns[0].device
         if device.type == "cuda":
@@ -61,9 +61,10 @@ class Course:
 
 
 class OffloadingStepper(Stepper):
-    """Takes the same steps as `Stepper` with a table in the memory of the host.
+    """Takes the same steps as `Stepper` with a table in host memory.
 
-    A step sees the pool of `Residence` as its table. The blocks of the next step come while it runs.
+    For a step, the pool of `Residence` is the table. The blocks of the next step are loaded while the step
+    runs.
     """
 
     scene: Residence
@@ -82,9 +83,9 @@ class OffloadingStepper(Stepper):
         """Prepare to step.
 
         Args:
-            residence: of this rank's Gaussians.
-            course: looks ahead.
-            optimiser: as for `Stepper`, like the rest.
+            residence: this rank's Gaussians and their pool.
+            course: the cameras of the next steps.
+            optimiser: as for `Stepper`, like the following arguments.
             owners: learns what the tiles cost.
             loss: weights of the loss.
             length_unit: L_scale's unit of length.
@@ -103,7 +104,7 @@ class OffloadingStepper(Stepper):
         self.table = self._residence.pool
 
     def catch_up(self, step: int) -> None:
-        """See `Stepper.catch_up`; the table on the host is up to date then."""
+        """See `Stepper.catch_up`; afterwards the table on the host is up to date."""
         self.settle()
         if self._stands_at != step:
             self._residence.catch_up(lambda pool: self._optimiser.catch_up(pool, None, step))
@@ -114,7 +115,7 @@ class OffloadingStepper(Stepper):
         self._residence.collect()
 
     def report(self, whole: bool = False) -> dict[str, float]:
-        """See `Stepper.report`: how many blocks were there already, and megabytes moved in a step."""
+        """See `Stepper.report`: the share of blocks that were on the device, and megabytes moved per step."""
         if whole:
             return self._residence.traffic.values()
         traffic = self._residence.traffic.since(self._reported)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The optimiser of a table: dense Adam that touches visible rows only, scaled to the batch."""
+"""The optimiser of a table: dense Adam that updates only visible rows, with batch scaling."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from blitzgs.training.schedule import Schedule
 class LazyAdam:
     """Adam over the rows of a table, batch-scaled as Grendel does: lr sqrt(B), beta^B, eps / sqrt(B).
 
-    Rows that a step does not name fall behind (columns `last_step` and `moment_step`); their parameters must
-    be caught up before they are read.
+    The batch scaling is that of Grendel-GS (Zhao et al. 2024). A step does not touch rows that it does not
+    update; the columns `last_step` and `moment_step` note how far each row is current. `catch_up` must be
+    called before the parameters of such rows are read.
 
     Attributes:
         lr_table: float32 [S + 1, 6], the learning rates of every step; see `Schedule.learning_rates`.
-        pending_table: what bounds the drift of rows that are behind (`lazy_adam.schedule_table`); None in the
-            sparse variant, where nothing drifts.
+        pending_table: table that bounds the movement by pending steps (`lazy_adam.schedule_table`); None with
+            `optimiser.sparse`, which has no pending steps.
     """
 
     def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:
@@ -38,9 +39,9 @@ class LazyAdam:
         self.follow(schedule)
 
     def follow(self, schedule: Schedule) -> None:
-        """Tabulate the learning rates of a schedule.
+        """Tabulate the learning rates of a changed schedule.
 
-        Rows that are behind owe the steps already taken: the new schedule has the same rates for those.
+        Pending steps are steps already taken, so the new schedule must have the same rates for those.
         """
         rates = schedule.learning_rates(self._config, self._extent)
         self._position_rates = rates[:, 0].tolist()
@@ -55,7 +56,7 @@ class LazyAdam:
     def catch_up(
         self, table: GaussianTable, ids: Tensor | None, step: int, count: Tensor | None = None
     ) -> None:
-        """Bring the parameters of rows `ids` (int32 [A]; None: all) to the state after `step`.
+        """Apply the pending steps up to `step` to the rows `ids` (int32 [A]; None: all).
 
         ``count``, int32 [1]: only the first `count` of `ids` are rows.
         """
@@ -94,10 +95,12 @@ class LazyAdam:
             v: gradients of the frame's splats, from `pipeline.backward_splats`.
             scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
                 such term.
-            opacity_reg: the same of its opacity.
-            step: the visible rows stand at the step before.
-            means2d_sums: [P, 2], becomes the gradient of the splats' means2d where `v` has it at ranks.
-            absolute_sums: the sum over pixels of its absolute values instead.
+            opacity_reg: weight per view, [B], of the opacity of each Gaussian visible in it; None: no such
+                term.
+            step: number of the step; the visible rows must be current up to `step` - 1.
+            means2d_sums: [P, 2], receives the gradient of the splats' means2d if its parts are at several
+                ranks.
+            absolute_sums: `means2d_sums` receives the sum over pixels of absolute gradients instead.
         """
         project_bwd_step_(
             table.parameters,

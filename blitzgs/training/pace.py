@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast a run goes through the times of its configuration."""
+"""Maps times of the configuration to images of the run, for runs that change their pace."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torch import Tensor
 
 
 class Pace:
-    """Maps times of the configuration to images of the run, and back: increasing and piecewise linear.
+    """An increasing, piecewise linear map from times of the configuration to images of the run, and back.
 
-    Changes that come later leave everything before them as it is, bit for bit.
+    A later change of pace does not change any bit of the map before it.
     """
 
     def __init__(self, scale: float, changes: Sequence[tuple[int, float]]) -> None:
-        """Lay the pieces one after the other.
+        """Make the map.
 
         Args:
-            scale: images of the run for one of the configuration, before the first change.
-            changes: pairs (image of the run, factor), the images increasing from above 0: from that image on
-                it is `scale` times the factor.
+            scale: images of the run per image of the configuration, before the first change.
+            changes: pairs (image of the run, factor) with increasing images above 0: from that image on, the
+                ratio is `scale` times the factor.
         """
         self._images = [0.0, *(float(image) for image, _ in changes)]
         self._scales = [scale, *(scale * factor for _, factor in changes)]
@@ -32,11 +32,11 @@ class Pace:
 
     @property
     def scale(self) -> float:
-        """Images of the run for one of the configuration, in the last piece."""
+        """Images of the run per image of the configuration, after the last change."""
         return self._scales[-1]
 
     def image(self, time: float) -> float:
-        """Return where in the run a time >= 0 of the configuration lies."""
+        """Return the image of the run at a time >= 0 of the configuration."""
         piece = bisect_right(self._times, time) - 1
         return self._images[piece] + (time - self._times[piece]) * self._scales[piece]
 
@@ -46,7 +46,7 @@ class Pace:
         return self._times[piece] + (image - self._images[piece]) / self._scales[piece]
 
     def times(self, images: Tensor) -> Tensor:
-        """Do the same as `time` for float64 [...]."""
+        """Return `time` of each element of a float64 tensor [...]."""
         begins, times, scales = torch.tensor([self._images, self._times, self._scales], dtype=torch.float64)
         piece = torch.bucketize(images, begins, right=True) - 1
         return times[piece] + (images - begins[piece]) / scales[piece]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the population grew and shrank over a run: in the summary, in the log, and as a picture."""
+"""Reports how the population changed over a run: in the summary, in the log, and as a picture."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ _STAGES = ("before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass
 
 @dataclass
 class MemoryMeter:
-    """Samples the memory that this rank's GPU has allocated; on the CPU there is nothing to sample."""
+    """Samples the memory that this rank's GPU has allocated; does nothing on the CPU."""
 
     total: float = 0.0
     samples: int = 0
 
     def sample(self, device: torch.device) -> None:
-        """Add what is allocated now."""
+        """Add a sample of the memory that is allocated now."""
         if device.type == "cuda":
             self.total += torch.cuda.memory_allocated(device)
             self.samples += 1
 
     def mean(self) -> int | None:
-        """Return the mean of the samples in bytes, or None."""
+        """Return the mean of the samples in bytes; None if there are none."""
         return round(self.total / self.samples) if self.samples else None
 
 
 def population_report(state: TrainingState, meter: MemoryMeter) -> dict[str, Any]:
-    """Return the stages of the population and the memory of each rank; every rank calls this.
+    """Return the population at its stages and the memory of each rank; every rank calls this.
 
     Returns:
-        initial, before_pass_1, after_pass_1, peak, before_pass_2, after_pass_2 (the passes where there were
-        any) and final, in Gaussians of all ranks; peak_memory_bytes and, on CUDA, mean_memory_bytes since the
-        run began or was resumed, a list with a value for each rank.
+        "initial", "before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2" (only passes that
+        happened) and "final": numbers of Gaussians of all ranks. "peak_memory_bytes" and, on CUDA,
+        "mean_memory_bytes" since the run began or was resumed: lists with a value for each rank.
     """
     progress = state.progress
     counts = progress.milestones | {"peak": progress.peak_gaussians, "final": state.population()}

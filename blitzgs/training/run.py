@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run: what is in it, and how to open a trained model again."""
+"""The folder of a run: the names of its files, and functions that save and open its checkpoints."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ CHECKPOINTS = "checkpoints"
 SUMMARY = "summary.json"
 EVALUATION = "evaluation"
 LINEAGE = "lineage"
-# Sections and fields that a resumed run may change: they decide nothing about the result beyond rounding, but
-# for `data.allow_missing`, without which a run whose photograph is lost could not go on.
+# Sections and fields that a resumed run may change, because they do not change the result beyond rounding.
+# The exception is `data.allow_missing`: a run whose photograph is lost could not be resumed without it.
 FREE_FIELDS = (
     "log",
     "memory",
@@ -53,23 +53,23 @@ BOUND_FIELDS = ("ranks.half_exchange",)
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands; saved with every checkpoint.
+    """The progress of a run; saved with every checkpoint.
 
     Attributes:
-        step: optimiser steps taken.
+        step: number of optimiser steps taken.
         sh_degree: spherical-harmonics degree of the last step.
-        level_count: octree levels K.
-        peak_gaussians: most Gaussians so far.
-        seconds: of training so far, without evaluations.
-        milestones: how many Gaussians there were at the points of the run that are named so.
-        ledger: of the lineage (`blitzgs.population.lineage.Ledger`), where there is one.
+        level_count: number of octree levels K.
+        peak_gaussians: largest number of Gaussians so far.
+        seconds: seconds of training so far, without evaluations.
+        milestones: number of Gaussians at named points of the run, such as "before_pass_1".
+        ledger: ledger of the lineage (`blitzgs.population.lineage.Ledger`), if births and deaths are logged.
         reference_distance: d_0 of the levels (`blitzgs.view.levels.Levels`), in the unit of the means.
         finest_level: finest level that the LOD gate keeps; None: there is no gate at this point of the run.
-        gated_views: the training views, in their order, as "1" where the LOD gate holds and "0" where it
-            would keep almost all; empty without a gate.
+        gated_views: for each training view, in order, "1" if it has the LOD gate and "0" if the gate would
+            keep almost all Gaussians; empty without a gate.
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
-        signals: `blitzgs.training.adaptive.Signals.saved`, where there are any.
-        gate: digest of the spawn gate's files; empty without one, and in old checkpoints.
+        signals: result of `blitzgs.training.adaptive.Signals.saved`, with `schedule.adaptive`.
+        gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
     """
 
     step: int
@@ -89,14 +89,14 @@ class Progress:
 
 @dataclass
 class TrainedModel:
-    """A model read back from a run, caught up and ready to render.
+    """A model read from a run's checkpoint, without pending optimiser steps, ready to render.
 
     Attributes:
-        config: of the run.
-        progress: where the run stood.
-        space: how the trained world lies in the capture's.
+        config: configuration of the run.
+        progress: progress of the run at the checkpoint.
+        space: maps between the trained world and the capture's world.
         table: this rank's Gaussians.
-        pool_bytes: of a device that they may take, where the run trained with a pool; else 0.
+        pool_bytes: bytes of a device that the Gaussians may take, if the run trained with a pool; else 0.
     """
 
     config: Config
@@ -106,10 +106,12 @@ class TrainedModel:
     pool_bytes: int = 0
 
     def scene(self, device: torch.device) -> Scene:
-        """Return what views on a device are rendered from; a table with a pool is moved for it, once.
+        """Return the scene that views are rendered from on a device.
+
+        With a pool, the first call moves the table into memory that the pool can reach.
 
         Raises:
-            ResidenceError: the pool has room for less than two blocks.
+            ResidenceError: the pool has room for fewer than two blocks.
         """
         if self.pool_bytes == 0:
             return self.table
@@ -127,7 +129,7 @@ def save(
     run_id: str = "",
     shared: Mapping[str, torch.Tensor] | None = None,
 ) -> Path:
-    """Write a checkpoint of a run; rows that are behind stay behind, so that saving changes nothing.
+    """Write a checkpoint of a run; pending optimiser steps stay pending, so that saving changes nothing.
 
     Returns:
         The checkpoint's folder.
@@ -150,16 +152,16 @@ def save(
 
 @dataclass
 class Restored:
-    """What a checkpoint of a run holds.
+    """The content of a run's checkpoint.
 
     Attributes:
         table: this rank's Gaussians.
-        progress: where the run stood.
-        space: how the trained world lies in the capture's.
-        config: of the run.
-        run_id: names the run in its log.
-        source: which checkpoint it is and why that one, in words.
-        shared: what all ranks have alike: `TileOwners.columns`.
+        progress: progress of the run at the checkpoint.
+        space: maps between the trained world and the capture's world.
+        config: configuration of the run.
+        run_id: identifies the run in its log.
+        source: name of the checkpoint and why it was chosen, as text.
+        shared: tensors that are the same on all ranks: `TileOwners.columns`.
     """
 
     table: GaussianTable
@@ -172,15 +174,15 @@ class Restored:
 
 
 def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> Restored | None:
-    """Read the newest sound checkpoint of a run; None when there is none.
+    """Read the newest undamaged checkpoint of a run; return None if the run has no checkpoint.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         ranks: the job.
-        device: where the Gaussians go; None: that of `ranks`.
+        device: device of the Gaussians; None: the ranks' device.
 
     Raises:
-        CheckpointError: there are checkpoints, but none is sound.
+        CheckpointError: there are checkpoints, but all are damaged.
     """
     loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns)
     if loaded is None:
@@ -217,9 +219,9 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         ranks: the job.
-        data: where the capture is now; None: where it was.
+        data: present folder of the capture; None: unchanged.
 
     Raises:
         FileNotFoundError: the folder is not a run, or holds no checkpoint.
@@ -241,7 +243,7 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
 
 
 def _pool_bytes(path: Path) -> int:
-    """Return how many bytes of a device a run's Gaussians may take, by its configuration; 0: all."""
+    """Return how many bytes of a device the configuration gives to the Gaussians; 0: no limit."""
     try:
         return int(load_config(path).memory.resident_gb * 1e9)
     except ConfigError:
@@ -249,25 +251,25 @@ def _pool_bytes(path: Path) -> int:
 
 
 def _compare_with_file(config: Config, path: Path) -> None:
-    """Say so when a run's configuration file is not what its checkpoint was trained with."""
+    """Warn if a run's configuration file differs from the configuration in its checkpoint."""
     try:
-        # The file has the pace of the run's end or of its beginning.
+        # The file has the pace of the run's beginning or, after its end, the final one.
         fields = _changed_fields(config, with_pace_of(load_config(path), config))
         what = f"differs in {', '.join(fields)}" if fields else ""
     except ConfigError as error:
         what = f"cannot be read ({error})"
     if what:
-        warnings.warn(f"{path} {what}: what the checkpoint was trained with counts", stacklevel=3)
+        warnings.warn(f"{path} {what}: the configuration in the checkpoint is used", stacklevel=3)
 
 
 def check_resumable(saved: Config, wanted: Config) -> None:
-    """Check that a resumed run computes what the checkpoint's run would have.
+    """Check that a configuration gives the same result as the one that a checkpoint was trained with.
 
     Raises:
-        ConfigError: names the first field that differs.
+        ConfigError: a field differs; the message names the first one.
     """
     for name, old, new in _differences(to_dict(saved), to_dict(wanted), ""):
-        # A run may get more time, or less: what is left of it is fitted into what is left of the time.
+        # The number of minutes may change: the rest of the run is then fitted into the rest of the new time.
         is_budget = name == "schedule.minutes" and old > 0 and new > 0
         if not (_is_free(name) or is_budget):
             raise ConfigError(
@@ -277,10 +279,11 @@ def check_resumable(saved: Config, wanted: Config) -> None:
 
 
 def with_pace_of(config: Config, saved: Config | None) -> Config:
-    """Return a configuration for going on from a checkpoint, or from the start where `saved` is None.
+    """Return `config` with the pace and the placed times of the checkpoint's configuration, `saved`.
 
-    With `schedule.minutes` the run has measured its pace so far, or is about to measure it; without, the
-    configuration says what the pace is. The same goes for the places of `schedule.adaptive`.
+    With `schedule.minutes`, the pace comes from `saved`, because the run has measured it; `saved` is None at
+    the start of a run, which has not measured any yet. Without `schedule.minutes`, the pace of `config` is
+    kept. The same rule applies to the times that `schedule.adaptive` places.
     """
     schedule = config.schedule
     if schedule.minutes > 0:
@@ -312,14 +315,14 @@ def _differences(old: dict[str, Any], new: dict[str, Any], where: str) -> list[t
 
 
 def peak_memory_bytes(device: torch.device) -> int:
-    """Most memory this process has used: on the GPU when there is one, else resident memory."""
+    """Return this process's peak memory in bytes: allocated on a GPU, or resident on the CPU."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def versions(device: torch.device) -> dict[str, str]:
-    """Return what the result was made with."""
+    """Return the versions of the software and the name of the device."""
     found = {"blitzgs": blitzgs.__version__, "torch": torch.__version__, "python": platform.python_version()}
     if device.type == "cuda":
         found |= {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}

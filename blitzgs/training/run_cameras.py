@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cameras of a run as a file in its folder, so that rendering needs neither capture nor photographs."""
+"""Stores the cameras of a run in its folder, so that rendering does not need the capture."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ _VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class RunCamera:
-    """A pinhole camera; what rendering reads of `blitzgs.scene.cameras.Camera`.
+    """A pinhole camera with the fields of `blitzgs.scene.cameras.Camera` that rendering reads.
 
     Attributes:
-        name: of the image.
-        width: pixels.
-        height: pixels.
+        name: name of the image.
+        width: image width in pixels.
+        height: image height in pixels.
         K: intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
-        world_to_camera: rigid pose, float64 [4, 4], of the capture's world moved by minus the run's offset.
+        world_to_camera: rigid pose, float64 [4, 4], in the re-centred world (capture position - the run's
+            offset).
     """
 
     name: str
@@ -43,10 +44,10 @@ class RunCameras:
     """All cameras of a run.
 
     Attributes:
-        cameras: in the order of the capture.
-        train: indices of those trained on.
-        test: indices of those held out.
-        inputs: where the photographs and masks lay.
+        cameras: all cameras in the order of the capture.
+        train: indices of the training cameras.
+        test: indices of the held-out cameras.
+        inputs: paths of the photographs and masks during training.
     """
 
     cameras: Sequence[CameraLike]
@@ -81,7 +82,7 @@ def load_cameras(folder: Path) -> RunCameras:
     """Read the cameras of a run.
 
     Raises:
-        FileNotFoundError: the run was made before runs had this file.
+        FileNotFoundError: the run is older than this file.
         ValueError: the file is damaged.
     """
     path = folder / CAMERAS
@@ -108,7 +109,7 @@ def load_cameras(folder: Path) -> RunCameras:
 
 
 def input_files(capture: Capture) -> list[Path]:
-    """The photographs and masks of a capture, which no command may overwrite."""
+    """Return the paths of a capture's photographs and masks, which no command may overwrite."""
     images = [camera.image_path for camera in capture.cameras]
     return images + [camera.mask_path for camera in capture.cameras if camera.mask_path is not None]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a finished run, without the trainer: configuration, log, figures, cameras and the model.
+"""Reads a finished run without the trainer: configuration, log, metrics, cameras and the model.
 
 run = blitzgs.open_run("runs/city")
 model = run.model("cuda")
@@ -44,11 +44,11 @@ class Model:
         opacities: float32 [N], logits.
         sh: float32 [N, K, 3].
         level: octree levels, uint8 [N].
-        lod: what views leave out by level and distance; None: nothing.
-        space: how the trained world lies in the capture's.
-        sh_degree: that is evaluated.
-        config: of the run.
-        images_seen: how long it was trained.
+        lod: LOD gate of the model; None: views leave out no Gaussians.
+        space: maps between the trained world and the capture's world.
+        sh_degree: spherical-harmonics degree to evaluate.
+        config: configuration of the run.
+        images_seen: number of images that the model was trained on.
     """
 
     means: Tensor
@@ -71,8 +71,8 @@ class Model:
         """Render a view as the run's own evaluation does.
 
         Args:
-            camera: any pinhole camera whose pose is of the re-centred world, as `RunFolder.cameras` and
-                `camera` give them.
+            camera: any pinhole camera with a pose in the re-centred world, for example from
+                `RunFolder.cameras` or `camera`.
 
         Returns:
             float32 [H, W, 3] on the model's device, not clamped.
@@ -81,7 +81,7 @@ class Model:
         return images[0]
 
     def _kept(self, camera: CameraLike) -> Model:
-        """Return the Gaussians that the LOD gate leaves for a view, as opaque as it leaves them."""
+        """Return the Gaussians that the LOD gate keeps for a view, faded if levels are smooth."""
         if self.lod is None:
             return self
         pose = torch.from_numpy(viewmat(camera, self.space)).float().to(self.means.device)[None]
@@ -121,14 +121,14 @@ class Model:
     def camera(
         self, K: np.ndarray, world_to_camera: np.ndarray, width: int, height: int, name: str = "view"
     ) -> RunCamera:
-        """Return a camera for `render` from a pose in the capture's own world.
+        """Make a camera for `render` from a pose in the capture's own world.
 
         Args:
             K: intrinsics in pixels, [3, 3].
             world_to_camera: rigid pose, [4, 4].
             width: pixels.
             height: pixels.
-            name: of the view.
+            name: name of the view.
         """
         pose = np.array(world_to_camera, dtype=np.float64)
         pose[:3, 3] += pose[:3, :3] @ np.array(self.space.offset)
@@ -136,27 +136,27 @@ class Model:
 
 
 class RunFolder:
-    """The folder that `blitzgs train --out` made."""
+    """The folder of a run, made by `blitzgs train --out`."""
 
     def __init__(self, path: Path | str) -> None:
-        """Note the folder.
+        """Open a folder.
 
         Raises:
-            FileNotFoundError: it is not a run.
+            FileNotFoundError: it is not the folder of a run.
         """
         self.path = Path(path)
         run.check_is_run(self.path)
 
     def config(self) -> Config:
-        """The configuration in the folder."""
+        """Return the configuration in the folder."""
         return load_config(self.path / run.CONFIG)
 
     def summary(self) -> dict[str, Any]:
-        """The figures of the finished run; empty until it is finished."""
+        """Return the content of `summary.json`; empty if the run is not finished."""
         return self._json(self.path / run.SUMMARY)
 
     def log(self) -> list[dict[str, Any]]:
-        """The records of the log, oldest first; lines torn by whatever ended the run are left out."""
+        """Return the records of the log, oldest first, without incomplete lines."""
         path, records = self.path / LOG, []
         for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
             try:
@@ -166,23 +166,23 @@ class RunFolder:
         return records
 
     def metrics(self) -> dict[str, dict[str, Any]]:
-        """The evaluations: images seen or split -> metrics, with those of each view under "views"."""
+        """Return the evaluations: number of images seen, or split -> metrics, each view's under "views"."""
         files = sorted((self.path / run.EVALUATION).glob("*/metrics.json"))
         return {file.parent.name: self._json(file) for file in files}
 
     def cameras(self) -> RunCameras:
-        """The cameras that the run was trained and measured with; see `run_cameras.load_cameras`."""
+        """Return the cameras that the run was trained and measured with; see `run_cameras.load_cameras`."""
         return load_cameras(self.path)
 
     def model(self, device: torch.device | str = "cpu") -> Model:
-        """The newest sound model.
+        """Return the model of the newest undamaged checkpoint.
 
-        The optimiser's moments are read with it, applied where steps are pending, and dropped before the
-        model goes to `device`.
+        The optimiser's moments are read too, to apply pending steps; they are dropped before the model is
+        copied to `device`.
 
         Raises:
             FileNotFoundError: there is no checkpoint yet.
-            CheckpointError: none of the checkpoints is sound.
+            CheckpointError: all checkpoints are damaged.
         """
         found = run.open_model(self.path, Ranks())
         columns = {name: found.table[name].to(device) for name in (*PARAMETERS, "level")}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run shows while it works: a progress bar (or plain lines), a JSONL file and TensorBoard events.
+"""The log of a run: a progress bar (or plain lines), a JSONL file and TensorBoard events.
 
-None of it may end a run: where the disk is full or the terminal has gone, a warning says so once, and the
-records wait for a while to be written later.
+A failure to log never ends a run. If the disk is full or the terminal is closed, one warning is printed, and
+records are kept in memory to be written later.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from blitzgs.output import write_file
 
 LOG = "log.jsonl"
 BOARD = "tensorboard"
-# Records kept for a disk that is full; later ones push out the oldest.
+# Largest number of records that are kept while the disk is full; then the oldest are dropped.
 _MOST_WAITING = 10_000
 
 _SHOWN: dict[str, Callable[[float], str]] = {
@@ -40,23 +40,23 @@ def _count(value: float) -> str:
 
 
 class RunLog:
-    """Writes records of a run. Silent without a folder (the ranks other than 0).
+    """Writes the records of a run; without a folder (on ranks other than 0) it does nothing.
 
     Attributes:
-        total: images of the whole run, which the time that is left is reckoned by.
+        total: images of the whole run, from which the remaining time is estimated.
     """
 
     def __init__(
         self, folder: Path | None, total: int, done: int, tensorboard: bool, run_id: str = ""
     ) -> None:
-        """Open the log. Records of this run that a resume makes again are dropped.
+        """Open the log, and drop the records that a resumed run will write again.
 
         Args:
-            folder: of the run; appends to its `log.jsonl`. None: log nothing.
+            folder: folder of the run, to whose `log.jsonl` records are appended. None: log nothing.
             total: images of the whole run.
-            done: images seen before (a resumed run).
+            done: images that a resumed run has seen before.
             tensorboard: also write events to `folder/tensorboard`, if the package is installed.
-            run_id: goes into every record.
+            run_id: identifies the run in every record.
         """
         self._file: _JsonLines | None = None
         self._board: _Board | None = None
@@ -108,7 +108,7 @@ class RunLog:
             self._print(f"{t:>7,} {text}")
 
     def close(self) -> None:
-        """Flush and end the progress display."""
+        """Write remaining records and end the progress display."""
         if self._progress is not None:
             with _optional("terminal"):
                 self._progress.stop()
@@ -128,7 +128,7 @@ class RunLog:
 
 
 class _JsonLines:
-    """A file of one JSON record a line; what the disk does not take waits in memory."""
+    """A file with one JSON record per line; records that cannot be written are kept in memory."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -146,20 +146,20 @@ class _JsonLines:
     def _flush(self) -> None:
         if not self._waiting:
             return
-        # Opened each time: the file may have been on a disk that went away and came back.
+        # Open the file each time, because its disk may have been detached and attached again.
         with open(self._path, "ab", buffering=0) as file:
             while self._waiting:
                 line = self._waiting[0]
                 written = file.write(line)
                 if written < len(line):
-                    # The rest follows when there is room; a reader skips a line that is torn for good.
+                    # Write the rest when there is space again; readers skip lines that stay incomplete.
                     self._waiting[0] = line[written:]
                     raise OSError("the disk is full")
                 self._waiting.popleft()
 
 
 class _Board:
-    """TensorBoard's events, as long as they can be written."""
+    """Writes TensorBoard events while that is possible."""
 
     def __init__(self, folder: Path, done: int) -> None:
         self._folder, self._done = folder, done
@@ -175,7 +175,7 @@ class _Board:
                     if self._writer is not None:
                         self._writer.add_scalar(name, value, t)
             except Exception:
-                # The writer's thread has ended with an error of its own; the next record gets a new one.
+                # The writer's thread has ended with an error; the next record makes a new writer.
                 self._writer = None
                 raise
 
@@ -190,7 +190,7 @@ class _Board:
         except ImportError:
             return
         with _optional("TensorBoard"):
-            # Steps after `done` that an interrupted run has logged are made again.
+            # Drop the steps after `done` that an interrupted run has logged: they will be logged again.
             self._writer = SummaryWriter(str(self._folder), purge_step=self._done + 1 if self._done else None)
 
 
@@ -199,7 +199,7 @@ _warned: set[str] = set()
 
 @contextlib.contextmanager
 def _optional(what: str) -> Iterator[None]:
-    """Turn an error of the operating system into a warning, once for each kind of log."""
+    """Turn an OSError into a warning, once for each kind of log."""
     try:
         yield
     except (OSError, ValueError, RuntimeError) as error:
@@ -212,7 +212,7 @@ def _optional(what: str) -> Iterator[None]:
 
 
 def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:
-    """Drop the records of run `run_id` that come after `done` images: the resumed run makes them again."""
+    """Drop the records of run `run_id` after `done` images: the resumed run will write them again."""
     if not run_id or not path.exists():
         return
     kept = []
@@ -224,7 +224,7 @@ def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:
                 record["t"] > done or (record["t"] == total and record.get("event") == "evaluation")
             )
         except (ValueError, LookupError, TypeError, AttributeError):
-            repeated = True  # torn by whatever ended the run
+            repeated = True  # an incomplete line, from a crash
         if not repeated:
             kept.append(line + "\n")
     if len(kept) < len(lines):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which training views form the batch of each step."""
+"""Chooses the training views of each step's batch."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from blitzgs.ops.counter_random import hash_keys
 class BatchSampler:
     """An endless shuffled sequence of batches of same-size images, as a pure function of the step.
 
-    Views are grouped by image size. Each group runs through its views epoch by epoch, reshuffled each time,
-    and gives B consecutive ones per batch, so that every view is drawn equally often. Rounds mix the groups
-    in proportion to their sizes. What a call returns depends on no other call: a resumed run, and every rank,
-    sees the same batches.
+    Views are grouped by image size. Each group is shuffled anew for each of its epochs, and a batch is B
+    consecutive views of this sequence, so that every view is drawn equally often. A round has batches of all
+    groups, in proportion to their sizes. The result of a call does not depend on earlier calls, so a resumed
+    run and every rank get the same batches.
 
     Attributes:
         batch_size: views per batch, B.
@@ -42,7 +42,7 @@ class BatchSampler:
         self._groups = [torch.tensor(views) for views in groups.values()]
         self.batch_size = batch_size
         self._seed = seed
-        # Only the newest are asked for: consecutive steps share them.
+        # Consecutive steps use the same rounds, so it suffices to cache the latest two.
         self._round = lru_cache(maxsize=2)(self._make_round)
         self._epoch = lru_cache(maxsize=2 * len(groups))(self._make_epoch)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one clock of a run: which events happen in a step, and the learning rates of every step."""
+"""The schedule of a run: the events of each step, and the learning rates of all steps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EventKind = Literal[
 ]
 # What `schedule.placed` holds, in this order.
 PLACED = ("t1", "densify_until", "t2")
-# Nothing is placed later than this share of the run, unless the fixed schedule has it there.
+# No time is placed later than this share of the run, unless the fixed schedule has it later.
 _LAST_PLACE = 0.95
 # The columns of the learning-rate table.
 RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
@@ -42,9 +42,9 @@ def latest_times(config: ScheduleConfig) -> list[int]:
 
 
 def _with_places(config: ScheduleConfig) -> ScheduleConfig:
-    """Return a configuration with T1, the end of densification and T2 where they are placed.
+    """Return a configuration in which T1, the end of densification and T2 have their placed values.
 
-    What is still open is expected as late as it may come.
+    A time that is not placed yet has its latest possible value.
     """
     if not (config.adaptive or config.placed):
         return config
@@ -53,13 +53,13 @@ def _with_places(config: ScheduleConfig) -> ScheduleConfig:
 
 
 class Schedule:
-    """Answers what happens when. Time t counts images; a step covers [t, t + B) and has the number t / B + 1.
+    """Tells which events happen at which step. Time t counts images; step number t / B + 1 covers [t, t + B).
 
-    Every time of the configuration goes through `pace` (without changes of pace: it is multiplied by `scale`)
-    and is rounded down, so the same shape runs at any length.
+    `pace` maps every time of the configuration to an image of the run (without changes of pace: multiplied by
+    `scale`), rounded down. The schedule therefore has the same shape at any length.
 
     Attributes:
-        pace: between times of the configuration and images of the run.
+        pace: maps times of the configuration to images of the run.
         batch_size: views per step, B.
         steps: optimiser steps of the whole run.
         iterations: images of the whole run, steps x B.
@@ -73,7 +73,7 @@ class Schedule:
         self.iterations = self.steps * self.batch_size
 
     def _scaled(self, time: float) -> int:
-        # The small excess keeps 0.1 * 30 from falling to 2.
+        # The small term keeps 0.1 * 30 from being rounded down to 2.
         return math.floor(self.pace.image(time) + 1e-6)
 
     def events(self, begin: int, end: int) -> list[Event]:
@@ -81,7 +81,7 @@ class Schedule:
         config = self._config
         series: list[tuple[EventKind, float, float, float]] = [
             ("densify", config.densify_from, config.densify_until, config.densify_every),
-            # A reset follows the density event of the same image: what it caps has grown and been pruned.
+            # A reset happens after the density event of the same image.
             ("reset_opacities", config.reset_every, config.densify_until, config.reset_every),
             ("pass_1", config.t1, config.t1 + 1, min(config.t1, 1)),
             ("pass_2", config.t2, config.t2 + 1, min(config.t2, 1)),
@@ -99,56 +99,57 @@ class Schedule:
         return sorted(found)
 
     def _looks_every(self) -> int:
-        """Return how often a run looks for the next time to place; 0: it need not."""
+        """Return the interval at which a run checks whether to place its next time; 0: never."""
         config = self._config
         is_open = config.adaptive and len(config.placed) < len(PLACED)
         return config.densify_every if is_open else 0
 
     def _clear_cull(self) -> tuple[EventKind, float, float, float]:
-        """Drop the cull mask halfway between the last importance pass and the end."""
+        """Return when the cull mask is dropped: halfway between the last importance pass and the end."""
         config = self._config
         last = config.t2 or config.t1
         time = math.floor((last + config.iterations) / 2)
         return "clear_cull", time, time + 1, min(last, 1)
 
     def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
-        """Images of the times first + k every < until that lie in [begin, end)."""
+        """Return the images in [begin, end) of the times first + k every < until."""
         k = max(0, math.floor((self.pace.time(begin) - first) / every) - 1)
         times: list[int] = []
         while (unscaled := first + k * every) < until and (time := self._scaled(unscaled)) < end:
-            # A compressed schedule may put two of a kind on one image: they are one event.
+            # A compressed schedule may map two events of one kind to the same image; they become one event.
             if time >= begin and (not times or times[-1] != time):
                 times.append(time)
             k += 1
         return times
 
     def sh_degree(self, begin: int, limit: int) -> int:
-        """Degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
+        """Return the SH degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
         time = self.pace.time(begin + self.batch_size)
         return min(limit, math.ceil(time / self._config.sh_every - 1e-9) - 1)
 
     def gathers_statistics(self, begin: int) -> bool:
-        """Tell whether the step at [begin, begin + B) counts for a density event still to come."""
+        """Tell whether a later density event uses the statistics of the step at [begin, begin + B)."""
         return self.pace.time(begin) < self._config.densify_until
 
     def has_lod_gate(self, begin: int) -> bool:
         """Tell whether the step at [begin, begin + B) may leave out Gaussians by their octree levels.
 
-        Not as long as it gathers statistics for density control: what is left out would lose its share.
+        It may not while statistics for density control are gathered, because a Gaussian that is left out
+        would gather no gradients.
         """
         return not self.gathers_statistics(begin)
 
     def finest_level(self, begin: int, count: int, first_levels: float, ratio: float) -> int:
         """Return L_max(t), the finest octree level that the step at [begin, begin + B) may keep.
 
-        It is floor(K x `first_levels`) at the start and K - 1 from `levels_until` on. The waits for the
-        levels between shrink by `ratio` from each to the next (Octree-GS).
+        It is floor(K x `first_levels`) at the start and K - 1 from `levels_until` on. Each wait for the next
+        level is shorter than the one before by `ratio` (Octree-GS, Ren et al. 2024).
 
         Args:
             begin: t.
             count: number of levels K.
             first_levels: L_max(0), relative to K.
-            ratio: of neighbouring waits.
+            ratio: ratio of consecutive waits.
         """
         first = min(count - 1, math.floor(count * first_levels))
         config, waits = self._config, count - 1 - first
@@ -158,7 +159,7 @@ class Schedule:
         return first + sum(begin + 1e-6 >= self.pace.image(until * share / whole) for share in unlocked)
 
     def gates(self, time: int) -> bool:
-        """Tell whether the candidates of a density event at `time` go through the spawn gate."""
+        """Tell whether the spawn gate judges the candidates of a density event at `time`."""
         return time >= self._scaled(self._config.gate_from)
 
     def prunes_by_size(self, time: int) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sets a run up: checks that the ranks agree, makes or restores the Gaussians, builds what trains them."""
+"""Sets up a run: checks that the ranks agree, makes or restores the Gaussians, builds the other objects."""
 
 from __future__ import annotations
 
@@ -46,22 +46,22 @@ from blitzgs.view.residence import Residence
 def set_up(
     config: Config, capture: Capture, images: Images, folder: Path, ranks: Ranks, resume: bool
 ) -> TrainingState:
-    """Make the state of a new run, or of the run in `folder` where it stopped.
+    """Make the state of a new run, or restore the state of the run in `folder`.
 
     Args:
         config: what to compute.
         capture: cameras and points.
         images: its photographs.
-        folder: of the run; gets configuration, log, checkpoints, evaluation and summary.
+        folder: folder of the run, for configuration, log, checkpoints, evaluation and summary.
         ranks: the job.
         resume: continue from the newest checkpoint in `folder`, if there is one.
 
     Raises:
         FileExistsError: the folder holds a trained run and `resume` is not set.
         ConfigError: the run to resume was started with another configuration.
-        GateError: the spawn gate cannot be read, or is not that of the run to resume.
+        GateError: the spawn gate cannot be read, or differs from that of the run to resume.
         MismatchError: the ranks differ in configuration, code or capture.
-        FolderError: a rank cannot write to the folder, or there is no room.
+        FolderError: a rank cannot write to the folder, or the disk has too little space.
     """
     check_alike(config, capture, ranks, resume)
     check_writable(folder / run.CHECKPOINTS, ranks)
@@ -92,7 +92,7 @@ def set_up(
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     optimiser = LazyAdam(config.optimiser, schedule, space.extent, ranks.device)
     owners = TileOwners(ranks)
-    # Costs and plans go by the places of the views: of others, they would be for images of other sizes.
+    # Tile costs and plans are stored by view index. With other views, they would belong to other images.
     has_same_views = restored is None or restored.progress.train_views in ("", progress.train_views)
     if restored is not None and restored.shared and has_same_views and ranks.world_size > 1:
         owners.restore(restored.shared)
@@ -137,7 +137,7 @@ def _stepper(
     extent: float,
     course: Course,
 ) -> Stepper:
-    """Return what takes steps with a table, wherever that is."""
+    """Return a stepper for a table on the device, or one with a pool for a table on the host."""
     shared = (
         optimiser,
         owners,
@@ -154,7 +154,7 @@ def _stepper(
 
 
 def _position_noise(config: Config, extent: float) -> PositionNoise | None:
-    """Return the noise that a configuration asks for."""
+    """Return the noise of `optimiser.position_noise`; None if it is 0."""
     factor = config.optimiser.position_noise
     if factor == 0:
         return None
@@ -164,7 +164,7 @@ def _position_noise(config: Config, extent: float) -> PositionNoise | None:
 def _start_lineage(
     config: Config, capture: Capture, folder: Path, table: GaussianTable, progress: Progress, ranks: Ranks
 ) -> Lineage | None:
-    """Begin the log of births and deaths, or go on from the checkpoint's."""
+    """Open the log of births and deaths, for a new run or at the checkpoint's state; None if it is off."""
     if not config.population.lineage:
         return None
     about, ledger = lineage_subject(config, capture), ledger_of(progress.ledger)
@@ -175,7 +175,7 @@ def _start_lineage(
 
 
 def _origin(restored: run.Restored | None, resume: bool, folder: Path) -> str:
-    """Say where the run begins."""
+    """Describe where the run begins, for the log."""
     if restored is not None:
         return f"resumed from {restored.source} after {restored.progress.step:,} steps"
     return f"nothing to resume in {folder}: starting anew" if resume else "new run"

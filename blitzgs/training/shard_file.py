@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes one safetensors file column by column, hashed on the way and synced to disk.
+"""Writes a safetensors file column by column, computes its digest meanwhile, and syncs it to disk.
 
-The writer of the safetensors package needs the whole shard in host memory and returns neither a digest nor
-an fsync; a shard of 100 million Gaussians wants none of it twice.
+The writer of the safetensors package needs the whole shard in host memory, and it neither computes a digest
+nor syncs. For a shard of 100 million Gaussians, a second copy in memory and a second pass over the file would
+be expensive.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def write_shard(path: Path, columns: Mapping[str, Tensor], reached: Callable[[st
 
     Raises:
         OSError: the disk is full or the folder cannot be written.
-        ValueError: a dtype that the format does not have.
+        ValueError: a column has a dtype that the format lacks.
     """
     # Widest elements first, so that every column starts at a multiple of its element size.
     names = sorted(columns, key=lambda name: (-columns[name].element_size(), name))
@@ -113,7 +114,7 @@ def header_of(path: Path) -> dict[str, ColumnSpec]:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
+    """Return the SHA-256 of a file in hexadecimal."""
     digest = hashlib.sha256()
     with open(path, "rb") as file:
         while chunk := file.read(1 << 20):
@@ -122,7 +123,7 @@ def file_digest(path: Path) -> str:
 
 
 def sync_folder(path: Path) -> None:
-    """Make the entries of a folder durable."""
+    """Sync a folder, so that its entries survive a power failure."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training run is made of: the objects that the loop and the schedule's events share."""
+"""The state of a training run: the objects that the loop and the events of the schedule share."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from blitzgs.view.blocks import morton_order
 
 
 def never() -> bool:
-    """Say that nothing asks the run to stop."""
+    """Return False: nothing asks the run to stop."""
     return False
 
 
@@ -48,29 +48,29 @@ class TrainingState:
         config: what to compute.
         capture: cameras and points.
         images: the capture's photographs.
-        folder: of the run; rank 0 writes most of it.
+        folder: folder of the run; rank 0 writes most of its files.
         ranks: the job.
-        schedule: answers what happens when.
-        space: how the trained world lies in the capture's.
+        schedule: tells which events happen at which step.
+        space: maps between the trained world and the capture's world.
         table: this rank's Gaussians.
-        progress: where the run stands.
+        progress: progress of the run.
         views: all cameras of the capture, on the device.
         sampler: chooses the views of each step.
-        optimiser: of the table.
-        stepper: takes the optimiser steps.
-        owners: knows what tiles cost, and divides them.
+        optimiser: optimiser of the table.
+        stepper: takes the training steps.
+        owners: measures what tiles cost, and divides them among the ranks.
         lpips: the perceptual metric, or None.
-        run_id: names the run in its log, over every resume.
-        origin: where the run begins, in words.
-        save_clock: says when the next checkpoint by wall time is due.
+        run_id: identifies the run in its log, also after it is resumed.
+        origin: describes where the run begins, for the log.
+        save_clock: tells when the next checkpoint by wall time is due.
         veto: withholds candidates of densification from `schedule.gate_from` on, or None.
         lineage: logs births and deaths, or None.
-        growth_was_limited: whether the log has said already that a limit holds growth back.
-        log: where the run reports; silent until the loop opens the run's own.
-        stops: whether the run has to stop soon, which long events ask every few seconds; the same answer on
-            every rank. The loop that runs the events sets it.
-        signals: what a run with `schedule.adaptive` has measured, or None.
-        clock: monotonic seconds, that training time is counted by.
+        growth_was_limited: whether the log has already reported that a limit holds growth back.
+        log: log of the run; it does nothing until the loop opens the run's log.
+        stops: returns whether the run has to stop soon, the same on every rank; long events call it every few
+            seconds. The loop sets it.
+        signals: measurements of a run with `schedule.adaptive`, or None.
+        clock: returns monotonic seconds, by which training time is measured.
     """
 
     config: Config
@@ -102,22 +102,22 @@ class TrainingState:
 
     @property
     def images_seen(self) -> int:
-        """The clock: images trained on so far."""
+        """The number of images trained on so far, which is the run's time t."""
         return self.progress.step * self.schedule.batch_size
 
     @cached_property
     def columns(self) -> dict[int, int]:
-        """The place of each training camera among them, which is its column of the cull matrix."""
+        """Maps each training camera to its index among them, which is its column in the cull matrix."""
         return {index: column for column, index in enumerate(self.capture.train)}
 
     @property
     def render_options(self) -> RenderOptions:
-        """How the run renders at its present spherical-harmonics degree."""
+        """The render options at the run's present spherical-harmonics degree."""
         lod = lod_gate(self.config, self.progress)
         return render_options(self.config, self.space, self.progress.sh_degree, lod)
 
     def start_clock(self) -> None:
-        """Count training time from now on, on top of what a resumed run has already taken."""
+        """Count training time from now on, in addition to the time before a resume."""
         self._started = self.clock() - self.progress.seconds
 
     def stepped(self, step: int, sh_degree: int) -> None:
@@ -127,7 +127,7 @@ class TrainingState:
 
     @contextlib.contextmanager
     def paused_clock(self) -> Iterator[None]:
-        """Leave what happens inside out of the training time."""
+        """Exclude the time inside this context from the training time."""
         paused = self.clock()
         try:
             yield
@@ -135,7 +135,7 @@ class TrainingState:
             self._started += self.clock() - paused
 
     def change_pace(self, factor: float) -> None:
-        """From now on, let `schedule.scale` count times `factor`; every rank calls this."""
+        """Multiply `schedule.scale` by `factor` from now on; every rank calls this."""
         schedule = self.config.schedule
         pace = (*schedule.pace, (self.images_seen, factor))
         self.config = replace(self.config, schedule=replace(schedule, pace=pace))
@@ -145,11 +145,11 @@ class TrainingState:
         self.log.total = self.schedule.iterations
 
     def catch_up(self) -> None:
-        """Apply every pending optimiser step, so that all rows of the table can be read."""
+        """Apply all pending optimiser steps, so that all rows of the table can be read."""
         self.stepper.catch_up(self.progress.step)
 
     def sort(self) -> None:
-        """Put neighbours in space next to each other, so that blocks of rows are small."""
+        """Sort the table in Morton order, so that blocks of rows are small in space."""
         self.table.permute(morton_order(self.table["means"]))
 
     def population(self) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One training step, from a batch of views to moved Gaussians; what the trainer and its benchmark share."""
+"""One training step: render a batch, compare it with its photographs, and update the Gaussians."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ from blitzgs.view.seen import Scene
 
 
 class Stepper:
-    """Takes training steps with one table: `forward`, then `backward`. Neither waits for a loss.
+    """Takes training steps with one table: `forward`, then `backward`. Neither waits for the loss.
 
     Attributes:
-        table: whose rows frames speak of: this rank's Gaussians, all or those that a step may need.
-        scene: what views are rendered from between steps, after `catch_up`: all of this rank's Gaussians.
+        table: the table whose rows a frame's ids refer to: all of this rank's Gaussians, or a pool with those
+            that a step may need.
+        scene: all of this rank's Gaussians, for rendering between steps; call `catch_up` before.
     """
 
     table: GaussianTable
@@ -49,12 +50,12 @@ class Stepper:
 
         Args:
             table: this rank's Gaussians, in `morton_order`.
-            optimiser: of the table.
-            owners: learns what the tiles cost.
+            optimiser: optimiser of the table.
+            owners: records what the tiles cost.
             loss: weights of the loss.
             length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
             half_exchange: send splats in half precision, see `open_transport`.
-            noise: of the means, after each step; None: none.
+            noise: noise on the means after each step; None: none.
         """
         self.table = self.scene = table
         self._optimiser, self._owners = optimiser, owners
@@ -63,19 +64,19 @@ class Stepper:
         self.reindex()
 
     def reindex(self) -> None:
-        """Take note that rows of the table were added, removed or reordered, or that the schedule changed."""
+        """Rebuild the block index after rows were added, removed or reordered, or the schedule changed."""
         self._blocks = BlockIndex(self.table, self._optimiser.pending_table)
 
     def catch_up(self, step: int) -> None:
-        """Apply every optimiser step that rows owe up to `step`, which was the last one."""
+        """Apply all pending optimiser steps; `step` is the last step taken."""
         self._optimiser.catch_up(self.table, None, step)
 
     def settle(self) -> None:
-        """Have this rank's whole table hold what the steps have changed. Here it always does."""
+        """Write all changes back to this rank's whole table. Nothing to do here; see `OffloadingStepper`."""
         return None
 
     def report(self, whole: bool = False) -> dict[str, float]:
-        """Return figures about the steps since the last call or, if `whole`, about all; none here."""
+        """Return figures for the log, of the steps since the last call or, if `whole`, of all; none here."""
         return {}
 
     def forward(
@@ -86,14 +87,14 @@ class Stepper:
         mark: Mark = unmarked,
         gate: ViewGate | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
-        """Catch up what the views may see, render them and compare them with their photographs.
+        """Apply pending steps of the rows that the views may see, render, and compare with the photographs.
 
         Args:
             step: number of the step, from 1.
             options: how to render.
-            batch: B views, their photographs, and who composites which tiles.
-            mark: called with its name at the end of each stage.
-            gate: what the views leave out; None: nothing.
+            batch: B views, their photographs, and the tiles of each rank.
+            mark: called at the end of each stage with the stage's name.
+            gate: LOD gate and cull mask of the views; None: neither.
 
         Returns:
             The frame, the loss's terms, and the sums of its `LossTerms.parts` over all ranks, which
@@ -104,7 +105,7 @@ class Stepper:
 
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         for attempt in self._transport.capacity.attempts():
-            # On the CPU the number of blocks is there at once, so there is always room for them.
+            # On the CPU the number of blocks is known at once, so no estimate is needed.
             room = attempt.sizes.blocks if attempt.sizes is not None and views.viewmats.is_cuda else None
             active = self._blocks.active(
                 table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
@@ -125,7 +126,7 @@ class Stepper:
         if batch.ranges is None:
             sums = HostSum(ranks, terms.parts)
         else:
-            # Costs of tiles and losses travel together.
+            # The costs of tiles are sent together with the losses.
             sums = self._owners.record(batch.indices, frame.tile_work, batch.ranges, terms.parts)
         mark("other")
         return frame, terms, sums
@@ -139,18 +140,18 @@ class Stepper:
         keep_means2d: bool = False,
         absolute: bool = False,
     ) -> Tensor | None:
-        """Carry the gradients of `forward`'s loss back to the splats, and move the Gaussians by them.
+        """Propagate the gradients of `forward`'s loss to the Gaussians, and take an optimiser step.
 
         Args:
             step: as for `forward`.
             frame: from `forward`.
             terms: from `forward`.
-            mark: called with its name at the end of each stage.
-            keep_means2d: whether the caller wants the gradient of the splats' means2d.
-            absolute: as the sum over pixels of its absolute values (AbsGS, Ye et al. 2024).
+            mark: called at the end of each stage with the stage's name.
+            keep_means2d: whether to return the gradient of the splats' means2d.
+            absolute: return the sum over pixels of absolute gradients instead (AbsGS, Ye et al. 2024).
 
         Returns:
-            That gradient, [P, 2] per pixel, or None.
+            The gradient of means2d, [P, 2] per pixel; None without `keep_means2d`.
         """
         table = self.table
         absolute &= keep_means2d

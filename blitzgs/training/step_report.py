@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the log says about one step: loss, PSNR of the batch, active and visible Gaussians, speed."""
+"""The log record of one step: loss, PSNR of the batch, active and visible Gaussians, speed."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
 def log_step(
     state: TrainingState, measured: Tensor, batch: Batch, names: Sequence[str], sums: HostSum
 ) -> None:
-    """Write one log record; waits for the device, and checks the table meanwhile.
+    """Write one log record; wait for the device, and check the parameters.
 
     Args:
-        state: after the step.
+        state: state of the run after the step.
         measured: from `measure_step`.
-        batch: of the step.
-        names: of the batch's views.
+        batch: batch of the step.
+        names: names of the batch's views.
         sums: `LossTerms.parts` over all ranks.
 
     Raises:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop: batches in, a model out."""
+"""The training loop."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ from blitzgs.training.views import render_options
 
 
 class Trainer:
-    """One run: initialises or resumes a model of a capture and trains it to the end of the schedule.
+    """Trains a model of a capture, from the start or from a checkpoint, to the end of the schedule.
 
     Attributes:
-        state: what the run is made of.
+        state: state of the run.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Trainer:
         ranks: Ranks,
         resume: bool = False,
     ) -> None:
-        """Set a run up; arguments and errors are those of `blitzgs.training.setup.set_up`."""
+        """Set up the run; arguments and errors are those of `blitzgs.training.setup.set_up`."""
         self.state = state = set_up(config, capture, images, folder, ranks, resume)
         self._loader = BatchLoader(
             images,
@@ -72,14 +72,14 @@ class Trainer:
         """Train to the end, evaluate, and write the summary.
 
         Returns:
-            The summary; None when the run was asked to stop early (it then saved a checkpoint to resume
-            from).
+            The summary; None if the run was asked to stop early. It has then saved a checkpoint to resume
+            from.
 
         Raises:
-            NonFiniteError: a loss or a parameter stopped being finite.
+            NonFiniteError: a loss or a parameter is not finite.
             PhotographError: a photograph cannot be read; the steps before it are saved.
             ModelLostError: no Gaussian is left.
-            CheckpointError: the model could not be saved, although the run waited for room.
+            CheckpointError: the model could not be saved, although the run waited for disk space.
         """
         state, done, size = self.state, self.state.progress.step, self.state.schedule.batch_size
         folder = state.folder if state.ranks.rank == 0 else None
@@ -92,7 +92,7 @@ class Trainer:
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 self._announce()
                 budget = Budget(state)
-                # The budget changes how many steps there are.
+                # The budget may change the number of steps.
                 while (step := state.progress.step + 1) <= state.schedule.steps:
                     self.step(step)
                     handle_all(state, state.schedule.events((step - 1) * size, step * size))
@@ -119,14 +119,14 @@ class Trainer:
             self.close()
 
     def _check_photographs(self) -> None:
-        """Fail on all ranks where one of them went on without a photograph (`BatchLoader.lost`)."""
+        """Raise an error on all ranks if one of them continued without a photograph (`BatchLoader.lost`)."""
         reasons = self.state.ranks.all_gather_object(self._loader.lost)
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:
             raise PhotographError(f"{'; '.join(lost)}. The last steps, {MOST_STEPS} at most, went without it")
 
     def _stop(self, text: str) -> None:
-        """Save where the run is, and say why it stops here."""
+        """Save a checkpoint and log why the run stops."""
         save.run_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
         self.state.log.event(self.state.images_seen, "stopped", {"reason": text}, text)
 
@@ -138,7 +138,7 @@ class Trainer:
             self.state.lineage.close()
 
     def step(self, step: int) -> None:
-        """Take one optimiser step (from 1), without the schedule's events."""
+        """Take optimiser step number `step` (from 1), without the schedule's events."""
         state, config, schedule = self.state, self.state.config, self.state.schedule
         begin, end = (step - 1) * schedule.batch_size, step * schedule.batch_size
         try:
@@ -189,7 +189,7 @@ class Trainer:
         )
 
     def _announce(self) -> None:
-        """Log what is about to be trained."""
+        """Log the start of the training: origin, population, views and ranks."""
         state, ranks = self.state, self.state.ranks
         views = {"train": len(state.capture.train), "test": len(state.capture.test)}
         text = (
@@ -246,7 +246,7 @@ class Trainer:
         if state.ranks.rank == 0:
             write_picture(state, population)
             try:
-                # The pace and the places have been measured since the run wrote its configuration.
+                # Pace and placed times were measured after the run first wrote its configuration.
                 save_config(state.config, state.folder / run.CONFIG)
                 if state.lineage is not None:
                     state.lineage.describe(lineage_subject(state.config, state.capture))

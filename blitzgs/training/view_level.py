@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The view level in a run: when the LOD gate opens, for which views it pays, and what a batch leaves out."""
+"""The view level in a run: opens the LOD gate, chooses its views, and makes each batch's gate."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from blitzgs.view.gate import ViewGate, lod_bits
 
 
 def follow_schedule(state: TrainingState, begin: int) -> None:
-    """Open the LOD gate, or let it keep another level, if the step at [begin, begin + B) is the first to.
+    """Open the LOD gate, or change its finest level, if the step at [begin, begin + B) requires it.
 
     Collective: every rank calls this before every step.
     """
@@ -32,10 +32,12 @@ def follow_schedule(state: TrainingState, begin: int) -> None:
 
 
 def choose_views(state: TrainingState) -> None:
-    """Find out which training views the LOD gate pays for, if it is open. Collective.
+    """If the LOD gate is open, choose the training views in which it leaves out enough to pay. Collective.
 
-    The choice holds until the gate keeps other levels or a pass has taken Gaussians out. It is saved with the
-    checkpoints, because a resumed run sees the Gaussians at another time.
+    The choice holds until the gate's levels change or an importance pass prunes Gaussians. It is saved with
+    the
+    checkpoints: a resumed run has other Gaussians than at the time of the choice, and might choose other
+        views.
     """
     if state.progress.finest_level is None:
         return
@@ -58,11 +60,11 @@ def choose_views(state: TrainingState) -> None:
 
 
 def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ranks: Ranks) -> Progress:
-    """Return where a run stands that goes on with the training views of a capture.
+    """Return the progress of a resumed run whose training views may have changed since the checkpoint.
 
-    Photographs may be lost, or come back, between a checkpoint and the run that goes on from it
-    (`data.allow_missing`). What is known of the views by their places would then be that of others: it is
-    dropped, here and from the table. The gated views are chosen anew before the next step.
+    Photographs may be lost, or be found again, between a checkpoint and the run that continues from it
+    (`data.allow_missing`). Data that are stored by view index would then belong to other views. They are
+    dropped from the progress and from the table, and the gated views are chosen again before the next step.
     """
     views = train_views_fingerprint(capture)
     if progress.train_views not in ("", views):
@@ -79,11 +81,11 @@ def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ra
 
 
 def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
-    """Return what a batch of training views leaves out; None: nothing.
+    """Return LOD gate and cull mask of a batch of training views; None if it has neither.
 
     Args:
-        state: of the run.
-        indices: cameras of the capture, all of them for training.
+        state: state of the run.
+        indices: training cameras, as indices into the capture.
     """
     columns = [state.columns[index] for index in indices]
     gate, flags = lod_gate(state.config, state.progress), state.progress.gated_views

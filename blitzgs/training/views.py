@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A capture as training sees it: in a unit of length of its own, with views ready for the kernels."""
+"""The trained world: a capture in a unit of length near its extent, with views in the form of the kernels."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ from blitzgs.view.gate import LodGate, centres_of
 
 
 class CameraLike(Protocol):
-    """What training reads of a camera (`blitzgs.scene.cameras.Camera`)."""
+    """The fields of a camera that training reads (`blitzgs.scene.cameras.Camera`)."""
 
     @property
     def name(self) -> str:
-        """Of the image."""
+        """Name of the image."""
 
     @property
     def width(self) -> int:
-        """Pixels."""
+        """Image width in pixels."""
 
     @property
     def height(self) -> int:
-        """Pixels."""
+        """Image height in pixels."""
 
     @property
     def K(self) -> npt.NDArray[np.float64]:  # noqa: N802
-        """Intrinsics [3, 3]."""
+        """Intrinsics in pixels, [3, 3]."""
 
     @property
     def world_to_camera(self) -> npt.NDArray[np.float64]:
-        """Pose [4, 4]."""
+        """Pose, world to camera, [4, 4]."""
 
 
 @dataclass(frozen=True)
 class Space:
-    """How the trained world lies in the capture's: x_capture = x_trained * unit + offset.
+    """Maps between the trained world and the capture's: x_capture = x_trained * unit + offset.
 
-    The unit is the power of two that brings the scene's extent into [1, 2). Scaling by powers of two rounds
-    nothing, so a capture scaled by one trains to the same bits.
+    The unit is the power of two for which the scene's extent is in [1, 2). Scaling by a power of two is
+    exact, so a capture that is scaled by one trains to the same bits.
 
     Attributes:
         offset: origin of the trained world in the capture's coordinates.
         unit: length of one trained unit in the capture's.
-        extent: of the scene, in trained units.
+        extent: extent of the scene, in trained units.
     """
 
     offset: tuple[float, float, float]
@@ -95,10 +95,10 @@ def unpack_views(numbers: Tensor, width: int, height: int) -> Views:
 
 
 class ViewSet:
-    """The cameras of a capture, ready to be picked into batches."""
+    """The cameras of a capture, from which batches of views are made."""
 
     def __init__(self, cameras: list[CameraLike], space: Space, device: torch.device) -> None:
-        """Bring all poses into the trained world; `device` is where `pick` puts its views."""
+        """Transform all poses into the trained world; `device` is the device of the views of `pick`."""
         poses = np.stack([viewmat(camera, space) for camera in cameras])
         self._viewmats = poses.astype(np.float32)
         self._Ks = np.stack([camera.K for camera in cameras]).astype(np.float32)
@@ -159,6 +159,6 @@ def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | 
 
 
 def camera_centres(cameras: list[CameraLike], space: Space) -> Tensor:
-    """Positions of the cameras in the trained world, float64 [V, 3]."""
+    """Return the positions of cameras in the trained world, float64 [V, 3]."""
     poses = np.stack([viewmat(camera, space) for camera in cameras])
     return torch.from_numpy(-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]))

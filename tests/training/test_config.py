@@ -140,7 +140,7 @@ def test_masks_may_be_switched_off():
 def test_a_section_that_is_there_twice_is_refused_and_a_bom_is_not_read(tmp_path):
     file = tmp_path / "config.yaml"
     file.write_text("seed: 1\nloss:\n  ssim: 0.5\nloss:\n  scale: 1\n")
-    with pytest.raises(ConfigError, match="config.yaml: not valid YAML: 'loss' is there twice"):
+    with pytest.raises(ConfigError, match="config.yaml: not valid YAML: the key 'loss' is given twice"):
         load_config(file)
     file.write_bytes(b"\xef\xbb\xbfseed: 7\n")
     assert load_config(file).seed == 7

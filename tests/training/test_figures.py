@@ -19,7 +19,7 @@ def test_a_view_that_is_masked_all_over_counts_for_nothing(tmp_path):
     config = tiny_config("schedule.iterations=20")
     plain = Trainer(config, capture, images, tmp_path / "plain", Ranks()).train()
     images.masks[3] = torch.zeros(32, 48, dtype=torch.uint8)
-    with pytest.warns(UserWarning, match="1 views are masked all over and count for nothing: 03.png"):
+    with pytest.warns(UserWarning, match="1 views are left out, as all their pixels are masked: 03.png"):
         summary = Trainer(config, capture, images, tmp_path / "masked", Ranks()).train()
     views = [
         json.loads((tmp_path / name / "evaluation" / "000020" / "metrics.json").read_text())["views"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run is looked at before the work begins."""
+"""The folder of a run is checked before training begins."""
 
 import subprocess
 import sys

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is not finite is found, and the message says what was looked at."""
+"""Non-finite values are found, and the message names the step and the op."""
 
 import pytest
 import torch
@@ -85,12 +85,10 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     with pytest.raises(NonFiniteError) as failure:
         guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, late)
     text = str(failure.value)
-    assert text.startswith(
-        "step 9: the loss of view 'b' is not finite; of step 9 nothing is left to look at;"
-    )
+    assert text.startswith("step 9: the loss of view 'b' is not finite; the data of step 9 no longer exist;")
     assert "in step 10 the parameters are finite" in text and "view 'c', 'd'" in text
     guard.check(9, ("a", "b"), bad, table, late)
     splats = rendered.projected._replace(depths=rendered.projected.depths * torch.inf)
     spoiled = Broken(rendered._replace(projected=splats), "cuda")
-    with pytest.raises(NonFiniteError, match="looked at in step 10: .* op project, output depths"):
+    with pytest.raises(NonFiniteError, match="found in step 10: .* op project, output depths"):
         guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, spoiled)

@@ -120,7 +120,7 @@ def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, capsys):
         assert "cameras.json is damaged" in (message := capsys.readouterr().err) and "--data" in message
 
 
-# The configuration that a model was trained with counts.
+# The configuration in the checkpoint is used.
 
 
 @pytest.mark.parametrize("content", ["", "model: {sh_degree: 0}\n", "loss: [", None])
@@ -135,7 +135,7 @@ def test_the_checkpoints_own_configuration_wins(copy, tmp_path, capsys, content)
         warnings.simplefilter("always")
         assert main(["eval", str(folder), "--data", str(data), "--out", str(tmp_path / "out")]) == 0
     assert json.loads(capsys.readouterr().out)["psnr"] == expected
-    assert any("what the checkpoint was trained with counts" in str(w.message) for w in caught)
+    assert any("the configuration in the checkpoint is used" in str(w.message) for w in caught)
 
 
 def test_what_a_resume_may_change(trained, tmp_path):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens between two steps, one file per event: `run(state, event)`.
+"""The events that happen between two steps, one file per event with a function `run(state, event)`.
 
 To add an event, name it in `blitzgs.training.schedule.EventKind`, say there when it happens, and list its
 function in `HANDLERS`.
@@ -28,8 +28,11 @@ HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
 def handle_all(state: TrainingState, events: Sequence[Event]) -> None:
     """Run the schedule's events of one step; every rank calls this with the same events.
 
-    A step has several images. What changes the model goes first, even where an evaluation or a checkpoint is
-    due some images earlier: a resumed run begins with the next step, and would never make up for it.
+    A step covers several images. Events that change the model run first, even if an evaluation or a
+    checkpoint of the
+    same step is due some images earlier: a run that is resumed from that checkpoint begins with the next
+        step, and
+    would never run them.
     """
     for event in sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint")):
         HANDLERS[event.kind](state, event)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event that ends the use of the cull mask: what it left out is trained in all its views again."""
+"""The event that drops the cull mask, so that every Gaussian is trained in all its views again."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from blitzgs.training.state import TrainingState
 
 
 def run(state: TrainingState, event: Event) -> None:
-    """Drop the mask, and the memory it takes, from a run that used it."""
+    """Delete the cull mask and free its memory."""
     if CULL not in state.table:
         return
     state.stepper.settle()

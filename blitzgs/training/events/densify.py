@@ -75,7 +75,7 @@ def run(state: TrainingState, event: Event) -> None:
 
 
 def change_population(state: TrainingState, time: int, rules: DensityRules) -> DensityReport:
-    """Run the strategy of `population.strategy`; rows are caught up. Every rank calls this."""
+    """Run the strategy of `population.strategy`; no optimiser step may be pending. Every rank calls this."""
     population, progress = state.config.population, state.progress
     call: dict[str, Any] = {
         "time": time,
@@ -99,7 +99,7 @@ def change_population(state: TrainingState, time: int, rules: DensityRules) -> D
 
 
 def find_floors(state: TrainingState) -> None:
-    """Find the floor of each Gaussian's scales."""
+    """Compute the smallest allowed scale of each Gaussian (`model.scale_floor`)."""
     model = state.config.model
     views = (state.views.pick([index]) for index in state.capture.train)
     near = model.near * state.space.extent
@@ -107,7 +107,7 @@ def find_floors(state: TrainingState) -> None:
 
 
 def _finds_floors(state: TrainingState, time: int) -> bool:
-    """Tell whether a density event finds the floors of scales anew: the first, and then every tenth."""
+    """Tell whether a density event recomputes the floors of scales: the first does, and then every tenth."""
     schedule, unscaled = state.config.schedule, state.schedule.pace.time(time)
     count = round((unscaled - schedule.densify_from) / schedule.densify_every)
     return count % 10 == 0

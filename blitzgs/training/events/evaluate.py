@@ -16,11 +16,11 @@ from blitzgs.training.state import TrainingState
 
 
 def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
-    """Evaluate the held-out views (the training views when there are none), while the clock stands still.
+    """Measure the held-out views, or the training views if none are held out; the training clock pauses.
 
     Returns:
-        The mean of each metric, and under "split" whether they are those of held-out or of training views;
-        nothing where the run has to stop meanwhile.
+        The mean of each metric, and under "split" which views were measured; an empty dictionary if the run
+        has to stop meanwhile.
     """
     with state.paused_clock():
         folder = state.folder / run_folder.EVALUATION / f"{state.images_seen:06d}"
@@ -43,9 +43,9 @@ def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -
     """Compare the model with the photographs of some cameras; see `blitzgs.training.evaluation.evaluate`.
 
     Args:
-        state: of the run; every rank calls this.
+        state: state of the run; every rank calls this.
         indices: cameras of the capture.
-        folder: gets the metrics and the pictures; None: nothing is written.
+        folder: folder for the metrics and the pictures; None: nothing is written.
     """
     state.catch_up()
     return evaluate(

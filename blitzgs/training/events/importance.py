@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two importance passes: a sweep over the training views, and what is kept by its scores."""
+"""The two importance passes: score all Gaussians over the training views, and prune by the scores."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from blitzgs.training.lod import scene_gate
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
 
-# Views surveyed at once, at least: fewer would leave a GPU waiting for the host.
+# Smallest number of views to survey together; with fewer, a GPU would wait for the host.
 LEAST_VIEWS = 4
 
 
 def run(state: TrainingState, event: Event) -> None:
-    """Score all Gaussians, store phi and the cull mask, prune by the scores and deal the rows anew.
+    """Score all Gaussians, store phi and the cull mask, prune by the scores and redistribute the rows.
 
     Raises:
         NonFiniteError: a parameter is not finite.
@@ -69,7 +69,7 @@ def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
     by_size: dict[tuple[int, int], list[int]] = {}
     for column, index in enumerate(state.capture.train):
         by_size.setdefault(state.views.size([index]), []).append(column)
-    # A pool is sure to have room for as many views as a step has.
+    # A pool has room for at least the views of one step.
     least = 1 if state.config.memory.resident_gb > 0 else LEAST_VIEWS
     length = max(state.schedule.batch_size, least)
     for columns in by_size.values():
@@ -80,7 +80,7 @@ def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
 
 
 def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Tensor:
-    """Tell which rows a pass takes out, and why: uint8 [N] of `Cause`; 0: kept. Every rank calls this."""
+    """Return why a pass prunes each row, uint8 [N] of `Cause`; 0: it is kept. Every rank calls this."""
     population, table, ids = state.config.population, state.table, state.table["id"]
     causes = torch.zeros_like(ids, dtype=torch.uint8)
     if event.kind == "pass_1":
@@ -90,7 +90,7 @@ def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Te
             )
             causes[~kept] = Cause.PASS_1
         return causes
-    # Where nothing contributes to any view, there is no mass to keep a share of.
+    # If no Gaussian contributes to any view, the total is zero and no share of it can be kept.
     total = state.ranks.all_reduce(found.score.double().sum())
     if min(population.pass2_mass, population.pass2_keep) < 1 and total.item() > 0:
         least = population.min_opacity

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event at which a run with `schedule.adaptive` looks at itself and may place the next of its times."""
+"""The event at which a run with `schedule.adaptive` reads its signals and may place its next time."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from blitzgs.training.state import TrainingState
 
 
 def run(state: TrainingState, event: Event) -> None:
-    """Measure, and place what the signals say; every rank decides alike, from sums over all."""
+    """Place the times for which the signals give a reason; every rank decides the same."""
     signals = state.signals
     if signals is None:
         return
     pace, config = state.schedule.pace, state.config.schedule
-    # A compressed schedule may have passed the latest places of several.
+    # A compressed schedule may have passed the latest places of several times.
     while (found := signals.next_place(config, pace, state.images_seen)) is not None:
         place, reason = found
         name = PLACED[len(config.placed)]
@@ -24,6 +24,6 @@ def run(state: TrainingState, event: Event) -> None:
         text = f"{name} is placed at {place:,}: {reason}" if place else None
         state.log.event(event.time, "place", {"name": name, "time": place, "reason": reason}, text)
     if config != state.config.schedule:
-        # The rates do not depend on these times, so the optimiser need not follow.
+        # The learning rates do not depend on these times, so the optimiser need not be updated.
         state.config = replace(state.config, schedule=config)
         state.schedule = Schedule(config)

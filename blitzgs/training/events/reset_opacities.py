@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event that makes every Gaussian almost transparent, so that those which are needed show it."""
+"""The event that caps all opacities at a low value; Gaussians that the images need become opaque again."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event that writes a checkpoint, and what happens where there is no room for one."""
+"""The event that writes a checkpoint, and what happens if that fails."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
 
-# A checkpoint that could not be written is tried again after this long, while training goes on.
+# If a checkpoint cannot be written, training continues and tries again after this time.
 RETRY_SECONDS = 60.0
-# The last one is waited for: first this long, then twice as long each time.
+# If the last checkpoint of a run cannot be written, the run waits this long, then twice as long each time.
 FIRST_WAIT_SECONDS = 1.0
 LONGEST_WAIT_SECONDS = 20.0
-# A run that ends at night waits until its user has seen the message.
+# The run waits up to a day, so that its user can see the message and free some space.
 PATIENCE_SECONDS = 24 * 3600.0
-# torchrun kills a process 30 seconds after it was told to stop.
+# A run that was told to stop waits less: torchrun kills a process 30 seconds after SIGTERM.
 STOPPING_PATIENCE_SECONDS = 15.0
 
 
 def run(state: TrainingState, event: Event | None = None) -> None:
     """Write a checkpoint; pending optimiser steps stay pending, so that saving changes nothing.
 
-    Where it cannot be written, the run goes on and tries again a minute later.
+    If it cannot be written, the run continues and tries again a minute later.
 
     Raises:
         NonFiniteError: a value is not finite; nothing is written, and earlier checkpoints are kept.
@@ -40,12 +40,12 @@ def run(state: TrainingState, event: Event | None = None) -> None:
 
 
 def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[], bool]) -> None:
-    """Write the checkpoint that a run ends with; where it cannot be written, wait and try again.
+    """Write the checkpoint at the end of a run; if it cannot be written, wait and try again.
 
     Args:
-        state: of the run.
-        patience_seconds: how long to wait.
-        gives_up: asked before each wait; the same answer on every rank.
+        state: state of the run.
+        patience_seconds: longest time to wait.
+        gives_up: asked before each wait whether to stop trying; it must return the same on every rank.
 
     Raises:
         NonFiniteError: as for `run`.
@@ -81,7 +81,7 @@ def _write(state: TrainingState) -> None:
         state.progress = replace(state.progress, ledger=ledger_state(ledger))
     if state.signals is not None:
         state.progress = replace(state.progress, signals=state.signals.saved())
-    # Who composites which tiles decides the order of sums, and with it their last bits.
+    # The division of tiles decides the order of sums, and therefore their last bits.
     shared = state.owners.columns() if state.ranks.world_size > 1 else None
     run_folder.save(
         state.folder,
