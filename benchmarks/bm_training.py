@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real training, some thousand images in: how long a step and a density event take, and who waits when.
+"""Measures a real training after some thousand images: time of a step, of a density event, and of waits.
 
     python benchmarks/bm_training.py --data DIR --config configs/aerial.yaml [--images 10000] [--FIELD=VALUE]
     torchrun --nproc-per-node=2 benchmarks/bm_training.py --data DIR --config configs/aerial.yaml
 
-Trains the capture with `--images` images, as `blitzgs train` does, batches loaded and logged, but without
-checkpoints and evaluations. Then measures, by the host's clock and with the GPU waited for at their ends,
-`--steps` further steps with the density events that fall among them. On CUDA `--profiled` more steps, without
-density events, go under torch's profiler: how long kernels and copies keep the main stream busy (the stream
-that works most), how long the host stands in calls that wait for the GPU, which kernels take the time, and
-the longest gaps on the main stream by what stands before and after them. The figures are rank 0's; ranks meet
-in every step.
+First the benchmark trains the capture with `--images` images, as `blitzgs train` does, with loading and
+logging of batches but without checkpoints and evaluations. Then it measures `--steps` further steps with the
+density events that fall among them, by the host's clock; the GPU is idle before and after.
+
+On CUDA, `--profiled` more steps, without density events, run under torch's profiler. Reported are: how long
+kernels and copies keep the busiest stream occupied, how long the host waits for the GPU, which kernels take
+the time, and the longest gaps on the busiest stream with the kernels before and after each. The figures are
+those of rank 0; the ranks wait for each other in every step.
 """
 
 from __future__ import annotations
