@@ -5,8 +5,10 @@
 
 The first 4 M Gaussians are `bm_step.py`'s aerial scene; the others are copies of it, 5 km apart behind the
 cameras. The step is that of `bm_step.py`: every row is 0 to 39 steps behind. Time is the median over steps of
-the sum of their stages by CUDA events; scratch is the most memory in use during a step, beyond the table and
-what stays from step to step.
+the sum of their stages by CUDA events; scratch is the most memory that a step asks for at a time, beyond the
+table and what stays from step to step. Torch hands out more than that: it rounds, and for more than 1 MiB it
+takes a free block whole where 1 MiB or less of it would be left. Beside the two, all that a step asks for in
+turn, in pieces of up to 1 MiB and in larger ones, and how many pieces these are.
 """
 
 from __future__ import annotations
@@ -41,15 +43,30 @@ def make_scene(gaussians: int, views: int) -> BenchmarkScene:
     return scene
 
 
-def scratch_of(step: OurStep) -> int:
-    """Return the bytes that a step needs beyond what is allocated before it."""
+def scratch_of(step: OurStep) -> dict[str, float]:
+    """Return what a step allocates beyond what is allocated before it."""
     step.prepare()
     torch.cuda.synchronize()
-    before = torch.cuda.memory_allocated()
+    before = torch.cuda.memory_stats()
     torch.cuda.reset_peak_memory_stats()
     step.take(lambda _: None)
     torch.cuda.synchronize()
-    return torch.cuda.max_memory_allocated() - before
+    after = torch.cuda.memory_stats()
+
+    def most(what: str) -> int:
+        return int(after[f"{what}.all.peak"] - before[f"{what}.all.current"])
+
+    def sum_of(what: str, pool: str) -> int:
+        return int(after[f"{what}.{pool}.allocated"] - before[f"{what}.{pool}.allocated"])
+
+    return {
+        "scratch MB": most("requested_bytes") / 1e6,
+        "handed out MB": most("allocated_bytes") / 1e6,
+        "small in all MB": sum_of("requested_bytes", "small_pool") / 1e6,
+        "small pieces": sum_of("allocation", "small_pool"),
+        "large in all MB": sum_of("requested_bytes", "large_pool") / 1e6,
+        "large pieces": sum_of("allocation", "large_pool"),
+    }
 
 
 def run(millions: float, views: int, repeats: int) -> dict[str, Any]:
@@ -58,14 +75,14 @@ def run(millions: float, views: int, repeats: int) -> dict[str, Any]:
     step = OurStep(make_scene(gaussians, views))
     torch.cuda.empty_cache()
     stages = measure(step, repeats)
-    scratch = sorted(scratch_of(step) for _ in range(5))[2]
+    scratch = sorted((scratch_of(step) for _ in range(5)), key=lambda sizes: sizes["scratch MB"])[2]
     return {
         "gaussians": gaussians,
         "views": views,
         "visible": step.visible,
         "ms": stages[-1][1],
-        "scratch MB": scratch / 1e6,
-        "scratch B a Gaussian": scratch / gaussians,
+        **scratch,
+        "scratch B a Gaussian": 1e6 * scratch["scratch MB"] / gaussians,
     }
 
 

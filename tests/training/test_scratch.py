@@ -34,13 +34,15 @@ def table_of(unseen: int, device: str) -> GaussianTable:
 
 
 def peak_bytes(run, device: str) -> int:
-    """How much more memory than before is in use at a time while `run()` runs."""
+    """How much more memory than before is asked for at a time while `run()` runs."""
     if device == "cuda":
+        # Not what is handed out (`max_memory_allocated`): for more than 1 MiB, torch hands out a free block
+        # whole where less than 1 MiB of it would be left, and which blocks are free depends on the table.
         torch.cuda.synchronize()
-        before = torch.cuda.memory_allocated()
+        before = torch.cuda.memory_stats()["requested_bytes.all.current"]
         torch.cuda.reset_peak_memory_stats()
         run()
-        return torch.cuda.max_memory_allocated() - before
+        return torch.cuda.memory_stats()["requested_bytes.all.peak"] - before
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as all:
         run()
     events = [e for e in all.profiler.kineto_results.events() if e.name() == "[memory]"]
