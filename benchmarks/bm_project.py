@@ -57,7 +57,7 @@ def backward_arguments(scene: BenchmarkScene, splats: ProjectedSplats) -> tuple[
     inputs = inputs_of(scene)
     return (
         inputs.gaussians, list(inputs.cameras), [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
-        inputs.options.ints, inputs.options.floats, v, None, None, False,
+        inputs.options.ints, inputs.options.floats, v, None, False,
     )  # fmt: skip
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from blitzgs import rasterization
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
-from blitzgs.ops.rasterize import rasterize_fwd
+from blitzgs.ops.rasterize import RasterizeForward, rasterize_fwd
 
 try:
     import gsplat
@@ -73,10 +73,12 @@ class OurRender:
 
     def rasterize_backward(self, v_renders: Tensor) -> None:
         """Differentiate the compositing."""
+        *splats, backgrounds, isect_splats, tile_offsets = self.splats
         _, rest, last, _, packed_splats, tile_order, packed = self.saved
-        ops.rasterize_bwd_packed_(
-            *self.splats, [rest, last, packed_splats, tile_order], v_renders, self.grid, False, packed
+        forward_pass = RasterizeForward(
+            splats, backgrounds, [isect_splats, tile_offsets], [rest, last, packed_splats, tile_order]
         )
+        ops.rasterize_bwd_packed_(*forward_pass, v_renders, self.grid, False, packed)
         self.v_splats = [packed]
 
     def project_backward(self) -> None:
@@ -84,7 +86,7 @@ class OurRender:
         r = self.projected
         self.gradients = ops.project_bwd(
             self.parameters, self.cameras, [r[1], r[2], r[3]], self.options.ints, self.options.floats,
-            self.v_splats, None, None, False,
+            self.v_splats, None, False,
         )  # fmt: skip
 
     def forward(self) -> Tensor:

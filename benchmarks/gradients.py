@@ -35,8 +35,8 @@ def parameter_gradients(
     if gradients.places is not None:
         parts = [sum_of_ranks(gradients, len(projected.means2d))]
     *parameters, _ = torch.ops.blitzgs.project_bwd(
-        list(table.parameters), [frame.views.viewmats, frame.views.Ks],
+        list(table.parameters), [frame.views.viewmats, frame.views.Ks, scale_reg],
         [projected.camera_ids, projected.visible_ids, projected.splat_offsets], options.ints, options.floats,
-        list(parts), None, scale_reg, False,
+        list(parts), None, False,
     )  # fmt: skip
     return parameters

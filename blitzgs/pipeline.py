@@ -31,6 +31,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.capacity import Attempt
 from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions, Splats
+from blitzgs.ops.rasterize import RasterizeForward
 from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients, absolute_column
 
 
@@ -290,21 +291,24 @@ def backward_splats(
     """
     views, options, splats, way_back = frame.views, frame.options, frame.splats, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.tiles
-    arguments = (
-        splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_splats,
-        frame.tile_offsets,
-        [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order], v_renders,
-    )  # fmt: skip
+    forward_pass = RasterizeForward(
+        [splats.means2d, splats.conics, splats.opacities, splats.colors],
+        frame.backgrounds,
+        [frame.isect_splats, frame.tile_offsets],
+        [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order],
+    )
     grid = [len(views), views.width, views.height, options.tile_size, *tiles]
     if way_back is not None:
         way_back.expect_gradients()
     if v_renders.is_cuda:
         packed = frame.gradients.take(splats.means2d)
-        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, grid, options.deterministic, packed, absolute)
+        torch.ops.blitzgs.rasterize_bwd_packed_(
+            *forward_pass, v_renders, grid, options.deterministic, packed, absolute
+        )
         gradients = SplatGradients([packed], None, absolute_column(packed) if absolute else None)
     else:
         *parts, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *arguments, None, grid, absolute, options.deterministic
+            *forward_pass, v_renders, None, grid, absolute, options.deterministic
         )
         gradients = SplatGradients(parts, None, v_abs if absolute else None)
     mark("raster back")

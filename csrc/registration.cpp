@@ -26,12 +26,10 @@ std::vector<std::int64_t> splat_gradient_layout() {
 STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The active set: blocks of consecutive rows with bounds, culled against the views.
   m.def("morton_keys(Tensor points) -> Tensor");
+  // rows: (means, scales[, four moments of these, last_step, moment_step, table]), blitzgs/ops/blocks.py.
+  m.def("update_block_bounds_(Tensor(a!) bounds, Tensor? ids, Tensor[] rows) -> ()");
   m.def(
-      "update_block_bounds_(Tensor(a!) bounds, Tensor? ids, Tensor means, Tensor scales, Tensor[] moments, "
-      "Tensor? last_step, Tensor? moment_step, Tensor? table) -> ()");
-  m.def(
-      "cull_blocks(Tensor bounds, Tensor means, Tensor scales, Tensor[] moments, Tensor? last_step, "
-      "Tensor? moment_step, Tensor? table, Tensor[] cameras, int[] size, float[] limits, "
+      "cull_blocks(Tensor bounds, Tensor[] rows, Tensor[] cameras, int[] size, float[] limits, "
       "Tensor? level_ranges=None, Tensor? level=None, float[] reach=[], int lod_views=0, Tensor? cull=None, "
       "int[] columns=[], int? room=None) "
       "-> (Tensor active_ids, Tensor active_views, Tensor count, Tensor n_blocks)");
@@ -53,22 +51,23 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
-  // v_splats: (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one table of splat gradients.
+  // views: cameras and, of each view, weights of the Gaussians' smallest axes and opacities: (viewmats, Ks[,
+  // scale_reg[, opacity_reg]]). v_splats: (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one
+  // table of splat gradients.
   m.def(
-      "project_bwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] splats, int[] ints, float[] floats, "
-      "Tensor[] v_splats, Tensor? v_depths, Tensor? scale_reg, bool need_viewmats, bool dense=False, "
-      "Tensor? opacity_reg=None, Tensor? level=None) -> ("
+      "project_bwd(Tensor[] gaussians, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
+      "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False, Tensor? level=None) -> ("
       "Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor v_opacities, Tensor v_sh, "
       "Tensor v_viewmats)");
-  // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the
-  // ranks that composited the splats. Groups: last_steps (last_step, moment_step); tables (schedule_table,
-  // lr_table[, final_rules]); steps (step, explicit_steps, sparse); decays (beta1, beta2, eps).
+  // project_bwd, then lazy_adam_step_ of the visible Gaussians. splats: (camera_ids, visible_ids,
+  // splat_offsets[, places]); with places, v_splats are the tables of the ranks that composited the splats.
+  // Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state (params, exp_avgs, exp_avg_sqs,
+  // last_step, moment_step); tables (schedule_table, lr_table[, final_rules]); steps (step, explicit_steps,
+  // sparse); decays (beta1, beta2, eps).
   m.def(
-      "project_bwd_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
-      "Tensor(d!)[] last_steps, Tensor[] tables, int[] steps, float[] decays, Tensor[] cameras, "
-      "Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, Tensor? places=None, "
-      "Tensor? scale_reg=None, Tensor(e!)? means2d_sums=None, Tensor? opacity_reg=None, "
-      "Tensor? level=None, bool absolute_sums=False) -> ()");
+      "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, "
+      "Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, "
+      "Tensor? level=None, Tensor(b!)? means2d_sums=None, bool absolute_sums=False) -> ()");
   // Where the parts of a splat gradient begin in its floats, and last how many these are: mean2d, conic,
   // opacity, color, mean2d_abs.
   m.def("splat_gradient_layout() -> int[]");
@@ -111,15 +110,16 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, int[] grid, Tensor(a!) packed, "
       "Tensor? n_splats=None) -> (Tensor renders, Tensor transmittances, Tensor last_ids, Tensor tile_work, "
       "Tensor packed_splats, Tensor tile_order)");
+  // Groups, as blitzgs/ops/rasterize.py names them: splats (means2d, conics, splat_opacities, colors); lists
+  // (isect_splats, tile_offsets).
   m.def(
-      "rasterize_bwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
-      "Tensor? v_alphas, int[] grid, bool absgrad, bool deterministic) -> (Tensor v_means2d, "
+      "rasterize_bwd(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
+      "Tensor v_renders, Tensor? v_alphas, int[] grid, bool absgrad, bool deterministic) -> ("
+      "Tensor v_means2d, "
       "Tensor v_conics, Tensor v_splat_opacities, Tensor v_colors, Tensor v_means2d_abs)");
   m.def(
-      "rasterize_bwd_packed_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, Tensor[] composited, Tensor v_renders, "
-      "int[] grid, bool deterministic, Tensor(a!) packed, bool absgrad=False) -> ()");
+      "rasterize_bwd_packed_(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
+      "Tensor v_renders, int[] grid, bool deterministic, Tensor(a!) packed, bool absgrad=False) -> ()");
 
   // What each splat contributes to the pixels, without colours.
   m.def(
@@ -156,12 +156,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The optimiser: dense Adam over an index list, and its statistics for density control. Groups of arguments
   // as for project_bwd_step_.
   m.def(
-      "lazy_adam_step_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
-      "Tensor(d!)[] last_steps, Tensor[] grads, Tensor ids, Tensor[] tables, int[] steps, float[] decays) "
-      "-> ()");
+      "lazy_adam_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, Tensor[] grads, "
+      "Tensor ids) -> ()");
   m.def(
-      "lazy_adam_catch_up_(Tensor(a!)[] params, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, "
-      "Tensor(d!)[] last_steps, Tensor? ids, Tensor[] tables, int[] steps, float[] decays, "
+      "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, Tensor? ids, "
       "Tensor? count=None) -> ()");
   // What a row owes in the end, by the step that it stands at; `like` is of the parameters' dtype.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");

@@ -2,11 +2,13 @@
 """One training step stays short to read (see tests/walk.py)."""
 
 import pytest
+import torch
 
 from blitzgs.distributed.group import Ranks
 from tests.walk import kernel_files, walk_of_a_step
 
 MOST_PYTHON, MOST_KERNELS, MOST_VISITS = 20, 61, 2
+MOST_ARGUMENTS = 12
 
 
 @pytest.fixture(scope="module")
@@ -26,3 +28,10 @@ def test_the_kernels_of_a_step_lie_in_few_files(walk):
     kernels = kernel_files(walk.ops)
     assert "csrc/project/project_step_cuda.cu" in kernels and "csrc/math/tiles.h" in kernels
     assert len(kernels) <= MOST_KERNELS, kernels
+
+
+def test_ops_take_few_arguments():
+    names = [name for name in torch._C._dispatch_get_all_op_names() if name.startswith("blitzgs::")]
+    ops = [getattr(torch.ops.blitzgs, name.partition("::")[2]).default for name in names]
+    many = {op.name(): len(op._schema.arguments) for op in ops if len(op._schema.arguments) > MOST_ARGUMENTS}
+    assert len(ops) > 30 and not many, many

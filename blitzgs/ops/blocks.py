@@ -120,7 +120,7 @@ def update_block_bounds_(
     Raises:
         RuntimeError: wrong shapes or dtypes.
     """
-    torch.ops.blitzgs.update_block_bounds_(bounds, ids, means, scales, *_pending_arguments(pending))
+    torch.ops.blitzgs.update_block_bounds_(bounds, ids, _rows(means, scales, pending))
 
 
 def cull_blocks(
@@ -168,9 +168,7 @@ def cull_blocks(
     """
     ids, views, length, blocks = torch.ops.blitzgs.cull_blocks(
         bounds,
-        means,
-        scales,
-        *_pending_arguments(pending),
+        _rows(means, scales, pending),
         [viewmats, Ks],
         [width, height],
         [near_plane, far_plane, eps2d],
@@ -180,10 +178,9 @@ def cull_blocks(
     return ActiveRows(ids, views, length, blocks)
 
 
-def _pending_arguments(
-    pending: PendingSteps | None,
-) -> tuple[list[Tensor], Tensor | None, Tensor | None, Tensor | None]:
-    return ([], None, None, None) if pending is None else (list(pending[:4]), *pending[4:])
+def _rows(means: Tensor, scales: Tensor, pending: PendingSteps | None) -> list[Tensor]:
+    """Return the group `rows` of the ops (`hold_rows` of csrc/blocks/blocks_op.cpp)."""
+    return [means, scales, *(pending or ())]
 
 
 @torch.library.register_fake("blitzgs::morton_keys")

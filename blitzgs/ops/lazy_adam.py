@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +16,56 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 
 # Drift terms below this fraction of their sum are lost in rounding.
 _NEGLIGIBLE = {torch.float32: 2.0**-27, torch.float64: 2.0**-56}
+
+
+class AdamState(NamedTuple):
+    """The optimiser's state of a table of N rows, as the ops that move parameters take it.
+
+    Attributes:
+        params: (means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3]).
+        exp_avgs: first moments, shaped like `params`.
+        exp_avg_sqs: second moments, shaped like `params`.
+        last_step: int32 [N], the step that each row's parameters stand at.
+        moment_step: int32 [N], <= `last_step`, the step that its moments stand at.
+    """
+
+    params: Sequence[Tensor]
+    exp_avgs: Sequence[Tensor]
+    exp_avg_sqs: Sequence[Tensor]
+    last_step: Tensor
+    moment_step: Tensor
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """The group `state` of the ops (`AdamTensors` of csrc/lazy_adam/lazy_adam_op.h)."""
+        return [*self.params, *self.exp_avgs, *self.exp_avg_sqs, self.last_step, self.moment_step]
+
+
+class AdamSchedule(NamedTuple):
+    """Adam's constants, and its learning rates of every step.
+
+    Attributes:
+        lr_table: float32 [S + 1, 6], as for `lazy_adam_step_`.
+        beta1: decay of the first moment, below sqrt(beta2).
+        beta2: decay of the second moment, in (0, 1).
+        eps: added to the root of the second moment.
+        sparse: plain sparse Adam: moments of unlisted rows keep their values and nothing drifts.
+    """
+
+    lr_table: Tensor
+    beta1: float
+    beta2: float
+    eps: float
+    sparse: bool = False
+
+    @property
+    def decays(self) -> list[float]:
+        """The group `decays` of the ops."""
+        return [self.beta1, self.beta2, self.eps]
+
+    def steps(self, step: int, dtype: torch.dtype) -> list[int]:
+        """Return the group `steps` of the ops: step number `step` of parameters of a dtype."""
+        return [step, explicit_steps(self.beta1, self.beta2, dtype), int(self.sparse)]
 
 
 @torch.no_grad()
@@ -60,16 +110,14 @@ def lazy_adam_step_(
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
+    schedule = AdamSchedule(lr_table, beta1, beta2, eps, sparse)
     torch.ops.blitzgs.lazy_adam_step_(
-        list(params),
-        list(exp_avgs),
-        list(exp_avg_sqs),
-        [last_step, moment_step],
+        AdamState(params, exp_avgs, exp_avg_sqs, last_step, moment_step).tensors,
+        schedule_tables(lr_table, beta1, beta2, eps, params[0]),
+        schedule.steps(step, params[0].dtype),
+        schedule.decays,
         list(grads),
         ids,
-        schedule_tables(lr_table, beta1, beta2, eps, params[0]),
-        [step, explicit_steps(beta1, beta2, params[0].dtype), int(sparse)],
-        [beta1, beta2, eps],
     )
 
 
@@ -101,15 +149,13 @@ def lazy_adam_catch_up_(
         ValueError: decay rates outside their range.
         RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
+    schedule = AdamSchedule(lr_table, beta1, beta2, eps)
     torch.ops.blitzgs.lazy_adam_catch_up_(
-        list(params),
-        list(exp_avgs),
-        list(exp_avg_sqs),
-        [last_step, moment_step],
-        ids,
+        AdamState(params, exp_avgs, exp_avg_sqs, last_step, moment_step).tensors,
         schedule_tables(lr_table, beta1, beta2, eps, params[0]),
-        [step, explicit_steps(beta1, beta2, params[0].dtype), 0],
-        [beta1, beta2, eps],
+        schedule.steps(step, params[0].dtype),
+        schedule.decays,
+        ids,
         count,
     )
 

@@ -172,19 +172,18 @@ def _(
 @torch.library.register_fake("blitzgs::project_bwd")
 def _(
     gaussians: Sequence[Tensor],
-    cameras: Sequence[Tensor],
+    views: Sequence[Tensor | None],
     splats: Sequence[Tensor],
     ints: Sequence[int],
     floats: Sequence[float],
     v_splats: Sequence[Tensor],
     v_depths: Tensor | None,
-    scale_reg: Tensor | None,
     need_viewmats: bool,
     dense: bool = False,
-    opacity_reg: Tensor | None = None,
     level: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
-    means, (_, visible_ids, _) = gaussians[0], splats
+    means, (_, visible_ids, _), viewmats = gaussians[0], splats, views[0]
+    assert viewmats is not None
     length = (means if dense else visible_ids).shape[0]
     return (
         means.new_empty(length, 3),
@@ -192,7 +191,7 @@ def _(
         means.new_empty(length, 3),
         means.new_empty(length),
         means.new_empty(length, gaussians[4].shape[1] if len(gaussians) > 4 else 0, 3),
-        means.new_empty(cameras[0].shape[0] if need_viewmats else 0, 4, 4),
+        means.new_empty(viewmats.shape[0] if need_viewmats else 0, 4, 4),
     )
 
 
@@ -254,7 +253,7 @@ def _first_gradients(
     dense = not any(sparse) and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         list(saved.gaussians), list(saved.cameras), list(saved.splats), options.ints, options.floats,
-        _splat_gradients(saved, v), v.depths, None, need_viewmats, dense, None, saved.level,
+        _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if not dense:

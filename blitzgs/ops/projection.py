@@ -116,6 +116,23 @@ class ProjectionOptions(NamedTuple):
         return [self.near_plane, self.far_plane, self.eps2d, self.radius_clip, *self.fade]
 
 
+class WeightedViews(NamedTuple):
+    """B views as the backward ops take them: cameras, and weights of regularisers.
+
+    Attributes:
+        viewmats: [B, 4, 4], world to camera.
+        Ks: [B, 3, 3], intrinsics in px.
+        scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such
+            term.
+        opacity_reg: the same of the opacity (without the compensation of antialiased splats).
+    """
+
+    viewmats: Tensor
+    Ks: Tensor
+    scale_reg: Tensor | None = None
+    opacity_reg: Tensor | None = None
+
+
 class ProjectionInputs(NamedTuple):
     """What is projected, in the groups of arguments that the ops take.
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +15,22 @@ from blitzgs.ops.intersect import tile_counts
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
 
 rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
+
+
+class RasterizeForward(NamedTuple):
+    """What the ops of the backward pass take of the forward pass, in their groups.
+
+    Attributes:
+        splats: means2d, conics, splat_opacities, colors.
+        backgrounds: [B, D]; None: black.
+        lists: isect_splats, tile_offsets.
+        composited: transmittances, last_ids, packed_splats, tile_order.
+    """
+
+    splats: list[Tensor]
+    backgrounds: Tensor | None
+    lists: list[Tensor]
+    composited: list[Tensor]
 
 
 def rasterize(
@@ -132,13 +148,9 @@ def _(
 
 @torch.library.register_fake("blitzgs::rasterize_bwd")
 def _(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    colors: Tensor,
+    splats: Sequence[Tensor],
     backgrounds: Tensor | None,
-    isect_splats: Tensor,
-    tile_offsets: Tensor,
+    lists: Sequence[Tensor],
     composited: Sequence[Tensor],
     v_renders: Tensor,
     v_alphas: Tensor | None,
@@ -146,6 +158,7 @@ def _(
     absgrad: bool,
     deterministic: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    means2d, _, _, colors = splats
     n_splats = means2d.shape[0]
     return (
         means2d.new_empty(n_splats, 2),
@@ -173,6 +186,16 @@ def _save(ctx: Any, splats: Any, grid: Any, output: tuple[Tensor, ...]) -> None:
     ctx.grid = grid
 
 
+def _saved(ctx: Any) -> RasterizeForward:
+    """Return what `_save` saved; read it once: checkpointing recomputes saved tensors for each reading."""
+    means2d, conics, opacities, colors, backgrounds, isect_splats, tile_offsets, *composited = (
+        ctx.saved_tensors
+    )
+    return RasterizeForward(
+        [means2d, conics, opacities, colors], backgrounds, [isect_splats, tile_offsets], composited
+    )
+
+
 def _backward(
     ctx: Any, v_renders: Tensor | None, v_transmittances: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
@@ -190,35 +213,33 @@ def _gradients(
     """
     if v_renders is None and v_alphas is None:
         return (None,) * 6
-    saved = ctx.saved_tensors  # read once: checkpointing recomputes them for each reading
+    saved = _saved(ctx)
     with torch.no_grad():
         gradients = _first_gradients(ctx, saved, v_renders, v_alphas, absgrad, may_pack)
-    return first_only("rasterize", gradients, (*saved[:5], v_renders, v_alphas))
+    return first_only("rasterize", gradients, (*saved.splats, saved.backgrounds, v_renders, v_alphas))
 
 
 def _first_gradients(
     ctx: Any,
-    saved: tuple[Any, ...],
+    saved: RasterizeForward,
     v_renders: Tensor | None,
     v_alphas: Tensor | None,
     absgrad: bool,
     may_pack: bool,
 ) -> tuple[Tensor | None, ...]:
-    *splats, transmittances, last_ids, packed_splats, tile_order = saved
-    means2d, _, _, colors, *_ = splats
+    (means2d, _, _, colors), (transmittances, *_) = saved.splats, saved.composited
     if v_renders is None:
         v_renders = transmittances.new_zeros(*transmittances.shape, colors.shape[1])
-    arguments = (*splats, [transmittances, last_ids, packed_splats, tile_order], v_renders)
     deterministic = torch.are_deterministic_algorithms_enabled()
     v_abs = v_backgrounds = None
     v_splats: Sequence[Tensor]
     if may_pack and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
         packed = ctx.gradients.take(means2d)
-        torch.ops.blitzgs.rasterize_bwd_packed_(*arguments, ctx.grid, deterministic, packed)
+        torch.ops.blitzgs.rasterize_bwd_packed_(*saved, v_renders, ctx.grid, deterministic, packed)
         v_splats = gradient_columns(packed)
     else:
         *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
-            *arguments, v_alphas, ctx.grid, absgrad, deterministic
+            *saved, v_renders, v_alphas, ctx.grid, absgrad, deterministic
         )
     if ctx.needs_input_grad[4]:
         v_backgrounds = torch.einsum("bhwd,bhw->bd", v_renders, transmittances)

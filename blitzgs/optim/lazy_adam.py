@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from blitzgs.ops.lazy_adam import AdamState
 from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
 
@@ -127,9 +128,8 @@ class LazyAdam(torch.optim.Optimizer):
             return
         gradients = [values.new_empty(len(values), 0)] * 4 + [values]
         torch.ops.blitzgs.lazy_adam_step_(
-            *_alone(param, state), [state["last_step"], state["moment_step"]], gradients, ids,
-            [drift.table, drift.lr_table], [int(state["step"]) - drift.begin, drift.reach, 0],
-            [*drift.betas, group["eps"]],
+            _alone(param, state).tensors, [drift.table, drift.lr_table],
+            [int(state["step"]) - drift.begin, drift.reach, 0], [*drift.betas, group["eps"]], gradients, ids,
         )  # fmt: skip
 
     @torch.no_grad()
@@ -155,9 +155,8 @@ class LazyAdam(torch.optim.Optimizer):
         self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift, rows: Tensor | None
     ) -> None:
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            *_alone(param, state), [state["last_step"], state["moment_step"]], rows,
-            [drift.table, drift.lr_table], [int(state["step"]) - drift.begin, drift.reach, 0],
-            [*drift.betas, group["eps"]], None,
+            _alone(param, state).tensors, [drift.table, drift.lr_table],
+            [int(state["step"]) - drift.begin, drift.reach, 0], [*drift.betas, group["eps"]], rows,
         )  # fmt: skip
 
     @torch.no_grad()
@@ -339,8 +338,10 @@ def _check_group(group: dict[str, Any]) -> None:
             raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
 
 
-def _alone(param: Tensor, state: dict[str, Any]) -> tuple[list[Tensor], ...]:
-    """Return a parameter and its moments as the op's SH column, with all its other columns empty."""
+def _alone(param: Tensor, state: dict[str, Any]) -> AdamState:
+    """Return a parameter and its state as the ops' SH column, with all their other columns empty."""
     nothing = param.new_empty(len(param), 0)
-    tensors = (param.detach(), *(state[name] for name in _MOMENTS))
-    return tuple([nothing] * 4 + [values] for values in tensors)
+    params, exp_avgs, exp_avg_sqs = (
+        [*[nothing] * 4, values] for values in (param.detach(), *(state[name] for name in _MOMENTS))
+    )
+    return AdamState(params, exp_avgs, exp_avg_sqs, *(state[name] for name in _STEPS))

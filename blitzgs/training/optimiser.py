@@ -8,8 +8,9 @@ import math
 from torch import Tensor
 
 from blitzgs.model import GaussianTable
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, schedule_table
+from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, schedule_table
 from blitzgs.ops.project_step import project_bwd_step_
+from blitzgs.ops.projection import WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
 from blitzgs.pipeline import Frame
 from blitzgs.training.config import OptimiserConfig
@@ -103,23 +104,20 @@ class LazyAdam:
             absolute_sums: `means2d_sums` receives the sum over pixels of absolute gradients instead.
         """
         project_bwd_step_(
-            table.parameters,
-            table.exp_avgs,
-            table.exp_avg_sqs,
-            table["last_step"],
-            table["moment_step"],
-            self.lr_table,
+            AdamState(
+                table.parameters,
+                table.exp_avgs,
+                table.exp_avg_sqs,
+                table["last_step"],
+                table["moment_step"],
+            ),
+            AdamSchedule(self.lr_table, *self._betas, self._eps, self._sparse),
             step,
-            *self._betas,
-            self._eps,
-            self._sparse,
+            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg),
             frame.projected,
-            (frame.views.viewmats, frame.views.Ks),
             frame.options.projection(frame.views),
             v,
-            scale_reg,
-            means2d_sums,
-            opacity_reg,
             table["level"] if frame.options.fade else None,
+            means2d_sums,
             absolute_sums,
         )

@@ -32,10 +32,14 @@ const std::int32_t* hold_steps(const char* op, const char* name, const Tensor& c
   return data<std::int32_t>(held.held.back());
 }
 
-// moments: empty, or exp_avg and exp_avg_sq of the means, then of the scales.
-HeldRows hold_rows(const char* op, const Tensor& means, const Tensor& scales,
-                   const std::vector<Tensor>& moments, const std::optional<Tensor>& last_step,
-                   const std::optional<Tensor>& moment_step, const std::optional<Tensor>& table) {
+// rows: (means, scales), and where steps are pending behind them the moments (exp_avg and exp_avg_sq of the
+// means, then of the scales), last_step, moment_step and table. Python's side is blitzgs/ops/blocks.py.
+HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
+  STD_TORCH_CHECK(rows.size() == 2 || rows.size() == 9, "blitzgs::", op,
+                  ": rows must be (means, scales) or, with pending steps, (means, scales, exp_avg_means, "
+                  "exp_avg_sq_means, exp_avg_scales, exp_avg_sq_scales, last_step, moment_step, table), got ",
+                  rows.size(), " tensors");
+  const Tensor &means = rows[0], &scales = rows[1];
   HeldRows held;
   const std::int64_t n = means.size(0);
   STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "blitzgs::", op, ": fewer than 2^31 - ",
@@ -43,21 +47,17 @@ HeldRows hold_rows(const char* op, const Tensor& means, const Tensor& scales,
   held.rows.n = n;
   held.rows.means = hold_column(op, "means", means, n, held);
   held.rows.scales = hold_column(op, "scales", scales, n, held);
-  const bool pending = !moments.empty();
-  const int given = last_step.has_value() + moment_step.has_value() + table.has_value();
-  STD_TORCH_CHECK(pending ? moments.size() == 4 && given == 3 : given == 0, "blitzgs::", op,
-                  ": pending steps need four moments, last_step, moment_step and table together; got ",
-                  moments.size(), " moments and ", given, " others");
-  if (!pending) return held;
-  held.rows.exp_avg_means = hold_column(op, "exp_avg of means", moments[0], n, held);
-  held.rows.exp_avg_sq_means = hold_column(op, "exp_avg_sq of means", moments[1], n, held);
-  held.rows.exp_avg_scales = hold_column(op, "exp_avg of scales", moments[2], n, held);
-  held.rows.exp_avg_sq_scales = hold_column(op, "exp_avg_sq of scales", moments[3], n, held);
-  check_dtype(op, "table", *table, ScalarType::Double);
-  check_shape(op, "table", *table, {-1, kAdamTable});
-  held.rows.last_step = hold_steps(op, "last_step", *last_step, n, held);
-  held.rows.moment_step = hold_steps(op, "moment_step", *moment_step, n, held);
-  held.held.push_back(as_contiguous(*table));
+  if (rows.size() == 2) return held;
+  held.rows.exp_avg_means = hold_column(op, "exp_avg of means", rows[2], n, held);
+  held.rows.exp_avg_sq_means = hold_column(op, "exp_avg_sq of means", rows[3], n, held);
+  held.rows.exp_avg_scales = hold_column(op, "exp_avg of scales", rows[4], n, held);
+  held.rows.exp_avg_sq_scales = hold_column(op, "exp_avg_sq of scales", rows[5], n, held);
+  held.rows.last_step = hold_steps(op, "last_step", rows[6], n, held);
+  held.rows.moment_step = hold_steps(op, "moment_step", rows[7], n, held);
+  const Tensor& table = rows[8];
+  check_dtype(op, "table", table, ScalarType::Double);
+  check_shape(op, "table", table, {-1, kAdamTable});
+  held.held.push_back(as_contiguous(table));
   held.rows.table = data<double>(held.held.back());
   return held;
 }
@@ -77,12 +77,10 @@ Tensor morton_keys(const Tensor& points) {
   return keys;
 }
 
-void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, const Tensor& means,
-                          const Tensor& scales, const std::vector<Tensor>& moments,
-                          const std::optional<Tensor>& last_step, const std::optional<Tensor>& moment_step,
-                          const std::optional<Tensor>& table) {
+void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in,
+                          const std::vector<Tensor>& rows) {
   const char* op = "update_block_bounds_";
-  const HeldRows held = hold_rows(op, means, scales, moments, last_step, moment_step, table);
+  const HeldRows held = hold_rows(op, rows);
   check_bounds(op, bounds, held.rows.n);
   std::optional<Tensor> ids;
   if (ids_in) {
@@ -97,9 +95,7 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in, co
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
-    const Tensor& bounds, const Tensor& means, const Tensor& scales, const std::vector<Tensor>& moments,
-    const std::optional<Tensor>& last_step, const std::optional<Tensor>& moment_step,
-    const std::optional<Tensor>& table, const std::vector<Tensor>& cameras,
+    const Tensor& bounds, const std::vector<Tensor>& rows, const std::vector<Tensor>& cameras,
     const std::vector<std::int64_t>& size, const std::vector<double>& limits,
     const std::optional<Tensor>& level_ranges_in, const std::optional<Tensor>& level,
     const std::vector<double>& reach, std::int64_t lod_views, const std::optional<Tensor>& cull,
@@ -110,7 +106,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
                   "far_plane and eps2d; got ",
                   cameras.size(), ", ", size.size(), " and ", limits.size(), " of them");
   const Tensor &viewmats_in = cameras[0], &Ks_in = cameras[1];
-  const HeldRows held = hold_rows(op, means, scales, moments, last_step, moment_step, table);
+  const HeldRows held = hold_rows(op, rows);
   check_bounds(op, bounds, held.rows.n);
   check_dtype(op, "viewmats", viewmats_in, ScalarType::Float);
   check_shape(op, "viewmats", viewmats_in, {-1, 4, 4});

@@ -4,13 +4,13 @@
 namespace blitzgs {
 namespace {
 
-void lazy_adam_step(std::vector<Tensor> params, std::vector<Tensor> exp_avgs, std::vector<Tensor> exp_avg_sqs,
-                    std::vector<Tensor> last_steps, std::vector<Tensor> grads, const Tensor& ids,
-                    const std::vector<Tensor>& tables, const std::vector<std::int64_t>& steps,
-                    const std::vector<double>& decays) {
+void lazy_adam_step(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,
+                    const std::vector<std::int64_t>& steps, const std::vector<double>& decays,
+                    const std::vector<Tensor>& grads, const Tensor& ids) {
   constexpr const char* kOp = "lazy_adam_step_";
-  AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
-  check_adam_list(kOp, grads, "grads");
+  AdamTensors state(kOp, state_in, tables, steps, decays);
+  STD_TORCH_CHECK(grads.size() == kAdamColumns, "blitzgs::", kOp,
+                  ": grads must hold means, quats, scales, opacities, sh; got ", grads.size(), " tensors");
   STD_TORCH_CHECK(state.step >= 1, "blitzgs::lazy_adam_step_: steps count from 1, got ", state.step);
   check_dtype(kOp, "ids", ids, ScalarType::Int);
   check_shape(kOp, "ids", ids, {-1});
@@ -33,13 +33,11 @@ void lazy_adam_step(std::vector<Tensor> params, std::vector<Tensor> exp_avgs, st
   });
 }
 
-void lazy_adam_catch_up(std::vector<Tensor> params, std::vector<Tensor> exp_avgs,
-                        std::vector<Tensor> exp_avg_sqs, std::vector<Tensor> last_steps,
-                        const std::optional<Tensor>& ids, const std::vector<Tensor>& tables,
+void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,
                         const std::vector<std::int64_t>& steps, const std::vector<double>& decays,
-                        const std::optional<Tensor>& count) {
+                        const std::optional<Tensor>& ids, const std::optional<Tensor>& count) {
   constexpr const char* kOp = "lazy_adam_catch_up_";
-  AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
+  AdamTensors state(kOp, state_in, tables, steps, decays);
   std::optional<Tensor> list;
   if (ids) {
     check_dtype(kOp, "ids", *ids, ScalarType::Int);

@@ -12,14 +12,13 @@ namespace blitzgs {
 
 inline constexpr const char* kAdamNames[kAdamColumns] = {"means", "quats", "scales", "opacities", "sh"};
 
-inline void check_adam_list(const char* op, const std::vector<Tensor>& tensors, const char* name) {
-  STD_TORCH_CHECK(tensors.size() == kAdamColumns, "blitzgs::", op, ": ", name,
-                  " must hold means, quats, scales, opacities, sh; got ", tensors.size(), " tensors");
-}
+// The tensors of a state: of each column its parameters, first and second moments; last_step, moment_step.
+inline constexpr std::size_t kAdamState = 3 * kAdamColumns + 2;
 
-// The optimiser's state of a table, and where its schedule stands. last_steps: (last_step, moment_step);
-// tables: (table of lazy_adam.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays:
-// (beta1, beta2, eps).
+// The optimiser's state of a table, and where its schedule stands. state: (params, exp_avgs, exp_avg_sqs,
+// last_step, moment_step), the first three (means, quats, scales, opacities, sh) each; tables: (table of
+// lazy_adam.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays: (beta1, beta2, eps).
+// Python's side of the groups is blitzgs/ops/lazy_adam.py.
 struct AdamTensors {
   const char* op;
   std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
@@ -29,18 +28,23 @@ struct AdamTensors {
   double beta1 = 0, beta2 = 0, eps = 0;
   bool sparse = false;
 
-  AdamTensors(const char* op_name, const std::vector<Tensor>& params_in,
-              const std::vector<Tensor>& exp_avgs_in, const std::vector<Tensor>& exp_avg_sqs_in,
-              const std::vector<Tensor>& last_steps, const std::vector<Tensor>& tables,
+  AdamTensors(const char* op_name, const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
               const std::vector<std::int64_t>& steps, const std::vector<double>& decays)
-      : op(op_name), params(params_in), exp_avgs(exp_avgs_in), exp_avg_sqs(exp_avg_sqs_in) {
-    STD_TORCH_CHECK(last_steps.size() == 2 && (tables.size() == 2 || tables.size() == 3) &&
+      : op(op_name) {
+    STD_TORCH_CHECK(state.size() == kAdamState && (tables.size() == 2 || tables.size() == 3) &&
                         steps.size() == 3 && decays.size() == 3,
-                    "blitzgs::", op, ": expected last_steps (last_step, moment_step), tables (table, ",
+                    "blitzgs::", op, ": expected state (params, exp_avgs and exp_avg_sqs of means, quats, ",
+                    "scales, opacities and sh, last_step, moment_step), tables (table, ",
                     "lr_table[, final_rules]), steps (step, explicit_steps, sparse) and decays (beta1, ",
-                    "beta2, eps)");
-    last_step = last_steps[0];
-    moment_step = last_steps[1];
+                    "beta2, eps); got ", state.size(), ", ", tables.size(), ", ", steps.size(), " and ",
+                    decays.size(), " entries");
+    auto next = state.begin();
+    for (std::vector<Tensor>* columns : {&params, &exp_avgs, &exp_avg_sqs}) {
+      columns->assign(next, next + kAdamColumns);
+      next += kAdamColumns;
+    }
+    last_step = *next++;
+    moment_step = *next;
     table = tables[0];
     lr_table = tables[1];
     if (tables.size() == 3) final_rules = tables[2];
@@ -89,9 +93,6 @@ struct AdamTensors {
 
  private:
   void check() const {
-    check_adam_list(op, params, "params");
-    check_adam_list(op, exp_avgs, "exp_avgs");
-    check_adam_list(op, exp_avg_sqs, "exp_avg_sqs");
     check_floating(op, "means", like());
     for (int c = 0; c < kAdamColumns; ++c) {
       for (const Tensor* tensor : {&params[c], &exp_avgs[c], &exp_avg_sqs[c]}) check_column(*tensor, c);

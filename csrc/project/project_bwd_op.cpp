@@ -105,16 +105,35 @@ class HeldSplatGradients {
 
 namespace {
 
-// What both ops know of the forward pass: (camera_ids, visible_ids, splat_offsets). Held here so that the raw
-// pointers stay valid.
-struct BackwardSplats {
-  Tensor camera_ids, visible_ids, splat_offsets;
+// The group of arguments `views`: cameras, and of each view the weights of regularisers.
+struct WeightedViews {
+  TensorList cameras;
   OptionalTensor scale_reg, opacity_reg;
 
-  BackwardSplats(const char* op, const ProjectArguments& p, const TensorList& splats,
-                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in)
-      : scale_reg(contiguous_or_none(scale_reg_in)), opacity_reg(contiguous_or_none(opacity_reg_in)) {
-    check_group(op, "(camera_ids, visible_ids, splat_offsets)", splats, 3, 3);
+  WeightedViews(const char* op, const OptionalTensorList& views) {
+    constexpr const char* kNames = "(viewmats, Ks[, scale_reg[, opacity_reg]])";
+    check_group(op, kNames, views, 2, 4);
+    STD_TORCH_CHECK(views[0] && views[1], "blitzgs::", op, ": expected ", kNames, ", got no viewmats or Ks");
+    cameras = {*views[0], *views[1]};
+    if (views.size() > 2) scale_reg = contiguous_or_none(views[2]);
+    if (views.size() > 3) opacity_reg = contiguous_or_none(views[3]);
+  }
+};
+
+// The group of arguments `splats`, what both ops know of the forward pass, and the weights of the views. Held
+// here so that the raw pointers stay valid. Only the step reads gradients at places.
+struct BackwardSplats {
+  Tensor camera_ids, visible_ids, splat_offsets;
+  OptionalTensor places, scale_reg, opacity_reg;
+
+  BackwardSplats(const char* op, const ProjectArguments& p, const WeightedViews& views,
+                 const TensorList& splats, bool reads_places)
+      : scale_reg(views.scale_reg), opacity_reg(views.opacity_reg) {
+    check_group(op,
+                reads_places ? "(camera_ids, visible_ids, splat_offsets[, places])"
+                             : "(camera_ids, visible_ids, splat_offsets)",
+                splats, 3, reads_places ? 4 : 3);
+    if (splats.size() > 3) places = splats[3];
     camera_ids = as_contiguous(splats[0]);
     visible_ids = as_contiguous(splats[1]);
     splat_offsets = as_contiguous(splats[2]);
@@ -148,14 +167,14 @@ struct BackwardSplats {
 
 using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-BackwardTensors project_bwd(const TensorList& gaussians, const TensorList& cameras, const TensorList& splats,
-                            const IntList& ints, const FloatList& floats, const TensorList& v_splats,
-                            const OptionalTensor& v_depths, const OptionalTensor& scale_reg,
-                            bool need_viewmats, bool dense, const OptionalTensor& opacity_reg,
-                            const OptionalTensor& level) {
+BackwardTensors project_bwd(const TensorList& gaussians, const OptionalTensorList& views_in,
+                            const TensorList& splats, const IntList& ints, const FloatList& floats,
+                            const TensorList& v_splats, const OptionalTensor& v_depths, bool need_viewmats,
+                            bool dense, const OptionalTensor& level) {
   constexpr const char* kOp = "project_bwd";
-  const ProjectArguments p(kOp, gaussians, cameras, ints, floats, level);
-  const BackwardSplats b(kOp, p, splats, scale_reg, opacity_reg);
+  const WeightedViews views(kOp, views_in);
+  const ProjectArguments p(kOp, gaussians, views.cameras, ints, floats, level);
+  const BackwardSplats b(kOp, p, views, splats, /*reads_places=*/false);
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
@@ -181,18 +200,17 @@ BackwardTensors project_bwd(const TensorList& gaussians, const TensorList& camer
   return {v_means, v_quats, v_scales, v_opacities, v_sh, v_viewmats};
 }
 
-void project_bwd_step(TensorList params, TensorList exp_avgs, TensorList exp_avg_sqs, TensorList last_steps,
-                      const TensorList& tables, const IntList& steps, const FloatList& decays,
-                      const TensorList& cameras, const TensorList& splats, const IntList& ints,
-                      const FloatList& floats, const TensorList& v_splats, const OptionalTensor& places,
-                      const OptionalTensor& scale_reg, const OptionalTensor& means2d_sums,
-                      const OptionalTensor& opacity_reg, const OptionalTensor& level, bool absolute_sums) {
+void project_bwd_step(const TensorList& state_in, const TensorList& tables, const IntList& steps,
+                      const FloatList& decays, const OptionalTensorList& views_in, const TensorList& splats,
+                      const IntList& ints, const FloatList& floats, const TensorList& v_splats,
+                      const OptionalTensor& level, const OptionalTensor& means2d_sums, bool absolute_sums) {
   constexpr const char* kOp = "project_bwd_step_";
-  AdamTensors state(kOp, params, exp_avgs, exp_avg_sqs, last_steps, tables, steps, decays);
+  AdamTensors state(kOp, state_in, tables, steps, decays);
   STD_TORCH_CHECK(state.step >= 1, "blitzgs::project_bwd_step_: steps count from 1, got ", state.step);
-  const ProjectArguments p(kOp, params, cameras, ints, floats, level);
-  const BackwardSplats b(kOp, p, splats, scale_reg, opacity_reg);
-  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
+  const WeightedViews views(kOp, views_in);
+  const ProjectArguments p(kOp, state.params, views.cameras, ints, floats, level);
+  const BackwardSplats b(kOp, p, views, splats, /*reads_places=*/true);
+  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, b.places,
                              means2d_sums, absolute_sums);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);

@@ -14,6 +14,7 @@ namespace blitzgs {
 
 using OptionalTensor = std::optional<Tensor>;
 using TensorList = std::vector<Tensor>;
+using OptionalTensorList = std::vector<OptionalTensor>;
 using IntList = std::vector<std::int64_t>;
 using FloatList = std::vector<double>;
 

@@ -125,6 +125,18 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
   return std::tuple_cat(std::move(composited), std::tuple(splat_gradients));
 }
 
+// The groups of arguments of the backward ops, as Splats has them: splats (means2d, conics, splat_opacities,
+// colors) and lists (isect_splats, tile_offsets).
+Splats backward_splats(const char* op, const std::vector<Tensor>& splats,
+                       const std::optional<Tensor>& backgrounds, const std::vector<Tensor>& lists,
+                       const TileGrid& grid) {
+  STD_TORCH_CHECK(splats.size() == 4 && lists.size() == 2, "blitzgs::", op,
+                  ": splats must be (means2d, conics, splat_opacities, colors) and lists (isect_splats, "
+                  "tile_offsets), got ",
+                  splats.size(), " and ", lists.size(), " tensors");
+  return {op, splats[0], splats[1], splats[2], splats[3], backgrounds, lists[0], lists[1], grid};
+}
+
 // What the backward ops need of the forward pass, checked and contiguous: (transmittances, last_ids,
 // packed_splats, tile_order), and the gradients of the images.
 struct Composited {
@@ -184,14 +196,13 @@ struct Composited {
 };
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
-    const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
-    const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
-    const std::vector<Tensor>& composited_in, const Tensor& v_renders, const std::optional<Tensor>& v_alphas,
-    const std::vector<std::int64_t>& grid_numbers, bool absgrad, bool deterministic) {
+    const std::vector<Tensor>& splats_in, const std::optional<Tensor>& backgrounds,
+    const std::vector<Tensor>& lists, const std::vector<Tensor>& composited_in, const Tensor& v_renders,
+    const std::optional<Tensor>& v_alphas, const std::vector<std::int64_t>& grid_numbers, bool absgrad,
+    bool deterministic) {
   constexpr const char* kOp = "rasterize_bwd";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
-  const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
-                      grid);
+  const Splats splats = backward_splats(kOp, splats_in, backgrounds, lists, grid);
   const Composited composited(kOp, splats, composited_in, v_renders, v_alphas);
   const std::int64_t n_splats = splats.n_splats;
   Tensor v_means2d = make_empty(splats.means2d, {n_splats, 2});
@@ -234,16 +245,13 @@ CompositedTensors rasterize_fwd_packed(const Tensor& means2d, const Tensor& coni
   return composite(splats, packed, false);
 }
 
-void rasterize_bwd_packed(const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities,
-                          const Tensor& colors, const std::optional<Tensor>& backgrounds,
-                          const Tensor& isect_splats, const Tensor& tile_offsets,
-                          const std::vector<Tensor>& composited_in, const Tensor& v_renders,
-                          const std::vector<std::int64_t>& grid_numbers, bool deterministic, Tensor packed,
-                          bool absgrad) {
+void rasterize_bwd_packed(const std::vector<Tensor>& splats_in, const std::optional<Tensor>& backgrounds,
+                          const std::vector<Tensor>& lists, const std::vector<Tensor>& composited_in,
+                          const Tensor& v_renders, const std::vector<std::int64_t>& grid_numbers,
+                          bool deterministic, Tensor packed, bool absgrad) {
   constexpr const char* kOp = "rasterize_bwd_packed_";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
-  const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
-                      grid);
+  const Splats splats = backward_splats(kOp, splats_in, backgrounds, lists, grid);
   check_packed(kOp, splats, packed);
   const Composited composited(kOp, splats, composited_in, v_renders, std::nullopt);
   DeviceScope scope(splats.means2d);

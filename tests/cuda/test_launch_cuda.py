@@ -40,7 +40,7 @@ class Calls:
         renders, rest, last, _, packed, order, _ = image
         _, v_renders = photometric_fwd_bwd(renders, self.targets, None, *self.weights)[:2]
         gradients = ops.rasterize_bwd(
-            *self.splats, None, *lists, [rest, last, packed, order], v_renders, None, self.grid, False, True
+            self.splats, None, lists, [rest, last, packed, order], v_renders, None, self.grid, False, True
         )
         return [*lists, renders, rest, last, v_renders, *gradients[:4]]
 

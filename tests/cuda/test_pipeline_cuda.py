@@ -32,8 +32,8 @@ def test_gradients_are_those_from_columns(degree):
     assert packed.shape == (len(frame.splats.depths), 12)
     projected, splats = frame.projected, frame.splats
     *unpacked, _ = ops.rasterize_bwd(
-        splats.means2d, splats.conics, splats.opacities, splats.colors, frame.backgrounds, frame.isect_splats,
-        frame.tile_offsets,
+        [splats.means2d, splats.conics, splats.opacities, splats.colors], frame.backgrounds,
+        [frame.isect_splats, frame.tile_offsets],
         [frame.transmittances, frame.last_ids, frame.packed_splats, frame.tile_order], v_renders, None,
         [len(views), views.width, views.height, options.tile_size, 0, -1], False, True,
     )  # fmt: skip
@@ -42,9 +42,9 @@ def test_gradients_are_those_from_columns(degree):
     scale_reg = torch.linspace(0.1, 0.3, 3, device="cuda")
     projection = options.projection(views)
     *expected, _ = ops.project_bwd(
-        list(table.parameters), [views.viewmats, views.Ks],
+        list(table.parameters), [views.viewmats, views.Ks, scale_reg],
         [projected.camera_ids, projected.visible_ids, projected.splat_offsets], projection.ints,
-        projection.floats, unpacked, None, scale_reg, False,
+        projection.floats, unpacked, None, False,
     )  # fmt: skip
     gradients = parameter_gradients(table, frame, v_renders, scale_reg)
     for x, y in zip(gradients, expected, strict=True):

@@ -63,8 +63,8 @@ def test_gradients_match_float64(scene, degree, antialiased):
         *gradients, scale_reg = [t.to(device, dtype) for t in (*v, regularizer)]
         means2d, conics, depths, opacities, colors = gradients
         return ops.project_bwd(
-            inputs.gaussians, list(inputs.cameras), structure, inputs.options.ints, inputs.options.floats,
-            [means2d, conics, opacities, colors], depths, scale_reg, True,
+            inputs.gaussians, [*inputs.cameras, scale_reg], structure, inputs.options.ints,
+            inputs.options.floats, [means2d, conics, opacities, colors], depths, True,
         )  # fmt: skip
 
     expected, gradients = backward("cpu", torch.float64), backward("cuda", torch.float32)
@@ -89,7 +89,7 @@ def test_nothing_visible(case):
     inputs = scene.inputs("cuda")
     gradients = ops.project_bwd(
         inputs.gaussians, list(inputs.cameras), [splats[i] for i in (1, 2, 3)], inputs.options.ints,
-        inputs.options.floats, [splats[i] for i in (4, 5, 7, 8)], splats.depths, None, True,
+        inputs.options.floats, [splats[i] for i in (4, 5, 7, 8)], splats.depths, True,
     )  # fmt: skip
     assert gradients[0].shape == (0, 3)
     assert not gradients[5].any()

@@ -5,6 +5,7 @@ import pytest
 import torch
 from cuda_scenes import Scene, ops, relative_error
 
+from blitzgs.ops.rasterize import RasterizeForward
 from blitzgs.ops.splat_gradients import absolute_column
 
 # Where rounding decides whether a splat takes part, the images differ by up to about alpha = 1/255.
@@ -33,14 +34,17 @@ class Job:
         moved = [t.to(device, dtype) for t in (*self.splats, self.backgrounds)]
         return [*moved, *(t.to(device) for t in self.lists)]
 
+    def saved(self, device, dtype, outputs):
+        """What the backward pass takes of the forward pass."""
+        *splats, backgrounds, isect_splats, tile_offsets = self.inputs(device, dtype)
+        return RasterizeForward(splats, backgrounds, [isect_splats, tile_offsets], kept_by(outputs))
+
     def forward(self, device, dtype=torch.float32, backward_follows=False):
         return ops.rasterize_fwd(*self.inputs(device, dtype), self.grid, None, True, backward_follows)
 
     def backward(self, device, dtype, saved, v_renders, v_alphas, absgrad, deterministic):
         v = [t.to(device, dtype) for t in (v_renders, v_alphas)]
-        return ops.rasterize_bwd(
-            *self.inputs(device, dtype), kept_by(saved), *v, self.grid, absgrad, deterministic
-        )
+        return ops.rasterize_bwd(*self.saved(device, dtype, saved), *v, self.grid, absgrad, deterministic)
 
 
 def close_images(job):
@@ -89,7 +93,7 @@ def test_packed_gradients_are_the_same(scene, channels, absgrad):
     v_renders = torch.randn(renders.shape, generator=torch.Generator().manual_seed(7)).cuda()
     none = torch.zeros_like(rest)
     *columns, absolute = job.backward("cuda", torch.float32, saved, v_renders, none, absgrad, True)
-    arguments = *job.inputs("cuda", torch.float32), kept_by(saved), v_renders, job.grid
+    arguments = *job.saved("cuda", torch.float32, saved), v_renders, job.grid
     ops.rasterize_bwd_packed_(*arguments, True, room, absgrad)
     assert torch.equal(room[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
     if absgrad:
@@ -121,7 +125,7 @@ def test_splats_of_many_channels_get_no_room(scene):
 def test_packed_gradients_have_four_channels_at_most(scene):
     job = Job(scene, 9)
     renders, *_, room = saved = job.forward("cuda")
-    arguments = *job.inputs("cuda", torch.float32), kept_by(saved), renders, job.grid
+    arguments = *job.saved("cuda", torch.float32, saved), renders, job.grid
     with pytest.raises(RuntimeError, match="1 to 4 channels, got 9"):
         ops.rasterize_bwd_packed_(*arguments, True, room)
 

@@ -4,7 +4,13 @@ import math
 import pytest
 import torch
 
-from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam_step_, schedule_tables
+from blitzgs.ops.lazy_adam import (
+    AdamState,
+    explicit_steps,
+    lazy_adam_catch_up_,
+    lazy_adam_step_,
+    schedule_tables,
+)
 from tests.helpers import DEVICES, needs_cuda
 
 COEFFICIENTS = 4
@@ -27,6 +33,9 @@ class State:
 
     def moments(self):
         return self.exp_avgs, self.exp_avg_sqs
+
+    def tensors(self):
+        return AdamState(self.params, *self.moments(), self.last_step, self.moment_step).tensors
 
     def step(self, grads, ids, lr_table, step, **kwargs):
         lazy_adam_step_(
@@ -272,8 +281,7 @@ def test_what_rows_owe_in_the_end_is_tabulated_once(gap, dtype):
         state.catch_up(None, lr_table, end)
         tables = schedule_tables(lr_table, BETA1, BETA2, EPS, alone.params[0])
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            alone.params, *alone.moments(), [alone.last_step, alone.moment_step], None, tables[:2],
-            [end, reach, 0], [BETA1, BETA2, EPS],
+            alone.tensors(), tables[:2], [end, reach, 0], [BETA1, BETA2, EPS], None,
         )  # fmt: skip
         for with_rules, without in zip(state.params, alone.params, strict=True):
             assert torch.equal(with_rules, without)
@@ -376,19 +384,17 @@ def test_opcheck():
     reach = explicit_steps(BETA1, BETA2, torch.float32)
     grads = [torch.randn(s) for s in shapes(2)]
     ids = torch.tensor([1, 3], dtype=torch.int32)
-    columns = state.params, *state.moments()
-    steps, decays = [state.last_step, state.moment_step], [BETA1, BETA2, EPS]
+    columns, decays = state.tensors(), [BETA1, BETA2, EPS]
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_step_,
-        (*columns, steps, grads, ids, tables, [2, reach, 0], decays),
+        torch.ops.blitzgs.lazy_adam_step_, (columns, tables, [2, reach, 0], decays, grads, ids)
     )
     torch.library.opcheck(
-        torch.ops.blitzgs.lazy_adam_catch_up_, (*columns, steps, ids, tables, [9, reach, 0], decays)
+        torch.ops.blitzgs.lazy_adam_catch_up_, (columns, tables, [9, reach, 0], decays, ids)
     )
     torch.library.opcheck(torch.ops.blitzgs.lazy_adam_final_rules, (tables[0], state.params[0], reach, EPS))
     bad = [*tables[:2], tables[2][1:]]
     with pytest.raises(RuntimeError, match=r"final_rules must have shape"):
-        torch.ops.blitzgs.lazy_adam_catch_up_(*columns, steps, ids, bad, [9, reach, 0], decays)
+        torch.ops.blitzgs.lazy_adam_catch_up_(columns, bad, [9, reach, 0], decays, ids)
 
 
 @pytest.mark.cuda

@@ -195,7 +195,7 @@ def test_dense_gradients_are_the_compact_ones_where_they_belong(backend, degree,
         gaussians, v_splats = [*gaussians, sh], [*v_splats, colors]
     arguments = (
         gaussians, [scene.viewmats, scene.Ks], [splats.camera_ids, splats.visible_ids, splats.splat_offsets],
-        options.ints, options.floats, v_splats, depths[:, 0], None, True,
+        options.ints, options.floats, v_splats, depths[:, 0], True,
     )  # fmt: skip
     compact = torch.ops.blitzgs.project_bwd(*arguments)
     dense = torch.ops.blitzgs.project_bwd(*arguments, dense=True)
@@ -216,9 +216,10 @@ def test_regularisers_add_the_slopes_of_smallest_axis_and_opacity():
     weights, others = torch.tensor([[0.5, 2.0], [-0.3, 0.7]], dtype=torch.float64)
     options = ProjectionOptions(scene.width, scene.height)
     _, _, v_scales, v_opacities, _, _ = torch.ops.blitzgs.project_bwd(
-        [scene.means, scene.quats, scene.scales, scene.opacities], [scene.viewmats, scene.Ks],
+        [scene.means, scene.quats, scene.scales, scene.opacities],
+        [scene.viewmats, scene.Ks, weights, others],
         [splats.camera_ids, splats.visible_ids, splats.splat_offsets], options.ints, options.floats,
-        [zeros[:, :2], zeros, zeros[:, 0]], None, weights, False, False, others,
+        [zeros[:, :2], zeros, zeros[:, 0]], None, False,
     )  # fmt: skip
     log_scales, logits = scene.scales.requires_grad_(), scene.opacities.requires_grad_()
     ids, views = splats.gaussian_ids.long(), splats.camera_ids.long()

@@ -4,10 +4,16 @@ import math
 import pytest
 import torch
 
-from blitzgs.ops.lazy_adam import explicit_steps, lazy_adam_catch_up_, lazy_adam_step_, schedule_table
+from blitzgs.ops.lazy_adam import (
+    AdamSchedule,
+    AdamState,
+    lazy_adam_catch_up_,
+    lazy_adam_step_,
+    schedule_table,
+)
 from blitzgs.ops.project import project
 from blitzgs.ops.project_step import project_bwd_step_
-from blitzgs.ops.projection import ProjectionOptions
+from blitzgs.ops.projection import ProjectionOptions, WeightedViews
 from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from tests.helpers import DEVICES, needs_cuda, sum_of_ranks
@@ -65,10 +71,16 @@ class Scene:
     def splat_ids(self):
         return [self.splats.camera_ids, self.splats.visible_ids, self.splats.splat_offsets]
 
+    def views(self):
+        return WeightedViews(self.viewmats, self.Ks, self.scale_reg, self.opacity_reg)
+
+    def schedule(self, sparse=False):
+        return AdamSchedule(self.lr_table, BETA1, BETA2, EPS, sparse)
+
     def backward_arguments(self, need_viewmats=False):
         return (
-            self.params, [self.viewmats, self.Ks], self.splat_ids(), self.options.ints, self.options.floats,
-            list(self.v.parts), None, self.scale_reg, need_viewmats, False, self.opacity_reg,
+            self.params, list(self.views()), self.splat_ids(), self.options.ints, self.options.floats,
+            list(self.v.parts), None, need_viewmats,
         )  # fmt: skip
 
     def backward(self, need_viewmats=False):
@@ -81,8 +93,8 @@ class Scene:
 
     def at_once(self, sparse, means2d_sums=None):
         project_bwd_step_(
-            *self.columns(), *self.stands(), *self.optimiser, sparse, self.splats, (self.viewmats, self.Ks),
-            self.options, self.v, self.scale_reg, means2d_sums, self.opacity_reg,
+            AdamState(*self.columns(), *self.stands()), self.schedule(sparse), STEP, self.views(),
+            self.splats, self.options, self.v, means2d_sums=means2d_sums,
         )  # fmt: skip
 
     def pack(self, width):
@@ -274,11 +286,11 @@ def test_errors_name_what_does_not_fit():
 def test_opcheck():
     scene = Scene(20, 16, 1, "cpu", torch.float32)
     scene.render(False)
+    state, schedule = AdamState(*scene.columns(), *scene.stands()), scene.schedule()
     tables = [schedule_table(scene.lr_table, BETA1, BETA2), scene.lr_table]
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,
-        (*scene.columns(), [*scene.stands()], tables, [STEP, explicit_steps(BETA1, BETA2, torch.float32), 0],
-         [BETA1, BETA2, EPS], [scene.viewmats, scene.Ks], scene.splat_ids(), scene.options.ints,
-         scene.options.floats, list(scene.v.parts), None, scene.scale_reg, None, scene.opacity_reg),
+        (state.tensors, tables, schedule.steps(STEP, torch.float32), schedule.decays, list(scene.views()),
+         scene.splat_ids(), scene.options.ints, scene.options.floats, list(scene.v.parts)),
     )  # fmt: skip
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, scene.backward_arguments(True))

@@ -43,7 +43,7 @@ def backward(
     splats, outputs, v_renders, v_alphas=None, n_cameras=1, backgrounds=None, absgrad=True, tiles=(0, -1)
 ):
     return torch.ops.blitzgs.rasterize_bwd(
-        *splats.values(), backgrounds, *lists(splats, n_cameras), kept_by(outputs), v_renders, v_alphas,
+        splats.values(), backgrounds, lists(splats, n_cameras), kept_by(outputs), v_renders, v_alphas,
         [n_cameras, WIDTH, HEIGHT, 16, *tiles], absgrad, True,
     )  # fmt: skip
 
@@ -332,7 +332,7 @@ def test_a_splat_that_is_not_finite_leaves_the_others_alone():
 
 def backward_with(splats, tile_lists, outputs):
     return torch.ops.blitzgs.rasterize_bwd(
-        *splats.values(), None, *tile_lists, kept_by(outputs), torch.ones_like(outputs[0]), None,
+        splats.values(), None, tile_lists, kept_by(outputs), torch.ones_like(outputs[0]), None,
         [1, WIDTH, HEIGHT, 16, 0, -1], True, True,
     )  # fmt: skip
 
@@ -386,6 +386,6 @@ def test_opcheck(absgrad):
         outputs = forward(splats)
         torch.library.opcheck(
             torch.ops.blitzgs.rasterize_bwd,
-            (*(t.detach() for t in values), None, *tile_lists, kept_by(outputs), outputs[0], None,
+            ([t.detach() for t in values], None, tile_lists, kept_by(outputs), outputs[0], None,
              [1, WIDTH, HEIGHT, 16, 0, -1], absgrad, False),
         )  # fmt: skip

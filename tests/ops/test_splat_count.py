@@ -101,7 +101,7 @@ def test_images_and_gradients_are_those_of_the_splats_alone(n, channels, composi
     v_renders = torch.randn(plain[0].shape, generator=torch.Generator().manual_seed(1)).to(device)
     gradients = [
         ops.rasterize_bwd(
-            *columns, None, *lists, kept_by(image), v_renders, None, [*VIEW, *owned], True, True
+            columns, None, lists, kept_by(image), v_renders, None, [*VIEW, *owned], True, True
         )
         for columns, image in (
             (columns.alone.values(), plain), ([c[:n] for c in columns.roomy.values()], roomy),
@@ -129,10 +129,10 @@ def test_a_table_of_gradients_is_zeroed_for_the_splats(n, room, tiles):
     assert (table[:n] == 0).all()
     assert memory[:40].isnan().all() and memory[40 + room :].isnan().all()
     v_renders = torch.randn(plain[0].shape, generator=torch.Generator().manual_seed(1)).cuda()
-    arguments = (*[c[:n] for c in columns.roomy.values()], None, *lists, kept_by(image), v_renders)
+    arguments = ([c[:n] for c in columns.roomy.values()], None, lists, kept_by(image), v_renders)
     ops.rasterize_bwd_packed_(*arguments, [*VIEW, *tiles], True, table)
     expected = ops.rasterize_bwd(
-        *columns.alone.values(), None, *lists, kept_by(plain), v_renders, None, [*VIEW, *tiles], False, True
+        columns.alone.values(), None, lists, kept_by(plain), v_renders, None, [*VIEW, *tiles], False, True
     )
     assert torch.equal(table[:n, :9], torch.cat([c if c.dim() == 2 else c[:, None] for c in expected[:4]], 1))
     assert memory[:40].isnan().all() and memory[40 + room :].isnan().all()
@@ -176,7 +176,7 @@ def test_errors(device):
         intersect(*columns.roomy.geometry(), **view, n_splats=columns.count.repeat(2))
     lists = intersect(*columns.alone.geometry(), **view)
     image = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, 0, -1])
-    arguments = (*columns.roomy.values(), None, *lists, kept_by(image), image[0], None, [*VIEW, 0, -1])
+    arguments = (columns.roomy.values(), None, lists, kept_by(image), image[0], None, [*VIEW, 0, -1])
     with pytest.raises(RuntimeError, match="for 150 splats and 30 tiles or more, got 100 and 30"):
         ops.rasterize_bwd(*arguments, False, True)
     if device == "cuda":

@@ -109,9 +109,9 @@ class DenseAdam:
         """Take a step with the gradients that the trainer's optimiser is about to be given."""
         splats, options = frame.projected, frame.options.projection(frame.views)
         *v, _ = torch.ops.blitzgs.project_bwd(
-            list(table.parameters), [frame.views.viewmats, frame.views.Ks],
+            list(table.parameters), [frame.views.viewmats, frame.views.Ks, scale_reg],
             [splats.camera_ids, splats.visible_ids, splats.splat_offsets], options.ints, options.floats,
-            list(gradients.parts), None, scale_reg, False,
+            list(gradients.parts), None, False,
         )  # fmt: skip
         self.move.grad.zero_().index_copy_(0, splats.visible_ids.long(), flat(v))
         self.adam.step()

@@ -330,13 +330,13 @@ def test_opcheck(device):
     moments = [
         table[name] for name in ("exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales")
     ]
-    columns = (table["means"], table["scales"], moments, table["last_step"], table["moment_step"], schedule)
+    rows = [table["means"], table["scales"], *moments, table["last_step"], table["moment_step"], schedule]
     torch.library.opcheck(torch.ops.blitzgs.morton_keys, (table["means"],))
-    torch.library.opcheck(torch.ops.blitzgs.update_block_bounds_, (bounds, None, *columns))
+    torch.library.opcheck(torch.ops.blitzgs.update_block_bounds_, (bounds, None, rows))
     # The rest of its lists is whatever was there, and opcheck's traced comparison looks at it.
     utilities = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(
         torch.ops.blitzgs.cull_blocks,
-        (bounds, *columns, [viewmats, Ks], [WIDTH, HEIGHT], [NEAR, FAR, 0.3]),
+        (bounds, rows, [viewmats, Ks], [WIDTH, HEIGHT], [NEAR, FAR, 0.3]),
         test_utils=utilities,
     )
