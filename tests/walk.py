@@ -81,7 +81,8 @@ def walk_of_a_step(ranks: Ranks, *overrides: str, whole: bool = False) -> Walk:
     """Train a few steps and follow the next one on this thread; `whole`: with the trainer's own part."""
     scene, images = tiny_scene()
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
-        trainer = Trainer(tiny_config(*overrides), scene, images, Path(folder), ranks)
+        shared = Path(ranks.broadcast_object(folder))
+        trainer = Trainer(tiny_config(*overrides), scene, images, shared, ranks)
         trainer.state.start_clock()
         for step in range(1, STEPS_BEFORE + 1):
             trainer.step(step)
