@@ -23,6 +23,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.training.trainer import Trainer
+from tests.distributed.rank_harness import run_ranks
 from tests.training.tiny import tiny_config, tiny_scene
 
 T = TypeVar("T")
@@ -98,6 +99,13 @@ def walk_of_a_step(ranks: Ranks, *overrides: str, whole: bool = False) -> Walk:
     return Walk([file for file, _ in groupby(files)], list(dict.fromkeys(ops)))
 
 
+def walk_of_ranks(world_size: int) -> Walk:
+    """Follow a step of rank 0 of so many, whose splats travel by collectives."""
+    from tests import walk  # the ranks know it by this name, also where this file is the program
+
+    return run_ranks(walk.walk_of_a_step, world_size)[0]
+
+
 @cache
 def _included(file: Path) -> frozenset[Path]:
     """Return a file and all of `csrc/` that it includes."""
@@ -133,3 +141,4 @@ def _report(title: str, walk: Walk) -> None:
 if __name__ == "__main__":
     _report("one rank", walk_of_a_step(Ranks()))
     _report("one rank, with the trainer's loop", walk_of_a_step(Ranks(), whole=True))
+    _report("two ranks", walk_of_ranks(2))

@@ -61,7 +61,6 @@ class Ranks:
     watchdog: Watchdog | None = None
     memory: SharedMemory | None = None
     transport: str = "none: one rank"
-    _side: torch.cuda.Stream | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
     def from_environment(
@@ -241,12 +240,6 @@ class Ranks:
     def wait(self, event: torch.cuda.Event) -> None:
         """Wait for work on the device, and so for the ranks that it waits for."""
         self._collective("wait", event.synchronize)
-
-    def side_stream(self) -> torch.cuda.Stream | None:
-        """Return the stream for what the step need not wait for; None on the CPU."""
-        if self._side is None and self.device.type == "cuda":
-            self._side = torch.cuda.Stream(self.device)
-        return self._side
 
     def read(self, tensor: Tensor) -> Any:
         """Return a small tensor as nested lists; waits for the device, and so for the ranks it waits for."""

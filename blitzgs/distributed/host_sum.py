@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -40,11 +40,12 @@ class HostSum:
         self._sums = 0 if parts is None else 2 * len(parts)
         self._copied: torch.cuda.Event | None = None
         words = ranks.world_size * self._sums + (0 if tile_work is None else len(tile_work))
-        stream = ranks.side_stream()
+        self._total: Tensor | None = None
+        stream = _side_stream(ranks.device)
         if stream is None:
-            value = torch.zeros(words)
-            report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [value])
-            self._value = self._folded(ranks.all_reduce(value))
+            self._value = torch.zeros(words)
+            report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [self._value])
+            ranks.all_reduce(self._value)
             return
         stream.wait_stream(torch.cuda.current_stream(ranks.device))
         with torch.cuda.stream(stream):
@@ -71,14 +72,21 @@ class HostSum:
 
         The B views' sums of |render - photograph|, those of the SSIM map, the T tiles' work.
         """
-        if self._copied is not None:
-            self._ranks.wait(self._copied)
-            self._copied = None
-            self._value = self._folded(self._value)  # the pinned memory serves the next one
-        return self._value
+        if self._total is None:
+            if self._copied is not None:
+                self._ranks.wait(self._copied)
+            self._total = self._folded(self._value)
+            del self._value  # pinned memory serves the next one
+        return self._total
 
     def _folded(self, value: Tensor) -> Tensor:
         """Add up the sums of the ranks, in their order; a copy."""
         numbers, end = value.numpy(), self._ranks.world_size * self._sums
         total = numbers[:end].reshape(self._ranks.world_size, self._sums).sum(0)
         return torch.from_numpy(np.concatenate((total, numbers[end:])))
+
+
+@lru_cache(maxsize=16)
+def _side_stream(device: torch.device) -> torch.cuda.Stream | None:
+    """Return the stream for what the step need not wait for, one for each device; None on the CPU."""
+    return torch.cuda.Stream(device) if device.type == "cuda" else None

@@ -109,32 +109,24 @@ class TileRanges:
         return max(y0, 0), min(y1, self.height)
 
 
-@dataclass(frozen=True)
 class TileAssignment:
     """Who composites what in one rendering.
 
     Attributes:
         ranks: the job; all its ranks render together.
         ranges: the tiles of each.
+        tiles: this rank's own [first, one past last) tile.
+        composited: the [first, one past last) tile that this rank composites: its own and the halo around
+            them.
+        all_composited: `composited` of every rank.
     """
 
-    ranks: Ranks
-    ranges: TileRanges
-
-    @property
-    def tiles(self) -> tuple[int, int]:
-        """This rank's own [first, one past last) tile."""
-        return self.ranges.of(self.ranks.rank)
-
-    @property
-    def composited(self) -> tuple[int, int]:
-        """The [first, one past last) tile that this rank composites: its own and the halo around them."""
-        return self.ranges.composited(self.ranks.rank)
-
-    @property
-    def all_composited(self) -> list[tuple[int, int]]:
-        """`composited` of every rank."""
-        return [self.ranges.composited(rank) for rank in range(self.ranks.world_size)]
+    def __init__(self, ranks: Ranks, ranges: TileRanges) -> None:
+        """Look up who composites what."""
+        self.ranks, self.ranges = ranks, ranges
+        self.tiles = ranges.of(ranks.rank)
+        self.composited = ranges.composited(ranks.rank)
+        self.all_composited = [ranges.composited(rank) for rank in range(ranks.world_size)]
 
 
 class _ViewCost(NamedTuple):
@@ -286,11 +278,11 @@ class TileOwners:
         Returns:
             The sums; see `HostSum.read`.
         """
+        if len(self._late) == _LATE:
+            self._learn(self._late.popleft()())
         sums = HostSum(self.ranks, parts, tile_work, ranges.of(self.ranks.rank))
         first = 0 if parts is None else 2 * len(parts)
         self._late.append(partial(_measured, sums, list(keys), ranges.tiles_per_view, first))
-        if len(self._late) > _LATE:
-            self._learn(self._late.popleft()())
         return sums
 
     def _learn(self, costs: Sequence[_ViewCost]) -> None:

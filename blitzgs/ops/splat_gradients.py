@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -73,12 +74,26 @@ class SplatGradients(NamedTuple):
     @property
     def means2d(self) -> Tensor | None:
         """The gradient of means2d, [P, 2] per pixel; None if its parts are at several ranks."""
-        return None if self.places is not None else columns_of(self.parts)[0]
+        return None if self.places is not None else self._columns()[0]
 
+    def side_by_side(self) -> tuple[Tensor, list[int]]:
+        """Return all columns, and `means2d_abs` if it is there, as one [P, F], and how wide each is.
 
-def columns_of(parts: Sequence[Tensor]) -> Sequence[Tensor]:
-    """Return the four columns of `SplatGradients.parts` without `places`."""
-    return gradient_columns(parts[0]) if len(parts) == 1 else parts
+        For gradients without `places`.
+        """
+        flat = [column.reshape(len(column), math.prod(column.shape[1:])) for column in self._columns()]
+        return torch.cat(flat, 1), [column.shape[1] for column in flat]
+
+    def of_sums(self, sums: Sequence[Tensor]) -> SplatGradients:
+        """Return the gradients of Q splats from the columns of `side_by_side`, summed: [Q, width] each."""
+        columns = zip(sums, self._columns(), strict=True)
+        parts = [total.reshape(-1, *column.shape[1:]) for total, column in columns]
+        return SplatGradients(parts[:4], None, parts[4] if self.means2d_abs is not None else None)
+
+    def _columns(self) -> list[Tensor]:
+        """Return the four columns, and `means2d_abs` if it is there."""
+        columns = gradient_columns(self.parts[0]) if len(self.parts) == 1 else self.parts
+        return [*columns, *([] if self.means2d_abs is None else [self.means2d_abs])]
 
 
 class GradientBuffer:

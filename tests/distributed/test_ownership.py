@@ -60,9 +60,6 @@ class TwoRanks(Ranks):
     def all_reduce(self, tensor, op="sum"):
         return tensor
 
-    def side_stream(self):
-        return None
-
 
 # 64 x 48: 4 x 3 tiles a view.
 SIZE, TILES = (64, 48), 12

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 
 import torch
@@ -13,7 +12,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
-from blitzgs.ops.projection import VIEW_TOTALS, Projected, ProjectionInputs, Splats, splats_of
+from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
 from blitzgs.ops.scatter import (
     RUN,
     as_column,
@@ -23,7 +22,7 @@ from blitzgs.ops.scatter import (
     words_of,
     words_per_splat,
 )
-from blitzgs.ops.splat_gradients import SplatGradients, columns_of
+from blitzgs.ops.splat_gradients import SplatGradients
 
 
 class CollectiveTransport:
@@ -50,21 +49,7 @@ class CollectiveTransport:
         """See `Transport.start`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
-        ranks, tiles = self._ranks, assignment.all_composited
-        # Waiting may mean to wait for other ranks, whose collectives are queued before.
-        projected = ranks.reading(partial(inputs.run, attempt.sizes, tiles))
-        everyone = ranks.share(projected.totals)
-        visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + inputs.n_views].sum(0)
-        traffic = Traffic.of(ranks.read(everyone), inputs.n_views, ranks.rank)
-        room, needed = attempt.sizes, Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
-        if room is not None and not room.holds(needed[:2]):
-            projected = ranks.reading(partial(inputs.run, None, tiles))
-        # All ranks find the same, as they have estimated the same number of blocks.
-        attempt.end(needed, room is None or needed.blocks <= room.blocks)
-        mark("project")
-        exchange = CollectiveExchange(ranks, self._codec, projected, traffic, visible, attempt)
-        mark("exchange")
-        return exchange
+        return CollectiveExchange(self._ranks, self._codec, inputs, assignment, attempt, mark)
 
 
 class CollectiveExchange:
@@ -74,29 +59,40 @@ class CollectiveExchange:
         self,
         ranks: Ranks,
         codec: HalfCodec | None,
-        projected: Projected,
-        traffic: Traffic,
-        visible: Tensor,
+        inputs: ProjectionInputs,
+        assignment: TileAssignment,
         attempt: Attempt,
+        mark: Mark,
     ) -> None:
-        """Carry the splats."""
-        self._ranks, self._codec, self._traffic, self._visible = ranks, codec, traffic, visible
-        self._attempt = attempt
+        """Project, show the other ranks how many splats there are for whom, and carry the splats."""
+        self._ranks, self._codec, self._attempt = ranks, codec, attempt
+        tiles, n_views = assignment.all_composited, assignment.ranges.n_views
+        # Waiting may mean to wait for other ranks, whose collectives are queued before.
+        projected = ranks.reading(partial(inputs.run, attempt.sizes, tiles))
+        everyone = ranks.share(projected.totals)
+        self._visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
+        self._traffic = traffic = Traffic.of(ranks.read(everyone), n_views, ranks.rank)
+        room, needed = attempt.sizes, Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
+        if room is not None and not room.holds(needed[:2]):
+            projected = ranks.reading(partial(inputs.run, None, tiles))
+        # All ranks find the same, as they have estimated the same number of blocks.
+        attempt.end(needed, room is None or needed.blocks <= room.blocks)
+        mark("project")
         self._own = splats_of(projected.splats[:12], traffic.counts)
         own = projected.composited.first(len(self._own.camera_ids))
         shape = (own.conics, own.opacities, own.colors)
         columns = [own.means2d, own.depths, own.camera_ids, own.ids]
         columns += [codec.encode(*shape)] if codec is not None else shape
-        sent, received = traffic.sent, traffic.received
-        packed, self._places = scatter_splats(columns, self._own.rank_masks, sent)
-        words = sum(map(words_per_splat, columns))
-        arrived = ranks.all_to_all(packed, [words * n for n in sent], [words * n for n in received])
-        means2d, depths, camera_ids, ids, *rest = gather_splats(arrived, columns, received)
+        packed, self._places = scatter_splats(columns, self._own.rank_masks, traffic.sent)
+        rows = packed.view(-1, sum(map(words_per_splat, columns)))
+        arrived = ranks.all_to_all(rows, traffic.sent, traffic.received)
+        means2d, depths, camera_ids, ids, *rest = gather_splats(arrived.view(-1), columns, traffic.received)
         conics, opacities, colors = rest if codec is None else codec.decode(rest[0], means2d.dtype)
         splats = Splats(means2d, conics, opacities, colors, depths, camera_ids, ids)
         self.gradient_table: Tensor | None = None
         # Rounding may let splats touch some tiles more.
         self.arrived = Arrived(splats, None, traffic.n_isects if codec is None else -1)
+        mark("exchange")
 
     def finish(self) -> HostCounts | None:
         """See `Exchange.finish`."""
@@ -112,21 +108,17 @@ class CollectiveExchange:
 
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
         """See `WayBack.return_gradients`."""
-        columns, absolute = [*columns_of(gradients.parts)], gradients.means2d_abs
-        columns += [] if absolute is None else [absolute]
-        flat = [g.reshape(len(g), math.prod(g.shape[1:])) for g in columns]
-        widths, dtype = [g.shape[1] for g in flat], flat[0].dtype
+        rows, widths = gradients.side_by_side()
         sent, received = self._traffic.sent, self._traffic.received
         if self._codec is None:
-            returned = self._ranks.all_to_all(torch.cat(flat, 1), received, sent).view(-1, sum(widths))
+            returned = self._ranks.all_to_all(rows, received, sent)
         else:
             # Gradients span too many magnitudes for float16.
-            halves = torch.cat(flat, 1).bfloat16()
+            halves = rows.bfloat16()
             carried = self._ranks.all_to_all(words_of(halves), received, sent)
-            returned = as_column(carried, halves).to(dtype)
+            returned = as_column(carried, halves).to(rows.dtype)
         sums = sum_splats(returned, self._places, sent, len(self._own.camera_ids), widths)
-        parts = [s.reshape(-1, *g.shape[1:]) for s, g in zip(sums, columns, strict=True)]
-        return SplatGradients(parts[:4], None, None if absolute is None else parts[4])
+        return gradients.of_sums(sums)
 
     def return_sums(self, sums: Tensor) -> Tensor:
         """See `WayBack.return_sums`."""
