@@ -102,5 +102,9 @@ def culled_blocks(cull: Tensor) -> Tensor:
 
 def _culling_views(culled: Tensor, columns: Tensor) -> Tensor:
     """Return for each block the bits of the views (of columns [V]) that leave out all its rows, int32 [N]."""
-    found = culled[:, columns // _WORD] >> columns % _WORD & 1
-    return (found.long() << torch.arange(len(columns), device=columns.device)).sum(1).int()
+    # In place and in 32 bits, because these are as many numbers as the table has blocks, for each view.
+    found = culled[:, columns // _WORD]
+    found >>= (columns % _WORD).int()
+    found &= 1
+    found <<= torch.arange(len(columns), dtype=torch.int32, device=columns.device)
+    return found.sum(1, dtype=torch.int32)
