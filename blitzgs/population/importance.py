@@ -18,7 +18,7 @@ world size and for any division of the work.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -45,6 +45,10 @@ _WORD = 32
 ScoreRule = Literal["density", "root", "weight"]
 # How a view's term grows with its pixels, of which there are less than 2^31: bits before the point.
 _TERM_BITS: dict[ScoreRule, int] = {"density": 0, "root": 16, "weight": 31}
+
+
+class SweepStoppedError(Exception):
+    """A sweep was given up because the run has to stop."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,7 @@ def sweep(
     owners: TileOwners | None = None,
     rule: ScoreRule = "density",
     lod: SceneGate | None = None,
+    stops: Callable[[], bool] | None = None,
 ) -> Importance:
     """Score the Gaussians by what they contribute to V views. Collective: every rank calls it.
 
@@ -107,12 +112,19 @@ def sweep(
         rule: of the score.
         lod: leaves Gaussians out of views as rendering does: they contribute nothing there and hide nothing;
             None: none are left out.
+        stops: whether to give up, asked before each batch but the first; the same answer on every rank. None:
+            never.
+
+    Raises:
+        SweepStoppedError: `stops` said so; the table is as it was.
     """
     table = table_of(scene)
     sums = _Sums(len(table), n_views, table.device, rule)
     owners = owners or TileOwners(ranks)
     transport = open_transport(ranks)
-    for batch in batches:
+    for number, batch in enumerate(batches):
+        if stops is not None and number > 0 and stops():
+            raise SweepStoppedError
         assignment = _assign(batch, options, owners)
         visible = seen(scene, *batch.views.as_arguments(), options.limits, lod)
         surveyed = survey(visible.table, batch.views, options, assignment, transport, visible.active)

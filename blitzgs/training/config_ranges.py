@@ -60,7 +60,7 @@ RANGES: Mapping[str, Range] = {
     "model.initial_opacity": Range(1e-4, 0.9999),
     "model.scale_floor": Range(0, 100),
     "lod.fork": Range(1.01, 100),
-    "lod.visible_threshold": Range(0, 1),
+    "lod.visible_threshold": Range(0, 1, high_open=True),
     "lod.base_resolution": Range(1e-6, 1),
     "schedule.iterations": Range(1, 1e9),
     "schedule.scale": SCALE,

@@ -70,6 +70,7 @@ class Progress:
         train_views: digest of the names of the training views, in their order; empty in old checkpoints.
         signals: result of `blitzgs.training.adaptive.Signals.saved`, with `schedule.adaptive`.
         gate: digest of the spawn gate's files; empty without a gate, and in old checkpoints.
+        events_left: (time, order, kind) of the events of the last step that a signal kept from running.
     """
 
     step: int
@@ -85,6 +86,7 @@ class Progress:
     train_views: str = ""
     signals: dict[str, Any] = dataclasses.field(default_factory=dict)
     gate: str = ""
+    events_left: list[tuple[Any, ...]] = dataclasses.field(default_factory=list)
 
 
 @dataclass

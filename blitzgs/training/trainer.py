@@ -24,7 +24,7 @@ from blitzgs.training.batches import BatchLoader, Images, PhotographError
 from blitzgs.training.budget import Budget
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import config_hash, save_config
-from blitzgs.training.events import evaluate, handle_all, save
+from blitzgs.training.events import evaluate, events_left, handle_all, save
 from blitzgs.training.gate import lineage_subject
 from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.lod import lod_gate
@@ -35,6 +35,7 @@ from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
 from blitzgs.training.step_report import log_step, measure_step
 from blitzgs.training.views import render_options
+from blitzgs.view.residence import ResidenceError
 
 
 class Trainer:
@@ -79,6 +80,8 @@ class Trainer:
             NonFiniteError: a loss or a parameter is not finite.
             PhotographError: a photograph cannot be read; the steps before it are saved.
             ModelLostError: no Gaussian is left.
+            ResidenceError: the Gaussians that a step needs do not fit into the pool of `memory.resident_gb`;
+                with one rank, the steps before it are saved.
             CheckpointError: the model could not be saved, although the run waited for disk space.
         """
         state, done, size = self.state, self.state.progress.step, self.state.schedule.batch_size
@@ -92,16 +95,21 @@ class Trainer:
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 self._announce()
                 budget = Budget(state)
+                if not handle_all(state, events_left(state.progress)):
+                    self._stop_for(agreement.now(done).signal)
+                    return None
                 # The budget may change the number of steps.
                 while (step := state.progress.step + 1) <= state.schedule.steps:
-                    self.step(step)
-                    handle_all(state, state.schedule.events((step - 1) * size, step * size))
+                    self._step_or_save(step, is_first=step == done + 1)
+                    if not handle_all(state, state.schedule.events((step - 1) * size, step * size)):
+                        self._stop_for(agreement.now(step).signal)
+                        return None
                     budget.after(step)
                     if step == state.schedule.steps:
                         break
                     decision = agreement.after(step, self._loader.lost is not None)
                     if decision.signal is not None:
-                        self._stop(f"stopped by {decision.signal}; continue with --resume")
+                        self._stop_for(decision.signal)
                         return None
                     if decision.lost:
                         break
@@ -118,12 +126,29 @@ class Trainer:
         finally:
             self.close()
 
+    def _step_or_save(self, step: int, is_first: bool) -> None:
+        """Take a step; where the views do not fit into the pool, save what there is before failing."""
+        state = self.state
+        try:
+            self.step(step)
+        except ResidenceError as error:
+            if is_first or state.ranks.world_size > 1:
+                raise  # all is saved, or the other ranks are in the middle of the step
+            self._stop(f"saved after {state.images_seen:,} images, before a step that lacks room")
+            raise ResidenceError(
+                f"{error}. The model so far is saved: continue with --resume and a larger memory.resident_gb"
+            ) from error
+
     def _check_photographs(self) -> None:
         """Raise an error on all ranks if one of them continued without a photograph (`BatchLoader.lost`)."""
         reasons = self.state.ranks.all_gather_object(self._loader.lost)
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:
             raise PhotographError(f"{'; '.join(lost)}. The last steps, {MOST_STEPS} at most, went without it")
+
+    def _stop_for(self, signal: str | None) -> None:
+        """Save where the run is, because of a signal."""
+        self._stop(f"stopped by {signal}; continue with --resume")
 
     def _stop(self, text: str) -> None:
         """Save a checkpoint and log why the run stops."""

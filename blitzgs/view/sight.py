@@ -95,7 +95,7 @@ def culled_blocks(cull: Tensor) -> Tensor:
     length = max(1, _MOST_WORDS // max(1, cull[:1].numel()))
     parts = [cull.new_empty(0, cull.shape[1] // _WORD)]
     for some in cull.split(length):
-        is_culled = (some == -1).all(2).view(len(some), -1, _WORD)
+        is_culled = (some == -1).all(2).view(len(some), cull.shape[1] // _WORD, _WORD)
         parts.append((is_culled.long() << bits).sum(2).int())
     return torch.cat(parts)
 

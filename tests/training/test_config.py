@@ -113,6 +113,7 @@ def test_senseless_numbers_are_refused_by_name(name, default, value):
         ("schedule.iterations=999999999", "times schedule.scale must be at most 10,000,000 images"),
         ("lod.fork=1e30", r"lod.fork: must be in \[1.01, 100\], got 1e\+30"),
         ("lod.base_resolution=0", "lod.base_resolution: must be in"),
+        ("lod.visible_threshold=1", r"lod.visible_threshold: must be in \[0, 1\), got 1.0"),
         ("population.min_opacity=2", r"population.min_opacity: must be in \[0, 1\), got 2.0"),
         ("model.near=2e6", "model.near: must be in"),
         ("model.far=0.001", "model.near: must be below model.far"),

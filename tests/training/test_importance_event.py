@@ -2,7 +2,9 @@
 """The importance passes in a training: what they keep, what they leave behind, and their ablations."""
 
 import json
+import os
 import shutil
+import signal
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -20,6 +22,7 @@ from blitzgs.population.spawn_gate import GateError, GateInfo, info_path
 from blitzgs.training import run
 from blitzgs.training.events import importance
 from blitzgs.training.gate import life_fields, misfits
+from blitzgs.training.guard import ModelLostError
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training.test_trainer import assert_same_table, stop_at_step_50
@@ -286,3 +289,50 @@ def test_two_ranks_pass_and_keep_the_books(tmp_path, world_size, device):
     assert sorted(set(births) - set(deaths)) == sorted(ids.tolist())
     assert (ledger["births"], ledger["deaths"]) == (len(births), len(deaths))
     assert population["final"] == len(ids)
+
+
+def stop_in_the_sweep_of(monkeypatch, time):
+    """Have the process asked to stop while the pass at `time` surveys its second batch of views."""
+    batches = importance.view_batches
+
+    def interrupted(state):
+        for number, batch in enumerate(batches(state)):
+            if number == 1 and state.images_seen == time + 1:  # the end of its step
+                os.kill(os.getpid(), signal.SIGTERM)
+            yield batch
+
+    monkeypatch.setattr(importance, "view_batches", interrupted)
+    monkeypatch.setattr(importance, "LEAST_VIEWS", 2)
+
+
+@pytest.mark.parametrize("time, left", [(40, ["pass_1"]), (80, ["pass_2", "checkpoint"])])
+def test_a_pass_that_a_signal_cuts_short_happens_after_the_resume(tmp_path, monkeypatch, time, left):
+    """It does not hold up the stop, and the run is bit for bit the one that was never stopped."""
+    options = ("schedule.checkpoint_every=80", "population.lineage=true", "view.cull=true")
+    whole, _ = train(tmp_path / "whole", *options)
+    stop_in_the_sweep_of(monkeypatch, time)
+    cut, summary = train(tmp_path / "cut", *options)
+    assert summary is None and cut.state.progress.step == time + 1
+    assert [event[2] for event in cut.state.progress.events_left] == left
+    assert (PHI in cut.state.table) == (time > 40)
+    # Stopped in the same place once more.
+    again, summary = train(tmp_path / "cut", *options, resume=True)
+    assert summary is None and again.state.progress == cut.state.progress
+    monkeypatch.undo()
+    resumed, _ = train(tmp_path / "cut", *options, resume=True)
+    assert_same_table(resumed.state.table, whole.state.table)
+    assert resumed.state.progress.milestones == whole.state.progress.milestones
+    assert resumed.state.progress.events_left == []
+
+
+@pytest.mark.parametrize(
+    "options, named",
+    [
+        (["population.pass1_keep=1e-4"], "after 40 images kept none of .* population.pass1_keep=0.0001"),
+        (["population.pass2_keep=1e-4"], "after 80 images kept none of .* pass2_keep=0.0001"),
+    ],
+)
+def test_a_pass_that_keeps_nothing_ends_the_run_before_it_is_saved(tmp_path, options, named):
+    with pytest.raises(ModelLostError, match=named):
+        train(tmp_path, *options, "schedule.checkpoint_every=10")
+    assert len(run.open_model(tmp_path, Ranks()).table) > 0

@@ -181,3 +181,28 @@ def test_a_model_is_rendered_through_a_pool(tmp_path):
 def test_a_batch_that_does_not_fit_is_named(tmp_path):
     with pytest.raises(ResidenceError, match=r"see \d+ blocks of 256 Gaussians, .* lower schedule"):
         train(tmp_path, "memory.resident_gb=0.002")
+    assert not list((tmp_path / run.CHECKPOINTS).iterdir())
+
+
+def test_a_model_that_outgrows_its_pool_is_saved_and_goes_on_with_a_larger_one(tmp_path):
+    growing = ("population.grad_threshold=1e-6", "schedule.densify_until=60")
+    whole, _ = train(tmp_path / "whole", *growing)
+    with pytest.raises(ResidenceError, match=r"The model so far is saved: continue with --resume"):
+        train(tmp_path / "pooled", *growing, "memory.resident_gb=0.0048")
+    with pytest.raises(ResidenceError, match=r"lower schedule.batch_size$"):  # nothing new to save
+        train(tmp_path / "pooled", *growing, "memory.resident_gb=0.0048", resume=True)
+    larger, _ = train(tmp_path / "pooled", *growing, "memory.resident_gb=0.1", resume=True)
+    assert larger.state.origin.startswith("resumed") and "after 0 steps" not in larger.state.origin
+    assert_same_run(larger, whole)
+
+
+def test_a_mask_for_a_table_of_less_than_a_block(tmp_path):
+    options = ("population.importance=true", "schedule.t1=30", "schedule.t2=0", "view.cull=true",
+               "population.grad_threshold=1e30", "schedule.iterations=45")  # fmt: skip
+    runs = []
+    for number, more in enumerate((["memory.resident_gb=0.0078"], [])):
+        config = tiny_config("lod.visible_threshold=0", *options, *more)
+        runs.append(Trainer(config, *street(50), tmp_path / str(number), Ranks()))
+        runs[-1].train()
+        assert 0 < len(runs[-1].state.table) < 256
+    assert_same_run(*runs)

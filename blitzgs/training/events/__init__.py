@@ -8,8 +8,11 @@ function in `HANDLERS`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, replace
 
+from blitzgs.population.importance import SweepStoppedError
 from blitzgs.training.events import clear_cull, densify, evaluate, importance, place, reset_opacities, save
+from blitzgs.training.run import Progress
 from blitzgs.training.schedule import Event, EventKind
 from blitzgs.training.state import TrainingState
 
@@ -25,14 +28,28 @@ HANDLERS: Mapping[EventKind, Callable[[TrainingState, Event], object]] = {
 }
 
 
-def handle_all(state: TrainingState, events: Sequence[Event]) -> None:
+def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
     """Run the schedule's events of one step; every rank calls this with the same events.
 
     A step covers several images. Events that change the model run first, even if an evaluation or a
-    checkpoint of the
-    same step is due some images earlier: a run that is resumed from that checkpoint begins with the next
-        step, and
-    would never run them.
+    checkpoint of the same step is due some images earlier: a run that is resumed from that checkpoint begins
+    with the next step, and would never run them.
+
+    Returns:
+        Whether all events have run. If a signal stops the run before that, `progress.events_left` holds the
+        others, and the resumed run begins with them (`events_left`).
     """
-    for event in sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint")):
-        HANDLERS[event.kind](state, event)
+    state.progress = replace(state.progress, events_left=[])
+    ordered = sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint"))
+    for done, event in enumerate(ordered):
+        try:
+            HANDLERS[event.kind](state, event)
+        except SweepStoppedError:
+            state.progress = replace(state.progress, events_left=[astuple(other) for other in ordered[done:]])
+            return False
+    return True
+
+
+def events_left(progress: Progress) -> list[Event]:
+    """Return the events of a run's last step that a stop kept from happening."""
+    return [Event(*entry) for entry in progress.events_left]

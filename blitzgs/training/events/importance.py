@@ -16,7 +16,7 @@ from blitzgs.population.lineage import Cause
 from blitzgs.population.pruning import sample_by_score, top_by_score
 from blitzgs.population.redistribution import redistribute
 from blitzgs.training import view_level
-from blitzgs.training.guard import check_table
+from blitzgs.training.guard import ModelLostError, check_table
 from blitzgs.training.lod import scene_gate
 from blitzgs.training.schedule import Event
 from blitzgs.training.state import TrainingState
@@ -30,6 +30,8 @@ def run(state: TrainingState, event: Event) -> None:
 
     Raises:
         NonFiniteError: a parameter is not finite.
+        ModelLostError: no Gaussian is left.
+        SweepStoppedError: the run has to stop; the pass has changed nothing.
     """
     if not state.config.population.importance:
         return
@@ -44,6 +46,7 @@ def run(state: TrainingState, event: Event) -> None:
         state.owners,
         cast(ScoreRule, state.config.population.score),
         scene_gate(state.config, state.progress, state.table, state.ranks),
+        state.stops,
     )
     found.store(state.table, state.config.view.cull)
     before = state.population()
@@ -53,6 +56,8 @@ def run(state: TrainingState, event: Event) -> None:
         state.lineage.died(state.table["id"][gone], causes[gone], event.time, state.progress.step)
     state.table.keep(causes == 0)
     after = state.population()
+    if after == 0:
+        raise ModelLostError(_nothing_kept(state, event, before))
     if redistribute(state.table, state.ranks, max_imbalance=0):
         state.sort()
     state.stepper.reindex()
@@ -62,6 +67,21 @@ def run(state: TrainingState, event: Event) -> None:
     view_level.choose_views(state)
     counts = {"before": before, "gaussians": after, "views": len(state.capture.train)}
     state.log.event(event.time, event.kind, counts)
+
+
+def _nothing_kept(state: TrainingState, event: Event, before: int) -> str:
+    population = state.config.population
+    if event.kind == "pass_1":
+        values = f"population.pass1_keep={population.pass1_keep:g}"
+    else:
+        values = (
+            f"population.pass2_mass={population.pass2_mass:g}, pass2_keep={population.pass2_keep:g} and "
+            f"min_opacity={population.min_opacity:g}"
+        )
+    return (
+        f"the importance pass after {event.time:,} images kept none of {before:,} Gaussians: with so few, "
+        f"{values} keep too little"
+    )
 
 
 def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
