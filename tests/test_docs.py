@@ -103,6 +103,15 @@ def test_modules_and_their_members_exist(name):
                 found = getattr(found, part)
 
 
+def test_the_ops_of_the_design_table_are_registered():
+    page = text_of(ROOT / "docs/design/README.md")
+    table = page.split("| equation | op | CPU | CUDA |")[1].split("\n\n")[0]
+    named = {op for row in table.split("\n")[2:] for op in re.findall(r"`(\w+)`", row.split("|")[2])}
+    registered = set(re.findall(r'm\.def\(\s*"(\w+)\(', (ROOT / "csrc/registration.cpp").read_text()))
+    assert len(named) > 10
+    assert named <= registered, f"docs/design/README.md names {named - registered}, which are no ops"
+
+
 @cache
 def fields():
     sections = to_dict(Config())
