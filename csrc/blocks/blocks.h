@@ -1,27 +1,30 @@
 // SPDX-License-Identifier: Apache-2.0
-// The active set of a step: which rows of the table some view may see, found without reading the others.
+// The active set of a step: the rows of the table that some view may see. The kernels find it without reading
+// most of the other rows.
 //
-// The table is kept in Morton order, so 256 consecutive rows are neighbours: a block. A block's bounds
-// contain every position and every size that its Gaussians can have while steps of the lazy optimiser are
-// pending: a row that no step touches moves along a straight line, by at most m / sqrt(v) times the tail of
-// the schedule (lazy_adam.h), so its mean lies between two corners and its log scales between two values.
+// The table is in Morton order, so consecutive rows are neighbours in space. A block is 256 consecutive rows.
+// The bounds of a block contain every position and every size that its Gaussians can have while steps of the
+// lazy optimiser are pending. A row moves along a straight line while its steps are pending, by at most
+// m / sqrt(v) times the tail of the schedule (lazy_adam.h). Its mean therefore lies in the box of this line,
+// and its log scales between two values.
 //
-// A box of means with axes up to sigma is dropped from a view iff it fails one of the linear inequalities
-// n . p + d + k sigma >= 0 of the view's frustum (math/frustum.h), which it does only if its farthest corner
-// does. Blocks are tested first. Then the rows of the remaining blocks are tested by the same inequalities,
-// each on the line along which it may move. Blocks get twice the rounding slack, so a row that passes its own
-// test is never lost with its block, and the result does not depend on how rows are grouped. Where a block's
-// box, with sigma = 0, satisfies all inequalities with slack to spare, all of its rows pass and need not be
-// read. Only the rows of blocks across a view's border are read.
+// A box of means with standard deviations up to sigma is dropped from a view iff all its points fail one of
+// the linear inequalities n . p + d + k sigma >= 0 of the view's frustum (math/frustum.h). Blocks are tested
+// first. Then the rows of the remaining blocks are tested by the same inequalities, each with the box of its
+// own line. The test of a block has twice the rounding slack, so a row that passes its own test is never
+// dropped with its block, and the result does not depend on how rows are grouped. If the box of a block
+// satisfies all inequalities with sigma = 0 and some slack, all its rows pass without being read. Only the
+// rows of mixed blocks, which lie across a border of a view, are read.
 //
-// A gate on the views (view_gate.h) drops rows by the same principle: the distances of a box decide for its
-// blocks, then for its rows; what is undecided stays, and the exact test follows when the rows have caught
-// up. A mask drops a block without reading its rows where it leaves all of them out (cull_mask.h).
+// A gate on the views (view_gate.h) drops rows by the same principle: the distances of a box from the camera
+// decide first for blocks and then for rows. A row for which they do not decide stays active; the exact test
+// follows when the row has caught up. A cull mask (cull_mask.h) that drops all rows of a block drops the
+// block without reading its rows.
 //
-// The test is conservative: every row that projection would project is in the set
-// (tests/view/test_blocks.py). O(N / 256 + rows of the blocks across a border + active rows) per view.
-// Memory: O(rows of the blocks that some view may see). The caller says for how many blocks there is room;
-// where there are more, the lists are left empty and the number of blocks tells what is needed.
+// The test is conservative: every row that the projection would project is in the set
+// (tests/view/test_blocks.py). The cost is O(N / 256 + rows of mixed blocks + active rows) per view, the
+// memory O(rows of the blocks that some view may see). The caller gives the capacity in blocks. If more
+// blocks are active, the lists are empty and n_blocks says how large the capacity has to be.
 #pragma once
 #include <cfloat>
 #include <cmath>
@@ -46,16 +49,17 @@ BLITZGS_HD int rows_in_block(std::int64_t rows, std::int64_t block) {
   return static_cast<int>(rest < kBlockRows ? rest : kBlockRows);
 }
 
-// Where rows are, and what decides where pending steps may move them. Moments null: no step is pending.
+// The columns of the table that say where rows are and where pending steps may move them. Moments null: no
+// row has pending steps.
 struct BlockRows {
   const float *means, *scales;  // [N, 3], scales logarithmic
   const float *exp_avg_means, *exp_avg_sq_means, *exp_avg_scales, *exp_avg_sq_scales;
-  const std::int32_t *last_step, *moment_step;  // [N], where parameters and moments stand
+  const std::int32_t *last_step, *moment_step;  // [N], the steps of parameters and moments (lazy_adam.h)
   const double* table;                          // [S + 1, kAdamTable]
   std::int64_t n;
 };
 
-// A box of means and the largest standard deviation in it; empty while low > high.
+// A box of means and an upper bound on the standard deviations; empty if low > high.
 struct SweptBox {
   float low[3], high[3], sigma;
 };
@@ -64,17 +68,17 @@ BLITZGS_HD SweptBox empty_box() {
   return {{FLT_MAX, FLT_MAX, FLT_MAX}, {-FLT_MAX, -FLT_MAX, -FLT_MAX}, 0.0f};
 }
 
-// The drift of a row's pending steps, enlarged by its rounding.
+// The drift by a row's pending steps, with a margin for rounding.
 BLITZGS_HD float pending_drift(float m, float v, float tail) {
   return m == 0.0f || !(v > 0.0f) ? 0.0f : m / std::sqrt(v) * tail * 1.00001f;
 }
 
-// The box that a row stays in while its steps are pending. A row that is not finite is never visible and
-// gives an empty box.
+// The box in which a row stays while its steps are pending. A row that is not finite is never visible and has
+// an empty box.
 BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, std::int64_t row) {
   SweptBox box = empty_box();
-  // Everything that is addressed by the row alone is loaded before anything is computed, so that a GPU waits
-  // once for all of these loads.
+  // All values whose address depends on the row alone are loaded before the first computation, so that a GPU
+  // waits once for all of these loads.
   const bool pending = rows.exp_avg_means != nullptr;
   const std::int32_t stand = pending ? rows.last_step[row] : 0;
   const std::int32_t behind = pending ? stand - rows.moment_step[row] : 0;
@@ -141,13 +145,12 @@ BLITZGS_HD Frustum make_frustum(const CullCamera& of, int view) {
   return make_frustum(camera, of.width, of.height, of.near_plane, of.far_plane, of.eps2d);
 }
 
-// What a view sees of a box. some: the view may see a part of it. all: the view certainly sees all that is in
-// it.
+// some: a view may see a part of a box. all: the view certainly sees all means in the box.
 struct Sight {
   bool some, all;
 };
 
-// slack: the largest relative rounding error of each term.
+// Tests a box against the planes of a view. slack: the largest relative rounding error of each term.
 BLITZGS_HD Sight sight_of(const Frustum& view, const SweptBox& box, float slack) {
   float centre[3], half[3];
   for (int axis = 0; axis < 3; ++axis) {
@@ -172,14 +175,14 @@ BLITZGS_HD Sight sight_of(const Frustum& view, const SweptBox& box, float slack)
 
 constexpr float kRowSlack = kPointSlack, kBlockSlack = 2 * kPointSlack;
 
-// What is left out of the views (view_gate.h), told from where rows may be before they have caught up: a row
-// is only dropped where its exact test would drop it. Without rules nothing is left out.
+// The gate of the views (view_gate.h) for blocks and for rows that have not caught up. A row is dropped only
+// if the exact test would drop it wherever it may be. Without rules no row is dropped.
 struct BlockGate {
   GateRules rules;
   const std::uint8_t* level_ranges;  // [blocks_of(n), 2], coarsest and finest level of each block
 };
 
-// Bounds of the squared distance of all points of a box from a camera.
+// Bounds on the squared distances of all points of a box from a camera.
 struct DistanceRange {
   float near2, far2;
 };
@@ -198,12 +201,13 @@ BLITZGS_HD DistanceRange distances_of(const SweptBox& box, const float* centre, 
   return {range.near2 * (1.0f - 4.0f * slack), range.far2 * (1.0f + 4.0f * slack)};
 }
 
-// One bit for each view: some: it may see a part of the block; inside: its frustum holds all rows; all: it
-// certainly sees all rows.
+// One bit for each view. some: the view may see a row of the block. inside: the view's frustum contains all
+// rows. all: the view certainly sees all rows.
 struct BlockViews {
   std::uint32_t some, inside, all;
 };
 
+// Removes from `seen` the views in which the gate drops all rows (some) or may drop a row (all).
 BLITZGS_HD void gate_block(const BlockGate& gate, const GateTable& table, std::int64_t block,
                            const SweptBox& box, BlockViews& seen) {
   const GateRules& rules = gate.rules;
@@ -227,6 +231,7 @@ BLITZGS_HD void gate_block(const BlockGate& gate, const GateTable& table, std::i
   seen.all &= seen.some;
 }
 
+// The test of a block from its bounds [kBlockBounds].
 template <bool kGated>
 BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const float* bounds, std::int64_t block,
                                      const BlockGate& gate, const GateTable& table) {
@@ -246,8 +251,8 @@ BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const floa
 // Whether the block's rows have to be tested one by one.
 BLITZGS_HD bool is_mixed(const BlockViews& block) { return block.some != block.all; }
 
-// The views that may see a row of a mixed block. A row's state is read where its block's bounds do not
-// decide.
+// The views that may see a row of a mixed block, as bits. The row's columns are read only if the bounds of
+// its block do not decide.
 template <bool kGated>
 BLITZGS_HD std::uint32_t views_of_row(const BlockRows& rows, const Frustum* views, int count,
                                       const float* bounds, const BlockViews& seen, std::int64_t row,
@@ -289,12 +294,11 @@ struct alignas(16) ActiveBlock {
   BlockViews seen;
 };
 
-// What the first kernels find, before rows are listed: the blocks that some view may see, in order, the views
-// of the rows of those that are mixed, and how many rows of each are active.
+// The result of the tests, from which the rows are listed. `room` is the capacity in blocks.
 struct CullPlan {
-  ActiveBlock* blocks;   // [room]
-  std::uint32_t* masks;  // [room, kBlockRows]
-  std::int32_t* active;  // [room]
+  ActiveBlock* blocks;   // [room], the blocks that some view may see, in order
+  std::uint32_t* masks;  // [room, kBlockRows], the views that may see each row of a mixed block, as bits
+  std::int32_t* active;  // [room], the number of active rows of each block
   std::int64_t room;
 
   CullPlan(std::int64_t n_blocks, Workspace& workspace)
@@ -304,14 +308,15 @@ struct CullPlan {
         room(n_blocks) {}
 };
 
-// Lists with room for the rows of `room` blocks; the active rows and their views come first. n_blocks is how
-// many blocks some view may see: where these are more than there is room for, count is 0.
+// The output: the active rows and the views that may see each (as bits), in lists with the capacity of `room`
+// blocks, of which the first *count entries are valid. *n_blocks is the number of blocks that some view may
+// see; if it exceeds `room`, *count is 0.
 struct ActiveList {
   std::int32_t *ids, *views, *count, *n_blocks;  // [room * kBlockRows] twice, [1] twice
   std::int64_t room;
 };
 
-// What decides which rows are active.
+// The inputs of the test: the rows, the bounds of their blocks, the views and the gate.
 struct CullInputs {
   BlockRows rows;
   const float* bounds;
@@ -322,7 +327,7 @@ struct CullInputs {
 
 namespace cpu {
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
-// ids null: every block. Otherwise the blocks of these rows.
+// Computes the bounds of the blocks that contain the rows `ids`, or of all blocks if ids is null.
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);
 // Waits for the number of blocks that some view may see.

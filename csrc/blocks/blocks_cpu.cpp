@@ -22,7 +22,7 @@ void bound_block(const BlockRows& rows, std::int64_t block, float* bounds) {
   store_bounds(box, all_finite, bounds + block * kBlockBounds);
 }
 
-// What all rows are compared with.
+// The frusta of the views and the table of the gate.
 struct CullViews {
   Frustum planes[kMaxViews];
   GateTable table;

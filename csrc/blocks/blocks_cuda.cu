@@ -11,10 +11,14 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kWarps = kBlockRows / 32;
-constexpr int kGroup = kBlockRows;  // blocks whose active rows are added up, one thread for each
-// How many CUDA blocks with a thread for each row fit into a multiprocessor of any supported GPU.
+// A group is this many blocks of the table, which a CUDA block tests with one thread each. Prefix sums over
+// active rows are kept by group.
+constexpr int kGroup = kBlockRows;
+// The number of CUDA blocks with kBlockRows threads that fit a multiprocessor of every supported GPU.
 constexpr int kResident = 6;
 
+// keys [n] = the Morton codes of points [n, 3], without their lowest bit so that they fit a signed integer.
+// One thread per point.
 __global__ void make_keys(const float* points, std::int64_t n, const MortonBounds* bounds,
                           std::int64_t* keys) {
   const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
@@ -32,8 +36,9 @@ __device__ void append(bool present, std::int32_t item, std::int32_t* list, std:
   if (present) list[first + __popc(all & ((1u << lane) - 1))] = item;
 }
 
-// Lists a block at its first row, as rows ascend. If they did not, a block would be listed several times,
-// which would only cost time.
+// Lists the blocks of the rows ids [n]. One thread per row; the thread of the first row of each block appends
+// the block. If the rows did not ascend, a block could be listed several times, which costs time but is
+// correct.
 __global__ void list_blocks(const std::int32_t* ids, std::int64_t n, std::int32_t* list,
                             std::int32_t* length) {
   wait_for_earlier_kernels();
@@ -42,7 +47,7 @@ __global__ void list_blocks(const std::int32_t* ids, std::int64_t n, std::int32_
   append(i < n && (i == 0 || ids[i - 1] / kBlockRows != block), block, list, length);
 }
 
-// The box around the boxes of each kLanes neighbouring lanes.
+// Returns the union of the boxes of each group of kLanes neighbouring lanes.
 template <int kLanes>
 __device__ __forceinline__ SweptBox box_around(SweptBox box) {
 #pragma unroll
@@ -58,10 +63,11 @@ __device__ __forceinline__ SweptBox box_around(SweptBox box) {
   return box;
 }
 
-// Each CUDA block handles blocks of the list in turn, one thread for each row. list null: all blocks.
+// Computes the bounds [blocks, kBlockBounds] of the listed blocks (list null: all blocks). A CUDA block
+// handles one block of the table at a time, one thread per row.
 __global__ void __launch_bounds__(kBlockRows, kResident)
     update_bounds(const BlockRows rows, const std::int32_t* list, const std::int32_t* length, float* bounds) {
-  __shared__ SweptBox warps[2][kWarps];  // used in alternation, so that one barrier is enough
+  __shared__ SweptBox warps[2][kWarps];  // two alternating buffers need only one barrier per block
   wait_for_earlier_kernels();
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const std::int64_t count = list ? *length : blocks_of(rows.n);
@@ -85,13 +91,14 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
 // Counters of a call, zero at its start.
 struct CullCounters {
   RunningSum earlier;     // over the groups of blocks
-  std::int32_t* groups;   // active rows of each kGroup blocks of the plan
-  std::int32_t* n_mixed;  // entries of `mixed`
+  std::int32_t* groups;   // active rows in each group of kGroup blocks of the plan
+  std::int32_t* n_mixed;  // the length of the list `mixed`
 };
 
-// One thread for each block, one CUDA block for each group of blocks, in turn. Lists the blocks that some
-// view may see behind those of earlier groups, as far as there is room, lists which of these are mixed, in
-// any order, counts the active rows of the others, and writes the planes of the views for test_rows.
+// The first kernel of cull_blocks: tests the blocks of the table from their bounds. One thread per block of
+// the table, one CUDA block per group. Writes to the plan the blocks that some view may see, in order, up to
+// its capacity; writes the positions of mixed blocks in the plan to `mixed`, in any order; counts the active
+// rows of the other blocks; and writes the planes of the views for test_rows.
 template <bool kGated>
 __global__ void __launch_bounds__(kGroup)
     test_blocks(const __grid_constant__ CullInputs in, const CullPlan plan, const CullCounters counters,
@@ -135,7 +142,8 @@ __global__ void __launch_bounds__(kGroup)
   append(listed && is_mixed(seen), static_cast<std::int32_t>(place), mixed, counters.n_mixed);
 }
 
-// Each CUDA block tests mixed blocks in turn, one thread for each row.
+// The second kernel of cull_blocks: tests the rows of mixed blocks and writes the views that may see each row
+// to plan.masks. A CUDA block tests one mixed block at a time, one thread per row.
 template <bool kGated>
 __global__ void __launch_bounds__(kBlockRows, kResident)
     test_rows(const __grid_constant__ CullInputs in, const CullPlan plan, const CullCounters counters,
@@ -165,8 +173,8 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
   }
 }
 
-// Returns the number of active rows before a place of the plan: those of earlier groups, and those of earlier
-// blocks of its own group. All threads call this.
+// Returns the number of active rows in the blocks before position `place` of the plan: the rows of earlier
+// groups, and those of earlier blocks of the same group. All threads call this.
 __device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* groups, std::int32_t place) {
   __shared__ std::int32_t parts[kWarps];
   const std::int32_t group = place / kGroup, near = group * kGroup + static_cast<std::int32_t>(threadIdx.x);
@@ -179,7 +187,8 @@ __device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* gr
   return __reduce_add_sync(kFullWarp, lane < kWarps ? parts[lane] : 0);
 }
 
-// One warp for each block of the plan.
+// The third kernel of cull_blocks: lists the active rows and their views, in order. One warp per block of the
+// plan.
 __global__ void __launch_bounds__(kBlockRows)
     emit_rows(std::int64_t n, const CullPlan plan, const std::int32_t* groups, const ActiveList out) {
   wait_for_earlier_kernels();
@@ -214,6 +223,7 @@ __global__ void __launch_bounds__(kBlockRows)
   }
 }
 
+// The number of CUDA blocks for a kernel that handles `blocks` blocks of the table in a loop.
 unsigned persistent_blocks(std::int64_t blocks) {
   return static_cast<unsigned>(std::min<std::int64_t>(blocks, kResident * multiprocessors()));
 }
@@ -246,7 +256,7 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
 
 namespace {
 
-// Finds the blocks that some view may see, and lists their rows where there is room for any.
+// Finds the blocks that some view may see. If the capacity is not 0, also lists their active rows.
 void cull(const CullInputs& in, const ActiveList& out, Workspace& workspace, CudaStream stream) {
   const CullPlan plan(out.room, workspace);
   std::int32_t* mixed = workspace.allocate<std::int32_t>(out.room);

@@ -10,7 +10,7 @@
 namespace blitzgs {
 namespace {
 
-// The columns of the table, checked, and kept alive during the call.
+// The columns of the table, checked. `held` keeps the tensors alive during the call.
 struct HeldRows {
   std::vector<Tensor> held;
   BlockRows rows{};
@@ -32,8 +32,8 @@ const std::int32_t* hold_steps(const char* op, const char* name, const Tensor& c
   return data<std::int32_t>(held.held.back());
 }
 
-// rows: (means, scales), and where steps are pending behind them the moments (exp_avg and exp_avg_sq of the
-// means, then of the scales), last_step, moment_step and table. Python's side is blitzgs/ops/blocks.py.
+// rows: (means, scales), and if steps may be pending also the moments (exp_avg and exp_avg_sq of the means,
+// then of the scales), last_step, moment_step and table. blitzgs/ops/blocks.py builds this group.
 HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
   STD_TORCH_CHECK(rows.size() == 2 || rows.size() == 9, "blitzgs::", op,
                   ": rows must be (means, scales) or, with pending steps, (means, scales, exp_avg_means, "
@@ -87,7 +87,7 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in,
     check_dtype(op, "ids", *ids_in, ScalarType::Int);
     check_shape(op, "ids", *ids_in, {-1});
     ids = as_contiguous(*ids_in);
-    if (ids->size(0) == 0) return;  // an empty tensor may have a null address, which would mean all rows
+    if (ids->size(0) == 0) return;  // an empty tensor may have a null pointer, which would mean all rows
   }
   DeviceScope scope(bounds);
   backend::update_block_bounds(held.rows, data_or_null<std::int32_t>(ids), ids ? ids->size(0) : 0,

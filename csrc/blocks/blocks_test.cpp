@@ -53,7 +53,7 @@ TEST_CASE("pending steps widen a row's box along its drift, and rows that are no
   m[0] = 2;
   std::vector<std::int32_t> last_step(2, 1), moment_step(2, 0);
   std::vector<double> table(3 * blitzgs::kAdamTable, 0.0);
-  table[1 * blitzgs::kAdamTable] = 0.5;  // of which half is past by step 1
+  table[1 * blitzgs::kAdamTable] = 0.5;  // the tail of the means at step 1
   table[1 * blitzgs::kAdamTable + blitzgs::kRatioPower] = 0.5;
   const blitzgs::BlockRows rows{
       means.data(), scales.data(),    m.data(),           v.data(),     still.data(),

@@ -1,26 +1,27 @@
 // SPDX-License-Identifier: Apache-2.0
-// Tells tests which branches the loaded code takes (cuda.cuh).
+// Functions that tell tests which branches of cuda.cuh the loaded library takes.
 #include <cuda_runtime.h>
 
 #include "common/cuda.cuh"
 
 namespace {
-// One value for each architecture in the library: the current device reads that of the code it runs.
+// Each architecture in the library has its own value; a device reads the value of the code that it runs.
 __device__ const int sm90_branches = BLITZGS_SM90;
 }  // namespace
 
 extern "C" {
 
-// 1 if the code that the current device runs has the branches for sm_90, otherwise 0; -1 without a device.
+// Returns 1 if the code that the current device runs has the branches for sm_90, otherwise 0; -1 without a
+// device.
 __attribute__((visibility("default"))) int blitzgs_sm90_branches() {
   int answer = -1;
   return cudaMemcpyFromSymbol(&answer, sm90_branches, sizeof(answer)) == cudaSuccess ? answer : -1;
 }
 
-// 1 if this build leaves out the branches for sm_90 whatever the device, otherwise 0.
+// Returns 1 if this build has no branches for sm_90 on any device, otherwise 0.
 __attribute__((visibility("default"))) int blitzgs_sm80_forced() { return BLITZGS_SM80_BRANCHES; }
 
-// The number of items from which sorts take 64-bit states.
+// Returns the number of items from which sorts take 64-bit states.
 __attribute__((visibility("default"))) std::int64_t blitzgs_small_states() {
   return blitzgs::cuda::kSmallStates;
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Catch2 v2 and v3 keep their macros under different headers.
+// Catch2 v2 and v3 define their macros in different headers.
 #pragma once
 #ifdef BLITZGS_CATCH2_V3
 #include <catch2/catch_all.hpp>

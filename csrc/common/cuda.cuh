@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What CUDA kernels share: launches, and what the threads of a warp, a block and a grid do together. No
-// torch.
+// Helpers of all CUDA kernels: launches, and sums over the threads of a warp, a block and a grid. This header
+// does not include torch.
 #pragma once
 #include <cuda_runtime.h>
 #include <array>
@@ -13,10 +13,10 @@
 
 #include "common/kernel.h"
 
-// Where the GPU or the size of the work decides which code runs. A test build takes the other branch on the
-// machine at hand: BLITZGS_SM80_BRANCHES compiles the code of GPUs before sm_90 for all of them, and
-// BLITZGS_SMALL_STATES lowers the number of items from which sorts take 64-bit states (docs/testing.md). A
-// library says what it was compiled with (branches_cuda.cu).
+// The GPU and the size of the work decide which code runs. A test build takes the other branches on the same
+// machine: BLITZGS_SM80_BRANCHES compiles the code for GPUs before sm_90 for all GPUs, and
+// BLITZGS_SMALL_STATES lowers the number of items from which sorts take 64-bit states (docs/testing.md).
+// Tests ask the library for both settings (branches_cuda.cu).
 
 #ifndef BLITZGS_SM80_BRANCHES
 #define BLITZGS_SM80_BRANCHES 0
@@ -37,8 +37,6 @@ namespace blitzgs::cuda {
 inline constexpr std::int64_t kSmallStates = BLITZGS_SMALL_STATES;
 static_assert(kSmallStates <= 1 << 30);
 
-// Launch helpers for the *_cuda.cu files. No torch.
-
 inline void check(cudaError_t status, const char* what) {
   if (status != cudaSuccess) {
     throw std::runtime_error(std::string("blitzgs: CUDA error in ") + what + ": " +
@@ -53,9 +51,7 @@ inline unsigned blocks_for(std::int64_t n, int threads) {
   return static_cast<unsigned>((n + threads - 1) / threads);
 }
 
-// The number of multiprocessors, for launches with as many blocks as run at a time.
-
-// The number of multiprocessors of the current device.
+// The number of multiprocessors of the current device, for launches with as many blocks as run at a time.
 inline int multiprocessors() {
   int device = 0, count = 0;
   check(cudaGetDevice(&device), "multiprocessors");
@@ -79,8 +75,9 @@ inline int multiprocessors() {
 //   them has ended, and so does another stream that waits for such an event.
 // - No kernel lets the next one in before its own blocks end (griddepcontrol.launch_dependents). A waiting
 //   block occupies a multiprocessor, so a kernel that spins for another GPU or stream must not let its
-//   successor in. Other kernels would only lose by it: blocks that are placed while others still run are
-//   spread unevenly over the multiprocessors (docs/decisions/launch-earlier.md).
+//   successor in. For other kernels it would cost time, because the blocks of the next kernel are spread
+//   unevenly over the multiprocessors if they are placed while others still run
+//   (docs/decisions/launch-earlier.md).
 // - Kernels of other libraries are launched plainly; they wait for all earlier kernels by themselves.
 
 // A kernel that is launched by launch_early calls this first.
@@ -90,9 +87,10 @@ __device__ __forceinline__ void wait_for_earlier_kernels() {
 #endif
 }
 
-// Whether kernels wait on the current device. This depends on the code that the device runs and not on the
-// device: code that was compiled for an older device and translated when it was loaded does not wait. All
-// kernels are compiled for the same architectures, so asking one of them is enough.
+// Whether wait_for_earlier_kernels() waits on the current device. This depends on the code that the device
+// runs and not on the device: code that was compiled for an older architecture and translated at load time
+// does not wait. All kernels are compiled for the same architectures, so it is enough to ask about one of
+// them.
 inline bool kernels_wait(const void* kernel) {
   if constexpr (BLITZGS_SM80_BRANCHES) return false;
   enum : signed char { kUnknown, kNo, kYes };
@@ -135,9 +133,8 @@ void launch_early(const char* what, void (*kernel)(Parameters...), const LaunchS
   check_launch(what);
 }
 
-// Zeroes a few counters between kernels that are launched early. A memset there would bring back the gaps
-// before and behind it.
-
+// Sets counters [n] to zero between kernels that are launched early, one thread per counter. A memset would
+// bring back the gaps before and after it.
 static __global__ void zero_kernel(std::int32_t* counters, std::int64_t n) {
   wait_for_earlier_kernels();
   const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
@@ -148,10 +145,9 @@ inline void zero(const char* what, std::int32_t* counters, std::int64_t n, CudaS
   launch_early(what, zero_kernel, {blocks_for(n, 256), 256, stream}, counters, n);
 }
 
-// What the lanes of a warp do together.
+inline constexpr unsigned kFullWarp = 0xffffffffu;  // the mask of warp functions that all lanes call
 
-inline constexpr unsigned kFullWarp = 0xffffffffu;  // all lanes take part
-
+// Returns the sum of `value` over the lanes up to and including this one.
 template <class T>
 __device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
 #pragma unroll
@@ -162,7 +158,7 @@ __device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
   return value;
 }
 
-// Sum over a block of THREADS threads, on thread 0.
+// Returns the sum of `value` over a block of THREADS threads on thread 0, and 0 on the others.
 template <int THREADS>
 __device__ double block_sum(double value) {
   __shared__ double warps[THREADS / 32];
@@ -177,12 +173,12 @@ __device__ double block_sum(double value) {
   return total;
 }
 
-// Sums of block sums over the blocks of one launch, while these run.
-
-// The sum over all blocks before a block, where each block has a sum in [0, 2^62). A block publishes its own
-// sum. It then adds up the sums of its predecessors, backwards, until it meets one that has published the sum
-// up to and including itself, and publishes its own such sum. No second launch is needed. Blocks are numbered
-// in the order in which they start, so all predecessors of a block that waits run or have run.
+// A prefix sum over the blocks of a launch while they run, without a second launch (decoupled look-back).
+// Each block has a sum in [0, 2^62) and gets the sum over all blocks before it. A block first publishes its
+// own sum. It then adds up the sums of its predecessors, from the nearest to the farthest, until it finds a
+// predecessor that has published the sum up to and including itself. At last the block publishes its own such
+// sum. Blocks are numbered in the order in which they start, so all predecessors of a waiting block run or
+// have run.
 class RunningSum {
  public:
   // zeros: one word for each block and one more, all zero.
@@ -197,8 +193,8 @@ class RunningSum {
     return turn;
   }
 
-  // Returns the sum before a block. All threads of the block call this, each looks at one predecessor at a
-  // time, and it is a barrier for them.
+  // Publishes the sum `own` of a block and returns the sum over all blocks before it. All threads of the
+  // block call this, each reads the state of one predecessor at a time, and it is a barrier for them.
   template <int kThreads>
   __device__ std::int64_t sum_before(int block, std::int64_t own) const {
     __shared__ std::int64_t parts[kThreads / 32];
@@ -234,8 +230,8 @@ class RunningSum {
 
  private:
   using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
-  // The two high bits say what the rest is: the block's own sum, or the sum up to and including this block.
-  // Both are in one word, so no fence is needed to order them.
+  // The two high bits of a state say whether the rest is the block's own sum or the sum up to and including
+  // the block. Kind and sum are in one word, so no fence is needed to order them.
   static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kThrough = std::uint64_t{2} << 62;
 
   __device__ static std::int64_t value(std::uint64_t state) {
@@ -248,13 +244,12 @@ class RunningSum {
   std::uint64_t *turn_, *states_;
 };
 
-// The sum over all earlier turns, for blocks of a launch that take turns, while they run.
-
-// Each turn has a sum in [0, 2^62). The first block that asks gets no turn: one of its warps adds the sums
-// up, in order, for all other blocks, each of which reads a single word. The result arrives later than with
-// RunningSum, but it costs the blocks no time if they have other work between publishing their sum and asking
-// for the sum before them. Turns are numbered in the order in which they are asked for, so a block that waits
-// for earlier turns waits for blocks that run.
+// Another prefix sum over the blocks of a launch while they run. A block takes turns (batches of work); each
+// turn has a sum in [0, 2^62), and the block gets the sum over all earlier turns. The first block that calls
+// next() gets no turn: one of its warps adds up the sums in order, and each other block reads one word. The
+// result arrives later than with RunningSum, but it costs the blocks no time if they have other work to do
+// between publish() and before(). Turns are numbered in the order of the calls of next(), so a block that
+// waits for earlier turns waits for blocks that run.
 class TurnSums {
  public:
   // zeros: one word for each turn and one more, all zero.
@@ -265,7 +260,7 @@ class TurnSums {
   __device__ int next() const {
     return static_cast<int>(Word(*asked_).fetch_add(1, ::cuda::memory_order_relaxed)) - 1;
   }
-  // The same, called by all threads of a block, and a barrier for them.
+  // next(), but called by all threads of a block; it is a barrier for them.
   __device__ int first() const {
     __shared__ int turn;
     if (threadIdx.x == 0) turn = next();
@@ -282,7 +277,8 @@ class TurnSums {
     return value(state);
   }
 
-  // Adds up the sums of turns [0, n), all of which are taken at some time; called by one warp.
+  // Adds up the sums of turns [0, n) as blocks publish them; called by one warp. Blocks must take all n
+  // turns.
   __device__ void add_up(int n) const {
     constexpr int kEach = 4;  // turns that a lane reads at a time
     const int lane = threadIdx.x % 32;
@@ -300,7 +296,7 @@ class TurnSums {
         ready = k + 1;
         own += value(states[k]);
       }
-      // Turns behind the first one that is not published yet have to wait for it.
+      // Turns after the first unpublished one wait for it.
       const unsigned short_of = __ballot_sync(kFullWarp, ready < kEach);
       const int last = short_of ? __ffs(short_of) - 1 : 31;
       if (lane > last) own = 0;
@@ -319,8 +315,8 @@ class TurnSums {
 
  private:
   using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
-  // The two high bits say what the rest is: the turn's own sum, or the sum of all earlier turns. Both are in
-  // one word, so no fence is needed to order them.
+  // The two high bits of a state say whether the rest is the turn's own sum or the sum of all earlier turns.
+  // Kind and sum are in one word, so no fence is needed to order them.
   static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kBefore = std::uint64_t{2} << 62;
 
   __device__ static std::int64_t value(std::uint64_t state) {

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What kernels of both backends and their callers share; no torch here.
+// Definitions that the kernels of both backends and their callers share: limits, scratch memory, the number
+// of splats, and the gradient of a splat. This header does not include torch.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -24,9 +25,6 @@ inline constexpr int kMaxPeers = 16;   // ranks that write to each other's memor
 
 }  // namespace blitzgs
 
-// What the signatures of CPU and CUDA kernels need in common: the stream in which work is queued, and the
-// source of scratch memory. No torch here.
-
 struct CUstream_st;  // cudaStream_t is a pointer to this; declared so that no CUDA header is needed
 
 namespace blitzgs {
@@ -46,8 +44,8 @@ class Workspace {
 using CudaStream = CUstream_st*;
 
 // Uninitialised arrays of one length in one piece of scratch memory, each aligned for any type. They share a
-// piece because the host spends microseconds on allocating each, while the device waits for the launch behind
-// it.
+// piece because each allocation takes the host microseconds, during which the device waits for the next
+// launch.
 template <class... T>
 std::tuple<T*...> allocate_arrays(std::int64_t length, Workspace& workspace) {
   constexpr std::size_t kAlignment = 256;
@@ -60,15 +58,14 @@ std::tuple<T*...> allocate_arrays(std::int64_t length, Workspace& workspace) {
     next += bytes(size);
     return array;
   };
-  return {static_cast<T*>(take(sizeof(T)))...};  // braces: from left to right
+  return {static_cast<T*>(take(sizeof(T)))...};  // the braces guarantee the order of the calls
 }
 
-// Splats whose number only the device knows. The host queues an op before it knows how many splats the ops
-// before it make. The op gets columns with room for n_splats splats and a pointer to their number in device
-// memory: the first *known splats are valid. The memory behind them is undefined and is not read as splats. A
-// number outside [0, n_splats] counts as 0: there was too little room, and the caller discards the result.
-
-// known: null if all n_splats splats are valid. Kernels read it after wait_for_earlier_kernels().
+// The number of valid splats. The host queues an op before it knows how many splats earlier ops make. The op
+// gets columns with a capacity of n_splats splats and a pointer `known` to their number in device memory: the
+// first *known splats are valid, and the memory after them is undefined and not read. A number outside
+// [0, n_splats] counts as 0: the splats exceeded the capacity, and the caller discards the result. known:
+// null if all n_splats splats are valid. Kernels read it after wait_for_earlier_kernels().
 BLITZGS_HD std::int64_t splats_there(std::int64_t n_splats, const std::int64_t* known) {
   if (!known) return n_splats;
   const std::int64_t there = *known;
@@ -80,14 +77,13 @@ BLITZGS_HD std::int64_t splats_there(const Input& in) {
   return splats_there(in.n_splats, in.known_splats);
 }
 
-// The gradient of one splat, as compositing's backward pass adds it up on CUDA and the projection's backward
-// pass reads it. This is the only definition of the layout: Python asks for it (the op
-// splat_gradient_layout).
-
+// The gradient of one splat: on CUDA the rasteriser's backward pass sums it, and the projection's backward
+// pass reads it. This is the only definition of the layout; Python reads it through the op
+// splat_gradient_layout.
 struct alignas(16) SplatGradient {
   float mean2d[2], conic[3], opacity;
-  float color[4];       // up to four channels, zero behind the last
-  float mean2d_abs[2];  // sums of absolute values over pixels, where they were asked for
+  float color[4];       // up to four channels; zeros after the last
+  float mean2d_abs[2];  // sums over pixels of the absolute gradients of mean2d, if absgrad is set
 
   BLITZGS_HD void add(const SplatGradient& v) {
     for (int i = 0; i < 2; ++i) mean2d[i] += v.mean2d[i];
@@ -100,7 +96,7 @@ struct alignas(16) SplatGradient {
 
 inline constexpr std::int64_t kSplatGradient = sizeof(SplatGradient) / sizeof(float);
 
-// The same as three pieces of 16 bytes, which the rasteriser's kernels move; they rely on these places.
+// The rasteriser's kernels move the gradient as three pieces of 16 bytes and rely on these offsets.
 static_assert(kSplatGradient == 12 && offsetof(SplatGradient, conic) == 8 &&
               offsetof(SplatGradient, opacity) == 20 && offsetof(SplatGradient, color) == 24 &&
               offsetof(SplatGradient, mean2d_abs) == 40);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What every *_op.cpp needs of torch: checks with full messages, allocation, dispatch over dtypes. Each
+// The torch helpers of all *_op.cpp files: checks with full messages, allocation, dispatch over dtypes. Each
 // *_op.cpp is compiled once per backend; `backend` names the namespace of that backend's kernels.
 #pragma once
 #include <torch/csrc/stable/accelerator.h>
@@ -34,8 +34,8 @@ namespace backend = cpu;
 }
 #endif
 
-// STABLE_TORCH_LIBRARY_IMPL pastes its key, so the key macro has to be expanded first. One
-// BLITZGS_REGISTER block per file; the file's op name keeps the symbols apart.
+// STABLE_TORCH_LIBRARY_IMPL pastes its key, so the key macro has to be expanded first. One BLITZGS_REGISTER
+// block per file; the file's op name keeps the symbols apart.
 #define BLITZGS_REGISTER_EXPANDED(key, m) STABLE_TORCH_LIBRARY_IMPL(blitzgs, key, m)
 #define BLITZGS_REGISTER(m) BLITZGS_REGISTER_EXPANDED(BLITZGS_DISPATCH_KEY, m)
 
@@ -52,7 +52,7 @@ inline std::string shape_of(const Tensor& tensor) {
   return text.str();
 }
 
-// shape: one entry per dimension, -1 for any size. The message is only made when a check fails, because a
+// shape: one entry per dimension, -1 for any size. The message is built only if the check fails, because a
 // step checks some two hundred tensors while the GPU waits for its next kernel.
 inline void check_shape(const char* op, const char* name, const Tensor& tensor,
                         std::initializer_list<std::int64_t> shape) {
@@ -81,7 +81,7 @@ inline void check_contiguous(const char* op, const char* name, const Tensor& ten
   STD_TORCH_CHECK(tensor.is_contiguous(), "blitzgs::", op, ": ", name, " must be contiguous");
 }
 
-// A tensor that kernels read or write where it lies, so that it cannot be copied first.
+// Checks a tensor that kernels read or write in its own memory, so that it must be contiguous.
 inline void check_in_place(const char* op, const char* name, const Tensor& tensor, ScalarType dtype,
                            std::initializer_list<std::int64_t> shape) {
   check_dtype(op, name, tensor, dtype);
@@ -102,13 +102,13 @@ inline void check_floating(const char* op, const char* name, const Tensor& tenso
 #endif
 }
 
-// Most tensors are contiguous, and the call into torch, which finds the op by name, takes microseconds; so
-// this asks first.
+// Tests is_contiguous() first, because most tensors are contiguous, and torch::stable::contiguous() looks the
+// op up by name, which takes microseconds.
 inline Tensor as_contiguous(const Tensor& tensor) {
   return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
 }
 
-// Calls torch by its shortest way, because a step allocates some sixty tensors.
+// Calls the C functions of torch directly, because a step allocates some sixty tensors.
 inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& shape,
                          std::optional<ScalarType> dtype = std::nullopt) {
   const auto rank = static_cast<std::int64_t>(shape.size());
@@ -138,8 +138,9 @@ const T* data_or_null(const std::optional<Tensor>& tensor) {
   return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
 }
 
-// The most entries that a list of length `room` may have, of which the first count [1] are valid (without a
-// count: all). The host does not wait for a count on the GPU; the kernels read it.
+// An upper bound on the number of valid entries of a list with the capacity `room`. The first count [1]
+// entries are valid; without a count all are. On CUDA the bound is the capacity, because the host does not
+// wait for the count; the kernels read it.
 inline std::int64_t most_listed(const char* op, const std::optional<Tensor>& count, std::int64_t room) {
   if (!count) return room;
   check_dtype(op, "the count of a list", *count, ScalarType::Int);
@@ -167,8 +168,8 @@ class TorchWorkspace final : public Workspace {
   std::vector<Tensor> held_;
 };
 
-// Where an op's kernels run: makes the tensor's device current and finds its stream (CUDA), and hands
-// out scratch. Kernels take (arguments..., scope.workspace, scope.stream).
+// Makes the tensor's device current and finds its stream (CUDA), and provides scratch memory. Kernels take
+// (arguments..., scope.workspace, scope.stream).
 struct DeviceScope {
   explicit DeviceScope(const Tensor& like)
       : workspace(like)
@@ -203,13 +204,11 @@ void dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
   f(float{});
 }
 
-// The optional argument n_splats of an op, int64 [1]: how many splats of its columns are valid
-// (kernel.h).
+// The optional argument n_splats of an op, int64 [1]: how many splats of its columns are valid (kernel.h).
 
 struct SplatCount {
-  std::int64_t n_splats;  // at most
-  const std::int64_t*
-      known_splats;  // null: all n_splats; otherwise the kernels read it, and the host does not wait
+  std::int64_t n_splats;             // the capacity of the columns
+  const std::int64_t* known_splats;  // null: all n_splats are valid; else kernels read the number here
 };
 
 inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor>& n_splats,
@@ -228,9 +227,8 @@ inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor
 #endif
 }
 
-// The arguments that describe tiles, checked the same way in every op.
-
-// numbers: n_cameras, width, height, tile_size, tile_begin, tile_end (-1: all tiles).
+// The argument `grid` of an op, checked. numbers: n_cameras, width, height, tile_size, tile_begin, tile_end
+// (-1: all tiles).
 inline TileGrid checked_tile_grid(const char* op, const std::vector<std::int64_t>& numbers) {
   STD_TORCH_CHECK(numbers.size() == 6, "blitzgs::", op,
                   ": grid must be (n_cameras, width, height, tile_size, tile_begin, tile_end), got ",
@@ -253,7 +251,7 @@ inline TileGrid checked_tile_grid(const char* op, const std::vector<std::int64_t
   return grid;
 }
 
-// A tensor in the host's pinned memory that kernels write to.
+// Checks a tensor in pinned memory of the host to which kernels write.
 inline void check_host_values(const char* op, const Tensor& host, std::initializer_list<std::int64_t> shape) {
   check_in_place(op, "host", host, ScalarType::Long, shape);
   STD_TORCH_CHECK(host.is_cpu(), "blitzgs::", op, ": host must be in pinned memory of the host");

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// How CPU kernels run on several threads without knowing torch. The library links the torch thread pool
-// (parallel_torch.cpp), so torch.set_num_threads governs the kernels; the Catch2 tests link plain threads.
+// Threads for the CPU kernels, which do not include torch. The library links the torch thread pool
+// (parallel_torch.cpp), so torch.set_num_threads applies to the kernels. The Catch2 tests link plain threads
+// (parallel_std.cpp).
 #pragma once
 #include <atomic>
 #include <cstdint>
@@ -13,8 +14,8 @@ void parallel_for_impl(std::int64_t begin, std::int64_t end, std::int64_t grain,
                        void* context);
 int num_threads();
 
-// Calls f(chunk_begin, chunk_end) over disjoint chunks that cover [begin, end). The results must not
-// depend on how the range is cut. f must not throw.
+// Calls f(chunk_begin, chunk_end) over disjoint chunks that cover [begin, end). The results must not depend
+// on how the range is cut. f must not throw.
 template <class F>
 void parallel_for(std::int64_t begin, std::int64_t end, std::int64_t grain, const F& f) {
   if (begin >= end) return;
@@ -24,8 +25,8 @@ void parallel_for(std::int64_t begin, std::int64_t end, std::int64_t grain, cons
       const_cast<void*>(static_cast<const void*>(&f)));
 }
 
-// Calls f(task, worker) once for each task in [0, n), tasks handed out one at a time to the workers: for
-// tasks of uneven cost. worker < num_threads() names the caller's own scratch. f must not throw.
+// Calls f(task, worker) once for each task in [0, n). Each worker takes one task at a time, which suits tasks
+// of uneven cost. worker < num_threads() is the index of the thread's scratch memory. f must not throw.
 template <class F>
 void parallel_tasks(std::int64_t n, const F& f) {
   std::atomic<std::int64_t> next{0};

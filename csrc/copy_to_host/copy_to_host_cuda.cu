@@ -8,6 +8,7 @@ namespace {
 
 constexpr int kThreads = 128;
 
+// host [n] = values [n], one thread per value.
 __global__ void copy_kernel(const std::int64_t* values, std::int64_t n, std::int64_t* host) {
   wait_for_earlier_kernels();
   const std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;

@@ -1,13 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-// A bit for each row of a table and each column, in two layouts:
-//   by row     int32 [N, words]: bit v % 32 of word v / 32 is that of column v. Rows move as those of any
-//   column. by sector  int32 [ceil(N / 256), 32 words, 8]: the bits of the 256 rows of a block, for one
-//   column, are the
+// The cull mask has a bit for each row of a table and each column (a training view), in two layouts:
+//
+//   by row:    int32 [N, words]. Bit v % 32 of word v / 32 is that of column v. In this layout a row of the
+//              mask moves together with the row of the table.
+//   by sector: int32 [ceil(N / 256), 32 words, 8]. The bits of the 256 rows of a block for one column are the
 //              32 bytes of a sector; bit r % 32 of word r / 32 is that of the block's row r. A kernel that
-//              asks for one column reads a sector for each block, not one for each row, and finds from the
-//              sector alone whether the block has to be looked at.
-// Bits of rows that the last block does not have are zero. Both directions transpose 32 x 32 bits at a time;
-// they are exact and inverse to each other. O(N words).
+//              needs one column reads one sector per block instead of one word per row, and the sector alone
+//              says whether any or all rows of the block have the bit.
+//
+// The bits of missing rows of the last block are zero. Both conversions transpose 32 x 32 bits at a time;
+// they are exact and inverse to each other. The cost is O(N words).
 #pragma once
 #include <cstdint>
 
@@ -19,7 +21,7 @@ constexpr int kSectorRows = 256, kSectorWords = kSectorRows / 32;
 
 BLITZGS_HD std::int64_t sector_blocks(std::int64_t rows) { return (rows + kSectorRows - 1) / kSectorRows; }
 
-// Where the sector of a block and a column begins, of n_columns.
+// The position of the sector of a block and a column, in a mask of n_columns columns.
 BLITZGS_HD std::int64_t sector_at(std::int64_t block, std::int64_t n_columns, std::int64_t column) {
   return (block * n_columns + column) * kSectorWords;
 }
@@ -31,7 +33,7 @@ BLITZGS_HD bool sector_bit(const std::int32_t* sectors, std::int64_t n_columns, 
   return (static_cast<std::uint32_t>(word) >> local % 32 & 1u) != 0;
 }
 
-// Of the first `count` rows of a sector: whether any has its bit set, and whether all have.
+// Whether any, and whether all, of the first `count` rows of a sector have the bit.
 struct SectorBits {
   bool any, all;
 };

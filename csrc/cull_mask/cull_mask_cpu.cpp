@@ -9,8 +9,8 @@ namespace blitzgs::cpu {
 
 namespace {
 
-// Transposes 32 x 32 bits: bit j of word i becomes bit i of word j. Swaps the off-diagonal halves of ever
-// smaller squares.
+// Transposes 32 x 32 bits: bit j of word i becomes bit i of word j. It swaps the off-diagonal quarters of
+// squares of 32, 16, 8, 4 and 2 bits.
 void transpose_bits(std::uint32_t* words) {
   std::uint32_t low = 0x0000ffffu;  // the columns of each square's left half
   for (int half = 16; half > 0; half /= 2, low ^= low << half) {
@@ -23,8 +23,9 @@ void transpose_bits(std::uint32_t* words) {
   }
 }
 
-// Calls f(words, number of rows there are, their first, their word of a sector, word of a row) with 32 words
-// of scratch for each square of 32 rows and 32 columns.
+// Calls f(words, count, rows, sector) for each square of 32 rows and 32 columns. words: 32 words of scratch,
+// zero. count: the number of existing rows. rows: the word of the first row. sector: the word of the first
+// column.
 template <class F>
 void for_each_square(const CullMask& mask, const F& f) {
   parallel_for(0, sector_blocks(mask.n) * kSectorWords, 64, [&](std::int64_t begin, std::int64_t end) {

@@ -6,7 +6,7 @@ namespace blitzgs::cuda {
 
 namespace {
 
-// The word that has bit i of lane's bit `lane`: a warp transposes 32 x 32 bits.
+// Transposes the 32 x 32 bits of a warp: bit i of the result of lane l is bit l of the argument of lane i.
 __device__ std::uint32_t transpose_bits(std::uint32_t word, int lane) {
   std::uint32_t own = 0;
 #pragma unroll
@@ -17,7 +17,8 @@ __device__ std::uint32_t transpose_bits(std::uint32_t word, int lane) {
   return own;
 }
 
-// A CUDA block handles a block of rows, each of its warps 32 of them and a word of each sector.
+// Converts a mask by rows to sectors or back (cull_mask.h). A CUDA block handles a block of 256 rows; each of
+// its warps handles 32 of these rows, which are one word of each sector.
 template <bool kToSectors>
 __global__ void __launch_bounds__(kSectorRows) transpose_kernel(const CullMask mask) {
   const int group = threadIdx.x / 32, lane = threadIdx.x % 32;

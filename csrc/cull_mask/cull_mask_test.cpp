@@ -29,7 +29,7 @@ TEST_CASE("a sector tells whether any and whether all of its rows have the bit",
   sector[1] = 1 << 8;
   REQUIRE(sector_bits(sector, 256).any);
   REQUIRE(sector_bits(sector, 41).any);
-  REQUIRE_FALSE(sector_bits(sector, 40).any);  // that row is not there
+  REQUIRE_FALSE(sector_bits(sector, 40).any);  // row 40 is beyond the count
   sector[0] = -1, sector[1] = (1 << 8) - 1;
   REQUIRE(sector_bits(sector, 40).all);
   REQUIRE_FALSE(sector_bits(sector, 41).all);

@@ -1,18 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
-// Statistics that density control reads, added up over the views of one step (Kerbl et al. 2023, section 5).
+// The statistics of density control (Kerbl et al. 2023, section 5), summed over the views of one step.
 //
 // For every visible Gaussian g and each of its splats r (g in one view):
 //   grad_sum[g]   += phi[g] * weight * |(v_means2d[r].x * width / 2, v_means2d[r].y * height / 2)|
 //   grad_count[g] += 1
-//   max_radii[g]   = max(max_radii[g], ceil(3 sqrt(largest eigenvalue of the 2D covariance))) pixels, with
-//   the
-//                    eigenvalue's root term clamped at sqrt(0.1) as in the original renderer
+//   max_radii[g]   = max(max_radii[g], ceil(3 sqrt(largest eigenvalue of the 2D covariance))), in pixels
+// The root term of the eigenvalue is clamped at sqrt(0.1), as in the original renderer.
 //
-// v_means2d [P, 2] is the gradient by the pixel position, with v_stride numbers from one splat to the next;
-// weight is the factor from the gradient of the batch's loss to the gradient of one view's loss (B for a mean
-// over B views); phi [N] or null (1); conics [P, 3] inverse covariance (a, b, c); visible_ids int32 [U],
-// splat_offsets int32 [U + 1]. The statistics are updated in place. One thread adds up the splats of a
-// Gaussian in order, so the result is deterministic. O(P).
+// v_means2d [P, 2] is the gradient by the pixel position; the values of consecutive splats are v_stride
+// numbers apart. weight is the factor from the gradient of the batch's loss to the gradient of one view's
+// loss (B for a mean over B views). phi [N] or null (1); conics [P, 3] inverse covariance (a, b, c);
+// visible_ids int32 [U], splat_offsets int32 [U + 1]. The statistics are updated in place. One thread sums
+// over the splats of a Gaussian in order, so the result is deterministic. The cost is O(P).
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -36,7 +35,8 @@ struct DensityStatsArgs {
   T half_width, half_height, weight;
 };
 
-// Half-extent in pixels at three standard deviations; 0 for a conic that is not positive definite.
+// The radius of a splat in pixels, three standard deviations of its longer axis; 0 for a conic that is not
+// positive definite.
 template <class T>
 BLITZGS_HD T three_sigma_radius(const T* conic) {
   const T determinant = conic[0] * conic[2] - conic[1] * conic[1];

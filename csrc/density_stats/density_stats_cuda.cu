@@ -5,6 +5,7 @@
 namespace blitzgs::cuda {
 
 namespace {
+// Updates the statistics (density_stats.h), one thread per visible Gaussian.
 template <class T>
 __global__ void density_stats_kernel(const DensityStatsArgs<T> args) {
   const std::int64_t u = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;

@@ -36,7 +36,7 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   if (visible == 0) return;
   const Tensor visible_ids = as_contiguous(visible_ids_in), splat_offsets = as_contiguous(splat_offsets_in);
   const Tensor conics = as_contiguous(conics_in);
-  // A gradient that is part of a table's rows is read in place, without a copy.
+  // If v_means2d is a part of the rows of a gradient table, the kernel reads it there, without a copy.
   const Tensor v_means2d = v_means2d_in.stride(1) == 1 ? v_means2d_in : as_contiguous(v_means2d_in);
 
   DeviceScope scope(grad_sum);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// The readers of files that other programs write, under libFuzzer: `make fuzz`. One program for each target,
-// which the build names in BLITZGS_FUZZ. A reader may refuse its input with FormatError and do nothing else
-// but succeed: the sanitizers end the program where it reads beyond the input, and libFuzzer where it hangs
-// or allocates wildly.
+// Runs the readers of files that other programs write under libFuzzer (`make fuzz`). There is one program for
+// each target, which the build names in BLITZGS_FUZZ. A reader must either succeed or throw FormatError. The
+// sanitizers stop the program if it reads beyond the input, and libFuzzer stops it if it hangs or allocates
+// too much.
 #include <cstddef>
 #include <cstdint>
 #include <span>
@@ -30,10 +30,10 @@ std::istringstream stream_of(Input input) {
 [[maybe_unused]] void qoi(Input input) {
   const io::QoiSize size = io::qoi_size(input);
   const std::uint64_t bytes = 3ull * size.width * size.height;
-  if (bytes > (64u << 20)) return;  // a run of pixels is small in the file; the limit is that of this program
+  if (bytes > (64u << 20)) return;  // limits the memory: a small file may have many pixels
   std::vector<std::uint8_t> pixels(bytes);
   io::decode_qoi(input, pixels.data());
-  // What can be read can be written and read again.
+  // An image that was read must be the same after it was written and read again.
   const std::vector<std::uint8_t> again = io::encode_qoi(pixels.data(), size);
   std::vector<std::uint8_t> second(bytes);
   io::decode_qoi(again, second.data());
@@ -46,7 +46,7 @@ std::istringstream stream_of(Input input) {
   if (table.rows.size() != table.count * table.row_bytes()) __builtin_trap();
 }
 
-// The first byte chooses the file and what of it is wanted.
+// The first byte chooses the kind of file, and whether observations or tracks are read.
 template <class Cameras, class Images, class Points>
 void colmap(Input input, Cameras cameras, Images images, Points points) {
   if (input.empty()) return;

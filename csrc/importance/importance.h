@@ -1,16 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-// What each splat contributes to the image: the instrumented rasterisation. Compositing is that of
-// rasterize/rasterize.h, without colours; per splat, over the pixels at which it is composited:
+// The contributions of splats to the image, for the importance pass (paper: w = sum of alpha T, a = number of
+// pixels). Compositing is that of rasterize/rasterize.h, without colours. The sums of a splat are over the
+// pixels at which it is composited:
 //   weights = sum of round(2^32 alpha T)   int64 [P], alpha T to the nearest unit of 2^-32, ties to even
 //   pixels  = number of these pixels       int32 [P]
 //
 //   means2d [P, 2], conics [P, 3], opacities [P], isect_splats and tile_offsets from intersect  ->  the sums
 //   over the tiles [tile_begin, tile_end). Splats in no list get zeros.
 //
-// Exact: alpha T of a pixel has the bits with which the backend renders the pixel (same tile size), and the
-// sums are integers, so tile ranges, ranks, threads, atomics and repetition change no bit. An alpha T is at
-// least 1e-4 / 255, so it is never rounded to zero, and below 1, so a sum over 2^31 pixels fits. CPU and CUDA
-// agree to the rounding of alpha. O(entries processed x pixels of the splat).
+// The sums are exact: alpha T of a pixel has the bits with which the backend renders the pixel (with the same
+// tile size), and the sums are integers, so tile ranges, ranks, threads, atomics and repetition change no
+// bit. An alpha T is at least 1e-4 / 255, so it is never rounded to zero, and below 1, so a sum over 2^31
+// pixels fits. CPU and CUDA agree to the rounding of alpha. The cost is O(entries processed x pixels of the
+// splat).
 #pragma once
 #include <cstdint>
 
@@ -19,7 +21,7 @@
 
 namespace blitzgs {
 
-inline constexpr double kContributionScale = 4294967296.0;  // units in 1
+inline constexpr double kContributionScale = 4294967296.0;  // 2^32, the number of units in 1
 
 template <class T>
 struct ContributionInput {
@@ -30,7 +32,7 @@ struct ContributionInput {
   const std::int64_t* tile_offsets;
   std::int64_t n_splats;
   TileGrid grid;
-  const std::int64_t* known_splats = nullptr;  // common/kernel.h; CUDA alone
+  const std::int64_t* known_splats = nullptr;  // null, or the number of splats (common/kernel.h; CUDA only)
 };
 
 struct ContributionSums {

@@ -10,21 +10,24 @@ namespace blitzgs::cuda {
 
 namespace {
 
-// A half-warp gathers what its pixels say of this many entries; then each lane adds one entry up.
+// A half-warp writes the weights of this many entries at its 16 pixels to shared memory; then each lane sums
+// over the pixels for one entry.
 constexpr int kGroup = 16;
 constexpr int kEntryStride =
     kHalfWarp + 4;  // words: lanes read quads of neighbouring entries without conflict
-// Half-warps of a warp write to different banks.
+// The 16 words of padding make the two half-warps of a warp write to different banks.
 constexpr int kGroupWords = kGroup * kEntryStride + 16;
 
-// Colours are not copied; their place in an entry holds what the tile contributes to its splat.
+// Replaces copy_color(): an entry gets no colour. The memory of the colour holds the TileSum of the entry.
 struct NoColors {};
 __device__ __forceinline__ void copy_color(float* shared, NoColors, std::int32_t) {
   *reinterpret_cast<uint2*>(shared) = {0u, 0u};
 }
 
-// The sum of an entry over a tile of at most 2^10 pixels, each below 2^32 units, in two words that shared
-// memory adds atomically: the low kLowBits of each subtile's sum, and its high ones below the pixels' number.
+// The sums of an entry over a tile: the weight, from at most 2^10 pixels with less than 2^32 units each, and
+// the number of pixels. They are two words, to which subtiles add atomically in shared memory. The first word
+// is the sum of the low kLowBits bits of the subtiles' weights. The second word has the sum of the other bits
+// in its low kPixelShift bits, and the number of pixels in its high bits.
 struct TileSum {
   static constexpr int kLowBits = 22, kPixelShift = 20;
 
@@ -37,7 +40,7 @@ struct TileSum {
   __device__ __forceinline__ static void send(const Entry& entry, std::int32_t splat,
                                               const ContributionSums& sums) {
     const uint2 words = *reinterpret_cast<const uint2*>(entry.color);
-    if (words.y == 0) return;  // an entry that is composited has at least a pixel
+    if (words.y == 0) return;  // no pixel composited the entry
     const std::uint64_t high = words.y & ((1u << kPixelShift) - 1);
     atomicAdd(reinterpret_cast<unsigned long long*>(sums.weights + splat),
               static_cast<unsigned long long>((high << kLowBits) + words.x));
@@ -59,7 +62,7 @@ struct ContributionArguments {
   ContributionSums sums;
 };
 
-// Adds up what the pixels of a subtile said of an entry.
+// Sums an entry's weights over the 16 pixels of a subtile and adds the sum to the entry's TileSum.
 __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& entry) {
   std::uint64_t weight = 0;
   std::uint32_t pixels = 0;
@@ -74,6 +77,9 @@ __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& en
   if (pixels > 0) TileSum::add(entry, weight, pixels);
 }
 
+// The contributions of the splats (importance.h). One block of 256 threads per tile, one thread per pixel, as
+// in forward_kernel (rasterize_fwd_cuda.cu). Reads the tile's list and the packed splats; adds to
+// sums.weights and sums.pixels [P] atomically, once per entry and tile.
 __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const ContributionArguments args) {
   constexpr int kBatch = kForwardBatch;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
@@ -93,7 +99,8 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
   const auto splat_at = [&](int at) {
     return thread < kBatch && at < count ? args.isect_splats[start + at] : -1;
   };
-  // `summed` is the splat of the thread's entry in the batch before, whose sums are complete at the barrier.
+  // `summed` is the splat of this thread's entry in the previous batch. Its sums are complete after the
+  // barrier.
   std::int32_t splat = splat_at(thread), next_splat = splat_at(thread + kBatch), summed = -1;
   int buffer = 0;
   const auto send_sums = [&] {

@@ -55,7 +55,7 @@ TEST_CASE("contributions are alpha T, summed over pixels in units of 2^-32") {
   }
   for (int splat = 0; splat < 2; ++splat) {
     REQUIRE(pair.pixels[splat] == pixels[splat]);
-    // The exponential of one pixel or another may round to another unit.
+    // The exponential may differ by rounding, which changes the weight of a pixel by at most one unit.
     REQUIRE(std::abs(pair.weights[splat] - weights[splat]) <= pixels[splat]);
   }
 }

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sorts splats by (depth, id): a radix sort of keys of up to 27 bits in three passes. A key is the depth's
-// place among all floats, counted from the smallest depth of the call. If 27 bits are more than that needs,
-// the remaining high bits hold the view: splats of different views need no order among each other, and fewer
-// keys are then equal. If 27 bits are too few (more than a factor of 65536 between the nearest and the
-// farthest depth), the low bits are left out, and splats with equal keys are compared by depth as well as by
-// id.
+// The order of compositing (docs/image.md, section 5): sorts splats by (depth, id), by a radix sort of keys
+// of up to 27 bits in three passes. A key is the number of floats between the smallest depth of the call and
+// the depth. If this needs fewer than 27 bits, the high bits hold the view: splats of different views need no
+// order among each other, and fewer keys are then equal. If it needs more (more than a factor of 65536
+// between the nearest and the farthest depth), the key lacks the low bits, and splats with equal keys are
+// compared by depth and then by id.
 #pragma once
 #include <cstdint>
 
@@ -12,12 +12,14 @@
 #include "intersect/intersect.h"
 #include "intersect/radix_sweep.cuh"
 
-// Which tiles a splat touches, found once and kept in 16 bytes. Only files that are compiled without
-// contraction may include this (cmake/cuda.cmake), because the projection must count the same tiles.
+// This file also finds the tiles that each splat touches, once per call, and keeps them in 16 bytes. Only
+// files that are compiled without FMA contraction may include it (cmake/cuda.cmake), because the projection
+// must count the same tiles.
 
 namespace blitzgs::cuda {
 
-// Tiles are counted from tile_begin on and fit 32 bits (intersect_op.cpp).
+// The owned tiles of one tile row that a splat touches. Tile numbers count from tile_begin and fit 32 bits
+// (intersect_op.cpp).
 struct Owned {
   int first, last;  // tiles [first, last)
   int ty;           // the tile row in its image
@@ -33,14 +35,14 @@ __device__ __forceinline__ SplatShape load_splat(const IntersectInput<float>& in
   const float* const conic = in.conics + 3 * index;
   const SplatShape s{
       {mean.x, mean.y}, {conic[0], conic[1], conic[2]}, in.opacities[index], in.camera_ids[index]};
-  // This makes the thread wait for all loads together. Otherwise the compiler moves each load behind the
-  // tests before it.
+  // This makes the thread wait for all loads together. Otherwise the compiler would move loads to after the
+  // tests of values that are loaded first.
   asm volatile("" ::"f"(s.mean[0]), "f"(s.mean[1]), "f"(s.conic[0]), "f"(s.conic[1]), "f"(s.conic[2]),
                "f"(s.opacity), "r"(s.camera));
   return s;
 }
 
-// Calls f(owned tiles) for each tile row the splat touches.
+// Calls f(owned tiles) for each tile row that the splat touches.
 template <class F>
 __device__ __forceinline__ void for_each_owned(const TileGrid& grid, const SplatShape& splat, const F& f) {
   const int n_owned = static_cast<int>(grid.tile_end - grid.tile_begin);
@@ -53,10 +55,10 @@ __device__ __forceinline__ void for_each_owned(const TileGrid& grid, const Splat
                     });
 }
 
-// The owned tiles that a splat touches. The compact form is tile `first` (counted from tile_begin) and up to
-// twelve tile rows of a byte each: the low half of the byte is the number of tiles, the high half 8 + the
-// shift of the first of them against that of the first tile row. Other shapes have first = kWalk, and their
-// number of tiles in rows[0].
+// The owned tiles that a splat touches. The compact form has the first tile (counted from tile_begin) and a
+// byte for each of up to twelve tile rows. The low half of a byte is the number of tiles in the row. The high
+// half is 8 plus the column of the row's first tile minus the column of the first tile of all. Shapes that do
+// not fit this form have first = kWalk, and rows[0] is their number of tiles.
 struct alignas(16) Touched {
   static constexpr std::uint32_t kWalk = ~0u;
   static constexpr int kWords = 3;
@@ -85,14 +87,14 @@ struct alignas(16) Touched {
       word = rows[i];
       through = (word & kCounts) * kOnes;
     }
-    // Finds the first byte that counts more than k. Bytes are at most 60, so the subtraction does not borrow
-    // between them.
+    // Finds the first byte of `through` that is larger than k. Bytes are at most 60, so the subtraction does
+    // not borrow between them.
     const std::uint32_t reached = ((through | kHighBits) - (k + 1) * kOnes) & kHighBits;
     const int bit = (__ffs(reached) - 1) & 24;
     return start + (bit >> 3) * tiles_x + (word >> (bit + 4) & 15u) - 8 + k - (through << 8 >> bit & 255u);
   }
 
-  // Returns the value of another lane; called by whole warps.
+  // Returns the value of another lane. All lanes of the warp must call this.
   __device__ Touched of_lane(int lane) const {
     Touched other{__shfl_sync(kFullWarp, first, lane), {}};
     for (int k = 0; k < kWords; ++k) other.rows[k] = __shfl_sync(kFullWarp, rows[k], lane);
@@ -100,6 +102,7 @@ struct alignas(16) Touched {
   }
 };
 
+// Finds the owned tiles that a splat touches.
 __device__ __forceinline__ Touched find_touched(const TileGrid& grid, const SplatShape& splat) {
   int count = 0, first = 0, top = 0;
   bool compact = true;
@@ -125,11 +128,11 @@ __device__ __forceinline__ Touched find_touched(const TileGrid& grid, const Spla
   return touched;
 }
 
-inline constexpr int kDepthThreads = 256, kDepthBlocks = 5;  // blocks of a multiprocessor
+inline constexpr int kDepthThreads = 256, kDepthBlocks = 5;  // kDepthBlocks: blocks per multiprocessor
 inline constexpr int kDepthPasses = 3, kDepthBits = 9, kDepthBins = 1 << kDepthBits;
 inline constexpr int kRangeBlocks = kDepthThreads, kRangeThreads = 512;
 inline constexpr int kTieItems = 4, kTieSplats = kDepthThreads * kTieItems;
-inline constexpr int kShortRun = 16;  // splats of equal keys that one thread orders
+inline constexpr int kShortRun = 16;  // the longest run of equal keys that one thread orders
 
 // Maps floats to unsigned integers of the same order.
 __device__ __forceinline__ std::uint32_t ordered_bits(float depth) {
@@ -137,10 +140,11 @@ __device__ __forceinline__ std::uint32_t ordered_bits(float depth) {
   return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
 }
 
+// The smallest and the largest of some depths, as ordered_bits().
 struct DepthRange {
   std::uint32_t low, high;
 
-  // Returns the union of the ranges of a block's threads to each of them; all of them call this.
+  // Returns the union of the ranges of all threads of a block to each thread. All threads call this.
   template <int kThreads>
   __device__ DepthRange of_block() const {
     __shared__ DepthRange warps[kThreads / 32];
@@ -153,9 +157,11 @@ struct DepthRange {
   }
 };
 
-// How keys are made of depths, for all kernels.
+// The layout of a sort key: the view in the high bits, the depth in the low bits.
 struct DepthDigits {
-  int dropped, view_shift, width;  // numbers of bits: left out of the depth, below the view, of a digit
+  int dropped;     // the low bits of the depth that the key lacks
+  int view_shift;  // the bits of the depth in the key, below the view
+  int width;       // the bits of a digit of the radix sort
   std::uint32_t view_mask;
 
   __device__ DepthDigits(const DepthRange& range, int n_views) {
@@ -168,14 +174,15 @@ struct DepthDigits {
     width = max(1, (view_shift + view_bits + kDepthPasses - 1) / kDepthPasses);
   }
 
-  // offset: a depth's place from the smallest one on.
+  // offset: ordered_bits() of the depth minus that of the smallest depth.
   __device__ std::uint32_t key(std::uint32_t offset, std::int32_t view) const {
     return (view & view_mask) << view_shift | offset >> dropped;
   }
 };
 
-// The first launch: finds the range of each block's depths, and zeroes the counters of the kernels that
-// follow.
+// The first launch of intersect(). Finds the range of the depths that each block reads (ranges
+// [kRangeBlocks]), one thread per splat in a grid-stride loop, and sets the counters of the following kernels
+// to zero.
 __global__ void __launch_bounds__(kRangeThreads)
     range_kernel(const IntersectInput<float> in, DepthRange* ranges, uint4* zeros, std::int64_t n_zeros) {
   wait_for_earlier_kernels();
@@ -193,8 +200,9 @@ __global__ void __launch_bounds__(kRangeThreads)
   if (threadIdx.x == 0) ranges[blockIdx.x] = range;
 }
 
-// Writes sort keys, the histograms of their digits, and which tiles the splats touch. Launched with as many
-// blocks as run at a time.
+// The second launch. Writes for each splat its sort key (keys [P]) and its tiles (touched [P]), and the
+// histograms of the keys' digits [kDepthPasses, kDepthBins]. One thread per splat in a grid-stride loop, with
+// as many blocks as run at a time.
 __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
     depth_keys_kernel(const IntersectInput<float> in, const DepthRange* ranges, std::uint32_t* keys,
                       Touched* touched, std::uint64_t* histograms, int* dropped_bits, int* width,
@@ -228,6 +236,7 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
   add_counts(counts[0], kDepthPasses * kDepthBins, histograms);
 }
 
+// The order (depth, id) of splats whose keys are equal.
 struct SplatOrder {
   const float* depths;      // null: not compared
   const std::int64_t* ids;  // null: the splat index
@@ -240,8 +249,8 @@ struct SplatOrder {
     return ids ? ids[a] < ids[b] : a < b;
   }
 
-  // A bitonic sort by a whole block. Every comparison orders upwards, so splats behind the last one need not
-  // exist.
+  // A bitonic sort by all threads of a block. Every comparison puts the smaller splat first, so the number of
+  // splats need not be a power of two.
   __device__ void sort(std::int32_t* splats, std::int64_t n) const {
     for (std::int64_t size = 2; size < 2 * n; size *= 2) {
       for (std::int64_t step = size / 2; step > 0; step /= 2) {
@@ -262,8 +271,9 @@ struct SplatOrder {
   }
 };
 
-// Orders each run of equal keys. One thread orders a run of a few splats, which is the usual case; its block
-// orders longer runs together, one after the other.
+// After the radix sort, orders each run of splats with equal keys by (depth, id). One thread for each sorted
+// splat; the thread of a run's first splat orders the run if it is short, which is the usual case. The
+// threads of a block order longer runs together, one run after the other.
 __global__ void __launch_bounds__(kDepthThreads)
     order_ties_kernel(const std::uint32_t* keys, std::int32_t* splats, const std::int64_t* n_splats,
                       SplatOrder order, const int* dropped_bits) {
@@ -272,7 +282,7 @@ __global__ void __launch_bounds__(kDepthThreads)
   wait_for_earlier_kernels();
   const std::int64_t n = *n_splats;
   if (*dropped_bits == 0) {
-    if (!order.ids) return;  // the passes kept equal depths in the order of splats
+    if (!order.ids) return;  // the stable sort kept splats of equal depth in order
     order.depths = nullptr;
   }
   if (threadIdx.x == 0) n_long = 0;

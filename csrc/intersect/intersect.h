@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Intersection: which splats each tile composites, front to back.
+// Intersection: makes the list of each tile, the splats that the tile composites, front to back.
 //
 // Splat p (a splat in camera camera_ids[p]) is listed in tile t of that camera iff for_each_tile() of
 // math/tiles.h visits it. Within a tile the splats are ordered by (depth, id); without ids by (depth, splat).
@@ -10,17 +10,18 @@
 //   tile t's list is isect_splats[tile_offsets[t] .. tile_offsets[t + 1]). Tiles that grid does not own have
 //   empty lists.
 //
-// known_splats: null, or the number of splats in device memory (common/kernel.h; CUDA alone).
+// known_splats: null, or the number of splats in device memory (common/kernel.h; CUDA only).
 //
-// capacity is the length of isect_splats; entries from tile_offsets[B*T] on are left unspecified. If there
-// are more entries than that, the CPU kernel returns their number and writes no list, and the op fails with
-// both numbers. On CUDA the op counts them first, which is a wait, and fails likewise. The CUDA kernel itself
-// then lists the first entries in depth order, in consistent lists and offsets: so does the op where the
-// caller asks for no check because it learns the number while the device works (`unchecked`).
+// capacity is the length of isect_splats; entries from tile_offsets[B*T] on are unspecified. If there are
+// more entries than the capacity, the CPU kernel returns their number and writes no list, and the op fails
+// with both numbers. On CUDA the op counts the entries first, for which the host waits, and fails in the same
+// way. With `unchecked` the op does not count on CUDA: the kernels then list the first `capacity` entries in
+// depth order, with consistent offsets, and the caller has to compare the number of entries, which it gets
+// from the projection, with the capacity.
 //
-// Deterministic: the lists depend on the splats alone, never on threads. Splat order need not follow depth.
-// O(P) for the radix sort, O(tile rows) for the tests, O(I) to write. Counts are 64-bit; P and
-// B*T < 2^31.
+// The lists depend on the splats alone and not on the number of threads. The splats may come in any order.
+// The cost is O(P) for the radix sort, O(tile rows) for the tests and O(I) to write. Counts are 64-bit; P and
+// B*T must be below 2^31.
 #pragma once
 #include <cstdint>
 
@@ -51,10 +52,10 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
 }  // namespace cpu
 
 namespace cuda {
-// Waits for the device: the count is needed on the host.
+// Waits for the device, because the host needs the count.
 template <class T>
 std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
-// Returns a count that is exact or at most the capacity, without waiting for the device.
+// Does not wait for the device. Returns the capacity.
 template <class T>
 std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_splats,
                        std::int64_t* tile_offsets, Workspace&, CudaStream);

@@ -51,7 +51,7 @@ void for_each_span(const IntersectInput<T>& in, std::int32_t splat, const F& f) 
                     });
 }
 
-// Where a piece begins when [0, n) is cut into `pieces` parts of nearly equal length.
+// The begin of piece number `piece` of [0, n), divided into `pieces` parts of nearly equal length.
 std::int64_t piece_start(std::int64_t n, int pieces, int piece) { return n * piece / pieces; }
 
 template <class F>
@@ -93,8 +93,8 @@ bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, std::int64_t n, int shif
   return true;
 }
 
-// The sort has kept splats of equal depth in splat order; this puts each run of equal depths in the order of
-// ids.
+// Orders each run of splats with equal depths by id. Before, they are in splat order, because the sort is
+// stable.
 template <class Key>
 void order_ties(Keyed<Key>* splats, std::int64_t n, const std::int64_t* ids) {
   for (std::int64_t begin = 0; begin < n;) {
@@ -109,7 +109,7 @@ void order_ties(Keyed<Key>* splats, std::int64_t n, const std::int64_t* ids) {
   }
 }
 
-// Splats of all cameras by (depth, id): within one camera's tile that is the order of compositing.
+// Returns the splats of all cameras sorted by (depth, id), the order of compositing.
 template <class T>
 const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& workspace) {
   using Key = KeyOf<T>;
@@ -126,7 +126,8 @@ const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& works
   return splats;
 }
 
-// As many pieces as threads, or fewer where a counter for each tile and piece would take too much memory.
+// The number of pieces is the number of threads, or fewer if one counter per tile and piece would take too
+// much memory.
 int choose_pieces(std::int64_t n_tiles) {
   constexpr std::int64_t kMostCounts = 1 << 25;
   return static_cast<int>(
@@ -159,7 +160,7 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
   const std::int64_t n_tiles = grid.tile_end - grid.tile_begin;
   const auto* splats = sort_splats(in, workspace);
 
-  // First, each piece of the depth order notes its spans and counts them per tile.
+  // First, each piece of the sorted splats records its spans and counts its entries per tile.
   const int pieces = choose_pieces(n_tiles);
   auto* places = workspace.allocate<std::int64_t>(n_tiles * pieces);
   std::vector<std::vector<Span>> spans(pieces);
@@ -183,7 +184,7 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
     }
   });
 
-  // These counts give every piece its place in every list.
+  // The prefix sums of these counts are the positions of each piece in each list.
   std::int64_t place = 0;
   std::fill_n(tile_offsets, grid.tile_begin, 0);
   for (std::int64_t tile = 0; tile < n_tiles; ++tile) {

@@ -1,10 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-// Splats are sorted by depth once (depth_order.cuh). Their entries are written in that order with the tile as
-// a key, of 16 bits where the tiles of the launch fit. A stable radix sort over the bits in use then brings
-// each tile's entries together and keeps their order. Which tiles a splat touches is found once, in splat
-// order, and kept in 16 bytes, so that the data of all splats fit into the L2 cache when they are gathered in
-// depth order. This file is compiled without FMA contraction (cmake/cuda.cmake), as the projection is,
-// because both must count the same tiles.
+// The tiles' lists (intersect.h) on CUDA:
+// 1. range_kernel, depth_keys_kernel, three passes of sweep_kernel and order_ties_kernel sort the splats by
+//    (depth, id) and find the tiles of each splat (depth_order.cuh, radix_sweep.cuh).
+// 2. emit_kernel writes the list entries in the order of the splats, with the tile as key (16 bits if the
+//    number of tiles allows it).
+// 3. Passes of sweep_kernel, a stable radix sort, order the entries by tile and keep their order otherwise.
+// 4. tile_offsets_kernel finds where each tile's list begins.
+//
+// Step 1 finds the tiles of a splat in splat order and keeps them in 16 bytes. The data of all splats then
+// fit into the L2 cache when step 2 gathers them in depth order. This file is compiled without FMA
+// contraction (cmake/cuda.cmake), like the projection, because both must count the same tiles.
 #include <cub/device/device_reduce.cuh>
 
 #include <algorithm>
@@ -21,10 +26,10 @@ namespace {
 
 using Input = IntersectInput<float>;
 constexpr int kThreads = 256;
-constexpr int kEmitItems = 4, kEmitSplats = kThreads * kEmitItems;  // splats that a thread and a block handle
+constexpr int kEmitItems = 4, kEmitSplats = kThreads * kEmitItems;  // splats per thread and per block
 
-// The digits by which tiles are sorted: as few passes as the number of tiles needs, with digits as narrow as
-// these allow.
+// The digits by which entries are sorted by tile: as few passes as the number of tiles allows, and the fewest
+// bits per digit for this number of passes.
 struct TileDigits {
   static constexpr int kBits = 8, kBins = 1 << kBits, kMost = 4;
   int passes = 1, width = 1;
@@ -43,6 +48,7 @@ struct TileDigits {
   }
 };
 
+// counts [P] = the number of owned tiles that each splat touches, one thread per splat.
 __global__ void count_kernel(const Input in, std::int32_t* counts) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
   if (i >= in.n_splats) return;
@@ -57,8 +63,8 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t spla
                                               Key* keys, std::int32_t* entries, const TileDigits& digits,
                                               std::uint32_t* counts) {
   const int lane = threadIdx.x % 32;
-  // The lanes share all entries of compact splats: each writes every 32nd entry, whichever lane's splat it
-  // belongs to.
+  // The warp numbers all entries of its compact splats and writes 32 of them at a time, one per lane. The
+  // splat of an entry (`source`) may belong to another lane.
   const std::int32_t count = touched.compact() ? touched.count() : 0;
   const std::int32_t until = sum_of_lanes_until(count, lane), total = __shfl_sync(kFullWarp, until, 31);
   const std::int32_t begin = until - count;
@@ -80,7 +86,7 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t spla
       digits.count(tile, counts);
     }
   }
-  // All lanes walk the tiles of each other splat together.
+  // For each splat that is not compact, all lanes go through its tile rows together.
   for (unsigned left = __ballot_sync(kFullWarp, !touched.compact()); left; left &= left - 1) {
     const int source = __ffs(left) - 1;
     const std::int32_t of_splat = __shfl_sync(kFullWarp, splat, source);
@@ -98,8 +104,9 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t spla
   }
 }
 
-// Writes the entries in depth order, their number, and the histograms of their tiles' digits. A block handles
-// kEmitSplats splats, a warp 32 * kEmitItems consecutive ones.
+// Writes the list entries (keys and entries, [capacity]: the tile and the splat) in depth order, their
+// number, and the histograms of the tiles' digits. A block handles kEmitSplats consecutive sorted splats, a
+// warp 32 * kEmitItems of them.
 template <class Key>
 __global__ void __launch_bounds__(kThreads, 4)
     emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* splats,
@@ -151,7 +158,7 @@ __global__ void __launch_bounds__(kThreads, 4)
   add_counts(counts, digits.passes * TileDigits::kBins, histograms);
 }
 
-// tile_offsets[t] = the first entry whose tile is >= t. One warp for each tile.
+// tile_offsets[t] = the position of the first sorted entry whose tile is >= t. One warp per tile.
 template <class Key>
 __global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entries, TileGrid grid,
                                     std::int64_t* tile_offsets) {
@@ -161,7 +168,7 @@ __global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entri
   if (tile > grid.count()) return;
   const std::int64_t wanted = (tile < grid.tile_end ? tile : grid.tile_end) - grid.tile_begin;
   std::int64_t low = 0, high = wanted <= 0 ? 0 : *n_entries;
-  while (low < high) {  // each lane looks at the end of one of 32 parts
+  while (low < high) {  // a search with 32 parts: each lane tests the last entry of one part
     const std::int64_t part = (high - low + 31) / 32, at = low + (lane + 1) * part - 1;
     const bool less = at < high && static_cast<std::int64_t>(keys[at]) < wanted;
     low += __popc(__ballot_sync(kFullWarp, less)) * part;
@@ -170,11 +177,11 @@ __global__ void tile_offsets_kernel(const Key* keys, const std::int64_t* n_entri
   if (lane == 0) tile_offsets[tile] = low;
 }
 
-// The scratch memory of a call, apart from the arrays of its splats and entries.
+// The scratch memory of a call, except for the arrays of splats and entries.
 template <class State>
 struct Counters {
   unsigned depth_blocks, tile_blocks, emit_blocks;
-  // The first kernel zeroes all of this but the ranges, which it writes.
+  // range_kernel sets all of these to zero, except for the ranges, which it writes.
   std::uint64_t *depth_histograms, *tile_histograms, *running, *turns;
   std::int64_t *n_splats, *n_entries;
   int *dropped_bits, *width;
@@ -193,7 +200,7 @@ struct Counters {
   }
 
  private:
-  // Returns the number of bytes.
+  // Sets the pointers to parts of `memory` (null: to null) and returns the number of bytes.
   std::int64_t lay_out(std::byte* memory, const TileDigits& digits) {
     std::int64_t bytes = 0;
     const auto take = [&]<class T>(T*& array, std::int64_t length) {
@@ -217,8 +224,8 @@ struct Counters {
 };
 
 struct DepthOrder {
-  Touched* touched;      // [P] of each splat
-  std::int32_t* splats;  // [P] by (depth, id)
+  Touched* touched;      // [P], the tiles of each splat
+  std::int32_t* splats;  // [P], the splats sorted by (depth, id)
 };
 
 template <class State>
@@ -258,7 +265,7 @@ void list_splats(const Input& in, std::int64_t capacity, std::int32_t* isect_spl
   const DepthOrder order = order_by_depth(in, counters, workspace, stream);
   auto [keys_0, keys_1, unsorted] = allocate_arrays<Key, Key, std::int32_t>(capacity, workspace);
   Key* const keys[] = {keys_0, keys_1};
-  // The last pass writes isect_splats.
+  // The two buffers are chosen such that the last pass writes isect_splats.
   const bool even = digits.passes % 2 == 0;
   std::int32_t* const entries[] = {even ? isect_splats : unsorted, even ? unsorted : isect_splats};
   launch_early("intersect", emit_kernel<Key>, {counters.emit_blocks, kThreads, stream}, in, order.touched,

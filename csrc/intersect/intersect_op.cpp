@@ -10,7 +10,8 @@
 namespace blitzgs {
 namespace {
 
-// Whether the host learns the number of intersections by a wait alone; the CPU kernel returns it.
+// Whether backend::intersect does not return the number of intersections, so that the op has to count them
+// first and wait for the count.
 #ifdef BLITZGS_BACKEND_CUDA
 constexpr bool kWaitsForCounts = true;
 #else
@@ -84,8 +85,8 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
       count = backend::intersect(in, capacity, mutable_data<std::int32_t>(splats),
                                  mutable_data<std::int64_t>(offsets), scope.workspace, scope.stream);
     } catch (const std::exception& error) {
-      // An error here means that memory ran out: the length of the lists follows from the splats, not from an
-      // argument, so the message states it.
+      // An error here means that memory ran out. The message states the length of the lists, because it
+      // depends on the splats and the caller may not know it.
       STD_TORCH_CHECK(false, "blitzgs::intersect: listing ", capacity, " intersections of ", n_splats,
                       " splats failed; it takes about ", capacity * 20 / 1000000,
                       " MB. Render fewer views at ",

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// One pass of a stable radix sort in one launch: each pair of a key and a value moves to the place that a
-// digit of its key gives it. The kernel that wrote the keys has counted how often each digit occurs. Each
-// block adds up what the blocks before it hold of each digit while they run (decoupled look-back). It looks
-// at several predecessors at a time, because a pass has only a few hundred blocks, which all run at once, and
-// would otherwise spend most of its time looking back. The number of pairs is read from device memory.
+// One pass of a stable radix sort in one launch: it sorts pairs of a key and a value by one digit of the key.
+// The kernel that wrote the keys has counted how often each digit occurs. Each block adds up the counts of
+// each digit in the blocks before it while these run (decoupled look-back). It reads the states of several
+// predecessors at a time, because a pass has only a few hundred blocks, which all run at once, and would
+// otherwise spend most of its time on the look-back. The number of pairs is read from device memory.
 #pragma once
 #include <algorithm>
 #include <cstdint>
@@ -15,10 +15,10 @@
 namespace blitzgs::cuda {
 
 inline constexpr int kSweepThreads = 512, kSweepItems = 16, kSweepTile = kSweepThreads * kSweepItems;
-inline constexpr int kSweepWindow = 4;  // predecessors that are looked at together
+inline constexpr int kSweepWindow = 4;  // predecessors whose states are read at a time
 
-// State: an unsigned integer. Its two high bits say what the other bits count, so n_items < kSmallStates for
-// 32 bits.
+// State: an unsigned integer. The two high bits say what the other bits count (sweep_kernel), so 32-bit
+// states need n_items < kSmallStates.
 template <class Key, class State>
 struct SweepPass {
   const Key* keys;
@@ -26,15 +26,15 @@ struct SweepPass {
   Key* sorted_keys;
   std::int32_t* sorted_values;
   const std::int64_t* n_items;
-  const std::uint64_t* histogram;  // [bins] of this digit
-  std::uint64_t* turn;             // must be zero before the launch
-  State* states;                   // [blocks, bins], must be zeros before the launch
-  int index;                       // of this digit; the lowest digit has index 0
+  const std::uint64_t* histogram;  // [bins], the number of keys for each value of this digit
+  std::uint64_t* turn;             // zero before the launch
+  State* states;                   // [blocks, bins], zeros before the launch
+  int index;                       // the index of this digit; the lowest digit has index 0
   int width;                       // bits of each digit
-  const int* known_width;          // null, or the width in device memory, where the host does not know it
+  const int* known_width;          // null, or the width in device memory if the host does not know it
 };
 
-// Adds the counts of a block to those of the whole launch; called by all its threads.
+// Adds the counts of a block to the histogram of the whole launch. All threads of the block call this.
 __device__ __forceinline__ void add_counts(const std::uint32_t* counts, int bins, std::uint64_t* histogram) {
   using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
   for (int bin = threadIdx.x; bin < bins; bin += blockDim.x) {
@@ -86,12 +86,14 @@ __device__ __forceinline__ unsigned lanes_with_same(unsigned value) {
   return lanes;
 }
 
+// One pass: sorts keys and values [n_items] stably by one digit of kBits bits at most. A block sorts
+// kSweepTile consecutive pairs, kSweepItems per thread; in the steps over bins a thread is a bin.
 template <int kBits, class Key, class State>
 __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass<Key, State> pass) {
   constexpr int kBins = 1 << kBits, kWarps = kSweepThreads / 32;
   static_assert(kBins <= kSweepThreads);
-  // The flags of a state: the rest is this block's own count, or the count of all blocks up to and including
-  // this one.
+  // The two flags of a state: the other bits are the block's own count, or the count of all blocks up to and
+  // including this one.
   constexpr State kOwn = State{1} << (8 * sizeof(State) - 2), kThrough = kOwn << 1;
   extern __shared__ std::int32_t staged_values[];
   auto* const staged_keys = reinterpret_cast<Key*>(staged_values + kSweepTile);
@@ -105,8 +107,8 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   for (int i = lane; i < kBins; i += 32) counts[warp * kBins + i] = 0;
   wait_for_earlier_kernels();
   if (threadIdx.x == 0) {
-    using Turn = ::cuda::atomic_ref<std::uint64_t,
-                                    ::cuda::thread_scope_device>;  // blocks with a smaller turn have started
+    // A block takes its number here, so that all blocks with smaller numbers have started.
+    using Turn = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
     turn = static_cast<unsigned>(Turn(*pass.turn).fetch_add(1, ::cuda::memory_order_relaxed));
   }
   const State everywhere = bin < kBins ? static_cast<State>(pass.histogram[bin]) : 0;
@@ -119,8 +121,8 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   if (first >= n) return;
   const int n_here = n - first < kSweepTile ? static_cast<int>(n - first) : kSweepTile;
 
-  // A warp handles consecutive pairs, so that equal digits keep their order. Items behind the last pair get
-  // the largest digit and are dropped at the end.
+  // A warp handles consecutive pairs, so that pairs of equal digits keep their order. Items after the last
+  // pair get the largest digit, so that they come last, and are not written.
   const int begin = warp * 32 * kSweepItems + lane;
   Key keys[kSweepItems];
 #pragma unroll
@@ -160,7 +162,7 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   __syncthreads();
   State target = until_everywhere - everywhere;
   if (bin < kBins) {
-    std::uint32_t start = until_here - here;  // where the bin begins among this block's pairs
+    std::uint32_t start = until_here - here;  // the position of the bin's first pair in this block
     for (int w = 0; w < warp; ++w) {
       start += sums_here[w];
       target += sums_everywhere[w];
@@ -194,7 +196,8 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) staged_values[places[k]] = values[k];
   __syncthreads();
-  // Neighbouring threads write pairs of one digit to neighbouring places.
+  // The pairs of one digit are neighbours in shared memory, so neighbouring threads write to neighbouring
+  // addresses.
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) {
     const int at = threadIdx.x + k * kSweepThreads;

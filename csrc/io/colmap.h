@@ -2,8 +2,8 @@
 // COLMAP sparse models: cameras, images and points3D, binary and text, over standard streams.
 //
 // The formats are COLMAP's documented output format (colmap.github.io/format.html). Poses map world to
-// camera: x_camera = R(q) x_world + t with q = (w, x, y, z). Pixel (i, j) has its centre at (i + 0.5, j +
-// 0.5). Readers throw FormatError with the file, the byte offset (binary) or line (text) and the reason;
+// camera: x_camera = R(q) x_world + t with q = (w, x, y, z). Pixel (i, j) has its centre at (i + 0.5,
+// j + 0.5). Readers throw FormatError with the file, the byte offset (binary) or line (text) and the reason;
 // every count is checked against the bytes left before anything is allocated, so memory stays within a small
 // multiple of the file's size. Newer models also have rigs and frames files; they are not needed, because the
 // images file still holds the pose of each image.
@@ -37,8 +37,8 @@ struct ColmapCamera {
   std::vector<double> params;
 };
 
-// N registered images, one column per field. Observations of image i are rows
-// [point2d_offsets[i], point2d_offsets[i + 1]); all offsets are 0 when they were not asked for.
+// N registered images, one column per field. Observations of image i are rows [point2d_offsets[i],
+// point2d_offsets[i + 1]); all offsets are 0 if observations were not requested.
 struct ColmapImages {
   std::vector<std::uint32_t> ids;
   std::vector<std::uint32_t> camera_ids;
@@ -50,8 +50,8 @@ struct ColmapImages {
   std::vector<std::int64_t> point3d_ids;       // [O], -1 = no 3D point
 };
 
-// M points. The track of point i is rows [track_offsets[i], track_offsets[i + 1]); the rows themselves are
-// empty when they were not asked for, the offsets (and so the lengths) are always there.
+// M points. The track of point i is rows [track_offsets[i], track_offsets[i + 1]). The offsets are always
+// filled in; the rows are empty if tracks were not requested.
 struct ColmapPoints {
   std::vector<std::int64_t> ids;
   std::vector<double> positions;     // [M, 3]
@@ -70,8 +70,8 @@ std::vector<ColmapCamera> read_cameras_text(std::istream& in, const std::string&
 ColmapImages read_images_text(std::istream& in, const std::string& name, bool with_points2d);
 ColmapPoints read_points_text(std::istream& in, const std::string& name, bool with_tracks);
 
-// Writers throw std::invalid_argument when columns differ in length, and leave stream errors to the caller.
-// Numbers in text are as short as they can be and still read back to the same bits.
+// Writers throw std::invalid_argument if columns differ in length. The caller has to check the stream for
+// errors. Numbers in text are the shortest that are read back as the same bits.
 void write_cameras_binary(std::ostream& out, const std::vector<ColmapCamera>& cameras);
 void write_images_binary(std::ostream& out, const ColmapImages& images);
 void write_points_binary(std::ostream& out, const ColmapPoints& points);

@@ -7,10 +7,10 @@ namespace blitzgs::io {
 
 namespace {
 
-constexpr std::uint64_t kCameraBytes = 4 + 4 + 8 + 8;         // and the parameters
-constexpr std::uint64_t kImageBytes = 4 + 7 * 8 + 4 + 1 + 8;  // empty name, no observations
+constexpr std::uint64_t kCameraBytes = 4 + 4 + 8 + 8;         // without the parameters
+constexpr std::uint64_t kImageBytes = 4 + 7 * 8 + 4 + 1 + 8;  // with an empty name and no observations
 constexpr std::uint64_t kPoint2dBytes = 2 * 8 + 8;
-constexpr std::uint64_t kPointBytes = 8 + 3 * 8 + 3 + 8 + 8;  // empty track
+constexpr std::uint64_t kPointBytes = 8 + 3 * 8 + 3 + 8 + 8;  // with an empty track
 constexpr std::uint64_t kTrackBytes = 4 + 4;
 
 template <class T>

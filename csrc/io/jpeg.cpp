@@ -13,27 +13,27 @@ namespace {
 constexpr std::uint8_t kSof0 = 0xc0, kSof1 = 0xc1, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8,
                        kEoi = 0xd9, kSos = 0xda, kDri = 0xdd;
 
-// Coefficients out of so many zero bytes in a row are damage. An encoder writes flat areas as zeros, but
-// never hundreds of equal coefficients. The look-ahead of 8 bytes counts, too.
+// If at least this many consecutive zero bytes decode to coefficients, the file is damaged: an encoder writes
+// flat areas as zeros, but never hundreds of equal coefficients. The 8 bytes of look-ahead are included.
 constexpr unsigned kHoleBytes = 64 + 8;
 
 constexpr std::uint64_t kMostBlocks = 1 << 24;
 
 struct Code {
-  std::uint8_t length = 0;  // 0: none
+  std::uint8_t length = 0;  // in bits; 0: no such code
   std::uint8_t symbol = 0;
 };
 
-// Huffman codes of 1 to 16 bits. Short ones are looked up by the bits that they begin, longer ones, which are
-// rare, found length by length: codes of one length follow each other, and those of a greater length come
-// after them.
+// Huffman codes of 1 to 16 bits. Codes of up to kShort bits are looked up by the next kShort bits of the
+// file. Longer codes, which are rare, are searched length by length: codes of one length are consecutive
+// numbers, and those of a greater length come after them.
 struct CodeTable {
   static constexpr unsigned kShort = 9;
 
   std::array<Code, 1 << kShort> short_codes{};
-  std::array<std::uint32_t, 17> ends{};  // of each length, the first 16 bits that are beyond its codes
-  std::array<int, 17> bases{};           // of each length, its first symbol less its first code
-  std::vector<std::uint8_t> symbols;     // empty: there is no table
+  std::array<std::uint32_t, 17> ends{};  // by length: the first 16-bit number beyond the codes of this length
+  std::array<int, 17> bases{};           // by length: the index of its first symbol minus its first code
+  std::vector<std::uint8_t> symbols;     // empty: the file has no such table
 
   Code find(std::uint32_t bits16) const {
     const Code found = short_codes[bits16 >> (16 - kShort)];
@@ -51,12 +51,13 @@ struct CodeTable {
 struct Component {
   std::uint8_t id;
   unsigned h, v;
-  // Of each block of a progressive file, which coefficients are not zero so far, in zigzag order.
+  // For each block of a progressive file, the coefficients that are not zero so far, as bits in zigzag order.
   std::vector<std::uint64_t> nonzero;
 };
 
 std::uint64_t ceil_div(std::uint64_t a, std::uint64_t b) { return (a + b - 1) / b; }
 
+// The check of one file (jpeg.h).
 class Checker {
  public:
   Checker(std::span<const std::uint8_t> file, const std::string& name) : file_(file), name_(name) {}
@@ -149,8 +150,8 @@ class Checker {
       v_max_ = std::max(v_max_, component.v);
       components_.push_back(std::move(component));
     }
-    // A height of 0 means that the height follows after the first scan. Only the markers of such files are
-    // walked.
+    // A height of 0 means that the height follows after the first scan. In such files only the markers are
+    // checked.
     walked_ = walked_ && width_ > 0 && height_ > 0 && width_ * height_ / 64 <= kMostBlocks;
   }
 
@@ -190,8 +191,8 @@ class Checker {
     Component* component;
   };
 
-  // The coefficients that a scan is about, in zigzag order, and whether it adds a bit to what earlier ones
-  // gave.
+  // The coefficients of a scan, in zigzag order, and whether it refines coefficients of earlier scans by one
+  // bit.
   struct Band {
     unsigned first = 0, last = 63;
     bool refines = false;
@@ -235,7 +236,7 @@ class Checker {
     end_of_interval();
   }
 
-  // The first scan of a band, of one block.
+  // Reads one block in the first scan of a band.
   void read_band(const CodeTable& table, const Band& band, std::uint64_t& nonzero) {
     if (end_run_ > 0) {
       --end_run_;
@@ -257,8 +258,8 @@ class Checker {
     }
   }
 
-  // A further bit for the coefficients of a band that are not zero, and those that are no longer, of one
-  // block.
+  // Reads one block in a refining scan of a band: one more bit for each coefficient that is not zero, and the
+  // coefficients that become nonzero.
   void refine_band(const CodeTable& table, const Band& band, std::uint64_t& nonzero) {
     unsigned k = band.first;
     for (; end_run_ == 0 && k <= band.last; ++k) {
@@ -288,6 +289,7 @@ class Checker {
     --end_run_;
   }
 
+  // Reads one block of a sequential file.
   void read_block(const Block& block) {
     take(next_symbol(*block.dc) & 15u);
     for (unsigned k = 1; k < 64; ++k) {
@@ -305,7 +307,7 @@ class Checker {
     if (zeros_ >= kHoleBytes) fail("damaged JPEG: a hole of zeros");
   }
 
-  // Keeps at least 16 bits available. Behind a marker these are padding, which no code may use.
+  // Makes at least 16 bits available. Bits after a marker are padding, which no code may use.
   void refill() {
     while (held_ <= 48) {
       std::uint64_t byte = 0;
@@ -339,8 +341,8 @@ class Checker {
     return code.symbol;
   }
 
-  // At the end of a scan fewer than eight bits may be left over, and then zero bytes, which some cameras
-  // append.
+  // Checks the end of a scan or restart interval. Fewer than eight bits may be left, and after them zero
+  // bytes, which some cameras append.
   void end_of_interval() {
     unsigned left = held_ - padding_;
     bits_ <<= left % 8;
@@ -373,14 +375,14 @@ class Checker {
   std::uint64_t width_ = 0, height_ = 0;
   unsigned h_max_ = 1, v_max_ = 1;
   unsigned restart_interval_ = 0;
-  bool walked_ = false;  // whether every code of the image data is read
+  bool walked_ = false;  // whether the check reads every code of the image data
   bool progressive_ = false;
   unsigned scans_ = 0;
   std::uint64_t bits_ = 0;  // the next bits, highest first
-  unsigned held_ = 0;       // how many bits `bits_` holds, padding included
-  unsigned padding_ = 0;    // how many of the last of them are padding
-  unsigned zeros_ = 0;      // bytes of zero in a row that were read last
-  unsigned end_run_ = 0;    // further blocks of a progressive scan that end where they begin
+  unsigned held_ = 0;       // the number of bits in `bits_`, padding included
+  unsigned padding_ = 0;    // the number of these bits, at their end, that are padding
+  unsigned zeros_ = 0;      // the number of consecutive zero bytes that were read last
+  unsigned end_run_ = 0;    // the number of further blocks of a progressive scan without new coefficients
 };
 
 }  // namespace

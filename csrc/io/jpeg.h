@@ -1,13 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-// Checks that a JPEG is complete. Decoders conceal damage: they fill missing blocks with grey and go on.
+// Checks that a JPEG is complete. Decoders hide damage: they fill missing blocks with grey and report no
+// error.
 //
-// The check walks the markers and, for sequential and progressive Huffman files (all photographs but for rare
-// kinds), every code of the image data, without computing pixels. It refuses data that end before the last
-// block, codes that are in no table, blocks of more than 64 coefficients, restart markers out of order, bytes
-// other than zeros after the last block of a scan, and coefficients that are read out of a long run of zero
-// bytes, such as a lost sector leaves. In other files (arithmetic coding, 12 bits, more than a gigapixel) it
-// walks the markers alone, up to the end marker. Damage that leaves a valid sequence of codes cannot be
-// detected. O(bytes), about 150 MB/s.
+// The check reads all markers and, for sequential and progressive Huffman files (nearly all photographs),
+// every code of the image data, without computing pixels. It refuses data that end before the last block,
+// codes that are in no table, blocks of more than 64 coefficients, restart markers out of order, bytes other
+// than zeros after the last block of a scan, and coefficients from a long run of zero bytes, which a lost
+// disk sector leaves. In other files (arithmetic coding, 12 bits, more than a gigapixel) it reads only the
+// markers, up to the end marker. It cannot detect damage that leaves a valid sequence of codes. O(bytes),
+// about 150 MB/s.
 #pragma once
 #include <cstdint>
 #include <span>

@@ -20,7 +20,7 @@ Bytes segment(std::uint8_t marker, const Bytes& payload) {
   return out;
 }
 
-// Codes by length: symbols[k] are those of k + 1 bits.
+// A Huffman table; symbols[k] are the symbols with codes of k + 1 bits.
 Bytes table(std::uint8_t number, const std::vector<Bytes>& symbols) {
   Bytes payload = {number};
   for (std::size_t k = 0; k < 16; ++k) {
@@ -30,8 +30,8 @@ Bytes table(std::uint8_t number, const std::vector<Bytes>& symbols) {
   return segment(0xc4, payload);
 }
 
-// Grey. DC codes: 0 (no bits), 10 (one bit). AC codes: 0 (end of block), 10 (one bit), 110 (sixteen zeros).
-// The flattest block is the bits 00.
+// The headers of a grey image. DC codes: 0 (no bits), 10 (one bit). AC codes: 0 (end of block), 10 (one bit),
+// 110 (sixteen zeros). A flat block is the bits 00.
 Bytes head(std::uint8_t width, std::uint8_t height, std::uint8_t frame, std::uint8_t restart = 0) {
   Bytes out = {0xff, 0xd8};
   append(out, segment(0xe0, {'a', 'n', 'y', 0xff, 0xd9}));
@@ -128,7 +128,7 @@ TEST_CASE("every code of a progressive JPEG is read") {
 TEST_CASE("coefficients out of a hole of zeros are damage, flat areas are not") {
   // The code 0 ends a block in `jpeg`, so zeros are flat blocks: 160 x 160 pixels are 400 of them, 100 bytes.
   REQUIRE(problem(jpeg(160, 160, Bytes(100, 0x00))).empty());
-  // Where 0 is a coefficient of one bit instead, zeros are 63 of them in each block.
+  // If the code 0 is a coefficient of one bit instead, each block of zeros has 63 coefficients.
   Bytes file = {0xff, 0xd8};
   append(file, table(0x00, {{0x00}, {0x01}}));
   append(file, table(0x10, {{0x01}, {0x00}}));

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// blitzgs._lib._io: host-side readers and writers. The only code that depends on Python's version.
-// Columns leave as numpy arrays that own the parsed memory; files are parsed and written without the GIL.
+// blitzgs._lib._io: the Python module of the host-side readers and writers. This is the only code that
+// depends on the version of Python. Columns are returned as numpy arrays that own the parsed memory; files
+// are parsed and written without the GIL.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
@@ -45,7 +46,7 @@ std::vector<T> to_vector(const py::dict& columns, const char* name) {
   return std::vector<T>(column.data(), column.data() + column.size());
 }
 
-// File names are bytes to the file system. Bytes that are not UTF-8 are kept as os.fsdecode keeps them.
+// File names are bytes in the file system. Bytes that are not UTF-8 are decoded as by os.fsdecode.
 py::list to_names(const std::vector<std::string>& names) {
   py::list out;
   for (const std::string& name : names) {
@@ -66,7 +67,7 @@ std::vector<std::string> from_names(const py::handle& names) {
   return out;
 }
 
-// A file that cannot be written: OSError in Python.
+// Thrown if a file cannot be written; OSError in Python.
 struct WriteError : std::runtime_error {
   using std::runtime_error::runtime_error;
 };

@@ -3,7 +3,7 @@
 //
 // Reads ASCII and binary of either byte order; writes binary little endian. Elements after the vertices are
 // not read; list properties of the vertices are refused. Rows are packed in header order without padding, so
-// a binary little-endian file that has vertices alone is written back byte for byte.
+// a binary little-endian file that has only vertices is written back byte for byte.
 #pragma once
 #include <cstdint>
 #include <iosfwd>
@@ -35,7 +35,8 @@ struct PlyTable {
 
 // Throws FormatError with the file, byte offset or header line, and reason.
 PlyTable read_ply(std::istream& in, const std::string& name);
-// Throws std::invalid_argument when the rows do not match the properties, or a name cannot stand in a header.
+// Throws std::invalid_argument if the rows do not match the properties, or if a name is not allowed in a
+// header.
 void write_ply(std::ostream& out, const PlyTable& table);
 
 }  // namespace blitzgs::io

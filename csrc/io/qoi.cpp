@@ -21,7 +21,7 @@ struct Pixel {
 // The format hashes four channels; alpha is always 255 here.
 unsigned slot(Pixel p) { return (p.r * 3u + p.g * 5u + p.b * 7u + 255u * 11u) % 64u; }
 
-// Recent pixels by hash. Empty slots stand for a transparent pixel, which no RGB pixel equals.
+// The recent pixels by hash. In the format an empty slot is a transparent pixel, which equals no RGB pixel.
 struct Recent {
   std::array<Pixel, 64> pixels{};
   std::array<bool, 64> filled{};

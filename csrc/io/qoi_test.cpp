@@ -16,7 +16,7 @@ std::uint32_t next_random(std::uint32_t& state) {
   return state >> 16;
 }
 
-// Every kind of code: flat runs, gentle ramps, noise, and pixels that come back.
+// An image that needs every kind of code: flat runs, gentle ramps, noise, and pixels that occur again.
 Bytes some_image(QoiSize size) {
   Bytes rgb(3 * std::size_t{size.width} * size.height);
   std::uint32_t state = 7;

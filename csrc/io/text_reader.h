@@ -17,12 +17,12 @@ class TextReader {
     if (!in_) throw FormatError(name_, "cannot be read");
   }
 
-  // The next line, without its line break; false at the end of the file.
+  // Goes to the next line; false at the end of the file.
   bool next_line();
-  // The same, passing over blank lines and comments (#).
+  // Goes to the next line that is not blank and no comment (#); false at the end of the file.
   bool next_record();
 
-  // The next token of the line; throws naming `what` when the line has no more.
+  // The next token of the line. Throws if the line has no more; `what` names the token in the message.
   std::string_view token(const char* what);
   bool has_token();
   // The rest of the line, without surrounding blanks.

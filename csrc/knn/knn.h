@@ -1,15 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// Distances to the k nearest other points, exact.
+// The exact distances of each point to its k nearest other points.
 //
-// points [N, 3]; distances [N, k] ascending, in the unit of the points. Duplicates are at distance 0 of each
-// other. A row that is not finite is no point's neighbour, and its distances are infinite. So are the entries
-// beyond the last neighbour when fewer than k others exist.
+// points [N, 3]; distances [N, k] ascending, in the unit of the points. Duplicates have distance 0. A row
+// that is not finite is no point's neighbour, and its distances are infinite. If fewer than k other points
+// exist, the remaining entries are infinite, too.
 //
-// Points are sorted along a Morton curve; boxes of 8 consecutive points, of 8 such boxes and so on form an
-// implicit tree, which follows the density of the cloud. A query starts in its own leaf and climbs,
-// descending into the siblings whose box is nearer than the worst neighbour so far. The distance to a box is
-// computed with the operations of the distance to a point, so rounding is monotone and no neighbour is lost.
-// O(N log N); results do not depend on the number of threads.
+// Points are sorted along a Morton curve. Boxes around 8 consecutive points are the leaves of an implicit
+// tree, whose nodes are boxes around 8 boxes of the level below. A query starts in the leaf of its point and
+// goes up the tree; at each level it descends into the siblings whose box is nearer than the k-th neighbour
+// so far. The distance to a box is computed by the same operations as the distance to a point, so rounding is
+// monotone and the query misses no neighbour. The cost is O(N log N); results do not depend on the number of
+// threads.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -54,7 +55,7 @@ std::int64_t plan_knn_levels(std::int32_t n, KnnTree<T>& tree) {
   return total;
 }
 
-// Box of node i of a level: of 8 points (level 0) or 8 boxes of the level below.
+// The box of node i of a level: around 8 points (level 0) or around 8 boxes of the level below.
 template <class T>
 BLITZGS_HD KnnBox<T> make_knn_box(const KnnTree<T>& tree, int level, std::int32_t i) {
   const std::int64_t begin = std::int64_t{i} * kKnnFan;
@@ -72,13 +73,14 @@ BLITZGS_HD KnnBox<T> make_knn_box(const KnnTree<T>& tree, int level, std::int32_
   return box;
 }
 
-// The K smallest squared distances so far, ascending.
+// A query for one point. best: the K smallest squared distances found so far, ascending.
 template <class T, int K>
 struct KnnQuery {
   const KnnTree<T>& tree;
   T p[3];
   T best[K];
 
+  // Compares the points of a leaf. self: the query's own point, which is skipped; -1: none.
   BLITZGS_HD void scan_leaf(std::int32_t leaf, std::int32_t self) {
     const std::int32_t begin = leaf * kKnnFan;
     const std::int32_t end = tree.n - begin < kKnnFan ? tree.n : begin + kKnnFan;
@@ -93,6 +95,7 @@ struct KnnQuery {
     }
   }
 
+  // Whether the box of a node is nearer than the K-th neighbour so far.
   BLITZGS_HD bool reaches(int level, std::int32_t node) const {
     const KnnBox<T>& box = tree.boxes[tree.offset[level] + node];
     T d[3];
@@ -103,7 +106,7 @@ struct KnnQuery {
     return d[0] * d[0] + d[1] * d[1] + d[2] * d[2] < best[K - 1];
   }
 
-  // Visits everything below one node.
+  // Visits the leaves below one node whose boxes are near enough.
   BLITZGS_HD void descend(int from_level, std::int32_t from_node) {
     std::int32_t nodes[kKnnLevels * kKnnFan];
     signed char levels[kKnnLevels * kKnnFan];
@@ -144,6 +147,7 @@ struct KnnQuery {
   }
 };
 
+// Writes the k distances of sorted point i to its row of `distances`.
 template <class T, int K>
 BLITZGS_HD void knn_row(const KnnTree<T>& tree, std::int32_t i, int k, T* distances) {
   const T* p = tree.points + 3 * std::int64_t{i};
@@ -158,7 +162,7 @@ BLITZGS_HD void knn_row(const KnnTree<T>& tree, std::int32_t i, int k, T* distan
   }
 }
 
-// Calls f with the list length to use for k as a compile-time constant.
+// Calls f with a compile-time constant K >= k, the length of the list of neighbours.
 template <class F>
 void with_knn_length(int k, const F& f) {
   switch (k) {

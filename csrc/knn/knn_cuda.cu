@@ -11,6 +11,7 @@ namespace {
 
 constexpr int kThreads = 128;
 
+// The Morton codes and rows of points [n, 3], one thread per point.
 __global__ void make_codes(const float* points, std::int32_t n, const MortonBounds* bounds,
                            std::uint64_t* codes, std::int32_t* rows) {
   const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
@@ -19,12 +20,14 @@ __global__ void make_codes(const float* points, std::int32_t n, const MortonBoun
   rows[i] = static_cast<std::int32_t>(i);
 }
 
+// sorted [n, 3] = the points in the order of the curve, one thread per point.
 __global__ void gather_points(const float* points, const std::int32_t* order, std::int32_t n, float* sorted) {
   const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
   if (i >= n) return;
   for (int axis = 0; axis < 3; ++axis) sorted[3 * i + axis] = points[3 * std::int64_t{order[i]} + axis];
 }
 
+// The boxes of one level of the tree, one thread per box.
 __global__ void make_boxes(const KnnTree<float> tree, int level, KnnBox<float>* boxes) {
   const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
   if (i < tree.count[level]) {
@@ -32,6 +35,7 @@ __global__ void make_boxes(const KnnTree<float> tree, int level, KnnBox<float>* 
   }
 }
 
+// distances [N, k], one thread per sorted point.
 template <int K>
 __global__ void __launch_bounds__(kThreads) query_kernel(const KnnTree<float> tree, int k, float* distances) {
   const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
@@ -43,8 +47,8 @@ __global__ void fill_infinite(float* values, std::int64_t n) {
   if (i < n) values[i] = INFINITY;
 }
 
-// Sorts the rows along the curve. It waits for the stream at its end, because the number of finite points
-// decides the shape of the tree.
+// Sorts the rows along the curve and returns the number of finite points. It waits for the stream, because
+// this number determines the shape of the tree.
 std::int32_t sort_along_curve(const float* points, std::int32_t n, std::int32_t* order, Workspace& workspace,
                               cudaStream_t stream) {
   MortonBounds* bounds = find_morton_bounds(points, n, workspace, stream);

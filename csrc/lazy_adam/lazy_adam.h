@@ -1,30 +1,36 @@
 // SPDX-License-Identifier: Apache-2.0
-// Dense Adam over an index list: a row that had no gradient for k steps is brought up to date when it is
-// next needed, in time that does not depend on k.
+// The lazy optimiser: dense Adam over a list of rows. A row that had no gradient for k steps has k pending
+// steps. It catches up (takes its pending steps) when it is needed next, in time that does not depend on k.
 //
-// Dense Adam (Kingma & Ba 2015), step t, gradient g: m = beta1 m + (1 - beta1) g v = beta2 v + (1 - beta2)
-// g^2 p -= lr_t b_t m / (a_t sqrt(v) + eps) b_t = 1 / (1 - beta1^t), a_t = 1 / sqrt(1 - beta2^t) Without a
-// gradient the moments only decay: j steps after a step P at which they are m and v, they are m beta1^j and v
-// beta2^j. Up to step s the parameter drifts by m sum over j = 1 .. s - P of mu_j rho_j / (rho_j sqrt(v) +
-// eps), t = P + j, rho_j = a_t beta2^(j/2), mu_j = lr_t b_t / a_t q_0^j, q_0 = beta1 / sqrt(beta2). rho_j
-// changes far more slowly than mu_j falls, so the sum is taken by the two-point Gauss rule of the weights mu
-// over rho: two places and weights with the weights' first four moments sum over j of mu_j rho_j^k =
-// tail_k[P] - q_k^(s-P) tail_k[s], k = 0 .. 3, of tails that are tabulated once per schedule (lazy_adam.h).
-// The rule is exact where eps is lost against sqrt(v) (moment 0) and where it dominates (moment 1); in
-// between, at its worst near eps = 3 sqrt(v), its relative error is below half the square of rho's relative
-// variance: 1e-9 of the drift in mid-schedule, the rounding of float32 after some 200 single-view steps.
-// Where that is not exact enough (earlier steps, and float64), the elements for which eps matters take the
-// zero-gradient steps one by one. At most `explicit_steps` of them are needed, because q_0^j is below the
-// rounding of the sum after that. A row that is behind by that many steps or more owes the same whatever the
-// step it goes to: its rule depends on the step it stands at alone (final_rules), so what a launch computes
-// anew does not grow with the number of steps.
+// Dense Adam (Kingma & Ba 2015), step t with gradient g:
+//   m = beta1 m + (1 - beta1) g,   v = beta2 v + (1 - beta2) g^2,
+//   p -= lr_t b_t m / (a_t sqrt(v) + eps),   b_t = 1 / (1 - beta1^t),   a_t = 1 / sqrt(1 - beta2^t).
 //
-// Two columns say where a row stands: its parameters are those after step `last_step`, its moments those
-// after step `moment_step` <= last_step. Catching up reads the moments but does not write them; the next step
-// with a gradient applies their decay.
+// Without a gradient the moments only decay: if they are m and v at step P, they are m beta1^j and v beta2^j
+// at step t = P + j. From step P to step s the parameter therefore drifts by
+//   m sum over j = 1 .. s - P of mu_j rho_j / (rho_j sqrt(v) + eps),
+//   rho_j = a_t beta2^(j/2),   mu_j = lr_t b_t / a_t q_0^j,   q_0 = beta1 / sqrt(beta2).
+// rho_j changes far more slowly than mu_j falls. The code therefore computes the sum by a two-point Gauss
+// rule in rho with the weights mu. The two places and weights of the rule reproduce the first four moments of
+// mu,
+//   sum over j of mu_j rho_j^k = tail_k[P] - q_k^(s-P) tail_k[s],   k = 0 .. 3,
+// where the tails are tabulated once per schedule (see the table below).
 //
-// Rows are independent and each element is computed the same way wherever it lies, so results do not depend
-// on the order of the list or on sharding. O(1) per element.
+// The rule is exact if eps is negligible against sqrt(v) (moment 0) and if eps dominates (moment 1). In
+// between its relative error is largest near eps = 3 sqrt(v), and below half the square of rho's relative
+// variance: 1e-9 of the drift in mid-schedule, and the rounding of float32 after some 200 single-view steps.
+// If this is not exact enough (at earlier steps, and in float64), the elements for which eps matters take the
+// pending steps one by one. They need at most `explicit_steps` of them, because q_0^j is below the rounding
+// of the sum after that. For the same reason the drift of a row with at least that many pending steps depends
+// only on the step at which its parameters are, and not on the target: its rule is tabulated (final_rules),
+// so the rules that a launch has to compute do not become more with the number of steps.
+//
+// Two columns hold the state of a row: its parameters are those after step `last_step`, and its moments are
+// those after step `moment_step` <= last_step. Catching up reads the moments but does not write them; the
+// next step with a gradient applies their decay.
+//
+// Rows are independent, and each element is computed in the same way wherever it is, so the results do not
+// depend on the order of the list or on sharding. The cost is O(1) per element.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -58,31 +64,32 @@ struct AdamColumn {
   T* param;
   T* exp_avg;
   T* exp_avg_sq;
-  const T* grad;  // [n, width], row of the list; null when catching up only
+  const T* grad;  // [n, width], one row for each row of the list; null if rows only catch up
   std::int64_t width;
 };
 
-// The Gauss rule of one group: drift = m times the sum of weight / (place sqrt(v) + eps).
+// The Gauss rule of one group: drift = m * (sum over both points of weight / (place sqrt(v) + eps)).
 template <class T>
 struct alignas(4 * sizeof(T)) AdamRule {
   T place[2], weight[2];
 };
 
-// The drift from step `from` to step `to`, which parameters that stand at `from` still have to take.
+// The pending steps of rows whose parameters are at step `from` and catch up to step `to`: the rules of the
+// drift.
 template <class T>
 struct PendingSteps {
   AdamRule<T> rules[kAdamGroups];
   std::int32_t from, to;
-  T explicit_up_to;  // elements with sqrt(v) up to this go step by step; negative: none
+  T explicit_up_to;  // elements with sqrt(v) <= this take the steps one by one; negative: none
 };
 
 template <class T>
 struct AdamArgs {
   AdamColumn<T> columns[kAdamColumns];
-  const std::int32_t* ids;  // [n] rows, unique; null = row i is i
+  const std::int32_t* ids;  // [n], the rows, each once; null: all n rows
   std::int64_t n;
-  const std::int32_t*
-      count;  // CUDA, catching up: how many of the n ids are valid, in device memory; null: all
+  // CUDA, catching up: the number of valid ids in device memory; null: all n
+  const std::int32_t* count;
   std::int32_t *last_step, *moment_step;  // [N]
   const double* table;                    // [S+1, kAdamTable]
   const float* lr_table;                  // [S+1, 6]
@@ -92,24 +99,22 @@ struct AdamArgs {
   double beta1, beta2, eps;
   bool sparse;  // plain sparse Adam: no decay, no drift
 
-  // SH are asked, as the other columns may be empty.
+  // Tests the SH column, because the other columns may be empty.
   BLITZGS_HD bool with_gradient() const { return columns[kAdamColumns - 1].grad != nullptr; }
-  // The step after which all listed parameters stand when they have caught up; a step with a gradient
-  // follows.
+  // The step to which the listed rows catch up: `step`, or the step before it if a gradient step follows.
   BLITZGS_HD std::int32_t target() const { return with_gradient() ? step - 1 : step; }
   BLITZGS_HD const double* table_row(std::int32_t t) const {
     return table + static_cast<std::int64_t>(t) * kAdamTable;
   }
 };
 
-// How many steps, from step 0, a row of a table of so many steps may stand at and be behind by
-// explicit_steps.
+// The number of final rules: the steps 0 .. n - 1 from which `explicit_steps` steps remain in the table.
 BLITZGS_HD std::int64_t final_rules_of(std::int64_t table_rows, std::int64_t explicit_steps) {
   return table_rows > explicit_steps ? table_rows - explicit_steps : 0;
 }
 
-// Returns the rule of a group; `error` becomes a bound of its relative error if that is larger. From
-// explicit_steps on, `to` makes no difference.
+// Returns the rule of a group from step `from` to step `to`, and raises `error` to the bound of its relative
+// error if that is larger. If to - from >= explicit_steps, the rule does not depend on `to`.
 template <class T>
 BLITZGS_HD AdamRule<T> adam_rule(const AdamArgs<T>& args, std::int32_t from, std::int32_t to, int group,
                                  double& error) {
@@ -122,10 +127,10 @@ BLITZGS_HD AdamRule<T> adam_rule(const AdamArgs<T>& args, std::int32_t from, std
     for (int k = 0; k < kAdamOrders; ++k, q *= power[kRootPower]) moments[k] -= q * end[k * kAdamGroups];
   }
   const double total = moments[0];
-  if (!(total > 0)) return {{T(1), T(1)}, {T(0), T(0)}};  // rates of zero
+  if (!(total > 0)) return {{T(1), T(1)}, {T(0), T(0)}};  // the learning rates are zero
   const double mean = moments[1] / total, square = moments[2] / total, cube = moments[3] / total;
   const double variance = square - mean * mean, share = variance / (mean * mean);
-  // A single step, or steps too alike for double to tell apart.
+  // A single step, or steps whose rho are equal to the precision of double.
   if (!(share > 1e-10)) return {{static_cast<T>(mean), T(1)}, {static_cast<T>(total * mean), T(0)}};
   const double skew = (cube - 3 * mean * square + 2 * mean * mean * mean) / (2 * variance);
   const double spread = std::sqrt(skew * skew + variance), above = skew + spread, below = skew - spread;
@@ -141,8 +146,8 @@ template <class T>
 BLITZGS_HD T adam_explicit_up_to(const AdamArgs<T>& args, std::int32_t from, std::int32_t to, double error) {
   const double rounding = sizeof(T) == 4 ? 5.9e-8 : 1.1e-16;
   if (!(error > 2 * rounding)) return T(-1);
-  // Above the returned value eps is lost in the rounding of the smallest place * sqrt(v): a_t >= 1, and no
-  // step after explicit_steps contributes.
+  // For sqrt(v) above the returned value, eps is below the rounding of the smallest place * sqrt(v):
+  // a_t >= 1, and steps after explicit_steps contribute nothing.
   const std::int32_t gap = to - from, reach = gap < args.explicit_steps ? gap : args.explicit_steps;
   return static_cast<T>(args.eps / (rounding * args.table_row(reach)[kRootPower]));
 }
@@ -158,13 +163,14 @@ BLITZGS_HD PendingSteps<T> pending_steps(const AdamArgs<T>& args, std::int32_t f
   return steps;
 }
 
-// Those of a row that is behind by explicit_steps or more.
+// The pending steps of a row that is behind by explicit_steps or more.
 template <class T>
 BLITZGS_HD PendingSteps<T> final_pending_steps(const AdamArgs<T>& args, std::int32_t from) {
   return pending_steps(args, from, from + args.explicit_steps);
 }
 
-// The zero-gradient steps of one element, one by one; m and root = sqrt(v) at step steps.from.
+// The drift of one element by its pending steps, one by one; m and root = sqrt(v) are those at step
+// steps.from.
 template <class T>
 BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const PendingSteps<T>& steps, int group, T m,
                                  T root) {
@@ -183,8 +189,9 @@ BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const PendingSteps<T>&
   return drift;
 }
 
-// A root, and the reciprocal of a number that is zero or normal. On CUDA they are exact to an ulp: correctly
-// rounded ones would be most of an update's instructions, and the ulp is lost in the update's own rounding.
+// The square root, and the reciprocal of a number that is zero or normal. On CUDA they are exact to an ulp.
+// Correct rounding would take most of an update's instructions, and the ulp is below the update's own
+// rounding.
 template <class T>
 BLITZGS_HD T adam_root(T x) {
 #ifdef __CUDA_ARCH__
@@ -207,7 +214,7 @@ BLITZGS_HD T adam_reciprocal(T x) {
   return T(1) / x;
 }
 
-// The drift of one element by its group's rule; m and root = sqrt(v) at the step the rule starts from.
+// The drift of one element by its group's rule; m and root = sqrt(v) are those at the rule's first step.
 template <class T>
 BLITZGS_HD T adam_ruled_drift(const AdamRule<T>& rule, T m, T root, T eps) {
   const T drift = m * (adam_reciprocal(rule.place[0] * root + eps) * rule.weight[0] +
@@ -224,17 +231,17 @@ BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const PendingSteps<T>& steps, i
   return adam_ruled_drift(steps.rules[group], m, root, static_cast<T>(args.eps));
 }
 
-// Whether a row drifts noticeably on its way to the target. explicit_steps after the moments' step, the rest
-// of the drift is below its rounding.
+// Whether the drift of a row on its way to the target is above rounding. `stand` is the step of its moments;
+// the drift from explicit_steps after that step on is below rounding.
 template <class T>
 BLITZGS_HD bool adam_moves(const AdamArgs<T>& args, std::int32_t from, std::int32_t stand) {
   return from < args.target() && from - stand < args.explicit_steps;
 }
 
-// By which factors one row's moments decay.
+// The factors by which the moments of a row decay.
 template <class T>
 struct AdamRow {
-  std::int32_t from;  // the step at which the parameters stand
+  std::int32_t from;  // the step of the parameters
   T here1, here2;     // beta1^k, beta2^k from the moments' step to `from`
   T then1, then2;     // beta1^k, beta2^k from the moments' step to the target
   bool moves;         // see adam_moves
@@ -278,6 +285,7 @@ BLITZGS_HD AdamStep<T> adam_step_scalars(const AdamArgs<T>& args) {
   return s;
 }
 
+// One Adam step of one element: parameter p, moments m and v, gradient g.
 template <class T>
 BLITZGS_HD void adam_update(const AdamStep<T>& s, int group, T g, T& p, T& m, T& v) {
   m = s.beta1 * m + s.one_minus_beta1 * g;
@@ -291,12 +299,13 @@ BLITZGS_HD int adam_group(int column, std::int64_t element) {
 }
 
 namespace cpu {
-// With gradients: the parameters of rows behind step - 1 are caught up, then step `step` is taken, after
-// which parameters and moments stand there. Without (column.grad null): the parameters of rows behind `step`
-// are caught up and stand at `step`.
+// With gradients: the listed rows catch up to step - 1 and take the step `step`; their parameters and moments
+// are then at `step`. Without gradients (column.grad null): the parameters of the listed rows catch up to
+// `step`.
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
-// Fills rules, [n], of which args has the table, explicit_steps and eps.
+// Computes the final rules [n] for rows at the steps 0 .. n - 1. Reads the table, explicit_steps and eps of
+// args.
 template <class T>
 void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream);
 }  // namespace cpu

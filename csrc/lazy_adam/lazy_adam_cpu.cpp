@@ -26,7 +26,7 @@ constexpr std::int64_t kPrefetchDistance = 3;
 template <class T>
 void prefetch_row(const AdamArgs<T>& args, std::int64_t row) {
   constexpr std::int64_t kLine = 64 / sizeof(T);
-  asm volatile("");  // gcc drops calls of functions that do nothing but prefetch
+  asm volatile("");  // without this, gcc drops calls of a function that only prefetches
   for (const AdamColumn<T>& column : args.columns) {
     for (T* start : {column.param, column.exp_avg, column.exp_avg_sq}) {
       for (std::int64_t j = 0; j < column.width; j += kLine)
@@ -35,8 +35,8 @@ void prefetch_row(const AdamArgs<T>& args, std::int64_t row) {
   }
 }
 
-// Few different steps occur among the rows that are behind, so each thread computes them once for many
-// rows.
+// Among rows with pending steps few different values of last_step occur, so each thread computes the rules
+// once for many rows.
 template <class T>
 class PendingStepsCache {
  public:

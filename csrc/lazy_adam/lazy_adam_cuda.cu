@@ -10,7 +10,12 @@ namespace blitzgs::cuda {
 
 namespace {
 
-// A row of SH degree 3 has 12 packs of SH, one quaternion and seven more numbers; each gets a thread.
+// The lazy optimiser (lazy_adam.h) on CUDA. Catching up takes three kernels: prepare computes the rules,
+// list_pending_rows lists the rows with pending steps, and catch_up_kernel moves their parameters.
+// step_kernel then takes the step with gradients. A parameter that is stepped alone has kernels of its own.
+
+// A row with SH degree 3 has 12 packs of four SH coefficients, one quaternion and seven more numbers; each of
+// these gets a thread.
 constexpr int kRows = 16;  // rows per block
 constexpr int kThreads = kRows * (12 + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
@@ -18,14 +23,14 @@ constexpr int kPrepareLanes = 8, kPrepareThreads = 64, kListThreads = 256;
 static_assert(kPrepareLanes > kAdamGroups);
 constexpr int kAlone = kAdamColumns - 1;  // the column of a parameter that is stepped alone
 
-// What rows need to catch up. All rows of a launch go to the same step, so it is computed once for each step
-// at which a row may stand, and not for each row; and only for the last explicit_steps of them where the
-// final rules of the others are tabulated.
+// The rules and decays by which rows catch up. All rows of a launch catch up to the same step, so the rules
+// depend on the row's last_step alone and are computed once for each such step. If final rules are tabulated,
+// only those of the last explicit_steps steps are computed.
 struct Prepared {
-  PendingSteps<float>* pending;            // [target - first], for parameters that stand at step first, ...
-  Decay* decays;                           // [n_decays], over each number of steps
-  bool* any_pending;                       // whether any row is behind
-  const PendingSteps<float>* final_rules;  // for parameters that stand at steps before `first`
+  PendingSteps<float>* pending;  // [target - first], for parameters at the steps first, first + 1, ...
+  Decay* decays;                 // [n_decays], the decay of the moments over i steps
+  bool* any_pending;             // whether any row has pending steps
+  const PendingSteps<float>* final_rules;  // for parameters at the steps before `first`
   std::int32_t first, n_decays;
 
   __device__ const PendingSteps<float>& of(std::int32_t from) const {
@@ -33,8 +38,8 @@ struct Prepared {
   }
 };
 
-// kPrepareLanes lanes work on a step, one for each rule, because the kernel's time is that of a chain of
-// divisions.
+// Computes prepared.pending and prepared.decays. kPrepareLanes lanes per step, one for each learning-rate
+// group, because the kernel's time is that of a chain of divisions.
 __global__ void __launch_bounds__(kPrepareThreads)
     prepare(const __grid_constant__ AdamArgs<float> args, const Prepared prepared) {
   wait_for_earlier_kernels();
@@ -57,6 +62,7 @@ __global__ void __launch_bounds__(kPrepareThreads)
   steps.explicit_up_to = adam_explicit_up_to(args, t, target, error);
 }
 
+// rules [n]: the final rules of each step, one thread per step.
 __global__ void __launch_bounds__(kListThreads)
     final_rules_kernel(const __grid_constant__ AdamArgs<float> args, std::int64_t n,
                        PendingSteps<float>* rules) {
@@ -64,14 +70,15 @@ __global__ void __launch_bounds__(kListThreads)
   if (from < n) rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
 }
 
-// A row that catches up by the rules of the step that it stands at.
+// A row with pending steps.
 struct alignas(16) PendingRow {
-  std::int32_t id;    // -1: nothing to do
-  std::int32_t from;  // the step at which its parameters stand
-  Decay here;         // of its moments, up to that step
+  std::int32_t id;    // -1: the row has no pending steps, or has taken them already
+  std::int32_t from;  // the step of its parameters
+  Decay here;         // the decay of its moments up to that step
 };
 
-// Lets a row catch up where the rules are not exact enough; a whole warp works on it.
+// One column of a row catches up if the rules are not exact enough for all its elements. All lanes of the
+// warp call this, each for some elements of the row.
 template <int Column>
 __device__ void catch_up_elements(const AdamArgs<float>& args, const PendingSteps<float>& steps,
                                   const Decay& here, std::int64_t row) {
@@ -83,11 +90,12 @@ __device__ void catch_up_elements(const AdamArgs<float>& args, const PendingStep
   }
 }
 
+// The number of valid rows in the list.
 __device__ std::int64_t listed(const AdamArgs<float>& args) { return args.count ? *args.count : args.n; }
 
-// Lists the rows that are behind and sets their last_step as if they had caught up already. Rows for which
-// the rules are not exact enough, which happens only early in a schedule, catch up here, each by a whole
-// warp.
+// Writes the pending rows [n], one thread per listed row, and sets last_step to the target, as if the rows
+// had caught up. Rows for which the rules are not exact enough, which occur only early in a schedule, catch
+// up here, each by a whole warp.
 __global__ void __launch_bounds__(kListThreads)
     list_pending_rows(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
                       PendingRow* pending_rows) {
@@ -126,11 +134,11 @@ __global__ void __launch_bounds__(kListThreads)
 }
 
 // Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every kRows rows.
-// ShPacks: packs in an SH row; 0: as many as `sh_packs` says.
+// ShPacks: the packs in an SH row; 0: sh_packs is their number.
 template <int ShWidth, int ShPacks, class F>
 __device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
   const int packs = ShPacks ? ShPacks : sh_packs;
-  // Where the number of packs is known, a single round handles all of them.
+  // If the number of packs is known at compile time, a single round handles all of them.
   constexpr int kRound = ShPacks ? kRows * (ShPacks + 8) : kThreads;
   for (int item = threadIdx.x; item < kRows * (packs + 8); item += kRound) {
     const int rest = item - kRows * packs;
@@ -148,6 +156,7 @@ __device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
   }
 }
 
+// One pack of a row catches up by the rules.
 template <int Column, int Width>
 __device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const Prepared& prepared,
                                               const PendingRow& row, int pack) {
@@ -168,8 +177,8 @@ __device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const
   *reinterpret_cast<P*>(column.param + at) = p;
 }
 
-// A thread handles the same pack of every (gridDim.x * kRows)-th listed row, and loads the next list entry
-// while it updates the present row.
+// The pending rows catch up: reads parameters and moments, writes parameters. A thread handles the same pack
+// of every (gridDim.x * kRows)-th listed row, and loads the next list entry while it updates the current row.
 template <int ShWidth, int ShPacks>
 __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
     catch_up_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
@@ -192,6 +201,7 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
   for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, catch_up_one);
 }
 
+// One pack of a row takes the Adam step; the row has caught up.
 template <int Column, int Width>
 __device__ __forceinline__ void step_pack(const AdamArgs<float>& args, const AdamStep<float>& step,
                                           std::int64_t row, std::int64_t list_row, int pack) {
@@ -202,8 +212,8 @@ __device__ __forceinline__ void step_pack(const AdamArgs<float>& args, const Ada
   own.finish(column, step, make_decay(args, args.sparse ? 0 : args.target() - args.moment_step[row]), g);
 }
 
-// A block handles kRows rows of the list in all five columns, so no other block reads or writes their
-// last_step and moment_step.
+// The Adam step with gradients, for rows that have caught up. One thread per pack. A block handles kRows rows
+// of the list in all five columns, so no other block reads or writes their last_step and moment_step.
 template <int ShWidth, int ShPacks>
 __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ AdamArgs<float> args) {
   __shared__ AdamStep<float> step;
@@ -225,11 +235,12 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
   args.moment_step[row] = args.step;
 }
 
-// A parameter that is stepped alone lies in the last column, of any width: a thread takes an element at a
-// time, so that neighbours in a warp read neighbours in memory.
+// A parameter that is stepped alone is in the last column and may have any width. A thread handles one
+// element at a time, so that neighbouring lanes access neighbouring addresses.
 __device__ std::int64_t first_element() { return blockIdx.x * std::int64_t{kListThreads} + threadIdx.x; }
 __device__ std::int64_t element_stride() { return gridDim.x * std::int64_t{kListThreads}; }
 
+// catch_up_kernel for a parameter that is stepped alone.
 __global__ void __launch_bounds__(kListThreads)
     catch_up_alone_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
                           const PendingRow* pending_rows) {
@@ -248,6 +259,7 @@ __global__ void __launch_bounds__(kListThreads)
   }
 }
 
+// step_kernel for a parameter that is stepped alone; mark_steps_kernel writes last_step and moment_step.
 __global__ void __launch_bounds__(kListThreads)
     step_alone_kernel(const __grid_constant__ AdamArgs<float> args) {
   __shared__ AdamStep<float> step;
@@ -268,7 +280,8 @@ __global__ void __launch_bounds__(kListThreads)
   }
 }
 
-// After the step, as elements of a row are stepped by several blocks, which read where its moments stand.
+// Sets last_step and moment_step of the listed rows, one thread per row. This is a launch of its own after
+// step_alone_kernel, because several blocks may step a row, and all of them read its moment_step.
 __global__ void __launch_bounds__(kListThreads)
     mark_steps_kernel(const __grid_constant__ AdamArgs<float> args) {
   wait_for_earlier_kernels();
@@ -281,7 +294,7 @@ __global__ void __launch_bounds__(kListThreads)
 
 bool is_alone(const AdamArgs<float>& args) { return args.columns[0].width == 0; }
 
-// As many blocks as the device runs at a time.
+// The number of blocks for `items` items, at most as many as the device runs at a time.
 unsigned filled_blocks(std::int64_t items, int items_per_block, int blocks_per_multiprocessor) {
   return std::min(blocks_for(items, items_per_block),
                   static_cast<unsigned>(blocks_per_multiprocessor * multiprocessors()));
@@ -294,7 +307,8 @@ LaunchShape alone_size(const AdamArgs<float>& args, CudaStream stream) {
 
 void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
   if (args.step == 0) return;
-  // Rows whose moments are behind by more do not move, so decays over more steps are not needed.
+  // Rows whose moments are explicit_steps or more before last_step do not move (adam_moves), so longer decays
+  // are not needed.
   const std::int32_t first = args.final_rules ? std::max(0, args.step - args.explicit_steps + 1) : 0,
                      n_decays = std::min(args.step + 1, args.explicit_steps);
   const Prepared prepared{workspace.allocate<PendingSteps<float>>(args.step - first),
@@ -308,7 +322,7 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
                {blocks_for(std::max(args.step - first, n_decays), kPrepareThreads / kPrepareLanes),
                 kPrepareThreads, stream},
                args, prepared);
-  // n may be far more than the number of valid ids.
+  // The grid is limited because n may be far more than the number of valid ids.
   launch_early("lazy_adam catch-up", list_pending_rows,
                {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
                pending_rows);

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The optimiser's step of a few elements of a row, for the kernels that take it.
+// The Adam step of a few elements of a row, for step_kernel (lazy_adam_cuda.cu) and for the projection's
+// backward pass that takes the step (project_step_cuda.cu).
 #pragma once
 #include <cstdint>
 
@@ -7,7 +8,7 @@
 
 namespace blitzgs::cuda {
 
-// How moments decay over a number of steps.
+// The factors beta1^k and beta2^k by which the moments decay over k steps.
 struct Decay {
   float first, second;
 };
@@ -17,6 +18,7 @@ __device__ inline Decay make_decay(const AdamArgs<float>& args, std::int32_t ste
   return {static_cast<float>(row[kBeta1Power]), static_cast<float>(row[kBeta2Power])};
 }
 
+// Width floats that one instruction loads or stores.
 template <int Width>
 struct alignas(4 * Width) Pack {
   float x[Width];
@@ -29,8 +31,8 @@ __device__ constexpr int pack_group(int pack, int element) {
   return adam_group(Column, pack * Width + (element < Width - 1 ? 0 : element));
 }
 
-// Width elements of a row of a column. They are loaded first, so that many loads are in flight, and updated
-// later.
+// The Adam step of Width elements of a row of a column. load() and finish() are separate, so that a thread
+// can have the loads of several packs in flight.
 template <int Column, int Width>
 class StepPack {
  public:

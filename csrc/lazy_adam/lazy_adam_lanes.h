@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The update of one row, eight elements at a time, over the lane types of math/lanes.h: the arithmetic
-// of adam_drift() and adam_update(). Compiled plain and with AVX2.
+// The update of one row on the CPU, eight elements at a time, over the lane types of math/lanes.h. The
+// arithmetic is that of adam_drift() and adam_update(). Compiled twice, plain and with AVX2.
 #pragma once
 #include <cstdint>
 
@@ -9,7 +9,8 @@
 
 namespace blitzgs::cpu {
 
-// The elements that catch up step by step are rare, so plain code handles them.
+// The function for elements that take their pending steps one by one. They are rare, so plain code handles
+// them.
 template <class T>
 using ExplicitDrift = T (*)(const AdamArgs<T>& args, const PendingSteps<T>& steps, int group, T m, T root);
 
@@ -31,7 +32,7 @@ AdamRowUpdate<float> avx2_adam_row_update();
 
 namespace {
 
-// One number per lane, which depends on its learning-rate group. Groups ascend.
+// Returns value(group) for the learning-rate group of each lane. Groups ascend over the lanes.
 template <class Lanes, class F>
 Lanes by_group(const int* groups, const F& value) {
   if (groups[0] == groups[kLanes - 1]) return Lanes::broadcast(value(groups[0]));
@@ -75,7 +76,7 @@ void take_step(const AdamStep<T>& s, const int* groups, Lanes g, Lanes& p, Lanes
   p = p - by_group<Lanes>(groups, [&](int i) { return s.rate[i]; }) * m / root;
 }
 
-// Updates eight elements in place; g null: the parameters catch up.
+// Updates eight elements in place: catches up, then takes the step. g null: the parameters catch up only.
 template <class Lanes, class T>
 void update_elements(const AdamRowJob<T>& job, const int* groups, T* p, T* m, T* v, const T* g) {
   Lanes param = Lanes::load(p), first = Lanes::load(m), second = Lanes::load(v);
@@ -94,7 +95,7 @@ void update_elements(const AdamRowJob<T>& job, const int* groups, T* p, T* m, T*
   param.store(p);
 }
 
-// Elements of several short columns, gathered to fill the lanes.
+// Collects elements of several short columns to fill the eight lanes, and updates them.
 template <class Lanes, class T>
 class AdamGather {
  public:

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the ops that move parameters share: the checked tensors of the optimiser's state and schedule.
+// The checked tensors of the optimiser's state and schedule, for all ops that move parameters.
 #pragma once
 #include <optional>
 #include <utility>
@@ -12,13 +12,14 @@ namespace blitzgs {
 
 inline constexpr const char* kAdamNames[kAdamColumns] = {"means", "quats", "scales", "opacities", "sh"};
 
-// The tensors of a state: of each column its parameters, first and second moments; last_step, moment_step.
+// The number of tensors in a state: parameters, first and second moments of each column; last_step,
+// moment_step.
 inline constexpr std::size_t kAdamState = 3 * kAdamColumns + 2;
 
-// The optimiser's state of a table, and where its schedule stands. state: (params, exp_avgs, exp_avg_sqs,
-// last_step, moment_step), the first three (means, quats, scales, opacities, sh) each; tables: (table of
-// lazy_adam.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays: (beta1, beta2, eps).
-// Python's side of the groups is blitzgs/ops/lazy_adam.py.
+// The optimiser's state of a table of Gaussians and its schedule. state: (params, exp_avgs, exp_avg_sqs,
+// last_step, moment_step), of which each of the first three is (means, quats, scales, opacities, sh); tables:
+// (table of lazy_adam.h, lr_table[, final_rules]); steps: (step, explicit_steps, sparse); decays: (beta1,
+// beta2, eps). blitzgs/ops/lazy_adam.py builds these groups.
 struct AdamTensors {
   const char* op;
   std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
@@ -60,7 +61,8 @@ struct AdamTensors {
   const Tensor& like() const { return params[0]; }
   std::int64_t rows() const { return like().size(0); }
 
-  // Of n rows: those that `ids` lists, or all when it is null; gradients are left null.
+  // The kernel's arguments for the n rows `ids`, or for all rows if ids is null. Gradients are null; the
+  // caller sets them.
   template <class T>
   AdamArgs<T> arguments(const std::int32_t* ids, std::int64_t n) {
     AdamArgs<T> args{};

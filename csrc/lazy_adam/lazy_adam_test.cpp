@@ -11,7 +11,7 @@ namespace {
 constexpr double kBeta1 = 0.9, kBeta2 = 0.999;
 constexpr int kSteps = 400;
 
-// A schedule of constant rate, tabulated as the contract says.
+// A schedule of constant rate, tabulated as lazy_adam.h says.
 struct Schedule {
   std::vector<float> rates = std::vector<float>((kSteps + 1) * blitzgs::kAdamGroups, 0.01f);
   std::vector<double> table = std::vector<double>((kSteps + 1) * blitzgs::kAdamTable);
@@ -52,7 +52,7 @@ struct Schedule {
   }
 };
 
-// The zero-gradient steps of one element, one by one, in double.
+// The drift of one element by its pending steps, one by one, in double.
 double drift_one_by_one(double m, double v, int from, int to, double eps) {
   double drift = 0;
   for (int t = from + 1; t <= to; ++t) {

@@ -1,23 +1,27 @@
 // SPDX-License-Identifier: Apache-2.0
-// The smallest set of items, by descending weight (ties by ascending id), that holds a share of the weight of
-// its segment: one search for all segments, without sorting and without the host.
+// The mass cut: for each segment, the smallest set of items by descending weight (ties by ascending id) whose
+// weights sum to at least a share of the segment's total. One search serves all segments, without sorting and
+// without waiting on the host. The importance pass cuts each view's contributions at 99 % in this way.
 //
 //   weights [P] int64 in [0, 2^62), segments [P] int32, owners [P] int32 and ids [N] int64: item i has the id
 //   ids[owners[i]], unique within its segment  ->  chosen [P]
 //
-// A segment's threshold is found digit by digit, as in a radix select. The first digit of a number is that of
-// a float: its exponent and four bits behind the leading one. Each later digit has kDigitBits of the bits
-// that are left. In a round
+// The search finds the threshold of each segment, the smallest weight in the set, digit by digit as in a
+// radix select. The first digit of a number is like that of a float: its exponent and the four bits after the
+// leading one. Each later digit is the next kDigitBits bits. A round finds one digit in two steps:
 //
-//   the scan adds up, by this digit, the weights of the items whose digits so far are those of the threshold;
-//   the descent finds, from the largest digit down, where the missing weight is reached: the next digit.
+//   scan:    sums the weights of the items whose earlier digits equal those of the threshold, by their next
+//            digit;
+//   descent: finds the next digit of the threshold: the digit, from the largest one down, at which the sums
+//            reach the missing weight.
 //
-// Sums are integers; between scan and descent they may be added up over ranks. Where more items weigh as much
-// as the threshold than are missing, kRounds more rounds find the largest id that is in, by the same search
-// for 2^63 - 1 - id, each item counting one. Items behind the first two digits are few: the second scan lists
-// them, and later ones read the list.
+// Sums are integers; between scan and descent they may be added up over ranks. If more items than needed
+// weigh as much as the threshold, kRounds more rounds find the largest id in the set, by the same search for
+// 2^63 - 1 - id in which each item counts one. Few items agree with the threshold in the first digit: the
+// second scan lists them, and later scans read the list.
 //
-// All of it is exact: no order of additions, division among ranks or repetition changes a bit. O(P).
+// The result is exact: no order of additions, division among ranks or repetition changes a bit. The cost is
+// O(P).
 #pragma once
 #include <cstdint>
 #include <limits>
@@ -32,15 +36,18 @@ inline constexpr int kFirstMantissaBits = 4;
 inline constexpr int kFirstDigits = 1 << 10;  // 1 + 63 exponents x 16
 // A first digit leaves at most 58 bits.
 inline constexpr int kRounds = 1 + (58 + kDigitBits - 1) / kDigitBits;
-// Steps of the whole search: scan and descent of the rounds for weights, those for ids, and the choice.
+// The steps of the whole search: scan and descent of each round for weights, then of each round for ids, then
+// the choice.
 inline constexpr int kTiesStep = 2 * kRounds, kChoiceStep = 4 * kRounds, kSteps = kChoiceStep + 1;
 
-// Where the search of a segment stands: the threshold's bits from `shift` on are `head`, and `missing` is to
-// come from the items that have these bits, which together hold `held`. Done when shift is 0.
+// The state of the search in a segment. It is done when shift is 0.
 struct MassSearch {
-  std::int64_t head, shift, missing, held;
+  std::int64_t head, shift;  // the bits of the threshold from bit `shift` on
+  std::int64_t missing;      // the weight that items with these bits have to contribute to the set
+  std::int64_t held;         // the weight of all items with these bits
 };
-inline constexpr std::int64_t kNobody = std::numeric_limits<std::int64_t>::max();  // a head above all weights
+// The initial head: no item weighs as much, so an empty search chooses no item.
+inline constexpr std::int64_t kAboveAllWeights = std::numeric_limits<std::int64_t>::max();
 
 struct SegmentSearch {
   MassSearch weight, id;
@@ -52,10 +59,10 @@ struct MassCutArgs {
   const std::int32_t* owners;
   const std::int64_t* ids;
   std::int64_t n_items, n_segments;
-  std::int64_t numerator, denominator;  // of the share
+  std::int64_t numerator, denominator;  // the share
   SegmentSearch* searches;              // [S]
   std::int64_t* sums;                   // [S, kDigits], zero between a descent and the next scan
-  std::int32_t* listed;                 // [1 + P]: how many items are listed, and these
+  std::int32_t* listed;                 // [1 + P]: the number of listed items, then these items
   bool* chosen;                         // [P], written by the last step
 };
 
@@ -67,7 +74,7 @@ BLITZGS_HD int bits_of(std::int64_t number) {
 #endif
 }
 
-// The first digit of a number in [0, 2^63): 0 for 0, and growing with it.
+// The first digit of a number in [0, 2^63). It is 0 for 0 and never decreases with the number.
 BLITZGS_HD int first_digit(std::int64_t number) {
   if (number == 0) return 0;
   const int exponent = bits_of(number) - 1, behind = exponent - kFirstMantissaBits;
@@ -79,7 +86,7 @@ BLITZGS_HD int later_digit_bits(std::int64_t shift) {
   return shift < kDigitBits ? static_cast<int>(shift) : kDigitBits;
 }
 
-// Takes the digit that a descent found; `above` is the sum of the larger ones, `held` that of this one.
+// Appends the digit that a descent found. above: the sum of the larger digits; held: the sum of this digit.
 BLITZGS_HD void take_digit(MassSearch& search, bool first, int digit, std::int64_t above, std::int64_t held) {
   if (first) {
     const int exponent = (digit - 1) >> kFirstMantissaBits, behind = exponent - kFirstMantissaBits;
@@ -95,16 +102,16 @@ BLITZGS_HD void take_digit(MassSearch& search, bool first, int digit, std::int64
   search.held = held;
 }
 
-// ceil(share x total), without the product, which might overflow.
+// ceil(share * total), without computing the product, which might overflow.
 BLITZGS_HD std::int64_t share_of(std::int64_t total, std::int64_t numerator, std::int64_t denominator) {
   const std::int64_t rest = denominator - numerator;
   return total - total / denominator * rest - total % denominator * rest / denominator;
 }
 
-// Begins the search for ids when that for the weight has ended: it has something to find only where some of
-// the items that weigh as much as the threshold are left out.
+// The initial state of the search for ids, after the search for the weight. It finds an id only if some of
+// the items that weigh as much as the threshold are not in the set; otherwise `missing` is 0.
 BLITZGS_HD MassSearch search_of_ids(const MassSearch& weight) {
-  if (weight.head == kNobody) return {0, 0, 0, 0};
+  if (weight.head == kAboveAllWeights) return {0, 0, 0, 0};
   const std::int64_t wanted = (weight.missing + weight.head - 1) / weight.head;
   return {0, 0, weight.held / weight.head > wanted ? wanted : 0, 0};
 }
@@ -115,7 +122,8 @@ BLITZGS_HD std::int64_t id_key_of(const MassCutArgs& args, std::int64_t item) {
   return id_key(args.ids[args.owners[item]]);
 }
 
-// What a scan of a round adds, and where; nothing for items that are not under the digits so far.
+// The summand of an item in a scan: `amount`, to the sum of `digit`. adds: whether the item's earlier digits
+// equal those of the threshold.
 struct ScanTerm {
   bool adds;
   int digit;
@@ -151,13 +159,13 @@ BLITZGS_HD bool is_chosen(const MassCutArgs& args, std::int64_t item) {
   return search.id.missing == 0 || id_key_of(args, item) >= search.id.head;
 }
 
-// Whether a descent has a digit to find.
+// Whether a descent has another digit to find.
 BLITZGS_HD bool descends(const MassSearch& search, bool first) {
   return first ? search.missing > 0 : search.shift > 0;
 }
 
 namespace cpu {
-// Takes the steps first_step to last_step - 1.
+// Runs the steps first_step to last_step - 1.
 void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream);
 }  // namespace cpu
 namespace cuda {

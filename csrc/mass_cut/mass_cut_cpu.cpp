@@ -31,7 +31,7 @@ void descend(const MassCutArgs& args, int round) {
     std::int64_t* const sums = args.sums + s * kDigits;
     if (round == 0) {
       search = {
-          kNobody, 0,
+          kAboveAllWeights, 0,
           share_of(std::accumulate(sums, sums + kDigits, std::int64_t{0}), args.numerator, args.denominator),
           0};
     }

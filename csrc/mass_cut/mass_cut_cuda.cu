@@ -9,10 +9,11 @@ namespace {
 
 constexpr int kThreads = 512;
 constexpr int kWarps = kThreads / 32;
-// Segments whose first digits a block counts in shared memory, 8 KiB each.
+// The number of segments whose first digits a block sums in shared memory, 8 KiB each.
 constexpr int kSegmentsAtOnce = 8;
 
-// Numbers of 64 bits in two words, because shared memory adds words at once and wider numbers in a loop.
+// A 64-bit sum as two words, because shared memory has an atomic addition of 32-bit words but none of 64-bit
+// ones, which would be a loop.
 struct WideSum {
   std::uint32_t low, high;
 
@@ -30,7 +31,8 @@ __device__ void add_to(std::int64_t* sum, std::int64_t amount) {
   atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(amount));
 }
 
-// Round 0: every item adds. Block row y counts the segments from y * kSegmentsAtOnce on.
+// The scan of round 0: sums the weights of all items by their first digit into sums [S, kDigits]. One thread
+// per item in a grid-stride loop. The blocks of grid row y handle the segments from y * kSegmentsAtOnce on.
 __global__ void __launch_bounds__(kThreads) first_scan_kernel(const MassCutArgs args) {
   extern __shared__ __align__(16) unsigned char shared_bytes[];
   auto* const digits = reinterpret_cast<WideSum*>(shared_bytes);
@@ -60,7 +62,8 @@ __device__ void add_term(const MassCutArgs& args, int round, std::int64_t item) 
   if (term.adds) add_to(args.sums + std::int64_t{args.segments[item]} * kDigits + term.digit, term.amount);
 }
 
-// Round 1: lists the items under the first digit of their segment, and adds up their next one.
+// The scan of round 1: lists the items with the first digit of their segment's threshold, and sums their
+// weights by the next digit. One thread per item in a grid-stride loop.
 __global__ void __launch_bounds__(kThreads) second_scan_kernel(const MassCutArgs args) {
   wait_for_earlier_kernels();
   const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
@@ -79,7 +82,7 @@ __global__ void __launch_bounds__(kThreads) second_scan_kernel(const MassCutArgs
   }
 }
 
-// Later rounds: the listed items.
+// The scan of later rounds: one thread per listed item in a grid-stride loop.
 __global__ void __launch_bounds__(kThreads) scan_kernel(const MassCutArgs args, int round) {
   wait_for_earlier_kernels();
   const std::int64_t count = args.listed[0], stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
@@ -88,7 +91,8 @@ __global__ void __launch_bounds__(kThreads) scan_kernel(const MassCutArgs args, 
   }
 }
 
-// The sum of a block's values up to and including each thread's own, and that of all.
+// until: the sum of the values of a block's threads up to and including this one. total: the sum over all
+// threads.
 struct BlockScan {
   std::int64_t until, total;
 };
@@ -106,14 +110,16 @@ __device__ BlockScan scan_block(std::int64_t value) {
   return {until, total};
 }
 
-// A block for each segment; a thread adds up neighbouring digits, thread 0 the largest.
+// The descent of a round: finds the next digit of each segment's threshold and sets the sums to zero. One
+// block per segment; each thread sums over kEach neighbouring digits, thread 0 over the largest ones.
 __global__ void __launch_bounds__(kThreads) descent_kernel(const MassCutArgs args, int round) {
   constexpr int kEach = kDigits / kThreads;
   wait_for_earlier_kernels();
   SegmentSearch& both = args.searches[blockIdx.x];
   const bool first = round % kRounds == 0;
   MassSearch search = round >= kRounds ? both.id : both.weight;
-  if (round > 0 && round != kRounds - 1 && !descends(search, first)) return;  // and no scan has added
+  // If there is no digit to find, the scan has added nothing either, so the sums are zero already.
+  if (round > 0 && round != kRounds - 1 && !descends(search, first)) return;
   std::int64_t* const sums = args.sums + std::int64_t{blockIdx.x} * kDigits;
   const int top = kDigits - 1 - static_cast<int>(threadIdx.x) * kEach;
   std::int64_t mine[kEach], sum = 0;
@@ -124,11 +130,11 @@ __global__ void __launch_bounds__(kThreads) descent_kernel(const MassCutArgs arg
     sum += mine[i];
   }
   const BlockScan scan = scan_block(sum);
-  if (round == 0) search = {kNobody, 0, share_of(scan.total, args.numerator, args.denominator), 0};
+  if (round == 0) search = {kAboveAllWeights, 0, share_of(scan.total, args.numerator, args.denominator), 0};
   std::int64_t above = scan.until - sum;
   const bool is_below = above < search.missing && search.missing <= scan.until;
   const bool writes = descends(search, first) ? is_below : threadIdx.x == 0;
-  __syncthreads();  // everyone has read the search
+  __syncthreads();  // all threads have read the search before one of them writes it
   if (!writes) return;
   if (descends(search, first)) {
     int i = 0;
@@ -139,6 +145,7 @@ __global__ void __launch_bounds__(kThreads) descent_kernel(const MassCutArgs arg
   if (round == kRounds - 1) both.id = search_of_ids(search);
 }
 
+// The last step: chosen [P], one thread per item.
 __global__ void __launch_bounds__(kThreads) choice_kernel(const MassCutArgs args) {
   wait_for_earlier_kernels();
   const std::int64_t item = static_cast<std::int64_t>(blockIdx.x) * kThreads + threadIdx.x;
@@ -154,9 +161,10 @@ void scan(const MassCutArgs& args, int round, CudaStream stream) {
     launch_early("mass_cut", second_scan_kernel, {std::min(all, resident), kThreads, stream}, args);
   } else {
     const auto groups = static_cast<unsigned>((args.n_segments + kSegmentsAtOnce - 1) / kSegmentsAtOnce);
-    constexpr std::size_t kBytes = kFirstDigits * sizeof(WideSum);  // of a segment
+    constexpr std::size_t kBytes = kFirstDigits * sizeof(WideSum);  // shared memory of a segment
     const std::size_t bytes = std::min<std::int64_t>(args.n_segments, kSegmentsAtOnce) * kBytes;
-    // The most that any call needs, as other threads may launch the kernel meanwhile.
+    // Every call sets the same attribute, the most that any call needs, because another thread may launch the
+    // kernel between this call and the launch.
     check(cudaFuncSetAttribute(first_scan_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize,
                                static_cast<int>(kSegmentsAtOnce * kBytes)),
           "mass_cut");

@@ -27,7 +27,7 @@ TEST_CASE("first digits grow with the number and fit their table") {
 TEST_CASE("a first digit leaves its numbers' leading bits and what is behind them") {
   for (const std::int64_t number : {std::int64_t{1}, std::int64_t{9}, std::int64_t{31}, std::int64_t{1} << 40,
                                     std::numeric_limits<std::int64_t>::max()}) {
-    MassSearch search{kNobody, 0, 10, 0};
+    MassSearch search{kAboveAllWeights, 0, 10, 0};
     take_digit(search, true, first_digit(number), 3, 8);
     REQUIRE(search.head == number >> search.shift);
     REQUIRE(search.shift <= (kRounds - 1) * kDigitBits);

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Counter-based random numbers: a draw depends on its key alone, so it is the same on every rank and device.
-// The same bits as blitzgs/ops/counter_random.py: SplitMix64 (Steele, Lea, Flood 2014) over a tuple of keys.
+// The functions give the same bits as blitzgs/ops/counter_random.py: SplitMix64 (Steele, Lea, Flood 2014)
+// over a tuple of keys.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -23,7 +24,7 @@ BLITZGS_HD std::uint64_t hash_key(std::uint64_t hash, std::int64_t key) {
 // Uniform in (0, 1), from 53 bits of a hash.
 BLITZGS_HD double uniform_of(std::uint64_t hash) { return (static_cast<double>(hash >> 11) + 0.5) * 0x1p-53; }
 
-// Standard normal (Box-Muller), from two hashes that follow from one.
+// Standard normal (Box-Muller), from two hashes that are derived from `hash`.
 BLITZGS_HD double normal_of(std::uint64_t hash) {
   const double first = uniform_of(hash_key(hash, 0)), second = uniform_of(hash_key(hash, 1));
   return std::sqrt(-2.0 * std::log(first)) * std::cos(2.0 * 3.14159265358979323846 * second);

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a view can see of Gaussians of which only the mean and a largest standard deviation are known. Blocks
-// of the table, their rows (blocks/blocks.h) and the candidates of a projection (project/project_cuda.cu)
-// are all tested by these planes.
+// A conservative test whether a view may see a Gaussian, from its mean and an upper bound sigma on its
+// standard deviations. Three callers use these planes: the tests of table blocks and of their rows
+// (blocks/blocks.h) and the prefilter of the projection (project/project_cuda.cu).
 //
 // A Gaussian with axes up to sigma cannot be seen iff its mean lies behind the near plane, beyond the far
 // plane, or beyond one image border by more than a splat can reach: half-width of alpha >= 1/255 is at most
-// sqrt(2 ln 255) sqrt(|J row|^2 sigma^2 + eps2d) pixels for an opacity of at most 1, with
-// |J row| <= f / z max |row_x - u row_z| over the clamped slopes u. Multiplied by z, each condition is a
-// linear inequality n . p + d + k sigma >= 0.
+// sqrt(2 ln 255) sqrt(|J row|^2 sigma^2 + eps2d) pixels for an opacity of at most 1, with |J row| <= f / z
+// max |row_x - u row_z| over the clamped slopes u. Multiplied by z, each condition is a linear inequality
+// n . p + d + k sigma >= 0.
 #pragma once
 #include <cmath>
 
@@ -21,7 +21,8 @@ constexpr int kFrustumPlanes = 6, kDepthPlanes = 2;  // near and far, then two b
 // The largest relative rounding error of each term of the inequality of a point.
 constexpr float kPointSlack = 4e-6f;
 
-// n . p + d + k sigma >= 0. For points: d_high = d + its error, n_error |p|_1 is the error of n . p.
+// The half-space n . p + d + k sigma >= 0. For single points, d_high is d plus its rounding error, and
+// n_error |p|_1 bounds the rounding error of n . p.
 struct alignas(16) FrustumPlane {
   float n[3], d_high, k, n_error, d;
 };
@@ -42,7 +43,7 @@ BLITZGS_HD PoseRow pose_row(const Vec3<T>& row, T offset) {
   return {{double(row.x), double(row.y), double(row.z)}, double(offset)};
 }
 
-// factor row + factor_z row_z + shift.
+// The plane of the linear form factor * row + factor_z * row_z + shift, with the coefficient k of sigma.
 BLITZGS_HD FrustumPlane make_plane(const PoseRow& row, double factor, const PoseRow& row_z, double factor_z,
                                    double shift, double k) {
   FrustumPlane plane;
@@ -83,7 +84,7 @@ BLITZGS_HD Frustum make_frustum(const Camera<T>& camera, int width, int height, 
   view.planes[0] = make_plane(z, 1.0, z, 0.0, -double(near_plane), 0.0);
   // A depth is rounded before it is compared with the far plane.
   view.planes[1] = make_plane(z, -1.0, z, 0.0, 1.000001 * double(far_plane), 0.0);
-  const double blur = kReach * std::sqrt(double(eps2d)) + 1.0;  // and a pixel to spare
+  const double blur = kReach * std::sqrt(double(eps2d)) + 1.0;  // one pixel of slack
   const auto add_borders = [&](FrustumPlane* planes, const frustum::PoseRow& row, double focal, double centre,
                                double size, double low, double high) {
     const double k = kReach * std::fabs(focal) * frustum::largest_gradient(row, z, low, high) * 1.00001;
@@ -97,18 +98,19 @@ BLITZGS_HD Frustum make_frustum(const Camera<T>& camera, int width, int height, 
 
 BLITZGS_HD float norm1(const Vec3<float>& v) { return std::fabs(v.x) + std::fabs(v.y) + std::fabs(v.z); }
 
-// norm: norm1(mean).
+// An upper bound on n . mean + d, rounding included. norm: norm1(mean).
 BLITZGS_HD float upper_value(const FrustumPlane& plane, const Vec3<float>& mean, float norm) {
   const float value = mul_add(plane.n[1], mean.y, mul_add(plane.n[0], mean.x, plane.d_high));
   return mul_add(plane.n_error, norm, mul_add(plane.n[2], mean.z, value));
 }
 
-// False only when project_splat would be false whatever the Gaussian's shape.
+// Returns false only if project_splat would return false for a Gaussian of this mean with any shape.
 BLITZGS_HD bool may_be_in_depth(const Frustum& view, const Vec3<float>& mean, float norm) {
   return upper_value(view.planes[0], mean, norm) >= 0.0f && upper_value(view.planes[1], mean, norm) >= 0.0f;
 }
 
-// The same of Gaussians in depth, none of whose standard deviations exceeds sigma.
+// Returns false only if project_splat would return false for every Gaussian of this mean with standard
+// deviations of at most sigma. The caller has tested may_be_in_depth().
 BLITZGS_HD bool may_overlap(const Frustum& view, const Vec3<float>& mean, float norm, float sigma) {
   bool overlaps = true;
   for (int i = kDepthPlanes; i < kFrustumPlanes; ++i) {
@@ -118,7 +120,7 @@ BLITZGS_HD bool may_overlap(const Frustum& view, const Vec3<float>& mean, float 
   return overlaps;
 }
 
-// What to take as sigma for an opacity above 1, whose splat is wider than the planes suppose.
+// The sigma that callers give for an opacity above 1, because the planes assume an opacity of at most 1.
 constexpr float kAnyWidth = 1e30f;
 
 }  // namespace blitzgs

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A Gaussian's axes, covariance and colour, and their derivatives.
+// A Gaussian's rotation, axes and activations, and the spherical harmonics of its colour, with their
+// derivatives (docs/image.md, sections 1 and 4).
 #pragma once
 #include "math/vec.h"
 
@@ -65,8 +66,8 @@ BLITZGS_HD void rotation_columns_vjp(const UnitQuaternion<T>& q, const Columns3<
   v_q[3] += q.inverse_norm * (v_z - along * z);
 }
 
-// Activations, and the 3D covariance in factored form: Sigma = A A^T with A = R(q) diag(s). The factor is
-// kept instead of the product, because everything downstream is more accurate from it.
+// Activations, and the 3D covariance in factored form: Sigma = A A^T with A = R(q) diag(s). The code keeps
+// the factor A instead of Sigma, because the projection is more accurate from it (projection.h).
 
 template <class T>
 BLITZGS_HD T sigmoid(T logit) {
@@ -85,7 +86,7 @@ BLITZGS_HD Columns3<T> scaled_axes(const Columns3<T>& rotation, const Vec3<T>& s
   return {scale.x * rotation.x, scale.y * rotation.y, scale.z * rotation.z};
 }
 
-// v_scale and v_rotation are overwritten with the gradients that follow from v_axes.
+// Sets v_scale and v_rotation to the gradients that follow from v_axes.
 template <class T>
 BLITZGS_HD void scaled_axes_vjp(const Columns3<T>& rotation, const Vec3<T>& scale, const Columns3<T>& v_axes,
                                 Vec3<T>* v_scale, Columns3<T>* v_rotation) {

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Eight numbers at a time for CPU kernels: Avx2Lanes where a file is compiled with -mavx2 -mfma, PlainLanes
-// everywhere (and for float64). Each operation gives the same bits in both, NaN included:
+// Types of eight numbers for CPU kernels: Avx2Lanes in files that are compiled with -mavx2 -mfma, PlainLanes
+// in all files (and for float64). Each operation gives the same bits in both, NaN included:
 //   min(a, b), max(a, b)  return b when either is NaN;   comparisons with NaN are false;
 //   sum()                 adds in one fixed order.
-// The types live in an unnamed namespace: files compiled for different instruction sets must not share
-// their inline functions.
+// The types are in an unnamed namespace, because files that are compiled for different instruction sets must
+// not share their inline functions.
 #pragma once
 #include <bit>
 #include <cmath>
@@ -101,7 +101,7 @@ struct PlainLanes {
   friend PlainLanes operator/(PlainLanes a, PlainLanes b) {
     return make([&](int i) { return a.v[i] / b.v[i]; });
   }
-  // float64 has no vector version whose bits it would have to match, so the plain expression does.
+  // In float64 there is no vector version with the same bits, so the plain expression is enough.
   static T fma1(T a, T b, T c) {
     if constexpr (sizeof(T) == 4) return std::fma(a, b, c);
     return a * b + c;
@@ -133,7 +133,7 @@ struct PlainLanes {
   static PlainLanes floor(PlainLanes a) {
     return make([&](int i) { return std::floor(a.v[i]); });
   }
-  // a in [1/2, 2], n an integer in [-126, 0]: a 2^n, NaN for NaN.
+  // Returns a 2^n for a in [1/2, 2] and an integer n in [-126, 0]; NaN if n is NaN (a is NaN then, too).
   static PlainLanes scale_exponent(PlainLanes a, PlainLanes n) {
     return make([&](int i) {
       if (n.v[i] != n.v[i]) return a.v[i];
@@ -153,7 +153,7 @@ struct PlainLanes {
   static PlainLanes keep(Mask m, PlainLanes a) {  // a where m, else +0
     return make([&](int i) { return m.v[i] ? a.v[i] : T(0); });
   }
-  Int to_int() const {  // truncates; the lowest integer where the value does not fit
+  Int to_int() const {  // truncates; a value that does not fit becomes the lowest integer
     Int r;
     for (int i = 0; i < kLanes; ++i) {
       r.v[i] = std::fabs(v[i]) < T(2147483648.0) ? static_cast<std::int32_t>(v[i]) : INT32_MIN;

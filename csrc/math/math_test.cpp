@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Every derivative of the maths headers against central differences in double, and the forward formulas at
-// the ends of the float range against double.
+// These tests compare every derivative of the maths headers with central differences in double, and the
+// forward formulas in float, at the ends of the float range, with those in double.
 #include <functional>
 #include <limits>
 #include <random>

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Morton (Z-order) codes: points that follow each other along the curve lie close together.
+// Morton (Z-order) codes: points with neighbouring codes lie close together.
 #pragma once
 #include <algorithm>
 #include <cstdint>
@@ -8,11 +8,13 @@
 
 namespace blitzgs {
 
+// The grid of cells of a cloud of points: its low corner and the resolution.
 struct MortonFrame {
   double low[3];
   double cells_per_unit;  // 2^21 cells along the longest axis
 };
 
+// Moves bit i of the lowest 21 bits to bit 3 i.
 BLITZGS_HD std::uint64_t spread_bits(std::uint64_t x) {
   x &= 0x1fffff;
   x = (x | x << 32) & 0x1f00000000ffffULL;
@@ -29,7 +31,7 @@ BLITZGS_HD bool is_finite_point(const T* p) {
   return sum == T(0);
 }
 
-// All ones for a point that is not finite: it sorts last.
+// The code of a point. A point that is not finite gets all ones, so that it sorts last.
 template <class T>
 BLITZGS_HD std::uint64_t morton_code(const T* p, const MortonFrame& frame) {
   if (!is_finite_point(p)) return ~std::uint64_t{0};
@@ -42,7 +44,7 @@ BLITZGS_HD std::uint64_t morton_code(const T* p, const MortonFrame& frame) {
   return code;
 }
 
-// The frame of a cloud from its corners.
+// The frame of a cloud from the corners of its bounding box.
 BLITZGS_HD MortonFrame make_morton_frame(const double* low, const double* high) {
   MortonFrame frame{{low[0], low[1], low[2]}, 0.0};
   double extent = 0;
@@ -53,7 +55,7 @@ BLITZGS_HD MortonFrame make_morton_frame(const double* low, const double* high) 
   return frame;
 }
 
-// Host: the frame around all finite points.
+// The frame of all finite points, on the host.
 template <class T>
 MortonFrame morton_frame_of(const T* points, std::int64_t n) {
   double low[3] = {0, 0, 0}, high[3] = {0, 0, 0};

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The frame of a cloud on the GPU, without visiting the host.
+// The Morton frame (morton.h) of a cloud of points, computed on the GPU so that the host need not wait for
+// it.
 #pragma once
 #include <cstdint>
 
@@ -9,7 +10,7 @@
 
 namespace blitzgs::cuda {
 
-// Floats as integers of the same order, so that atomicMin/Max find the bounds of the cloud.
+// Maps floats to integers of the same order, so that atomicMin and atomicMax find the bounds of the cloud.
 __device__ inline std::int32_t ordered(float x) {
   const std::int32_t bits = __float_as_int(x);
   return bits < 0 ? bits ^ 0x7fffffff : bits;
@@ -23,12 +24,15 @@ struct MortonBounds {
   std::int32_t finite;  // number of finite points
 };
 
+// Sets the bounds to those of no points. One warp.
 static __global__ void reset_bounds(MortonBounds* bounds) {
   const int axis = threadIdx.x;
   if (axis < 3) bounds->low[axis] = INT32_MAX, bounds->high[axis] = INT32_MIN;
   if (axis == 3) bounds->finite = 0;
 }
 
+// Finds the bounding box and the number of the finite points of points [n, 3]. One thread per point, in a
+// grid-stride loop.
 static __global__ void find_bounds(const float* points, std::int64_t n, MortonBounds* bounds) {
   std::int32_t low[3] = {INT32_MAX, INT32_MAX, INT32_MAX}, high[3] = {INT32_MIN, INT32_MIN, INT32_MIN},
                finite = 0;

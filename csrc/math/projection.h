@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// EWA projection of one Gaussian into one pinhole camera, and its derivative. The covariance is carried as
-// the 2x3 factor M = J W A (Sigma' = M M^T + eps I): the determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is
-// then a sum of non-negative terms, where the usual ac - b^2 cancels for elongated splats.
+// EWA projection of one Gaussian into one pinhole camera (docs/image.md, section 2), and its derivative. W is
+// the world-to-camera rotation. The covariance is kept as its 2x3 factor M = J W A with rows m0 and m1, so
+// Sigma' = M M^T + eps I. The determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is then a sum of non-negative
+// terms, while the usual ac - b^2 cancels for elongated splats.
 #pragma once
 #include "math/gaussian.h"
 
@@ -16,8 +17,8 @@ struct Camera {
   T slope_min_x, slope_max_x, slope_min_y, slope_max_y;
 };
 
-// viewmat [4, 4] and K [3, 3] row-major. The slopes leave 0.15 of the image size beyond each border, which
-// is 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t.
+// viewmat [4, 4] and K [3, 3] row-major. The slopes leave 0.15 of the image size beyond each border, which is
+// 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t.
 template <class T>
 BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int height) {
   Camera<T> camera;
@@ -39,7 +40,7 @@ BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int he
   return camera;
 }
 
-// Where a mean is projected to. This is computed in double: in float, the rounding of the rotation alone
+// The projection of a mean. It is computed in double, because in float the rounding of the rotation alone
 // would move a splat by hundreds of ulps of its pixel position.
 struct ProjectedMean {
   double slope_x, slope_y, z, inverse_z;  // x/z, y/z, camera-space depth
@@ -89,8 +90,8 @@ BLITZGS_HD PixelGradients<T> pixel_gradients(const Camera<T>& camera, const Proj
   return g;
 }
 
-// The footprint of a Gaussian in the image: M's rows, the blurred covariance's diagonal, its inverse (conic
-// a, b, c) and determinant.
+// The footprint of a Gaussian in the image: the rows of M, and of the blurred covariance Sigma' the diagonal,
+// the inverse (conic a, b, c) and the determinant.
 template <class T>
 struct Footprint {
   Vec3<T> m0, m1;
@@ -103,8 +104,8 @@ struct Footprint {
   T blur;           // eps2d, divided by `magnitude`
 };
 
-// Quantities are divided by the larger diagonal entry before they are multiplied, so that neither 1e-8 nor
-// 1e4 pixel scales leave the range of float.
+// Computes the footprint. Quantities are divided by the larger diagonal entry before they are multiplied, so
+// that scales from 1e-8 to 1e4 pixels stay in the range of float.
 template <class T>
 BLITZGS_HD Footprint<T> make_footprint(const PixelGradients<T>& g, const Columns3<T>& axes, T eps2d) {
   Footprint<T> s;
@@ -128,10 +129,11 @@ BLITZGS_HD Footprint<T> make_footprint(const PixelGradients<T>& g, const Columns
   return s;
 }
 
-// The conic as it is stored. The length of a splat along its axis depends on ac - b^2. Rounding a, b and c to
-// float changes that difference by up to ac / (ac - b^2) roundings, which is 1e-3 of it for a splat that is a
-// hundred times longer than wide. The function therefore tries floats next to a, scales b with a (the axis
-// has the direction (-b, a)), and keeps the pair for which some float c gives the determinant best.
+// Writes the conic (a, b, c) to conic [3]. The length of a splat along its axis depends on ac - b^2. Rounding
+// a, b and c to float changes that difference by up to ac / (ac - b^2) roundings, which is 1e-3 of it for a
+// splat that is a hundred times longer than wide. The function therefore tries floats next to a, scales b
+// with a (the axis has the direction (-b, a)), and keeps the pair for which some float c gives the best
+// determinant.
 template <class T>
 BLITZGS_HD void store_conic(const Footprint<T>& s, T* conic) {
   for (int i = 0; i < 3; ++i) conic[i] = s.conic[i];
@@ -165,8 +167,8 @@ BLITZGS_HD T compensation(const Footprint<T>& s) {
 
 // Gradients of the rows of M from those of the conic (b counted once) and of the compensation. With Q the
 // conic matrix, d(Sigma'^-1) = -Q dSigma' Q and d log det Sigma' = tr(Q dSigma'), so v_M = -2 (Q V + v / 2) Q
-// M. Computed as a matrix product, Q M loses every digit for a splat a thousand times longer than wide. The
-// form (m1 x n + eps m0, n x m0 + eps m1) / det with n = m0 x m1 loses none.
+// M. As a matrix product, Q M would lose all digits for a splat that is a thousand times longer than wide.
+// The form (m1 x n + eps m0, n x m0 + eps m1) / det with n = m0 x m1 loses none.
 template <class T>
 BLITZGS_HD void footprint_vjp(const Footprint<T>& s, const T* v_conic, T v_compensation, Vec3<T>* v_m0,
                               Vec3<T>* v_m1) {
@@ -188,7 +190,7 @@ BLITZGS_HD void footprint_vjp(const Footprint<T>& s, const T* v_conic, T v_compe
   *v_m1 = *v_m1 + cross(v_normal, s.m0);
 }
 
-// Gradients of M's rows to those of J W (v_gx, v_gy) and of the axes (added to v_axes).
+// From the gradients of the rows of M: sets those of J W (v_gx, v_gy) and adds those of the axes to v_axes.
 template <class T>
 BLITZGS_HD void factor_vjp(const PixelGradients<T>& g, const Columns3<T>& axes, const Vec3<T>& v_m0,
                            const Vec3<T>& v_m1, Vec3<T>* v_gx, Vec3<T>* v_gy, Columns3<T>* v_axes) {
@@ -205,8 +207,8 @@ struct PoseGradient {
   Vec3<T> row_x, row_y, row_z, translation;
 };
 
-// Gradient of the camera-space mean from those of J W, of the pixel position and of the depth; the rows of
-// the rotation, on which J W depends directly, are added to pose (null: not wanted).
+// Returns the gradient of the camera-space mean from those of J W, of the pixel position and of the depth.
+// J W also depends on the rows of the rotation; their gradients are added to pose (null: not wanted).
 template <class T>
 BLITZGS_HD Vec3<T> pixel_gradients_vjp(const Camera<T>& camera, const ProjectedMean& p,
                                        const PixelGradients<T>& g, const Vec3<T>& v_gx, const Vec3<T>& v_gy,
@@ -242,7 +244,7 @@ BLITZGS_HD void camera_point_vjp(const Camera<T>& camera, const Vec3<T>& mean, c
   }
 }
 
-// c = -W^T t: gradient v_c of the camera centre to the pose.
+// c = -W^T t: adds the pose's gradient from the gradient v_c of the camera centre.
 template <class T>
 BLITZGS_HD void camera_centre_vjp(const Camera<T>& camera, const Vec3<T>& v_c, PoseGradient<T>* pose) {
   const Vec3<T>& t = camera.translation;

@@ -1,19 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which tiles a splat touches: the test that projection (counting) and intersection (listing) share, on
-// every backend.
+// The test of which tiles a splat touches (docs/image.md, section 3). The projection counts tiles by it and
+// the intersection lists them by it, on every backend.
 //
-// A splat is drawn where opacity * exp(-q/2) >= 1/255 with q = a dx^2 + 2 b dx dy + c dy^2, that is inside
-// the ellipse q <= 2 ln(255 opacity). A tile is listed iff, over its pixel rows, that ellipse spans at least
-// one of its pixel columns: per tile row the x-interval of the ellipse over the band of pixel centres is
-// found in closed form (the interval is widest at the clamped turning point), so the cost is O(tile rows).
+// A splat is composited where opacity * exp(-q/2) >= 1/255 with q = a dx^2 + 2 b dx dy + c dy^2, that is
+// inside the ellipse q <= 2 ln(255 opacity). Consider the band of pixel centres of one row of tiles. The part
+// of the ellipse in this band spans an interval of x, whose ends have a closed form: the interval is widest
+// at the turning point of the ellipse, clamped to the band. The splat touches the tiles of the row with a
+// pixel column in this interval. The cost is O(tile rows).
 //
 // The test is conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q, and the interval by
 // some float roundings. This covers the rounding of the test itself and of the rasterisers, which evaluate q
 // as factor_conic() writes it. A tile that is not listed therefore gets no contribution from the splat. A
 // splat that is not finite, not convex (a <= 0 or c <= 0) or too faint (opacity < 1/255) touches no tile.
 //
-// Every kernel must count the same tiles, because the count of one sizes the buffer of another. Expressions
-// here therefore leave the compiler no choice of contraction.
+// Every kernel must count the same tiles, because the count of one kernel is the buffer size of another. The
+// expressions here therefore use mul() and mul_add(), which the compiler cannot contract differently.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -64,7 +65,7 @@ BLITZGS_HD bool finite(T value) {
   return value - value == T(0);
 }
 
-// x / size for x >= 0, as a shift where the size is a power of two, which tile sizes usually are.
+// x / size for x >= 0. If the size is a power of two, as tile sizes usually are, the division is a shift.
 struct Divider {
   int size, shift;
 
@@ -78,9 +79,10 @@ struct Divider {
 
 }  // namespace tiles
 
-// conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2: never negative, and free of the cancellation that
-// ruins a dx^2 + 2 b dx dy + c dy^2 for thin splats. A conic that rounding made indefinite gets l22 = 0: a
-// splat that is so long is constant along its axis. The products of floats are exact in double.
+// The factor L of conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2. This form is never negative, and it
+// is free of the cancellation in a dx^2 + 2 b dx dy + c dy^2 for thin splats. A conic that rounding made
+// indefinite gets l22 = 0: a splat that is so long is constant along its axis. The products of floats are
+// exact in double.
 template <class T>
 struct ConicFactor {
   T l11, l21, l22;
@@ -111,14 +113,14 @@ BLITZGS_HD ConicFactor<T> factor_conic(const T* conic) {
 template <class T>
 struct SplatEllipse {
   T cut;      // q <= cut
-  T shear;    // the ellipse's chord at height dy is centred on dx = -shear * dy
-  T inv_l11;  // half a chord: sqrt(cut - (l22 dy)^2) * inv_l11
+  T shear;    // the row at height dy meets the ellipse in a chord that is centred on dx = -shear * dy
+  T inv_l11;  // half the length of this chord is sqrt(cut - (l22 dy)^2) * inv_l11
   T l22;
   T half_width, half_height;  // of the bounding box, infinite for a stripe
   T turn;                     // dy of the rightmost point; the leftmost has -turn
 };
 
-// False when the splat is drawn nowhere.
+// Returns false if the splat touches no pixel.
 template <class T>
 BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse) {
   const T a = conic[0], b = conic[1], c = conic[2];
@@ -141,8 +143,8 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
   return tiles::finite(ellipse->shear) && tiles::finite(ellipse->inv_l11);
 }
 
-// First and last index of the pixel centres i + 0.5 in [low, high], within [0, size); empty: first > last. A
-// bound that is NaN is ignored.
+// Sets the first and last index of the pixel centres i + 0.5 in [low, high], within [0, size); first > last
+// if there is none. A bound that is NaN is ignored.
 template <class T>
 BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
   *first = static_cast<int>(std::ceil(tiles::clamp_nan_low(low - T(0.5), T(0), static_cast<T>(size))));
@@ -199,10 +201,8 @@ BLITZGS_HD void for_each_tile(const T* mean2d, const T* conic, T opacity, int wi
   });
 }
 
-// Which ranks need a splat: each rank composites a range of the flattened tiles of all cameras
-// (math/tiles.h).
-
-// Rank m composites tiles [begin[m], end[m]). Ranges may be empty and may overlap; their begins ascend.
+// The tiles of each rank: rank m composites the flattened tiles [begin[m], end[m]) of all cameras. Ranges may
+// be empty and may overlap; their begins ascend.
 struct RankTiles {
   std::int64_t begin[kMaxRanks], end[kMaxRanks];
   int n_ranks;

@@ -5,8 +5,6 @@
 
 #include "common/kernel.h"
 
-// Products and sums whose rounding does not depend on compiler options.
-
 namespace blitzgs {
 
 // a b + c. On a GPU this is a fused multiply-add. On a CPU the compiler must not contract products (the build

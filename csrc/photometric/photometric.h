@@ -1,28 +1,31 @@
 // SPDX-License-Identifier: Apache-2.0
-// Fused L1 and SSIM of rendered views against their images, and the gradient to the renders.
+// The photometric loss (docs/image.md, Loss): fused L1 and SSIM of rendered views against their images, and
+// the gradient by the renders.
 //
 //   l1[b]   = sum over owned, unmasked pixels and channels of |x - y|
 //   ssim[b] = sum over the same of SSIM(x, y), Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5, zero
 //             padding, C1 = 0.01^2, C2 = 0.03^2
 //
-// x renders [B, H, W, 3]; y targets of the same shape, uint8 (value / 255) or the dtype of x; masks uint8 [B,
-// H, W], 0 = excluded from the sums (windows centred at other pixels still read the pixel). The caller
+// x renders [B, H, W, 3]; y targets of the same shape, uint8 (value / 255) or the dtype of x; masks uint8
+// [B, H, W], 0 = excluded from the sums (windows centred at other pixels still read the pixel). The caller
 // divides by the number of pixels. Owned pixels are those of the tiles [tile_begin, tile_end) of the B views,
 // tile index (b * tiles_y + ty) * tiles_x + tx; the forward reads x up to 5 pixels beyond them.
 //
-// v_renders = d(sum_b l1_weights[b] l1[b] + ssim_weights[b] ssim[b]) / dx for the sums over ALL tiles,
-// written for the owned pixels: the gradients of all owners together are the gradient of the whole. Elsewhere
-// v_renders is zero with clear_rest, otherwise zero or not written. It reads x up to 10 pixels beyond the
-// owned tiles. The derivative of |x - y| at 0 is 0. With samples [B], the weights of view b are divided by
-// samples[b]. The kernel also writes scale_reg[b] = scale_weight / max(visible[b], 1), the weight of the
-// training loss's other term.
+// The gradient is v_renders = d(sum_b l1_weights[b] l1[b] + ssim_weights[b] ssim[b]) / dx for the sums over
+// ALL tiles. Each rank computes it for its owned pixels, so the gradients of all ranks together are the
+// gradient of the whole. For other pixels v_renders is zero with clear_rest, otherwise zero or not written.
+// The gradient reads x up to 10 pixels beyond the owned tiles. The derivative of |x - y| at 0 is 0. With
+// samples [B], the weights of view b are divided by samples[b]. The kernel also writes
+// scale_reg[b] = scale_weight / max(visible[b], 1), the weight of the scale term of the training loss.
 //
-// With e = mean(x) - mean(y), P = E[x^2 + y^2], Q = E[(x - y)^2] under the window, SSIM is computed as (1 -
-// e^2 / A) (1 - V / S), A = mean(x)^2 + mean(y)^2 + C1, V = Q - e^2 (variance of x - y), S = P - mean(x)^2 -
-// mean(y)^2 + C2, the textbook quotient rearranged: it needs four windowed quantities rather than five and
-// stays accurate in flat regions, where var(x) + var(y) cancels. Separable windows: O(22 B H W) multiply-adds
-// a quantity. The sums are written in parts, double [B, K, 2]: each part is the sum over a fixed block of
-// pixels in a fixed order, and zero where the block has no pixel. report/report.h adds the parts up. The
+// SSIM is computed from four windowed quantities: mean(x), e = mean(x) - mean(y), P = E[x^2 + y^2] and
+// Q = E[(x - y)^2]. With A = mean(x)^2 + mean(y)^2 + C1, V = Q - e^2 (the variance of x - y) and
+// S = P - mean(x)^2 - mean(y)^2 + C2, it is SSIM = (1 - e^2 / A) (1 - V / S). This is the textbook quotient
+// rearranged. It needs four quantities instead of five, and it stays accurate in flat regions, where
+// var(x) + var(y) cancels. The windows are separable, so a quantity takes O(22 B H W) multiply-adds.
+//
+// The sums are written in parts, double [B, K, 2]. Each part is the sum over a fixed block of pixels in a
+// fixed order, and zero if the block has no pixel; the op report (report/report.h) adds the parts up. The
 // result repeats bit for bit for any number of threads.
 #pragma once
 #include <cstdint>
@@ -37,7 +40,7 @@ constexpr int kSsimTaps = 2 * kSsimRadius + 1;
 template <class T>
 struct PhotometricArgs {
   const T* renders;
-  const T* targets;  // null where the targets are uint8
+  const T* targets;  // null if the targets are uint8
   const std::uint8_t* targets_u8;
   const std::uint8_t* masks;    // null: all pixels count
   const T* l1_weights;          // [B]; null: no gradient
@@ -55,7 +58,8 @@ struct PhotometricArgs {
   T window[kSsimTaps];
 };
 
-// The owned columns [begin, end) of one pixel row: always an interval, as a tile range is contiguous.
+// The owned columns [begin, end) of one pixel row. They form an interval because the range of tiles is
+// contiguous.
 struct OwnedColumns {
   int begin, end;
 };
@@ -90,7 +94,7 @@ struct SsimTerms {
   T value, by_mean, by_p, by_q;
 };
 
-// The reciprocal of a normal number; on a GPU to within 1 ulp.
+// The reciprocal of a normal number; on a GPU its error is at most 1 ulp.
 template <class T>
 BLITZGS_HD T reciprocal(T x) {
 #ifdef __CUDA_ARCH__

@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// One kernel for all owned pixels of all views; nothing between the images and the gradient leaves the chip.
-// A block streams a strip of rows downwards, four rows a round, through five steps:
-//   1 vertical windows of the images: a thread holds one column and keeps the partial sums of the 10 windows
-//     that are open there in registers (the shift to the next row is free: it is the destination of the
-//     multiply-add), so an input is read once;
-//   2 horizontal windows, four neighbouring pixels a thread from four 16-byte shared loads a quantity;
-//     SSIM of each pixel, its sums and its three derivatives;
-//   3 vertical windows of the derivatives, as 1;
-//   4 horizontal windows of those, as 2;
-//   5 the gradient, written with the threads on the columns again.
-// All five run together, each one round behind the step before it: one barrier a round. A pixel's arithmetic
-// does not depend on how the image is cut into strips.
+// The photometric loss on CUDA: one kernel for all owned pixels of all views. Intermediate values stay in
+// registers and shared memory. A block goes down a strip of rows, four rows in each round, in five steps:
+//   1 Vertical windows of the images. A thread has one column and keeps the partial sums of the 10 incomplete
+//     windows of this column in registers, so each input is read once. (The shift of the sums to the next row
+//     costs nothing, because the multiply-add writes to the shifted register.)
+//   2 Horizontal windows. A thread computes four neighbouring pixels from four 16-byte shared loads per
+//     quantity, then the SSIM of each pixel, its sums and its three derivatives.
+//   3 Vertical windows of the derivatives, as in step 1.
+//   4 Horizontal windows of these, as in step 2.
+//   5 The gradient; a thread has one column again.
+// All five steps run in every round, each on the rows that the step before it handled one round earlier, with
+// one barrier per round. The arithmetic of a pixel does not depend on how the image is divided into strips.
 #include <algorithm>
 #include <climits>
 
@@ -30,16 +30,16 @@ struct Shared {
   float results[3][kRows][3][kOutPitch];  // 4 -> 5
 };
 
-// How many rows above its first row a strip starts to read, and the round of its first window. They are
-// chosen so that sums are added in the same order with and without a gradient.
+// kLead: how many rows above its first row a strip starts to read. kWindowRound: the round of its first
+// windows. They are chosen such that sums are added in the same order with and without a gradient.
 template <bool kGradient>
 constexpr int kLead = kGradient ? 2 * kSsimRadius : kSsimRadius + 1;
 constexpr int kWindowRound = 2;
 constexpr int kOutRound = 5;
 static_assert(kRows * kOutRound == 4 * kSsimRadius);
 
-// Each step has two forms. The plain form serves rounds whose rows all exist and are owned as a whole,
-// without a mask; nearly all rounds are of this kind.
+// One block's work on its strip. Steps 2 and 5 have two forms. The plain form is for rounds whose rows are
+// all inside the image and owned as a whole, without a mask; nearly all rounds are of this kind.
 template <bool kBytes, bool kGradient, bool kSums>
 class StripWalk {
  public:
@@ -88,7 +88,7 @@ class StripWalk {
       }
       if (round >= kWindowRound + 1 && round < rounds + 1) {
         const int top = row - kRows - kSsimRadius;
-        // Without sums, and for rows beyond the strip, ownership does not matter.
+        // Ownership matters only for sums, and only for rows of the strip.
         const bool simple = !args_.masks && (kSums && top + kRows > strip_.begin && top < strip_.end
                                                  ? plain(top)
                                                  : top >= 0 && top + kRows <= args_.height);
@@ -106,7 +106,7 @@ class StripWalk {
     }
   }
 
-  // The index of the part that takes this block's sums: part blockIdx.x of its strip.
+  // The index of this block's part of the sums: part blockIdx.x of its strip.
   __device__ __forceinline__ std::int64_t part(const Launch& launch) const {
     return (std::int64_t{strip_.view} * launch.view_strips + strip_.index) * gridDim.x + blockIdx.x;
   }
@@ -119,10 +119,12 @@ class StripWalk {
     return !args_.masks && top >= whole_.begin && top + kRows <= whole_.end;
   }
 
+  // Whether the mask includes the pixel.
   __device__ __forceinline__ bool counted(int row, int pixel) const {
     return !args_.masks || args_.masks[image_ + std::int64_t{row} * args_.width + pixel];
   }
 
+  // Loads this thread's column of the images for the rows of the next round.
   __device__ __forceinline__ void load(int row) {
     const bool all = row >= 0 && row + kRows <= args_.height;
 #pragma unroll
@@ -134,6 +136,7 @@ class StripWalk {
     }
   }
 
+  // Step 1, and the sum of |x - y|. keep: windows are complete from this round on.
   __device__ __forceinline__ void image_columns(Shared& shared, int top, bool keep) {
     float differences[kRows];
 #pragma unroll
@@ -162,7 +165,7 @@ class StripWalk {
     }
   }
 
-  // Computes the windows centred on the rows of the round from `top` on.
+  // Step 2: the windows that are centred on the rows of the round from `top` on.
   template <bool kPlain>
   __device__ __forceinline__ void windows(Shared& shared, int top) {
     if (threadIdx.x >= kRows * 3 * kMidGroups) return;
@@ -171,7 +174,7 @@ class StripWalk {
 #pragma unroll
     for (int q = 0; q < 4; ++q)
       convolve4(args_.window, &shared.inputs[q][item.row][item.channel][item.pixel], sums[q]);
-    const int row = top + item.row, column = item.pixel - kSsimRadius;  // in the block
+    const int row = top + item.row, column = item.pixel - kSsimRadius;  // column: in the block
     const bool in_rows = kPlain || (row >= 0 && row < args_.height);
     const bool in_strip = kSums && row >= strip_.begin && row < strip_.end;
     float by_mean[4], by_p[4], by_q[4];
@@ -198,6 +201,7 @@ class StripWalk {
     }
   }
 
+  // Step 3.
   __device__ __forceinline__ void map_columns(Shared& shared) {
     if (!has_map_column_) return;
     const int channel = threadIdx.x / kMid, local = threadIdx.x % kMid;
@@ -211,6 +215,7 @@ class StripWalk {
     }
   }
 
+  // Step 4.
   __device__ __forceinline__ void map_rows(Shared& shared) {
     if (threadIdx.x >= kRows * 3 * kOutGroups) return;
     const Item item = item_of<kOutGroups>(threadIdx.x);
@@ -223,7 +228,7 @@ class StripWalk {
     }
   }
 
-  // Handles the rows of the round from `top` on.
+  // Step 5: writes the gradient of the rows of the round from `top` on.
   template <bool kPlain>
   __device__ __forceinline__ void write_gradient(const Shared& shared, int top) {
     if (local_ >= width_) return;
@@ -255,7 +260,7 @@ class StripWalk {
   const Strip strip_, whole_;
   const int first_pixel_, width_, first_row_, stride_;
   const std::int64_t image_;
-  const int channel_, local_;  // of this thread's column: channels interleaved, as in memory
+  const int channel_, local_;  // the channel and the pixel of this thread's column, interleaved as in memory
   bool has_column_, in_core_, has_map_column_ = false;
   std::int64_t next_, out_;  // the elements that this thread reads and writes next
   float ssim_weight_ = 0, l1_weight_ = 0;
@@ -265,7 +270,7 @@ class StripWalk {
   float map_pending_[3][kPending] = {};
 };
 
-// Zeroes the parts of strips that a view does not have, because it has fewer strips than others.
+// Sets the parts of missing strips to zero: a view may have fewer strips than others.
 __device__ void clear_parts(const PhotometricArgs<float>& args, const Launch& launch) {
   const int rows = static_cast<int>(args.views) * launch.view_strips;
   for (int i = blockIdx.y; i < rows; i += gridDim.y) {
@@ -275,6 +280,9 @@ __device__ void clear_parts(const PhotometricArgs<float>& args, const Launch& la
   }
 }
 
+// The loss and its gradient (photometric.h). The grid is (blocks of kOut pixels in a row, strips of all
+// views). Reads renders, targets and masks; writes parts [B, K, 2] (kSums), v_renders [B, H, W, 3] and
+// scale_reg [B] (kGradient).
 template <bool kBytes, bool kGradient, bool kSums>
 __global__ void __launch_bounds__(kThreads, 2)
     photometric_kernel(const __grid_constant__ PhotometricArgs<float> args,
@@ -301,11 +309,11 @@ __global__ void __launch_bounds__(kThreads, 2)
 
 int cut(int rows, int rows_per_strip) { return (rows + rows_per_strip - 1) / rows_per_strip; }
 
-// How many blocks cover the width of an image.
+// The number of blocks that cover the width of an image.
 int block_columns(const PhotometricArgs<float>& args) { return (args.width + kOut - 1) / kOut; }
 
-// Cuts the owned rows into strips so that the blocks fill whole waves of the device and few rows are read
-// twice.
+// Divides the owned rows into strips such that the blocks fill whole waves of the device and few rows are
+// read twice.
 Launch cut_strips(const PhotometricArgs<float>& args) {
   Launch result{};
   result.view_strips = 1;
@@ -321,7 +329,7 @@ Launch cut_strips(const PhotometricArgs<float>& args) {
       std::min(args.height, static_cast<int>((last % tiles / args.tiles_x + 1) * args.tile_size));
   const int views = launch->last_view - launch->first_view;
   const int first_rows = (views ? args.height : launch->end_row) - launch->begin_row;
-  constexpr int kLeadCost = 24;  // rows of work before the first output
+  constexpr int kLeadCost = 24;  // the work of a strip before its first output, in rows
   std::int64_t best_cost = LLONG_MAX;
   for (int pieces = 1; pieces <= cut(args.height, 16); ++pieces) {
     const int rows = cut(cut(args.height, pieces), kRows) * kRows;
@@ -359,7 +367,7 @@ void launch_strips(dim3 grid, const PhotometricArgs<float>& args, const Launch& 
   }
 }
 
-// Zeros v_renders before and after the rows that hold an owned pixel.
+// Sets v_renders to zero before the first row and after the last row with an owned pixel.
 void clear_rest(const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
   const std::int64_t row = 3 * std::int64_t{args.width};
   const std::int64_t begin = (std::int64_t{launch.first_view} * args.height + launch.begin_row) * row;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Pieces of the CUDA kernels in photometric_cuda.cu: sizes, ownership, the two passes of a window.
+// Helpers of the kernel in photometric_cuda.cu: sizes, ownership, the vertical and horizontal windows.
 #pragma once
 #include <type_traits>
 
@@ -10,27 +10,28 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kOut = 64;                      // pixels of a block's row
-constexpr int kMid = kOut + 2 * kSsimRadius;  // windows that contain these pixels
-constexpr int kIn = kMid + 2 * kSsimRadius;   // pixels that these windows contain
+constexpr int kOut = 64;                      // pixels in a row of a block
+constexpr int kMid = kOut + 2 * kSsimRadius;  // windows in a row that contain some of these pixels
+constexpr int kIn = kMid + 2 * kSsimRadius;   // pixels in a row that these windows contain
 constexpr int kRows = 4;                      // rows per round
 constexpr int kMidGroups = (kMid + 3) / 4;    // horizontal items of a row and channel: four windows each
 constexpr int kOutGroups = kOut / 4;
-constexpr int kInPitch = 88;  // shared rows: the last item reads 16 values from pixel 72
+constexpr int kInPitch = 88;  // pitch of shared rows: the last item reads 16 values from pixel 72 on
 constexpr int kMidPitch = 76;
 constexpr int kOutPitch = 68;
 constexpr int kPending = kSsimTaps - 1;
 static_assert(3 * kIn <= kThreads && kRows * 3 * kMidGroups <= kThreads && kOut % 4 == 0);
 
-// The rows that hold an owned pixel, cut into strips: those of the first view, then of the next, ...
+// The division of the rows with owned pixels into strips: first those of the first view, then those of the
+// next, and so on.
 struct Launch {
   int first_view, last_view;
-  int begin_row, end_row;  // of the first view; one past the last of the last view
-  int rows_per_strip, first_strips, view_strips;
-  int strips;  // of all views
+  int begin_row, end_row;  // the first owned row of first_view; one past the last owned row of last_view
+  int rows_per_strip, first_strips, view_strips;  // first_strips: of first_view; view_strips: of a whole view
+  int strips;                                     // of all views
 };
 
-// Rows [begin, end) of a view; the index-th of the view's strips.
+// Strip number `index` of a view: its rows [begin, end).
 struct Strip {
   int view, index, begin, end;
 };
@@ -74,8 +75,8 @@ __device__ inline bool owns_pixel(const PhotometricArgs<float>& args, int view, 
   return column >= owned.begin && column < owned.end;
 }
 
-// Targets stay in the type in which they were loaded until they are used: a conversion right behind the load
-// would wait for it.
+// Targets keep the type in which they were loaded until they are used, because a conversion right after the
+// load would wait for the load.
 template <bool kBytes>
 using Target = std::conditional_t<kBytes, std::uint8_t, float>;
 
@@ -88,16 +89,16 @@ __device__ __forceinline__ const Target<kBytes>* targets_of(const PhotometricArg
   }
 }
 
-// The value is rounded before it is subtracted. If the compiler contracted the product into the difference,
-// equal pixels would not cancel.
+// The value of a target in [0, 1]. __fmul_rn rounds it: if the compiler contracted the product into a
+// following subtraction, the difference of equal pixels would not be zero.
 __device__ __forceinline__ float target_value(std::uint8_t target) {
-  // The integer becomes a float through its bits, because conversion instructions are slow.
+  // This converts the integer to a float through its bits, because conversion instructions are slow.
   const float value = __uint_as_float(0x4b000000u | target) - 8388608.0f;
   return __fmul_rn(value, 1.0f / 255.0f);
 }
 __device__ __forceinline__ float target_value(float target) { return target; }
 
-// Adds one input to the open windows of a column; returns the window that it completes.
+// Adds one input to the incomplete windows of a column and returns the window that it completes.
 __device__ __forceinline__ float advance(const float (&window)[kSsimTaps], float (&pending)[kPending],
                                          float value) {
   const float complete = fmaf(window[kSsimTaps - 1], value, pending[0]);
@@ -107,7 +108,8 @@ __device__ __forceinline__ float advance(const float (&window)[kSsimTaps], float
   return complete;
 }
 
-// Four neighbouring horizontal windows from a shared row; `row` points at the first pixel of the first.
+// Computes four neighbouring horizontal windows of a row in shared memory; `row` points to the first pixel of
+// the first window.
 __device__ __forceinline__ void convolve4(const float (&window)[kSsimTaps], const float* row,
                                           float (&out)[4]) {
 #pragma unroll
@@ -126,7 +128,7 @@ __device__ __forceinline__ void convolve4(const float (&window)[kSsimTaps], cons
   }
 }
 
-// The place of a horizontal item of a round; `pixel` is the first of its four pixels.
+// An item of a horizontal step, which one thread computes: four pixels of a row and channel, from `pixel` on.
 struct Item {
   int row, channel, pixel;
 };

@@ -24,7 +24,7 @@ struct PhotometricOutputs {
   std::optional<Tensor> parts, v_renders, scale_reg;
 };
 
-// The weights of the terms whose gradient is wanted.
+// The weights of the sums in the loss whose gradient is computed.
 struct PhotometricWeights {
   const Tensor& l1;
   const Tensor& ssim;

@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// One strip of rows on the CPU. The file is compiled twice, for the baseline and for AVX2, from the same
-// element-wise loops, so both give the same bits. Everything here has internal linkage, so that the linker
-// cannot mix the two.
+// The photometric loss of one strip of rows on the CPU. The file is compiled twice, for the baseline and for
+// AVX2. Both compile the same element-wise loops, so they give the same bits. Everything here has internal
+// linkage, so that the linker cannot mix the two.
 //
-// Rows stream downwards: an input row is convolved horizontally into a ring of 11 rows; the ring convolved
-// vertically gives the windows of the row 5 above; their derivatives go through a second ring and give the
-// gradient of the row 10 above. Channels are interleaved, so a tap's stride is 3 floats in a flat row.
+// A strip is computed from its first row to its last. Each input row is convolved horizontally into a ring of
+// 11 rows. The vertical convolution of the ring gives the windows of the row 5 above. Their derivatives go
+// through a second ring and give the gradient of the row 10 above. Channels are interleaved, so neighbouring
+// taps are 3 floats apart in a row.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -21,6 +22,7 @@ namespace {
 
 constexpr int kPad = 3 * kSsimRadius;
 
+// out [count] = the horizontal convolution of a row that is padded by kPad zeros on both sides.
 template <class T>
 void convolve_row(const T* window, const T* padded, std::int64_t count, T* out) {
 #pragma GCC ivdep
@@ -55,7 +57,7 @@ class PhotometricStrip {
     }
   }
 
-  // Rows [begin, end) of one view: adds to the sums and writes the gradient.
+  // Computes rows [begin, end) of one view: adds to the sums and writes the gradient.
   void run(std::int64_t view, int begin, int end, double* l1, double* ssim) {
     const bool gradient = args_.l1_weights != nullptr;
     const int reach = gradient ? kSsimRadius : 0;
@@ -154,7 +156,8 @@ class PhotometricStrip {
     return args_.masks ? args_.masks + (view * args_.height + row) * args_.width : nullptr;
   }
 
-  // Eight running sums keep the order of additions the same for every vector width.
+  // Adds the L1 and SSIM of the owned pixels of a row. Eight partial sums give the same order of additions
+  // for every vector width.
   void add_sums(std::int64_t view, int centre, double* l1, double* ssim) const {
     const OwnedColumns owned = owned_columns(args_, view, centre);
     const std::int64_t start = start_of(view, centre);
@@ -215,7 +218,7 @@ class PhotometricStrip {
   T* ring2_[3][kSsimTaps];
 };
 
-// Runs the listed strips; sums[2 s] and sums[2 s + 1] take the sums of strip s.
+// Computes strips[begin .. end). The sums of strip s are added to sums[2 s] (L1) and sums[2 s + 1] (SSIM).
 template <class T>
 void run_photometric_strips(const PhotometricArgs<T>& args, const std::int64_t* strips, std::int64_t begin,
                             std::int64_t end, double* sums) {

@@ -7,10 +7,11 @@
 //   gate = sigmoid(100 (threshold - o))
 //   means[i] += strength * gate * Sigma n,   n = three standard normal numbers of (ids[i], seed, step)
 //
-// So a Gaussian moves along its own axes, and one that the images need (o well above the threshold) stays
-// where it is: a gate below 2^-24 changes no mean, and such rows are left unread. The draws are float64 and
-// depend on the persistent id alone, so the noise is the same for any order of the rows and any number of
-// ranks. In place, one thread a row: deterministic. O(U).
+// A Gaussian therefore moves along its own axes, and a Gaussian with an opacity well above the threshold does
+// not move: a gate below 2^-24 changes no mean, so the other columns of such rows are not read. The draws are
+// float64 and depend on the persistent id, the seed and the step alone, so the noise is the same for any
+// order of the rows and any number of ranks. The means are updated in place, one thread per row:
+// deterministic. The cost is O(U).
 //
 // means [N, 3], quats [N, 4], scales [N, 3] (log), opacities [N] (logit), ids int64 [N], visible_ids int32
 // [U] (each row once). strength has the unit of an inverse length.
@@ -25,7 +26,7 @@ namespace blitzgs {
 
 constexpr double kGateSlope = 100;
 constexpr double kLeastGate = 0x1p-24;
-// Sets these draws apart from others of the same id and seed.
+// The key that makes these draws differ from other draws of the same id and seed.
 constexpr std::int64_t kPositionNoise = 1;
 
 template <class T>

@@ -5,6 +5,7 @@
 namespace blitzgs::cuda {
 
 namespace {
+// Adds the noise (position_noise.h) to the means, one thread per visible Gaussian.
 template <class T>
 __global__ void position_noise_kernel(const PositionNoiseArgs<T> args) {
   const std::int64_t u = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;

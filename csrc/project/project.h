@@ -1,29 +1,34 @@
 // SPDX-License-Identifier: Apache-2.0
-// Projection: N Gaussians and B views to splats, one for each Gaussian that a view sees. The arithmetic of
-// one splat is project_splat.h.
+// Projection (docs/image.md, sections 1, 2 and 4): turns N Gaussians and B views into splats, one for each
+// pair of a Gaussian and a view that sees it. project_splat.h holds the arithmetic of one splat.
 //
 // A splat exists iff near < z <= far, its opacity (compensated when antialiased) is >= 1/255, the box around
 // alpha >= 1/255 overlaps the image and reaches beyond radius_clip, its view is in the candidate's mask, and
-// its geometry is finite: a NaN or infinite parameter hides its Gaussian and spreads nowhere. With
-// radius_clip = 0 no dropped splat could have changed a pixel. A splat whose colour is not finite is there
-// but hidden: opacity, colour, radii and tiles_touched are 0, so nothing composites it (SH rows are by far
-// the most bytes, and are read once, for splats alone).
+// its geometry is finite. A NaN or infinite parameter therefore hides its own Gaussian and changes nothing
+// else. With radius_clip = 0 no dropped splat could have changed a pixel. A splat whose colour is not finite
+// exists but is hidden: its opacity, colour, radii and tiles_touched are 0, so the rasteriser skips it.
+// (Colours do not decide which splats exist, because SH rows are most of the bytes of a Gaussian and are read
+// once, for existing splats only.)
 //
 // Splats are ordered by (Gaussian, view). Every value of a splat depends on its Gaussian and view alone, so
-// splats are bit-identical however Gaussians are divided among calls. O(candidates * B + splats); no output
-// of size N.
+// splats are bit-identical however Gaussians are divided among calls. The cost is O(candidates * B + splats),
+// and no output has N rows.
 //
-// project() counts the splats and writes them, by three kernels on CUDA: the prefilter lists, from few bytes
-// per candidate, the views that may see it; write_splats projects those pairs, counts what are splats and
-// writes each behind those before it, in one launch; write_colors adds the colours. With a capacity given,
-// CUDA does all of that without waiting for the number of splats; without one it waits for the number and
-// then writes.
+// project() counts the splats and writes them. On CUDA it launches three kernels:
+// 1. prefilter (project_cuda.cu) reads the mean and the scales of each candidate and lists the candidates
+//    that some view may see, with those views;
+// 2. write_splats (write_splats_cuda.cu) projects the listed pairs of a candidate and a view, counts the
+//    pairs that are splats, and writes the splats in order, in one launch;
+// 3. write_colors (project_cuda.cu) computes the colour of each splat.
+// When the caller gives a capacity, CUDA queues all three without waiting for the number of splats. Without a
+// capacity project() waits for the number, allocates, and launches write_splats a second time.
 //
-// On several ranks, rank_tiles says which tiles each composites. The walk over a splat's tiles that counts
-// them then also finds the ranks that the splat has to reach.
+// On several ranks, rank_tiles holds the range of tiles that each rank composites. The loop that counts the
+// tiles of a splat then also finds the ranks that need the splat.
 //
-// project_bwd visits each visible Gaussian once, recomputes its splats and sums their gradients in splat
-// order: no atomics, deterministic. The pose gradient is summed in double over fixed blocks of Gaussians.
+// project_bwd (project_bwd_device.cuh on CUDA) visits each visible Gaussian once, recomputes its splats and
+// sums their gradients in splat order, so it needs no atomics and is deterministic. It sums the pose
+// gradients in double over fixed blocks of Gaussians.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -35,23 +40,25 @@
 #include "project/project_splat.h"
 #include "scatter/scatter.h"
 
-// Smooth levels: the opacity of a Gaussian fades out towards the distance beyond which a view leaves out its
-// octree level (view_gate.h), where the LOD gate alone would cut it off.
+// Smooth levels: the LOD gate (view_gate.h) drops an octree level from a view beyond a certain distance, the
+// reach of the level. With smooth levels the opacity of a Gaussian falls to zero towards this distance, so
+// that Gaussians do not disappear from one frame to the next.
 //
-// weight(d) = clamp((1 - d^2 / reach^2) f / (f - 1), 0, 1) for a mean at distance d from the camera: 0 from
-// `reach` on, 1 up to reach / sqrt(f), which is half a level nearer. Everything fainter by it follows from
-// the faded opacity: the alpha of a pixel, which splats exist, and which tiles they touch. What the gate
-// leaves out has the weight 0, so the gate before the projection saves work and changes nothing.
+// weight(d) = clamp((1 - d^2 / reach^2) f / (f - 1), 0, 1) for a mean at distance d from the camera. The
+// weight is 0 from `reach` on and 1 up to reach / sqrt(f), which is half a level nearer. The opacity of the
+// splat is multiplied by the weight. The alpha of a pixel, the existence of the splat and its tiles all
+// follow from this opacity. Every Gaussian that the gate drops has the weight 0, so applying the gate before
+// the projection saves work and changes no pixel.
 //
-// A weight is a constant for the gradient of means and poses: it says what a view shows, not where the
-// scene is. The opacity's gradient has it as a factor.
+// The gradients of means and poses treat the weight as a constant, because it chooses the level of detail and
+// does not describe the scene. The gradient of the opacity has the weight as a factor.
 
 namespace blitzgs {
 
 struct LevelFade {
-  const std::uint8_t* level;         // [N]; null: nothing fades
-  int n_levels;                      // a level beyond the last counts as the last
-  float inverse_reach2[kMaxLevels];  // 1 / reach^2; 0: kept at any distance
+  const std::uint8_t* level;         // [N], octree levels; null: nothing fades
+  int n_levels;                      // Gaussians of a higher level fade as those of level n_levels - 1
+  float inverse_reach2[kMaxLevels];  // by level: 1 / reach^2; 0: the level never fades
 };
 
 BLITZGS_HD float inverse_reach2_of(const LevelFade& fade, std::int64_t id) {
@@ -60,10 +67,11 @@ BLITZGS_HD float inverse_reach2_of(const LevelFade& fade, std::int64_t id) {
   return fade.inverse_reach2[level < last ? level : last];
 }
 
-// Where the projection's backward pass finds the gradients of the splats. Each source has the same three
-// members, for splat r: geometry(r), color(r), and whether there are colours at all.
+// The three sources from which the projection's backward pass reads the gradients of the splats. Each has the
+// same three members: geometry(r) and color(r), the gradients of splat r, and colored(), whether the source
+// has gradients of colours.
 
-// In columns: [P, 2], [P, 3], [P], [P], [P, 3]; depths and colors may be null (zero).
+// One array for each attribute: [P, 2], [P, 3], [P], [P], [P, 3]. depths and colors may be null (zero).
 template <class T>
 struct SplatGradientColumns {
   const T *means2d, *conics, *depths, *opacities, *colors;
@@ -78,7 +86,7 @@ struct SplatGradientColumns {
   BLITZGS_HD Vec3<T> color(std::int64_t r) const { return load3(colors + 3 * r); }
 };
 
-// In the table that the rasteriser's backward pass adds them up in.
+// The table [P] in which the rasteriser's backward pass sums the gradients.
 struct PackedSplatGradients {
   const SplatGradient* splats;
 
@@ -87,22 +95,23 @@ struct PackedSplatGradients {
     const SplatGradient& v = splats[r];
     return {{v.mean2d[0], v.mean2d[1]}, {v.conic[0], v.conic[1], v.conic[2]}, 0.f, v.opacity};
   }
-  // By member, so that the compiler knows the alignment.
+  // Reads each member by itself, because load3 would hide the alignment of the row from the compiler.
   BLITZGS_HD Vec3<float> color(std::int64_t r) const {
     const SplatGradient& v = splats[r];
     return {v.color[0], v.color[1], v.color[2]};
   }
 };
 
-// In such tables of all ranks that composited the splats (CUDA), added up in the order of ranks. The memory
-// is shared: `tables` are mapped here, each from this rank's first splat on.
+// One such table on each rank that composited the splats (CUDA). The gradient of a splat is the sum over
+// these tables in the order of the ranks. tables[m] points into the memory of rank m, which is mapped into
+// this process, at the first splat of this rank.
 struct RankSplatGradients {
   const SplatPlace* places;
   int n_ranks;
   const SplatGradient* tables[kMaxPeers];
-  std::int32_t sizes[kMaxPeers];  // this rank's splats in each
-  float* means2d;                 // null, or [P, 2]: where the projection's backward pass leaves these sums
-  bool absolute;                  // those of mean2d_abs instead
+  std::int32_t sizes[kMaxPeers];  // the number of this rank's splats in each table
+  float* means2d;                 // null, or [P, 2]: the backward pass writes the sums of v_means2d here
+  bool absolute;                  // writes the sums of mean2d_abs to means2d instead
 
   BLITZGS_HD bool colored() const { return true; }
   BLITZGS_HD GeometryGradient<float> geometry(std::int64_t r) const {
@@ -123,7 +132,7 @@ struct RankSplatGradients {
     }
     return sum;
   }
-  // The splat at rank m; null: that composited none of it.
+  // The gradient of splat r at rank m; null: rank m did not composite the splat.
   BLITZGS_HD const SplatGradient* at(int m, std::uint64_t r) const {
     const SplatPlace place = places[r / kPlaceSplats * n_ranks + m];
     const auto in_run = static_cast<std::uint32_t>(r % kPlaceSplats);
@@ -132,15 +141,15 @@ struct RankSplatGradients {
   }
 };
 
-// One that a kernel on CUDA reads; the CPU reads columns.
+// The source that a CUDA kernel reads. The CPU reads columns only.
 using SplatGradientSource =
     std::variant<SplatGradientColumns<float>, PackedSplatGradients, RankSplatGradients>;
 
-// means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3] or null; viewmats [B, 4, 4],
-// Ks [B, 3, 3]. Candidates: rows active_ids (ascending), or all N when null; bit v of active_views[c] allows
-// view v for candidate c (null: all views). n_active (CUDA, on the device): how many of the n_candidates
-// there are; null: all. n_blocks (where the inputs are): a number that is passed on to the totals; null: 0.
-// fade: of smooth levels.
+// means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3] or null; viewmats [B, 4, 4], Ks
+// [B, 3, 3]. The candidates are the rows active_ids [n_candidates] (ascending), or all N when null. Bit v of
+// active_views[c] allows view v for candidate c (null: all views). n_active (CUDA, a number in device memory)
+// says how many of the n_candidates entries are valid; null: all. n_blocks (one number in the memory of the
+// inputs) is copied to totals[kTotalBlocks]; null: 0. fade: the parameters of smooth levels.
 template <class T>
 struct ProjectInputs {
   const T *means, *quats, *scales, *opacities, *sh, *viewmats, *Ks;
@@ -153,10 +162,10 @@ struct ProjectInputs {
   const std::int32_t* n_blocks = nullptr;
 };
 
-// What project() sums up, int64 [project_totals(...)], where the inputs are: U visible Gaussians, P splats,
-// the tiles they touch (an upper bound: hidden splats count), the blocks of the table that some view may see
-// (blocks.h), the splats of each view [B], and for each rank its splats and the tiles they touch there [M,
-// 2].
+// The totals of project(), int64 [project_totals(...)], in the memory of the inputs: U visible Gaussians, P
+// splats, the tiles that the splats touch (an upper bound, because hidden splats count), the blocks of the
+// table that some view may see (blocks.h), the splats of each view [B], and for each rank the splats that it
+// composites and the tiles that these touch there [M, 2].
 inline constexpr int kTotalVisible = 0, kTotalSplats = 1, kTotalTiles = 2, kTotalBlocks = 3, kTotalViews = 4;
 
 BLITZGS_HD std::int64_t project_totals(std::int64_t n_views, std::int64_t n_ranks) {
@@ -167,26 +176,29 @@ inline constexpr std::int64_t kProjectBlock = 1024;
 
 inline std::int64_t project_blocks(std::int64_t items) { return (items + kProjectBlock - 1) / kProjectBlock; }
 
-// Visible Gaussians and splats.
+// Numbers of visible Gaussians and of splats.
 struct ProjectSizes {
   std::int64_t visible, splats;
 };
 
-// How many there is room for, and what there is, as project_totals where the inputs are; null: exactly so
-// many.
+// sizes: how many visible Gaussians and splats the columns have memory for. totals: the actual numbers, as
+// project_totals in the memory of the inputs; null: the actual numbers equal `sizes`.
 struct ProjectCapacity {
   ProjectSizes sizes;
   const std::int64_t* totals;
 };
 
-// Which Gaussian and view each splat is of, and where the splats of each visible Gaussian begin: [P], [P],
-// [U], [U + 1].
+// gaussian_ids [P] and camera_ids [P]: the Gaussian and the view of each splat. visible_ids [U]: the
+// Gaussians that have splats. The splats of visible_ids[u] are splat_offsets[u] to splat_offsets[u + 1] - 1;
+// [U + 1].
 struct ProjectIds {
   std::int32_t *gaussian_ids, *camera_ids, *visible_ids, *splat_offsets;
 };
 
-// colors is null without sh, rank_masks (bit m: rank m composites tiles of the splat) without ranks.
-// splat_ids: the persistent ids of the splats' Gaussians, from those of all, ids [N]; null: not wanted.
+// The values of the splats: means2d [P, 2], conics [P, 3], depths [P], opacities [P], colors [P, 3] (null
+// without sh), radii [P, 2], tiles_touched [P], rank_masks [P] (bit m: rank m composites tiles of the splat;
+// null on one rank). splat_ids [P] takes the persistent ids of the splats' Gaussians from ids [N], those of
+// all Gaussians; splat_ids null: not wanted.
 template <class T>
 struct ProjectOutputs {
   T *means2d, *conics, *depths, *opacities, *colors;
@@ -195,42 +207,43 @@ struct ProjectOutputs {
   const std::int64_t* ids;
 };
 
-// Where project() puts the splats.
+// The memory that project() writes the splats to.
 template <class T>
 struct ProjectColumns {
   ProjectIds ids;
   ProjectOutputs<T> values;
 };
 
-// Memory for the splats, from the caller of project().
+// The caller of project() implements this class to provide the memory for the splats.
 template <class T>
 class SplatMemory {
  public:
   virtual ~SplatMemory() = default;
-  // CUDA: splats for which the caller has asked for room before their number is known; null: as many as there
-  // are.
+  // CUDA: the capacity that the caller chose before the number of splats is known; null: project() waits for
+  // the number and allocates exactly as much.
   virtual const ProjectSizes* capacity() const = 0;
-  // Called once.
+  // project() calls this once, with the capacity or with the counted sizes.
   virtual ProjectColumns<T> allocate(const ProjectSizes&) = 0;
 };
 
-// Gradients by visible Gaussian, [U, ...] (sh [U, K, 3], null without sh), or, where `dense`, by Gaussian:
-// [N, ...], zeros, of which the rows of the visible are written. viewmats [B, 4, 4] or null.
+// The outputs of the backward pass. By default there is one row for each visible Gaussian, [U, ...] (sh
+// [U, K, 3], null without sh). With `dense` there is one row for each Gaussian, [N, ...]; the caller fills
+// them with zeros, and the backward pass writes the rows of visible Gaussians. viewmats [B, 4, 4] or null.
 template <class T>
 struct ProjectGradients {
   T *means, *quats, *scales, *opacities, *sh, *viewmats;
   bool dense = false;
 };
 
-// Terms of the training loss that look at no pixel, as weights per view, [B] each, or null: the loss grows by
-// scale[b] times the smallest axis (the paper's L_scale) and by opacity[b] times the opacity of each Gaussian
-// that has a splat in view b.
+// The terms of the training loss that do not depend on pixels, as weights per view, [B] each, or null (zero).
+// For each Gaussian that has a splat in view b, the loss has scale[b] times the smallest axis of the Gaussian
+// (the paper's L_scale) and opacity[b] times its opacity as summands.
 template <class T>
 struct Regularisers {
   const T *scale, *opacity;
 };
 
-// What the backward pass knows of the forward pass.
+// The outputs of the forward pass that the backward pass reads (ProjectIds); n_visible is U.
 struct SplatIndex {
   const std::int32_t *camera_ids, *visible_ids, *splat_offsets;
   std::int64_t n_visible;
@@ -245,8 +258,8 @@ void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradient
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cpu
 namespace cuda {
-// Where the splats do not fit into the capacity, the totals are right all the same; the columns then hold the
-// first splats without colours.
+// If there are more splats than the capacity, the totals are still correct, and the columns hold the first
+// splats, without colours. The caller has to compare the totals with the capacity.
 template <class T>
 void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
@@ -255,12 +268,13 @@ void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradient
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
 }  // namespace cuda
 
-// The projection's backward pass and the optimiser's step of the visible Gaussians in one: what project_bwd
-// and lazy_adam do one after the other, but for the gradients, which need never be stored. Parameters are
-// raw, with SH; `adam` lists splats.visible_ids and has no gradients; the listed rows' parameters stand at
+// project_bwd_step is the projection's backward pass and the optimiser's step of the visible Gaussians in one
+// call. The result is that of project_bwd followed by lazy_adam; on CUDA one kernel does both, so that the
+// gradients need not be written to global memory. Parameters are raw, with SH. `adam` lists
+// splats.visible_ids and has no gradients. The parameters of the listed rows must have caught up to step
 // adam.step - 1.
 
-// Gradients of the visible Gaussians in scratch memory, which `adam` is then given.
+// Allocates the gradients of the visible Gaussians in scratch memory and gives them to `adam`.
 template <class T>
 ProjectGradients<T> scratch_gradients(const SplatIndex& splats, AdamArgs<T>& adam, Workspace& workspace) {
   T* slots[kAdamColumns];

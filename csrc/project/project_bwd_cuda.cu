@@ -9,7 +9,8 @@ namespace {
 
 constexpr int kPoseThreads = 256;
 
-// Stores the gradients, compact or dense.
+// The sink of backward_kernel (project_bwd_device.cuh) that writes the gradients of the Gaussians to global
+// memory, with one row for each visible Gaussian or (dense) one for each Gaussian.
 struct StoreGradients {
   struct Shared {};
   struct Own {};
@@ -50,13 +51,15 @@ struct StoreGradients {
   }
 
  private:
-  // The lane's own.
+  // The row of the outputs that belongs to this lane's Gaussian.
   __device__ std::int64_t row(const WarpRows& warp) const {
     return out.dense ? warp.id : warp.first + warp.lane;
   }
 };
 
-// One block's share of the gradients of view blockIdx.y: [blocks, B, 12] doubles.
+// Computes the gradient of the camera pose of view blockIdx.y from kProjectBlock visible Gaussians. The grid
+// is (blocks of visible Gaussians, B), one thread per visible Gaussian at a time. Each block recomputes the
+// splats of its Gaussians in its view and writes its sum to partial [blocks, B, 12].
 template <class Source>
 __global__ void __launch_bounds__(kPoseThreads)
     pose_kernel(const __grid_constant__ BackwardInputs<Source> args, double* partial) {
@@ -96,7 +99,9 @@ __global__ void __launch_bounds__(kPoseThreads)
   }
 }
 
-// partial is in the order rotation rows (9), translation (3).
+// Sums the partial pose gradients [n_blocks, B, 12] over the blocks into v_viewmats [B, 4, 4]: a block of 16
+// threads for each view, one thread per entry of the matrix. The 12 values of `partial` are the three rows of
+// the rotation (9), then the translation (3). The last row of the matrix has the gradient 0.
 __global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks, int n_views,
                                     float* v_viewmats) {
   const int view = blockIdx.x, i = threadIdx.x;

@@ -1,15 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
-// The projection's backward pass on CUDA, whatever becomes of the gradients.
+// The kernel of the projection's backward pass on CUDA. What happens to the gradients is up to a sink:
+// project_bwd_cuda.cu stores them, project_step_cuda.cu takes the optimiser's step with them.
 #pragma once
 #include "common/cuda.cuh"
 #include "project/project.h"
 #include "project/project_device.cuh"
 
-// How the lanes of a warp, neighbours among the visible Gaussians, read the gradients of their splats.
+// SplatGradientReader reads the gradients of the splats of a warp's 32 visible Gaussians. These Gaussians are
+// consecutive in visible_ids, so their splats are consecutive, too.
 
 namespace blitzgs::cuda {
 
-// Each lane where they are.
+// For gradients in the memory of this GPU: each lane reads the gradients of its own splats directly.
 template <class Source>
 class SplatGradientReader {
  public:
@@ -19,7 +21,8 @@ class SplatGradientReader {
   __device__ SplatGradientReader(const Source& source, void*, int) : source_(source) {}
   __device__ __forceinline__ void pull(std::int32_t, std::int32_t) const {}
   __device__ __forceinline__ void finish_pull(std::int32_t, std::int32_t) const {}
-  // Calls f(splat, what to ask for its gradients) for the lane's splats [begin, end), as the whole warp does.
+  // Calls f(splat, source of its gradients) for the splats [begin, end) of this lane. All lanes of the warp
+  // must call for_each.
   template <class F>
   __device__ __forceinline__ void for_each(std::int32_t begin, std::int32_t end, const F& f) const {
     for (std::int64_t r = begin; r < end; ++r) f(r, source_);
@@ -29,22 +32,25 @@ class SplatGradientReader {
   const Source& source_;
 };
 
-// Splats in the memory of other GPUs come by way of shared memory. Neighbouring splats lie as neighbours at
-// each rank, too, so a warp pulls them in whole lines, all of them before it waits for anything, where a lane
-// for each splat would use a third of the links. Splats that do not fit into the stage (of more than
-// kMostRuns views, or a warp's with very many at several ranks) are read where they are. What lanes have in
-// common is kept in shared memory or worked out anew: they have no registers to spare for it.
+// For gradients in the memory of other GPUs: the warp copies the gradients of its splats into shared memory
+// (the stage) first. Splats that are consecutive here are consecutive in the table of each rank, too, so the
+// warp copies whole cache lines, and it issues all copies before it waits for the first. One lane per splat
+// would use only a third of the bandwidth of the links. If the splats do not fit into the stage (more than
+// 32 * kMostRuns splats, or too many splats that lie at several ranks), the lanes read them from the tables
+// directly. Values that are the same for all lanes are kept in shared memory or computed again, because the
+// kernel has no registers left for them.
 template <>
 class SplatGradientReader<RankSplatGradients> {
   using Gradient = SplatGradient;
-  static constexpr int kPieces = sizeof(Gradient) / 16;  // of 16 bytes in a splat
-  static constexpr int kMostRuns = 6;  // of 32 splats that a warp's stage holds: of so many views
-  static constexpr int kSpare = 8;     // splats more, for some that lie at several ranks
+  static constexpr int kPieces = sizeof(Gradient) / 16;  // pieces of 16 bytes in the gradient of a splat
+  static constexpr int kMostRuns = 6;  // the stage of a warp holds up to this many runs of 32 splats
+  static constexpr int kSpare = 8;     // further slots of the stage, for splats that lie at several ranks
 
-  // The splats of a run that lie at one rank: which, the first one's place there and in the stage.
+  // The splats of one run of kPlaceSplats splats (scatter.h) that lie at one rank.
   struct Segment {
-    std::uint32_t bits;
-    std::int32_t from, to;
+    std::uint32_t bits;  // bit i: splat i of the run is one of them
+    std::int32_t from;   // the position of the first of them in the rank's table
+    std::int32_t to;     // the slot of the first of them in the stage
   };
   __host__ __device__ static int runs_for(int n_views) {
     return n_views < 1 ? 1 : n_views < kMostRuns ? n_views : kMostRuns;
@@ -61,11 +67,12 @@ class SplatGradientReader<RankSplatGradients> {
     return n_warps * static_cast<std::size_t>(warp_bytes(runs_for(n_views), source.n_ranks));
   }
 
-  // memory: of the block.
+  // memory: the block's dynamic shared memory, of shared_bytes() bytes.
   __device__ __forceinline__ SplatGradientReader(const RankSplatGradients& source, void* memory, int n_views)
       : source_(source), memory_(static_cast<char*>(memory)), n_runs_(runs_for(n_views)) {}
 
-  // Begins to bring the warp's splats into the stage; a lane's are [begin, end).
+  // Starts the copies of the gradients of the warp's splats into the stage, asynchronously. The splats of
+  // this lane are [lane_begin, lane_end).
   __device__ __forceinline__ void pull(std::int32_t lane_begin, std::int32_t lane_end) {
     const std::int32_t begin = first_of(lane_begin), end = last_of(lane_end);
     if (lane() < kPieces) reinterpret_cast<float4*>(stage() + nothing())[lane()] = {0.f, 0.f, 0.f, 0.f};
@@ -117,8 +124,8 @@ class SplatGradientReader<RankSplatGradients> {
       }
     }
   }
-  // Waits for the splats that were pulled, and finds them in the stage: those at several ranks added up, in
-  // the order of these.
+  // Waits for the copies. For each splat of the warp it then adds up the gradients from several ranks, in the
+  // order of the ranks, and records the slot of the sum in index(). It also writes means2d if that is wanted.
   __device__ __forceinline__ void finish_pull(std::int32_t begin, std::int32_t end) const {
     asm volatile("cp.async.wait_all;" ::: "memory");
     __syncwarp();
@@ -172,16 +179,17 @@ class SplatGradientReader<RankSplatGradients> {
   };
 
   __device__ __forceinline__ float2 kept_of(const SplatGradient& v) const {
-    // By value: an address of either would put the whole splat onto the stack.
+    // Returns values: with a pointer to one of the two members, the compiler would keep `v` on the stack.
     return source_.absolute ? float2{v.mean2d_abs[0], v.mean2d_abs[1]} : float2{v.mean2d[0], v.mean2d[1]};
   }
   static __device__ __forceinline__ int lane() { return static_cast<int>(threadIdx.x) % 32; }
-  // The runs that splats [begin, end) touch, by ranks.
+  // The number of segments of splats [begin, end): runs that these splats touch, times ranks.
   __device__ __forceinline__ int n_segments(std::int32_t begin, std::int32_t end) const {
     return begin == end ? 0 : ((end - 1) / kPlaceSplats - begin / kPlaceSplats + 1) * source_.n_ranks;
   }
 
-  // The warp's splats: the first lane's first, and the last lane's last that has any.
+  // The splats of the warp are [first_of(begin), last_of(end)). Lanes without a Gaussian have
+  // begin = end = 0, hence the maximum.
   static __device__ __forceinline__ std::int32_t first_of(std::int32_t begin) {
     return __shfl_sync(kFullWarp, begin, 0);
   }
@@ -189,12 +197,12 @@ class SplatGradientReader<RankSplatGradients> {
     return __reduce_max_sync(kFullWarp, end);
   }
 
-  // The stage's last splat, zeros, stands for splats that no rank composited.
+  // The last slot of the stage holds zeros, the gradient of every splat that no rank composited.
   __device__ __forceinline__ int nothing() const { return 32 * n_runs_ + kSpare; }
   __device__ __forceinline__ Gradient* stage() const {
     return reinterpret_cast<Gradient*>(memory_ + threadIdx.x / 32 * warp_bytes(n_runs_, source_.n_ranks));
   }
-  // By splat of the stage's: where it is there.
+  // For each splat of the warp, its slot in the stage.
   __device__ __forceinline__ std::uint8_t* index() const {
     return reinterpret_cast<std::uint8_t*>(stage() + nothing() + 1);
   }
@@ -210,7 +218,7 @@ class SplatGradientReader<RankSplatGradients> {
 
 constexpr int kBackwardThreads = 128;
 
-// v: one of SplatGradientSource.
+// v: the gradients of the splats, one alternative of SplatGradientSource.
 template <class Source>
 struct BackwardInputs {
   Inputs in;
@@ -219,7 +227,7 @@ struct BackwardInputs {
   Regularisers<float> regularisers;
 };
 
-// Calls f(degree, quads, BackwardInputs) with degree and quads as dispatch_sh has them.
+// Calls f(degree, quads, BackwardInputs); dispatch_sh says what degree and quads are.
 template <class F>
 void dispatch_backward(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
                        const Regularisers<float>& regularisers, const F& f) {
@@ -231,15 +239,19 @@ void dispatch_backward(const Inputs& in, const SplatIndex& splats, const SplatGr
       v);
 }
 
-// A warp's visible Gaussians, a lane each.
+// The visible Gaussians of a warp, one per lane.
 struct WarpRows {
-  std::int64_t first, count;  // position of the first in the list; how many positions are left from there
-  std::int32_t id;            // the lane's own; -1: none
-  int warp, lane;
+  std::int64_t first;  // the position of the first of them in visible_ids
+  std::int64_t count;  // the length of visible_ids from there on (may exceed 32)
+  std::int32_t id;     // the Gaussian of this lane; -1: none
+  int warp, lane;      // the warp's index in the block, the lane's in the warp
 };
 
-// A thread is a visible Gaussian. Its gradients go to the sink: begin() is called by every thread before the
-// block meets, take() and then take_sh() at the end, with the warp's stages to reorder them in.
+// The gradients of the Gaussians' parameters: those of the splats taken back through the projection, the
+// colours and the activations (docs/image.md, sections 4, 2 and 1). One thread per visible Gaussian; it
+// recomputes the Gaussian's splats and sums over them in order. The gradients go to the sink. Every thread
+// calls sink.begin() before the block's only barrier, and sink.take() and then sink.take_sh() at the end; the
+// sink may use the warp's stages to reorder values between lanes.
 template <int DEGREE, bool QUADS, class Source, class Sink>
 __global__ void __launch_bounds__(kBackwardThreads, 3)
     backward_kernel(const __grid_constant__ BackwardInputs<Source> args, const __grid_constant__ Sink sink) {
@@ -266,7 +278,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   if constexpr (QUADS) {
     if (has_colors) stage.gather(in.sh, stride, id, lane);
   }
-  // Everything that is needed first is loaded before anything is waited for.
+  // Issue all early loads before the first wait, so that their latencies overlap.
   const std::int64_t known = id < 0 ? 0 : id;
   const Vec3<float> mean_part = TripleStage::fetch(in.means, id, lane),
                     scale_part = TripleStage::fetch(in.scales, id, lane);
@@ -304,7 +316,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
     load_splat(r + 1);
   });
 
-  // The colours after the geometry, so that their coefficients are in registers for no longer than needed.
+  // The colours come after the geometry, so that the SH coefficients occupy registers only here.
   Coefficients v_sh;
 #pragma unroll
   for (float& value : v_sh.values) value = 0.f;

@@ -22,8 +22,8 @@ class HeldSplatGradients {
   using Source = SplatGradientColumns<T>;
 #endif
 
-  // splats: P. sums: none, or [P, 2], for the sums of the gradients of means2d from the ranks, or (absolute)
-  // of their absolute values over pixels.
+  // splats: P. sums: none, or [P, 2], to which the kernel writes the gradients of means2d summed over ranks
+  // or, with `absolute`, those of mean2d_abs.
   HeldSplatGradients(const char* op, ScalarType dtype, std::int64_t splats,
                      const std::vector<Tensor>& v_splats, const std::optional<Tensor>& v_depths,
                      const std::optional<Tensor>& places, const std::optional<Tensor>& sums,
@@ -51,7 +51,7 @@ class HeldSplatGradients {
     if (depths_) check_column(op, "v_depths", *depths_, dtype, {splats});
   }
 
-  // What the kernels read; this has to outlive them.
+  // The source that the kernels read. It points to tensors that this object holds.
   template <class T>
   Source<T> source() const {
 #ifdef BLITZGS_BACKEND_CUDA
@@ -105,7 +105,7 @@ class HeldSplatGradients {
 
 namespace {
 
-// The group of arguments `views`: cameras, and of each view the weights of regularisers.
+// The group of arguments `views`: the cameras, and the weights of the regularisers for each view.
 struct WeightedViews {
   TensorList cameras;
   OptionalTensor scale_reg, opacity_reg;
@@ -120,8 +120,9 @@ struct WeightedViews {
   }
 };
 
-// The group of arguments `splats`, what both ops know of the forward pass, and the weights of the views. Held
-// here so that the raw pointers stay valid. Only the step reads gradients at places.
+// The group of arguments `splats`, the outputs of the forward pass that both ops read, and the weights of the
+// regularisers. The object holds the tensors, so that the raw pointers stay valid. Only project_bwd_step_
+// reads gradients at places.
 struct BackwardSplats {
   Tensor camera_ids, visible_ids, splat_offsets;
   OptionalTensor places, scale_reg, opacity_reg;

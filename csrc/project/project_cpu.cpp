@@ -32,7 +32,8 @@ ActiveGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
       activate_opacity(in.opacities[id], in.options.raw), static_cast<T>(inverse_reach2_of(in.fade, id)));
 }
 
-// A splat as counting finds it and writing takes it back.
+// A splat that the counting pass of project() found, kept for the writing pass: the splat, the number of its
+// tiles, and the ranks that need it as bits.
 template <class T>
 struct KeptSplat {
   Splat<T> splat;
@@ -40,8 +41,9 @@ struct KeptSplat {
   std::int64_t ranks;
 };
 
-// What counting finds of a block of kProjectBlock candidates: its splats, the views that see each candidate,
-// and how many visible Gaussians and splats the blocks before it have.
+// The result of the counting pass for a block of kProjectBlock candidates: its splats, the views that see
+// each candidate (as bits), the number of its visible Gaussians, and the numbers of visible Gaussians and
+// splats in all blocks before it.
 template <class T>
 struct CountedBlock {
   std::vector<KeptSplat<T>> splats;
@@ -49,8 +51,8 @@ struct CountedBlock {
   std::int64_t visible = 0, visible_before = 0, splats_before = 0;
 };
 
-// Projects a candidate into the views that may see it, adds its splats to `splats` and what they are to
-// `totals`, and returns their views.
+// Projects a candidate into the views that may see it, appends its splats to `splats`, adds to `totals`, and
+// returns the views of its splats as bits.
 template <class T>
 std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
                                 const std::vector<Camera<T>>& cameras, const std::vector<Frustum>& frusta,
@@ -117,7 +119,7 @@ void write_splat(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64
   if (out.splat_ids) out.splat_ids[index] = out.ids[id];
 }
 
-// Gradients of visible Gaussian u; poses [B] or null.
+// Computes the gradients of visible Gaussian u and adds to those of the camera poses, [B] or null.
 template <class T>
 void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras, const SplatIndex& splats,
                   const SplatGradientColumns<T>& v, const Regularisers<T>& regularisers, std::int64_t u,
@@ -144,7 +146,7 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
                         {out.means + 3 * at, out.quats + 4 * at, out.scales + 3 * at, out.opacities + at});
 }
 
-// Adds one block's pose gradients, [B] of them, to its slice [B, 12] of doubles.
+// Adds the pose gradients [B] of one block to the block's sums [B, 12].
 template <class T>
 void store_poses(const std::vector<PoseGradient<T>>& poses, double* sums) {
   for (const PoseGradient<T>& pose : poses) {

@@ -1,13 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// The projection on CUDA: the quick test of all candidates, the colours of the splats, and what queues the
-// kernels. Compiled without FMA contraction (cmake/cuda.cmake), as write_splats_cuda.cu.
+// The projection on CUDA: the prefilter of all candidates (kernel 1 of project.h), the colours of the splats
+// (kernel 3), and project(), which queues the three kernels. Compiled without FMA contraction
+// (cmake/cuda.cmake), as write_splats_cuda.cu.
 #include "common/cuda.cuh"
 #include "math/frustum.h"
 #include "project/project_device.cuh"
 
 #include <algorithm>
-
-// The first kernel of the projection: a quick test of every candidate, from its mean and its largest scale.
 
 namespace blitzgs::cuda {
 
@@ -16,13 +15,14 @@ namespace {
 constexpr int kWarps = kPrefilterThreads / 32, kMostOfWarp = kMostAtOnce / kWarps;
 constexpr int kBlocksPerMultiprocessor = 8;
 
-// Not inlined: the doubles of this would have the loop of the kernel spill registers.
+// Not inlined: the double-precision values in here would make the kernel's loop spill registers.
 __device__ __noinline__ void store_frustum(const Camera<float>* camera, int width, int height,
                                            float near_plane, float far_plane, float eps2d, Frustum* frustum) {
   *frustum = make_frustum(*camera, width, height, near_plane, far_plane, eps2d);
 }
 
-// An upper bound. Stored opacities may exceed 1, logits cannot.
+// An upper bound on the Gaussian's largest scale, for may_overlap. That test assumes an opacity of at most 1.
+// A sigmoid always satisfies this; a stored opacity may exceed 1, and then the scale counts as unbounded.
 __device__ float largest_scale(const Inputs& in, std::int64_t id) {
   const float* s = in.scales + 3 * id;
   const float widest = fmaxf(s[0], fmaxf(s[1], s[2]));
@@ -30,8 +30,9 @@ __device__ float largest_scale(const Inputs& in, std::int64_t id) {
   return in.opacities[id] <= 1.f ? widest : kAnyWidth;
 }
 
-// The views that may see each of kPrefilterBatch candidates first, first + 32, ..., from the mean, then the
-// scale.
+// Finds the views that may see each of the kPrefilterBatch candidates first, first + 32, ...: first from
+// their means, then, for candidates that some view still may see, from their scales, too. Writes the views as
+// bits to `maybe` and the Gaussians to `ids`.
 __device__ void quick_views(const Inputs& in, std::int64_t n_candidates, const Frustum* frusta,
                             std::int64_t first, std::uint32_t* maybe, std::int32_t* ids) {
   Vec3<float> means[kPrefilterBatch];
@@ -65,8 +66,9 @@ __device__ void quick_views(const Inputs& in, std::int64_t n_candidates, const F
   }
 }
 
-// A block takes candidates turn by turn; those that some view may see are listed behind those of the turns
-// before.
+// Lists the candidates that some view may see, in order, in `kept`: the Gaussians and those views as bits. A
+// block takes batches of candidates (turns) until none is left; each thread tests kPrefilterBatch candidates
+// at a time. `before` (RunningSum, common/cuda.cuh) gives the length of the list before each turn.
 __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
     prefilter_kernel(const Inputs in, const Prefiltered kept, const RunningSum before) {
   __shared__ Camera<float> cameras[kMaxViews];
@@ -140,11 +142,11 @@ void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, 
 
 namespace {
 
-constexpr int kColorThreads = 128, kColorBlocks = 5;  // such blocks fill a multiprocessor
+constexpr int kColorThreads = 128, kColorBlocks = 5;  // kColorBlocks: the blocks that fit a multiprocessor
 constexpr int kSplatsOfBlock = 2 * kColorThreads;
 
-// Writes the colour of splat i, of Gaussian id (-1: none), and hides the splat if it is not finite; the whole
-// warp takes part. sh_slot: where `stage` gathers its SH row.
+// Writes the colour of splat i, of Gaussian id (-1: none), and hides the splat if its colour is not finite.
+// All lanes of the warp must call this. sh_slot: the slot of `stage` that holds the Gaussian's SH row.
 template <int DEGREE, bool QUADS>
 __device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>& camera,
                                            const Vec3<float>& mean, ShStage<DEGREE>& stage, int sh_slot,
@@ -167,6 +169,9 @@ __device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>
   out.tiles_touched[i] = 0;
 }
 
+// The colour of each splat (docs/image.md, section 4), to out.colors [P, 3]. One thread per splat, 256 splats
+// per block. The warp gathers SH rows and means through shared memory. Does nothing if the splats exceeded
+// the capacity.
 template <int DEGREE, bool QUADS>
 __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
     color_kernel(const Inputs in, const ProjectIds ids, const ProjectCapacity capacity,

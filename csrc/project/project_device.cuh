@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the CUDA projection's forward and backward share: cameras in shared memory, loads, and SH rows that a
-// warp moves between global and shared memory together.
+// Device code that the forward and backward kernels of the CUDA projection share: cameras in shared memory,
+// loads of parameters, and stages through which a warp moves rows between global memory and its lanes.
 #pragma once
 #include <cstdint>
 #include <type_traits>
@@ -12,7 +12,7 @@ namespace blitzgs::cuda {
 
 using Inputs = ProjectInputs<float>;
 
-// The cameras of a launch in shared memory; the caller synchronises.
+// Fills `cameras` (shared memory) with the cameras of the launch. The caller synchronises the block.
 __device__ inline void load_cameras(const Inputs& in, Camera<float>* cameras) {
   for (int view = threadIdx.x; view < in.n_views; view += blockDim.x) {
     cameras[view] =
@@ -37,7 +37,7 @@ __device__ inline void load_quat(const Inputs& in, std::int64_t id, float* quat)
   quat[3] = q.w;
 }
 
-// From a mean and a stored scale that are loaded already.
+// Activates Gaussian `id`, whose mean and stored scale the caller has loaded.
 __device__ inline ActiveGaussian<float> make_gaussian(const Inputs& in, std::int64_t id,
                                                       const Vec3<float>& mean, const Vec3<float>& scale) {
   float quat[4];
@@ -51,12 +51,13 @@ __device__ inline ActiveGaussian<float> load_gaussian(const Inputs& in, std::int
   return make_gaussian(in, id, load3(in.means + 3 * id), load3(in.scales + 3 * id));
 }
 
-// A warp's 32 rows of three floats in shared memory, so that global memory is read and written in whole
-// sectors.
+// Shared memory for 32 rows of three floats, one row per lane of a warp. The warp reads and writes global
+// memory through it with consecutive lanes at consecutive floats, that is, in whole sectors.
 struct TripleStage {
   float values[96];
 
-  // Loads a lane's part of row `id` of each lane (id < 0: none), for share().
+  // Loads this lane's three of the 96 floats of the warp's rows. Each lane gives the `id` of its row (id < 0:
+  // none). share() then brings each lane its own row.
   __device__ static __forceinline__ Vec3<float> fetch(const float* source, std::int32_t id, int lane) {
     float part[3] = {};
 #pragma unroll
@@ -67,7 +68,7 @@ struct TripleStage {
     }
     return {part[0], part[1], part[2]};
   }
-  // Returns the lane's own row of what the lanes fetched.
+  // Returns this lane's row of those that the warp fetched.
   __device__ __forceinline__ Vec3<float> share(const Vec3<float>& part, int lane) {
     values[lane] = part.x;
     values[32 + lane] = part.y;
@@ -77,16 +78,16 @@ struct TripleStage {
     __syncwarp();
     return mine;
   }
-  // Gathers row `id` of each lane (id < 0: none) and returns the lane's own.
+  // fetch() and share() in one.
   __device__ __forceinline__ Vec3<float> gather(const float* source, std::int32_t id, int lane) {
     return share(fetch(source, id, lane), lane);
   }
-  // Sets each lane's row.
+  // Writes this lane's row to the stage.
   __device__ __forceinline__ void set(int lane, const Vec3<float>& mine) {
     store3(mine, values + 3 * lane);
     __syncwarp();
   }
-  // Stores each lane's row, the first `rows` of them, one behind the other at `out`.
+  // Writes the rows of the first `rows` lanes to out [rows, 3].
   __device__ __forceinline__ void store(const Vec3<float>& mine, float* out, std::int64_t rows, int lane) {
     set(lane, mine);
 #pragma unroll
@@ -96,7 +97,7 @@ struct TripleStage {
     }
     __syncwarp();
   }
-  // Stores each lane's row as row `id` of `out` (id < 0: nowhere).
+  // Writes each lane's row to row `id` of `out` (id < 0: not at all).
   __device__ __forceinline__ void scatter(const Vec3<float>& mine, float* out, std::int32_t id, int lane) {
     set(lane, mine);
 #pragma unroll
@@ -109,11 +110,11 @@ struct TripleStage {
   }
 };
 
-// The SH coefficients of one Gaussian in use at a degree, in registers.
+// The SH coefficients of one Gaussian that the degree uses, in registers.
 template <int DEGREE>
 struct ShRow {
   static constexpr int kCount = 3 * (DEGREE + 1) * (DEGREE + 1);
-  static constexpr bool kWhole = kCount % 4 == 0;  // in 16-byte quads
+  static constexpr bool kWhole = kCount % 4 == 0;  // whether the row is a whole number of 16-byte quads
   static constexpr int kQuads = kWhole ? kCount / 4 : 1;
   float values[kCount];
 
@@ -128,23 +129,23 @@ struct ShRow {
   }
 };
 
-// Whether rows of `stride` floats at `sh` can be moved by 16 bytes.
+// Whether rows of `stride` floats at `sh` can be read and written 16 bytes at a time.
 template <int DEGREE>
 bool quads_fit(const float* sh, int stride) {
   return ShRow<DEGREE>::kWhole && sh && stride % 4 == 0 && aligned16(sh);
 }
 
-// A warp's 32 SH rows in shared memory. Lanes of one instruction move consecutive 16-byte pieces, of two or
-// three rows, where a lane for each row would touch 32 cache lines.
+// Shared memory for the 32 SH rows of a warp. In each load or store the lanes move consecutive 16-byte pieces
+// of two or three rows. One lane per row would touch 32 cache lines at a time.
 template <int DEGREE>
 struct ShStage {
   using Row = ShRow<DEGREE>;
-  static constexpr int kPitch = Row::kQuads | 1;  // odd, so that a column of rows spreads over the banks
+  static constexpr int kPitch = Row::kQuads | 1;  // odd: quads of the same column lie in different banks
   float4 quads[32 * kPitch];
   std::int32_t ids[32];
 
-  // Gathers row `id` of each lane (id < 0: none), once where consecutive lanes have the same; returns where a
-  // lane's row is. Asynchronous until wait().
+  // Starts to copy row `id` of each lane (id < 0: none) to the stage; consecutive lanes with the same id
+  // share one copy. Returns the slot of this lane's row. The rows are complete after wait().
   __device__ __forceinline__ int gather(const float* sh, std::int64_t stride, std::int32_t id, int lane) {
     const std::int32_t previous = __shfl_up_sync(kFullWarp, id, 1);
     const bool first = id >= 0 && (lane == 0 || id != previous);
@@ -175,7 +176,8 @@ struct ShStage {
     for (int i = 0; i < Row::kQuads; ++i) quads[lane * kPitch + i] = row.quad(i);
     __syncwarp();
   }
-  // Stores the first `rows` rows at out, `stride` floats apart, and zeros where a row has more coefficients.
+  // Writes the first `rows` rows of the stage to `out`, `stride` floats apart. The floats of a row that the
+  // degree does not use are set to zero.
   __device__ __forceinline__ void store(float* out, std::int64_t stride, std::int64_t rows, int lane) const {
 #pragma unroll
     for (int i = 0; i < Row::kQuads; ++i) {
@@ -188,7 +190,8 @@ struct ShStage {
       if (row < rows) reinterpret_cast<float4*>(out + stride * row)[quad] = {0.f, 0.f, 0.f, 0.f};
     }
   }
-  // Stores each lane's row as row `id` of `out` (id < 0: nowhere), the coefficients in use.
+  // Writes each lane's row to row `id` of `out` (id < 0: not at all), only the coefficients that the degree
+  // uses.
   __device__ __forceinline__ void scatter(float* out, std::int64_t stride, std::int32_t id, int lane) const {
 #pragma unroll
     for (int i = 0; i < Row::kQuads; ++i) {
@@ -199,7 +202,8 @@ struct ShStage {
   }
 };
 
-// Calls f(degree, quads) with both as types: the SH degree (0 without SH), and whether rows move by 16 bytes.
+// Calls f(degree, quads) with two integral constants: the SH degree (0 without SH), and whether SH rows can
+// be moved 16 bytes at a time.
 template <class F>
 void dispatch_sh(const Inputs& in, const F& f) {
   const auto with_degree = [&](auto degree) {
@@ -221,10 +225,10 @@ void dispatch_sh(const Inputs& in, const F& f) {
   }
 }
 
-// What the three kernels of the projection share: the prefilter hands the Gaussians that some view may see to
-// the kernel that projects them and writes splats, and that hands the splats to the kernel of the colours.
+// The rest of this file is shared by the three forward kernels (project.h).
 
-// Candidates that a block of the prefilter takes at a time: as many as leave enough of them to fill the
+// A turn is the batch of candidates that a block of the prefilter takes at a time. A turn has between
+// kLeastAtOnce and kMostAtOnce candidates: the most that still give kTurnsWanted turns, which fill the
 // device.
 inline constexpr int kPrefilterThreads = 128, kPrefilterBatch = 4;
 inline constexpr int kLeastAtOnce = kPrefilterThreads * kPrefilterBatch, kMostAtOnce = 4 * kLeastAtOnce;
@@ -236,22 +240,22 @@ __host__ __device__ inline int prefiltered_at_once(std::int64_t candidates) {
   return count;
 }
 
-// The most turns that so many candidates, or fewer, can take.
+// An upper bound on the number of turns for any number of candidates up to `candidates`.
 inline std::int64_t most_prefilter_turns(std::int64_t candidates) {
   const std::int64_t in_small = (candidates + kLeastAtOnce - 1) / kLeastAtOnce,
                      in_large = (candidates + kMostAtOnce - 1) / kMostAtOnce;
   return in_small < 2 * kTurnsWanted ? in_small : in_large > 2 * kTurnsWanted ? in_large : 2 * kTurnsWanted;
 }
 
-// Gaussians that a block projects at a time, a thread each at first, and the most pairs of one and a view
-// that these make.
+// A turn of write_splats: up to kSplatThreads Gaussians, one per thread, with at most kMostPairs pairs of a
+// Gaussian and a view.
 inline constexpr int kSplatThreads = 128, kMostPairs = 512;
 
 __host__ __device__ inline int projected_at_once(int n_views) {
   return n_views > kMostPairs / kSplatThreads ? kMostPairs / n_views : kSplatThreads;
 }
 
-// For a RunningSum over so many turns, or their TurnSums.
+// Allocates and clears the memory of a RunningSum or a TurnSums over this many turns.
 inline std::uint64_t* turn_zeros(std::int64_t turns, Workspace& workspace, CudaStream stream) {
   const std::int64_t count = turns + 1;
   auto* zeros = workspace.allocate<std::uint64_t>(count);
@@ -259,7 +263,7 @@ inline std::uint64_t* turn_zeros(std::int64_t turns, Workspace& workspace, CudaS
   return zeros;
 }
 
-// How many candidates there are.
+// The number of valid candidates.
 __device__ inline std::int64_t candidates_of(const Inputs& in) {
   return in.n_active ? *in.n_active : in.n_candidates;
 }
@@ -268,7 +272,8 @@ __device__ inline std::int64_t candidate_id(const Inputs& in, std::int64_t candi
   return in.active_ids ? in.active_ids[candidate] : candidate;
 }
 
-// What is to be read of splats that write_splats had room for: nothing where they did not fit.
+// The numbers of visible Gaussians and splats that write_splats wrote, or zeros if they exceeded the
+// capacity.
 __device__ inline ProjectSizes fitting(const ProjectCapacity& capacity) {
   if (!capacity.totals) return capacity.sizes;
   const ProjectSizes sizes{capacity.totals[kTotalVisible], capacity.totals[kTotalSplats]};
@@ -277,8 +282,8 @@ __device__ inline ProjectSizes fitting(const ProjectCapacity& capacity) {
              : ProjectSizes{0, 0};
 }
 
-// The Gaussians that some views may see, in the order of the candidates, and these views as bits:
-// count [1], ids and views [candidates].
+// The output of the prefilter: the Gaussians that some view may see, in the order of the candidates, and
+// these views as bits. count [1]; ids and views [candidates], of which the first *count entries are valid.
 struct Prefiltered {
   std::int64_t* count;
   std::uint32_t* views;
@@ -293,10 +298,10 @@ struct Prefiltered {
 };
 
 void prefilter(const Inputs&, const Prefiltered&, Workspace&, CudaStream);
-// totals: null, where they are known. With no room splats are counted only.
+// totals: null if the caller knows them already. With a capacity of 0 splats the kernel only counts.
 void write_splats(const Inputs&, const RankTiles&, const Prefiltered&, const ProjectSizes& capacity,
                   const ProjectColumns<float>&, std::int64_t* totals, Workspace&, CudaStream);
-// Of the splats that write_splats wrote; none without sh.
+// Computes the colours of the splats that write_splats wrote. Does nothing without sh.
 void write_colors(const Inputs&, const ProjectCapacity&, const ProjectColumns<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -7,8 +7,9 @@
 namespace blitzgs {
 namespace {
 
-// The candidates of a projection: ids, which views may see each, how many of the ids are there, and how many
-// blocks of the table they are of; all Gaussians and views where nothing is given.
+// The candidates of a projection: ids, the views that may see each, the number of valid ids, and the number
+// of blocks of the table to which they belong. If `active` is empty, all Gaussians in all views are
+// candidates.
 struct Candidates {
   OptionalTensor ids, views, listed, blocks;
   std::int64_t count;
@@ -48,7 +49,7 @@ RankTiles checked_rank_tiles(const char* op, const IntList& begins_and_ends) {
   return ranks;
 }
 
-// The columns of splats as tensors, in the order in which the op returns them.
+// The columns of the splats as tensors, in the order in which the op returns them.
 struct SplatTensors {
   Tensor gaussian_ids, camera_ids, visible_ids, splat_offsets, means2d, conics, depths, opacities, colors,
       radii, tiles_touched, rank_masks, splat_ids;
@@ -57,7 +58,7 @@ struct SplatTensors {
 template <class T>
 class TorchSplats final : public SplatMemory<T> {
  public:
-  // ids: persistent, of the Gaussians; none: the splats' are not wanted.
+  // ids: the persistent ids of the Gaussians; none: the ids of the splats are not wanted.
   TorchSplats(const Tensor& like, bool with_colors, bool with_masks, const OptionalTensor& ids,
               const std::optional<ProjectSizes>& capacity, SplatTensors* tensors)
       : like_(like),

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the ops of the projection share: groups of arguments, checked. Python's side of the groups is
-// blitzgs/ops/project.py.
+// The checked groups of arguments that the ops of the projection share. blitzgs/ops/project.py builds these
+// groups.
 #pragma once
 #include <cfloat>
 #include <limits>
@@ -22,7 +22,7 @@ inline OptionalTensor contiguous_or_none(const OptionalTensor& tensor) {
   return tensor ? OptionalTensor(as_contiguous(*tensor)) : std::nullopt;
 }
 
-// A group of arguments has as many entries as its names.
+// Checks the number of entries of a group of arguments. names: those of the entries, for the message.
 template <class List>
 void check_group(const char* op, const char* names, const List& list, std::size_t least, std::size_t most) {
   STD_TORCH_CHECK(list.size() >= least && list.size() <= most, "blitzgs::", op, ": expected ", names,
@@ -30,7 +30,7 @@ void check_group(const char* op, const char* names, const List& list, std::size_
 }
 
 // ints: width, height, tile_size, sh_degree, antialiased, raw. floats: near_plane, far_plane, eps2d,
-// radius_clip, and with smooth levels those of set_fade.
+// radius_clip and, with smooth levels, the floats of set_fade.
 inline ProjectOptions<double> checked_options(const char* op, const IntList& ints, const FloatList& floats) {
   check_group(op, "(width, height, tile_size, sh_degree, antialiased, raw)", ints, 6, 6);
   check_group(op, "(near_plane, far_plane, eps2d, radius_clip[, fade_slope, reach of each level])", floats, 4,
@@ -55,8 +55,9 @@ inline ProjectOptions<double> checked_options(const char* op, const IntList& int
   return options;
 }
 
-// floats from the fifth on: f / (f - 1), then for each level the distance at which it has faded away
-// (infinite: nowhere; negative: everywhere).
+// Sets the parameters of smooth levels. The floats from the fifth on are f / (f - 1), then for each level the
+// distance from which on its weight is 0 (infinite: the level never fades; negative: its weight is 0
+// everywhere).
 inline void set_fade(const char* op, const Tensor& level, const FloatList& floats, LevelFade& fade) {
   STD_TORCH_CHECK(floats.size() > 5 && floats[4] >= 1, "blitzgs::", op,
                   ": levels need a fade_slope of at least 1 and a reach for each level behind the other "
@@ -70,8 +71,8 @@ inline void set_fade(const char* op, const Tensor& level, const FloatList& float
   }
 }
 
-// Gaussians (means, quats, scales, opacities and perhaps sh) and cameras (viewmats, Ks), contiguous and
-// checked. Held here so that the raw pointers stay valid.
+// Gaussians (means, quats, scales, opacities[, sh]) and cameras (viewmats, Ks), contiguous and checked. The
+// object holds the tensors, so that the raw pointers stay valid.
 struct ProjectArguments {
   Tensor means, quats, scales, opacities, viewmats, Ks;
   OptionalTensor sh, level;
@@ -79,7 +80,7 @@ struct ProjectArguments {
   ProjectOptions<double> options;
   LevelFade fade{};
 
-  // level_in: octree levels of the Gaussians, where opacities fade by them.
+  // level_in: the octree levels of the Gaussians, with smooth levels.
   ProjectArguments(const char* op, const TensorList& gaussians, const TensorList& cameras,
                    const IntList& ints, const FloatList& floats, const OptionalTensor& level_in)
       : options(checked_options(op, ints, floats)) {

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// One splat: a Gaussian projected into a view, forward and backward, from the maths headers. Both backends
-// call these functions, so they compute the same splat. CUDA should compile them without FMA contraction: two
-// kernels that project the same splat (counting, then writing) must get the same bits.
+// The arithmetic of one splat, a Gaussian projected into a view, forward and backward (docs/image.md,
+// sections 1, 2 and 4). Both backends call these functions, so they compute the same splat. CUDA forward
+// kernels must be compiled without FMA contraction, because two launches that project the same splat
+// (counting, then writing) must get the same bits.
 #pragma once
 #include <cstdint>
 
@@ -19,17 +20,17 @@ struct ProjectOptions {
   int sh_degree, sh_stride;  // sh_stride: coefficients stored per Gaussian, K
   T near_plane, far_plane, eps2d, radius_clip;
   bool antialiased, raw;
-  T fade_slope = T(0);  // of level_weight
+  T fade_slope = T(0);  // f / (f - 1) of smooth levels (project.h)
 };
 
-// A Gaussian after activation, shared by its splats.
+// A Gaussian after activation (docs/image.md, section 1). All its splats use the same one.
 template <class T>
 struct ActiveGaussian {
   Vec3<T> mean, scale;
   UnitQuaternion<T> quat;
   Columns3<T> rotation, axes;
   T opacity;
-  T inverse_reach2;  // of its level (project.h); 0: it fades nowhere
+  T inverse_reach2;  // 1 / reach^2 of its level (project.h); 0: the Gaussian does not fade
 };
 
 template <class T>
@@ -49,8 +50,8 @@ BLITZGS_HD T activate_opacity(T opacity, bool raw) {
   return raw ? sigmoid(opacity) : opacity;
 }
 
-// How far from its centre, in standard deviations, a splat of this opacity can reach alpha = 1/255; negative
-// when it never does.
+// The largest distance from the centre, in standard deviations, at which a splat of this opacity has
+// alpha >= 1/255; negative if alpha is smaller everywhere.
 template <class T>
 BLITZGS_HD T reach(T opacity) {
   return opacity >= T(kAlphaCut) && is_finite(opacity)
@@ -89,7 +90,7 @@ BLITZGS_HD ActiveGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* qua
   return gaussian;
 }
 
-// The weight of a Gaussian's opacity in a view with smooth levels (project.h).
+// The factor on a Gaussian's opacity in a view with smooth levels (project.h).
 template <class T>
 BLITZGS_HD T level_weight(const Camera<T>& camera, const ActiveGaussian<T>& gaussian, T slope) {
   if (!(gaussian.inverse_reach2 > T(0))) return T(1);
@@ -97,8 +98,8 @@ BLITZGS_HD T level_weight(const Camera<T>& camera, const ActiveGaussian<T>& gaus
   return smaller(larger(slope - slope * gaussian.inverse_reach2 * dot(offset, offset), T(0)), T(1));
 }
 
-// False when the splat does not exist: outside (near, far], alpha below 1/255 everywhere, no overlap with the
-// image, no larger than radius_clip, or anything not finite.
+// Projects a Gaussian into a view (docs/image.md, section 2). Returns false if the splat does not exist, by
+// the rules at the top of project.h.
 template <class T>
 BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
                               const ProjectOptions<T>& options, Splat<T>* splat) {
@@ -117,12 +118,12 @@ BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActiveGaussian<T>& 
   if (options.radius_clip > T(0) && !(larger(splat->extent[0], splat->extent[1]) > options.radius_clip)) {
     return false;
   }
-  // 1.0001: an extent rounded down must not lose a pixel at the border.
+  // The factor 1.0001 makes sure that an extent that was rounded down loses no pixel at the border.
   return touches_image(splat->mean2d, T(1.0001) * splat->extent[0], T(1.0001) * splat->extent[1], options);
 }
 
-// How many tiles a splat touches, and in *ranks which ranks want it: f(rank, tiles) for every piece of a tile
-// row that a rank wants.
+// Returns the number of tiles that a splat touches and sets *ranks to the ranks (as bits) that composite some
+// of them. Calls f(rank, number of tiles) for each piece of a tile row that one rank composites.
 template <class T, class F>
 BLITZGS_HD std::int32_t splat_tiles(const Splat<T>& splat, int view, const ProjectOptions<T>& options,
                                     const RankTiles& rank_tiles, std::int64_t* ranks, const F& f) {
@@ -173,8 +174,8 @@ BLITZGS_HD bool finite_color(const Vec3<T>& color) {
   return is_finite(color.x) && is_finite(color.y) && is_finite(color.z);
 }
 
-// color = max(sum_k basis_k sh_k + 0.5, 0); sh [K, 3]. False, and zeros, when the sum is not finite, as with
-// any coefficient in use that is not: the splat is hidden.
+// color = max(sum_k basis_k sh_k + 0.5, 0); sh [K, 3] (docs/image.md, section 4). Returns false and sets
+// color to zeros if the sum is not finite; the caller then hides the splat.
 template <class T>
 BLITZGS_HD bool splat_color(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree, T* color) {
   Vec3<T> direction;
@@ -187,7 +188,8 @@ BLITZGS_HD bool splat_color(const Camera<T>& camera, const Vec3<T>& mean, const 
   return shown;
 }
 
-// v_sh [K, 3] += and v_mean +=; pose (null: not wanted) += . Zero where the colour is clipped at 0 or hidden.
+// Adds the gradients of a splat's colour to v_sh [K, 3], v_mean and pose (null: not wanted). A channel that
+// is clipped at 0 and a hidden splat contribute zero.
 template <class T>
 BLITZGS_HD void splat_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, const T* sh, int degree,
                                 const T* v_color, T* v_sh, Vec3<T>* v_mean, PoseGradient<T>* pose) {
@@ -222,7 +224,8 @@ struct GaussianGradient {
   T opacity;
 };
 
-// Adds one splat's share to gradient and to pose (null: not wanted). Recomputes the splat.
+// Adds the gradients of one splat's geometry to `gradient` and to pose (null: not wanted). Recomputes the
+// intermediate values of the projection.
 template <class T>
 BLITZGS_HD void project_splat_vjp(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
                                   const ProjectOptions<T>& options, const GeometryGradient<T>& v,
@@ -239,7 +242,8 @@ BLITZGS_HD void project_splat_vjp(const Camera<T>& camera, const ActiveGaussian<
   camera_point_vjp(camera, gaussian.mean, v_p, &gradient->mean, pose);
 }
 
-// The paper's scale regulariser: weight * d(min_j s_j); which of two equal axes takes it is the first.
+// Adds the gradient of the paper's scale regulariser, weight * min_j s_j. Of equal axes the first one gets
+// it.
 template <class T>
 BLITZGS_HD void smallest_axis_vjp(const Vec3<T>& scale, T weight, Vec3<T>* v_scale) {
   if (scale.x <= scale.y && scale.x <= scale.z) {
@@ -251,14 +255,14 @@ BLITZGS_HD void smallest_axis_vjp(const Vec3<T>& scale, T weight, Vec3<T>* v_sca
   }
 }
 
-// Where a Gaussian's gradients go: its slots of the compact outputs.
+// Pointers to one Gaussian's rows of the gradient outputs.
 template <class T>
 struct ParameterGradients {
   T *mean, *quat, *scale, *opacity;
 };
 
-// From the activated Gaussian back to the stored parameters (log scales and logit when raw). axis_weight: the
-// summed weights of the scale regulariser over the splats. Overwrites the slots.
+// Takes the gradients of the activated Gaussian back to the stored parameters (log scales and logit if raw)
+// and writes them to `out`. axis_weight: the weights of the scale regulariser, summed over the splats.
 template <class T>
 BLITZGS_HD void activate_gaussian_vjp(const ActiveGaussian<T>& gaussian, bool raw,
                                       const GaussianGradient<T>& gradient, T axis_weight,

@@ -8,10 +8,11 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kPacks = 12;  // of an SH row, of degree 3
+constexpr int kPacks = 12;  // packs of four floats in an SH row of degree 3
 constexpr int kBatch = 4;   // packs that a lane has in flight
 
-// Takes the optimiser's step with the gradients, which are in shared memory at most.
+// The sink of backward_kernel (project_bwd_device.cuh) that takes the Adam step of the visible Gaussians
+// (lazy_adam.h). The gradients stay in registers and shared memory.
 struct StepRows {
   struct Shared {
     AdamStep<float> step;
@@ -19,7 +20,7 @@ struct StepRows {
     Decay decays[kBackwardThreads];
   };
   struct Own {
-    std::int32_t behind;  // steps that the moments still have to decay
+    std::int32_t behind;  // pending steps by which the moments of this lane's Gaussian must decay first
   };
   AdamArgs<float> adam;
 
@@ -32,7 +33,8 @@ struct StepRows {
   __device__ void take(Shared& shared, const Own& own, const WarpRows& warp, TripleStage& triple,
                        const Vec3<float>& v_mean, const float4& v_quat, const Vec3<float>& v_scale,
                        float v_opacity) const {
-    // Zeros, as the compiler keeps on the stack what lanes without a Gaussian would leave undefined.
+    // Initialised because the compiler would keep these on the stack if lanes without a Gaussian left them
+    // undefined.
     StepPack<0, 1> means[3]{};
     StepPack<1, 4> quat{};
     StepPack<2, 1> scales[3]{};
@@ -133,7 +135,7 @@ void project_bwd_step<float>(const Inputs& in, const SplatIndex& splats, const S
     });
   }
   if (done) return;
-  // Rows that are no whole packs.
+  // Parameters that are not aligned in whole packs take the two passes one after the other.
   const ProjectGradients<float> gradients = scratch_gradients(splats, adam, workspace);
   project_bwd(in, splats, v, regularisers, gradients, workspace, stream);
   lazy_adam(adam, workspace, stream);

@@ -80,7 +80,7 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
   return p;
 }
 
-// A scalar of the splats: the weighted sum of everything differentiable.
+// A scalar function of the splats, the weighted sum of all their differentiable values and the regularisers.
 struct Weights {
   std::vector<double> means2d, conics, depths, opacities, colors;
   std::vector<double> scale_reg{0.3, 0.0, -0.2}, opacity_reg{-0.1, 0.4, 0.2};
@@ -209,7 +209,8 @@ TEST_CASE("the backward pass is the derivative of the splats") {
       ProjectGradients<double>{v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(),
                                v_sh.data(), v_viewmats.data()},
       workspace, nullptr);
-  // Steps of 1e-6 may move a splat across the edge of the image; the sums are then of different splats.
+  // A step of 1e-6 could move a splat across the edge of the image and so change the number of splats; the
+  // difference quotient would then be meaningless, and the test fails.
   const auto slope = [&](double* value) {
     const double middle = *value, h = 1e-6;
     *value = middle + h;
@@ -262,7 +263,7 @@ TEST_CASE("opacities fade with the distance by their levels, and a level beyond 
     const bool there =
         at < faded.opacities.size() && faded.gaussian_ids[at] == id && faded.camera_ids[at] == view;
     if (!there) {
-      // Its box may have shrunk out of the image.
+      // The splat faded below 1/255 everywhere, or its smaller box no longer overlaps the image.
       REQUIRE(weight < 1);
       ++gone;
       continue;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The second kernel of the projection: the exact test of what the prefilter kept, and the splats.
-// Compiled without FMA contraction (cmake/cuda.cmake): splats that are projected twice must get the same
-// bits.
+// Kernel 2 of the projection (project.h): projects the pairs of a Gaussian and a view that the prefilter
+// kept, decides which of them are splats, and writes the splats in order. Compiled without FMA contraction
+// (cmake/cuda.cmake), because a splat that is projected in two launches must get the same bits in both.
 #include <algorithm>
 
 #include "common/cuda.cuh"
@@ -13,7 +13,8 @@ namespace {
 
 constexpr int kWarps = kSplatThreads / 32, kBlocksPerMultiprocessor = 6;
 
-// A block's sums for project_totals. Adding 64-bit numbers in shared memory is slow, so tiles carry by hand.
+// A block's contributions to project_totals. Atomic addition of 64-bit numbers in shared memory is slow, so
+// the tiles of each rank are two 32-bit numbers with an explicit carry.
 struct Sums {
   unsigned views[kMaxViews], rank_splats[kMaxRanks], tiles_low[kMaxRanks], tiles_high[kMaxRanks];
   unsigned long long visible, splats, tiles;
@@ -43,22 +44,25 @@ __device__ void store_sums(const Sums& sums, const Inputs& in, int n_ranks, unsi
   }
 }
 
-// Pairs that turned out to be splats, until it is known where they belong.
 constexpr std::uint16_t kNoSplat = 0xffff;
+
+// The splats of a turn in shared memory, by pair, until the block knows their positions in the output.
 struct Pending {
   float2 means2d[kMostPairs];
   float conics[3][kMostPairs], depths[kMostPairs], opacities[kMostPairs];
   int2 radii[kMostPairs];
   std::int32_t tiles[kMostPairs];
   std::int64_t ranks[kMostPairs];
-  std::uint16_t pairs[kMostPairs];  // kMaxViews * Gaussian + view; kNoSplat: not a splat
+  std::uint16_t pairs[kMostPairs];  // kMaxViews * (slot in the group) + view; kNoSplat: not a splat
 };
-// Tiles of a splat, and which ranks want it; what each of them wants goes to `sums`.
+
+// Returns the number of tiles of a splat, sets *ranks to the ranks that composite some of them, and adds the
+// splat and its tiles to the sums of these ranks.
 __device__ __forceinline__ std::int32_t find_tiles(const Splat<float>& splat, int view, const Inputs& in,
                                                    const RankTiles& rank_tiles, std::int64_t* ranks,
                                                    Sums& sums) {
-  int current = -1;  // most splats are of one rank: its pieces are added up here
-  unsigned of_rank = 0;
+  int current = -1;      // the rank of the last pieces of tile rows
+  unsigned of_rank = 0;  // tiles of these pieces: few splats have several ranks, so this saves atomics
   const std::int32_t tiles =
       splat_tiles(splat, view, in.options, rank_tiles, ranks, [&](int rank, std::int64_t count) {
         if (rank != current) {
@@ -75,17 +79,18 @@ __device__ __forceinline__ std::int32_t find_tiles(const Splat<float>& splat, in
   return tiles;
 }
 
-// Gaussians that a block projects together.
+// The Gaussians of a turn, which a block projects together.
 struct Group {
-  std::uint32_t seen[kSplatThreads];  // views that do see them
+  std::uint32_t seen[kSplatThreads];  // the views in which each has a splat, as bits
   std::int32_t ids[kSplatThreads];
-  std::int32_t before[kSplatThreads];  // visible ones << 16 | splats of those before
+  std::int32_t before[kSplatThreads];  // of the Gaussians before it in the group: visible << 16 | splats
   int of_warps[kWarps];
   int next_turn;
-  std::int64_t of_turns_before;  // visible << 31 | splats
+  std::int64_t of_turns_before;  // of all turns before: visible << 31 | splats
 };
 
-// The sum of `value` over the threads before, and of all. A barrier, and wants one between two calls.
+// Returns the sum of `value` over the threads before this one and sets *all to the sum over the block. It
+// contains a barrier, and the caller needs another one between two calls.
 __device__ __forceinline__ int sum_of_threads_before(int value, Group& group, int* all) {
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const int until = sum_of_lanes_until(value, lane);
@@ -101,7 +106,7 @@ __device__ __forceinline__ int sum_of_threads_before(int value, Group& group, in
   return before;
 }
 
-// Closes the splats of the last visible Gaussian; all: visible << 31 | splats.
+// Writes the last entry of splat_offsets, the total number of splats. all: visible << 31 | splats.
 __device__ __forceinline__ void end_splats(std::int64_t all, const ProjectSizes& capacity,
                                            const ProjectIds& ids) {
   const std::int64_t visible = all >> 31;
@@ -110,7 +115,8 @@ __device__ __forceinline__ void end_splats(std::int64_t all, const ProjectSizes&
   }
 }
 
-// Writes a group's splats, as far as there is capacity. before: visible << 31 | splats of the turns before.
+// Writes the visible Gaussians and splats of a group, up to the capacity. before: visible << 31 | splats of
+// all turns before.
 __device__ __forceinline__ void write_splats(const Group& group, std::int64_t before, const Pending& pending,
                                              int n_pairs, const ProjectSizes& capacity, const ProjectIds& ids,
                                              const ProjectOutputs<float>& out) {
@@ -142,11 +148,14 @@ __device__ __forceinline__ void write_splats(const Group& group, std::int64_t be
   }
 }
 
-// A block takes Gaussians turn by turn, a thread each, and writes their splats behind those of the turns
-// before. To find which pairs are splats takes every block about the same time. To find the tiles that they
-// touch takes some blocks much longer, so a block first tells the others how many splats it has, then finds
-// the tiles, and only then asks how many splats the blocks before it have. No block waits for the slowest
-// one.
+// Projects the Gaussians that the prefilter kept (docs/image.md, sections 1 and 2) and writes their splats
+// (ProjectIds, ProjectOutputs without colours) and the totals. A block takes Gaussians turn by turn, one per
+// thread, and writes their splats after those of all turns before.
+//
+// Every block takes about the same time to decide which pairs are splats. Some blocks take much longer than
+// others to count the tiles of their splats. A block therefore first publishes the number of its splats, then
+// counts the tiles, and only then reads the number of splats of the turns before, so that no block waits for
+// the tile counts of another one.
 __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     splats_kernel(const __grid_constant__ Inputs in, const __grid_constant__ RankTiles rank_tiles,
                   const Prefiltered kept, const ProjectSizes capacity, const ProjectIds ids,
@@ -171,7 +180,7 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
   }
   load_cameras(in, cameras);
   std::int64_t tiles = 0;
-  unsigned of_view = 0;  // splats of view `lane`
+  unsigned of_view = 0;  // splats of this warp in view number `lane`
   int turn = turns.first();
   if (turn < 0) {
     if (warp == 0 && writes) turns.add_up(n_turns);
@@ -235,7 +244,8 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     int next = 0;
     if (thread == 0) {
       if (writes) group.of_turns_before = turns.before(turn);
-      next = turns.next();  // not sooner, as others wait for what it will publish
+      // The block takes its next turn only here, because other blocks wait until the taken turn is published.
+      next = turns.next();
     }
     __syncthreads();
     if (writes) {

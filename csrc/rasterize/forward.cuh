@@ -1,12 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the image and the contributions of splats share on CUDA.
+// Code that two CUDA passes share: the forward pass of the rasteriser (rasterize_fwd_cuda.cu) and the
+// contributions of splats (importance_cuda.cu). It packs the splats, orders the tiles and composites a pixel.
 #pragma once
 #include <cstdint>
 
 #include "common/cuda.cuh"
 #include "rasterize/tile_batch.cuh"
-
-// What comes before compositing on CUDA: splats packed as the kernels read them, and the order of the tiles.
 
 namespace blitzgs::cuda {
 
@@ -28,8 +27,9 @@ __device__ __forceinline__ PackedSplat pack_splat(const RasterizeInput<float>& i
   return splat;
 }
 
-// The last blocks order the tiles; the others pack splats. A warp's splats go through shared memory, so that
-// each store fills whole sectors.
+// Prepares compositing: packs the splats [P] and, unless null, their colours [P, 4], one thread per splat,
+// and fills in the order of the tiles, one thread per tile in the last blocks. The packed splats of a warp go
+// through shared memory, so that each store fills whole sectors.
 inline __global__ void __launch_bounds__(kPackThreads, 8)
     prepare_kernel(RasterizeInput<float> in, PackedSplat* splats, float4* colors, TileOrder order) {
   wait_for_earlier_kernels();
@@ -61,8 +61,7 @@ inline __global__ void __launch_bounds__(kPackThreads, 8)
   colors[i] = c;
 }
 
-// Packs the splats of an input, and their colours unless null, and orders the tiles; `what` is named where it
-// fails.
+// Launches prepare_kernel. `what` is the name of the op in error messages.
 inline void prepare(const char* what, const RasterizeInput<float>& in, PackedSplat* splats, float4* colors,
                     const TileOrder& order, CudaStream stream) {
   order.clear(stream);
@@ -71,27 +70,29 @@ inline void prepare(const char* what, const RasterizeInput<float>& in, PackedSpl
     launch_early(what, prepare_kernel, {blocks, kPackThreads, stream}, in, splats, colors, order);
 }
 
-// Compositing a pixel on CUDA: one definition for the image and for the contributions of splats, so that both
-// see the same alpha T, bit for bit.
+// Compositing a pixel on CUDA (docs/image.md, sections 3 and 5). The image and the contributions of splats
+// use the same definition, so both get the same alpha T, bit for bit.
 
-// List entries that a block copies at once.
+// List entries that a block copies at a time.
 inline constexpr int kForwardBatch = 256;
 
-// Alpha T of four entries of a batch at a pixel: zero where an entry is not composited.
+// The weights alpha T of four entries of a batch at a pixel, zero for entries that are not composited, and
+// whether each entry is composited.
 struct QuadWeights {
   float at[4];
   bool touched[4];
 };
 
-// One pixel's state while its list is composited. Entries are named by their offset in the batch.
+// The state of one pixel while its list is composited. `last` and `ended` are byte offsets of entries in the
+// current batch.
 struct Compositor {
   static constexpr std::uint32_t kNone = ~0u;
   float transmittance = 1.f;
-  float limit;                  // least log2(alpha) that still counts: infinite once the pixel has ended
-  std::uint32_t last = kNone;   // composited last
-  std::uint32_t ended = kNone;  // at which the pixel ended
+  float limit;                  // the least log2(alpha) that is composited; infinite once the pixel has ended
+  std::uint32_t last = kNone;   // the last entry that was composited
+  std::uint32_t ended = kNone;  // the entry at which the pixel ended
 
-  // Composites four entries of a batch. Whether the pixel ends is asked once for all of them.
+  // Composites four entries of a batch. It tests once for all four whether a pixel of the warp ends.
   __device__ __forceinline__ QuadWeights add(const char* entries, const QuadOffsets& offsets,
                                              const Pixel& pixel) {
     float alpha[4];
@@ -116,7 +117,7 @@ struct Compositor {
     return weights;
   }
 
-  // Takes the entry that would end the pixel, and those behind it, out of the four.
+  // If one of the four entries ends the pixel, removes this entry and the entries after it.
   __device__ __forceinline__ void end(float (&alpha)[4], bool (&touched)[4], const QuadOffsets& offsets) {
     float after = transmittance;
 #pragma unroll

@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// From the gradient of a pixel to the gradients of splats, on CUDA.
+// The steps of the CUDA backward pass from the gradient of a pixel to the gradients of splats: per entry and
+// pixel (BackwardPixel), per entry (sum_pixels, finish), per splat (sum_entries_kernel for deterministic
+// gradients), and from the packed table to one array per input (unpack_kernel).
 #pragma once
 #include <cub/device/device_radix_sort.cuh>
 #include <stdexcept>
@@ -8,14 +10,16 @@
 #include "common/cuda.cuh"
 #include "rasterize/tile_batch.cuh"
 
-// From the two numbers of each (entry, pixel) that the backward pass leaves in shared memory, the weight
-// alpha T and g = dL/d(ln alpha), to an entry's gradients: sums of the weights against the pixels' gradients,
-// and moments of g over the pixel grid, from which the gradients of mean and conic follow.
+// For each pair of an entry and a pixel the backward pass leaves two numbers in shared memory: the weight
+// alpha T and g = dL/d(ln alpha). The gradients of the entry follow from these: the colour's gradient is the
+// sum of the weight times the pixel's gradient, and the gradients of mean and conic follow from the moments
+// of g over the pixel grid.
 
 namespace blitzgs::cuda {
 
-inline constexpr int kGroup = 16;  // entries transposed at a time, one for each lane of a half-warp
-// float2 per entry: its pixels, and a pad that spreads the entries over the banks.
+// A half-warp transposes this many entries at a time: first a lane is a pixel, then a lane is an entry.
+inline constexpr int kGroup = 16;
+// float2 values per entry: one for each pixel, and two of padding so that entries lie in different banks.
 inline constexpr int kGroupStride = kSubtile * kSubtile + 2;
 
 __device__ __forceinline__ void add_quad(float* address, float a, float b, float c, float d) {
@@ -31,14 +35,14 @@ __device__ __forceinline__ void add_quad(float* address, float a, float b, float
 #endif
 }
 
-// Gradients of a subtile's pixels, channel by channel.
+// The gradients of the loss by the colours of a subtile's pixels, channel by channel.
 template <int CHANNELS>
 struct __align__(16) SubtileGradient {
   float v[CHANNELS][kSubtile * kSubtile];
 };
 
-// Sums of one entry over pixels: weights times v_render, moments of g about the subtile's centre, and
-// |gradient of the mean|.
+// The sums of one entry over the pixels of a subtile: weights times v_render (the colour's gradient), the
+// moments of g about the subtile's centre, and the absolute values of the mean's gradient (absgrad).
 template <int CHANNELS>
 struct EntrySums {
   float color[CHANNELS] = {};
@@ -46,7 +50,7 @@ struct EntrySums {
   float abs_x = 0.f, abs_y = 0.f;
 };
 
-// Sums over four values at the offsets -1.5, -0.5, 0.5 and 1.5.
+// The moments of order 0, 1 and 2 of four values at the offsets -1.5, -0.5, 0.5 and 1.5.
 struct Moments {
   float zeroth, first, second;
   __device__ __forceinline__ Moments(float a, float b, float c, float d) {
@@ -57,7 +61,8 @@ struct Moments {
   }
 };
 
-// x and y: the subtile's centre from the entry's mean.
+// Computes the sums of one entry over the 16 pixels of a subtile. group: weight and g of each pixel. (x, y):
+// from the entry's mean to the subtile's centre.
 template <int CHANNELS, bool ABSOLUTE>
 __device__ __forceinline__ EntrySums<CHANNELS> sum_pixels(const float2* group,
                                                           const SubtileGradient<CHANNELS>& gradient,
@@ -98,7 +103,8 @@ __device__ __forceinline__ EntrySums<CHANNELS> sum_pixels(const float2* group,
   return sums;
 }
 
-// Moments about the subtile's centre to gradients of the splat.
+// Turns the sums of an entry over a subtile into the entry's contribution to the splat's gradients: shifts
+// the moments of g to the mean, and multiplies by the conic (a, b, c) for the mean's gradient.
 template <int CHANNELS, bool ABSOLUTE>
 __device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, const Entry& shape, float x,
                                                  float y) {
@@ -116,17 +122,15 @@ __device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, c
   return gradient;
 }
 
-// A pixel of the backward pass: from an entry, the two numbers that its gradients are summed from.
-
-// One pixel's state while its list is walked from the back.
+// The state of one pixel while the backward pass visits its list from the last entry to the first.
 template <int CHANNELS>
 struct BackwardPixel {
-  float transmittance;  // in front of the entries walked so far
-  float behind;         // v . (what would be seen behind there, background included)
-  float v[CHANNELS];
+  float transmittance;  // in front of the entries visited so far
+  float behind;         // v . (the colour of those entries and the background, as seen with T = 1)
+  float v[CHANNELS];    // the gradient of the loss by the pixel's colour
 
-  // Four entries of a batch: writes weight and g of each to slots[k * kGroupStride]. last: offset from which
-  // on the pixel has composited nothing. dot(offset): v . color.
+  // Visits four entries of a batch and writes the weight and g of each to slots[k * kGroupStride]. last: the
+  // forward pass composited no entry of this offset or a higher one. dot(offset): v . colour of the entry.
   template <class Dot>
   __device__ __forceinline__ void add(const char* entries, const QuadOffsets& offsets, std::uint32_t last,
                                       const Pixel& pixel, const Dot& dot, float2* slots) {
@@ -145,24 +149,27 @@ struct BackwardPixel {
       transmittance *= reciprocal_approx(1.f - alpha);
       const float weight = alpha * transmittance;
       const float difference = dots[k] - behind;
-      if (touched[k]) behind = __fmaf_rn(alpha, difference, behind);  // not 0 * NaN where a color is NaN
+      if (touched[k]) behind = __fmaf_rn(alpha, difference, behind);  // the test avoids 0 * NaN
       const bool differentiable = touched[k] && raw[k] <= static_cast<float>(kAlphaMax);
       slots[k * kGroupStride] = {weight, differentiable ? weight * difference : 0.f};
     }
   }
 };
 
-// Gradients that repeat bit for bit: the entries of each splat, found by a stable sort, are added in their
-// order.
+// Deterministic gradients: a stable sort groups the list entries by splat, and sum_entries_kernel adds the
+// gradients of a splat's entries in the order of the list.
 
+// values[i] = i, one thread per value.
 inline __global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
   if (i < n) values[i] = static_cast<std::int32_t>(i);
 }
 
-// Adds each splat's entries in the order of the list of all tiles. Of the n entries those from *n_listed on
-// are of no tile, and name any splat: sorted by the low bits of it, they come behind the listed ones of a
-// splat.
+// splat_gradients[splat] = the sum of entry_gradients over the splat's entries, in the order of the list of
+// all tiles. Three threads for each of the n sorted entries, one per quad of the gradient; the threads of a
+// splat's first entry sum over all its entries. Entries from *n_listed on belong to no tile, and their splats
+// are unspecified. The stable sort puts them after the listed entries of the same splat, so the sum ends at
+// the first of them.
 inline __global__ void sum_entries_kernel(const std::int32_t* sorted_splats, const std::int32_t* entries,
                                           std::int64_t n, const std::int64_t* n_listed,
                                           const PackedGradient* entry_gradients,
@@ -182,7 +189,7 @@ inline __global__ void sum_entries_kernel(const std::int32_t* sorted_splats, con
   splat_gradients[splat].quads[quad] = sum;
 }
 
-// Which entries belong to each splat, in order.
+// The list entries sorted by splat: the splat and the position in the list of each, [n].
 struct EntriesBySplat {
   std::int32_t* splats;
   std::int32_t* entries;
@@ -212,12 +219,10 @@ inline EntriesBySplat sort_entries(const std::int32_t* isect_splats, std::int64_
   return sorted;
 }
 
-// From gradients packed by splat to one array for each input.
-
 inline constexpr int kUnpackThreads = 256;
 
-// Stores the WIDTH floats of each of the warp's first n_splats lanes to consecutive memory. By way of
-// shared memory, because a store that skips over others' floats fills no sector.
+// Writes the WIDTH floats of each of the warp's first n_splats lanes to out [n_splats, WIDTH], or adds them.
+// The floats go through shared memory, so that each store fills whole sectors.
 template <int WIDTH>
 __device__ __forceinline__ void store_splats(float* stage, const float (&mine)[WIDTH], float* out,
                                              int n_splats, bool add) {
@@ -233,7 +238,9 @@ __device__ __forceinline__ void store_splats(float* stage, const float (&mine)[W
   __syncwarp();
 }
 
-// colors_only: an earlier chunk gave the gradient of everything else.
+// Writes the packed gradients [n] to one array per input: v_colors, v_means2d, v_conics, v_opacities and, if
+// wanted, v_means2d_abs. One thread per splat. The first chunk of channels writes, later chunks add.
+// colors_only: the first chunk gave the complete gradients of everything but the colours.
 inline __global__ void unpack_kernel(const PackedGradient* packed, std::int64_t n, ChannelChunk chunk,
                                      bool colors_only, RasterizeGradients<float> out) {
   __shared__ float4 stages[kUnpackThreads / 32][3 * 32];
@@ -241,7 +248,7 @@ inline __global__ void unpack_kernel(const PackedGradient* packed, std::int64_t 
   float4* stage = stages[threadIdx.x / 32];
   const int lane = threadIdx.x % 32;
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kUnpackThreads) + threadIdx.x;
-  const std::int64_t first = i - lane;  // of the warp's splats
+  const std::int64_t first = i - lane;  // the first splat of the warp
   const int n_splats = static_cast<int>(min(max(n - first, std::int64_t{0}), std::int64_t{32}));
 #pragma unroll
   for (int k = 0; k < 3; ++k) {
@@ -259,7 +266,7 @@ inline __global__ void unpack_kernel(const PackedGradient* packed, std::int64_t 
     for (int k = 0; k < chunk.count; ++k) out.v_colors[i * chunk.n_channels + chunk.first + k] = color[k];
   }
   if (colors_only) return;
-  const bool add = chunk.first > 0;  // later channels add to what the first ones gave
+  const bool add = chunk.first > 0;
   store_splats<2>(floats, {a.x, a.y}, out.v_means2d + 2 * first, n_splats, add);
   store_splats<3>(floats, {a.z, a.w, b.x}, out.v_conics + 3 * first, n_splats, add);
   store_splats<1>(floats, {b.y}, out.v_opacities + first, n_splats, add);

@@ -1,38 +1,44 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rasterisation: alpha compositing of each tile's list, front to back, and its gradient.
+// Rasterisation (docs/image.md, sections 3 and 5): alpha compositing of each tile's list, front to back, and
+// its gradient. The kernels are forward_kernel (rasterize_fwd_cuda.cu) and backward_kernel
+// (rasterize_bwd_cuda.cu) on CUDA, forward_tile (tile_forward.h) and backward_tile (tile_kernels.h) on the
+// CPU.
 //
 // Per pixel with centre (i + 0.5, j + 0.5), over the tile's list in order, T = 1 at the start:
 //   q     = a dx^2 + 2 b dx dy + c dy^2,  (dx, dy) = pixel centre - mean2d,  conic = (a, b, c)
 //   alpha = min(0.99, opacity * exp(-q / 2));           skipped unless alpha >= 1/255
 //   if T (1 - alpha) < 1e-4 the pixel ends and this splat is not composited
 //   color += alpha T splat_color;  T *= 1 - alpha
-// and at the end color += T background. No other cut: culling inside the kernel is conservative (q is best
-// evaluated through factor_conic() of math/tiles.h, which the tile test's slack is made for).
+// and at the end color += T background. There is no other cut: culling inside the kernel is conservative.
+// (The kernels evaluate q through factor_conic() of math/tiles.h, because the slack of the tile test covers
+// the rounding of that form.)
 //
 //   means2d [P, 2], conics [P, 3], opacities [P], colors [P, D], backgrounds [B, D] or null, isect_splats and
 //   tile_offsets from intersect  ->  renders [B, H, W, D]; transmittances [B, H, W] (final T; alpha = 1 - T);
 //   last_ids int32 [B, H, W]: 1 + index in the tile's list of the last composited entry, 0 for none;
-//   tile_work int32 [B*T]: list entries processed before every pixel of the tile had ended (or the list
-//   had): what the tile cost. Pixels of unowned tiles are zero in all outputs, transmittance included, with
-//   clear_rest; otherwise they are not written.
+//   tile_work int32 [B*T], the cost of each tile: the list entries processed until every pixel of the tile
+//   had ended, or the list was at its end. With clear_rest, the pixels of unowned tiles are zero in all
+//   outputs, transmittance included; without it they are not written.
 //
-// Exact: a pixel depends on its tile's list and the splats in it alone, so tile ranges, batch position,
-// threads and (CPU) the instruction set change no bit. The CPU float32 kernel does the same operations with
-// and without AVX2. CPU and CUDA agree to rounding.
+// Exactness: a pixel depends only on its tile's list and the splats in it. The range of tiles, the position
+// in the batch, the number of threads and (CPU) the instruction set therefore change no bit. The CPU float32
+// kernel does the same operations with and without AVX2. CPU and CUDA agree to rounding.
 //
 // Gradients, given v_renders [B, H, W, D] and optionally v_alphas [B, H, W]: per splat v_means2d [P, 2],
 // v_conics [P, 3] (of a, b, c as three independent numbers), v_opacities [P], v_colors [P, D], and with
 // absgrad v_means2d_abs [P, 2] = sum over pixels of |that pixel's gradient of mean2d| per axis. Zero where
-// min(0.99, .) clips; the order, the cut at 1/255 and the end of a pixel are constants. The gradient of the
-// background is sum over pixels of v_renders * T, left to the caller. Splats in no list get zeros. v_renders
-// of unowned tiles are not read.
+// min(0.99, .) clips; the order, the cut at 1/255 and the end of a pixel count as constants. The caller
+// computes the gradient of the background, the sum over pixels of v_renders * T. Splats in no list get zeros.
+// v_renders of unowned tiles are not read.
 //
-// Forward may be queued with room for more splats than there are (known_splats, common/kernel.h; CUDA
-// alone): it packs, and zeroes gradients of, those that are there; gradients behind them are unspecified.
-// Backward may then be given just these splats.
+// On CUDA, the forward pass may be queued with a capacity n_splats before the number of splats is known. The
+// kernels then read the number from known_splats (common/kernel.h). They pack so many splats and set the
+// gradients of so many to zero; gradients beyond are unspecified. The backward pass may then be called with
+// just these splats.
 //
-// The CPU gradient is bitwise repeatable for any number of threads: one partial sum per (splat, tile), added
-// in the order of the tiles. CUDA: when deterministic is set. O(entries processed x pixels of the splat).
+// The CPU gradient is bitwise repeatable for any number of threads: there is one partial sum per splat and
+// tile, and these are added in the order of the tiles. The CUDA gradient is repeatable if `deterministic` is
+// set. The cost is O(entries processed x pixels of the splat).
 #pragma once
 #include <cstdint>
 
@@ -53,7 +59,7 @@ struct RasterizeInput {
   std::int64_t n_splats;
   int n_channels;
   TileGrid grid;
-  const std::int64_t* known_splats = nullptr;
+  const std::int64_t* known_splats = nullptr;  // null: n_splats
 };
 
 template <class T>
@@ -62,7 +68,7 @@ struct RasterizeOutput {
   T* transmittances;
   std::int32_t* last_ids;
   std::int32_t* tile_work;
-  T* splat_gradients;  // null, or [P] SplatGradient to be zeroed; up to four channels on CUDA
+  T* splat_gradients;  // null, or [P] SplatGradient that forward sets to zero (CUDA, up to four channels)
   bool clear_rest;
 };
 
@@ -83,16 +89,16 @@ struct RasterizeGradients {
   T* v_means2d_abs;  // null: not wanted
 };
 
-// Tiles composited in no plain order are listed by class of length (CUDA), so many numbers for each tile.
+// The number of classes of list length by which CUDA orders tiles (tile_batch.cuh).
 inline constexpr int kTileOrderClasses = 16;
 
-// What forward leaves for backward besides its outputs, in the backend's own layout. Backward may have fewer
-// splats than forward had room for, and may differentiate fewer tiles than were composited.
+// Memory that forward fills for backward besides its outputs, in the layout of the backend. Backward may be
+// called with fewer splats than forward had capacity for, and for fewer tiles than forward composited.
 struct RasterizeAux {
-  void* packed;         // splats as the kernels read them, splats * rasterize_splat_bytes(), 64-byte aligned
-  std::int64_t splats;  // that forward had room for
-  std::int32_t* order;  // [1 + composited, kTileOrderClasses], or null: in the order of their numbers
-  std::int64_t composited;  // tiles
+  void* packed;         // the packed splats, splats * rasterize_splat_bytes() bytes, 64-byte aligned
+  std::int64_t splats;  // the capacity of forward
+  std::int32_t* order;  // [1 + composited, kTileOrderClasses] of tile_batch.cuh; null: tiles by their numbers
+  std::int64_t composited;  // the number of composited tiles
 };
 
 namespace cpu {

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// The gradient of compositing. A half-warp walks its subtile's list from the back, a lane a pixel, so the
-// pixel's state is a transmittance and one number (what lies behind, dotted with the pixel's gradient), and
-// nothing but the final transmittance has to be kept from the forward pass. Per entry and pixel that leaves
-// two numbers: the weight alpha T and g = dL/d(ln alpha). Sixteen entries at a time, the half-warp transposes
-// them through shared memory, and each lane then sums for one entry: the weights against the pixels'
-// gradients, and the moments of g over the pixel grid, from which the gradients of mean and conic follow.
+// The gradient of compositing (docs/image.md, sections 3 and 5). A half-warp visits the list of its 4x4
+// subtile from the last entry to the first, one lane per pixel. The state of a pixel is its transmittance and
+// one number, the dot product of the colour behind the entry with the pixel's gradient, so the backward pass
+// needs only the final transmittance and last_ids from the forward pass. For each entry and pixel this gives
+// two numbers: the weight alpha T and g = dL/d(ln alpha). The half-warp writes these for sixteen entries to
+// shared memory. Each lane then sums over the sixteen pixels for one of the entries (gradients.cuh).
 #include <algorithm>
 #include <stdexcept>
 #include <string>
@@ -46,7 +46,9 @@ __device__ __forceinline__ float4 add_halves(float4 a) {
           a.z + __shfl_xor_sync(kFullWarp, a.z, kHalfWarp), a.w + __shfl_xor_sync(kFullWarp, a.w, kHalfWarp)};
 }
 
-// Sums the group's entries, list[0 .. filled) of the half-warp's list, and hands the results on.
+// Sums a group of entries, list[0 .. filled) of the half-warp's list, over the subtile's pixels, one lane per
+// entry. Adds the sums to the splats' gradients atomically or, if DETERMINISTIC, stores them in
+// shared.partial.
 template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
 __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINISTIC>& shared,
                                             const BackwardArguments& args, const TilePlace& tile,
@@ -67,7 +69,7 @@ __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINIST
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) touched |= sums.color[k] != 0.f;
   touched &= slot < filled;
-  if constexpr (DETERMINISTIC) {  // both halves have the same list
+  if constexpr (DETERMINISTIC) {  // both halves of the warp visit the same list, so their sums are added here
     const bool half = threadIdx.x & kHalfWarp;
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
@@ -93,6 +95,7 @@ __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINIST
   __syncwarp();
 }
 
+// Returns the state of a pixel behind its last entry, and writes the pixel's gradient to shared.v_render.
 template <int CHANNELS, bool WIDE, class Shared>
 __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, const BackwardArguments& args,
                                                                const Pixel& pixel, int camera) {
@@ -100,7 +103,7 @@ __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, c
   state.transmittance = pixel.inside ? args.saved.transmittances[pixel.index] : 1.f;
   const ChannelChunk& chunk = args.chunk;
   const float* v_render = args.saved.v_renders + pixel.index * chunk.n_channels;
-  float open = 0.f;  // gradient of the final transmittance
+  float open = 0.f;  // the gradient of the loss by the final transmittance
   if (pixel.inside && args.saved.v_alphas && chunk.first == 0) open = -args.saved.v_alphas[pixel.index];
 #pragma unroll
   for (int k = 0; k < CHANNELS; ++k) {
@@ -128,7 +131,10 @@ __device__ __noinline__ float wide_dot(const BackwardArguments& args, const Pixe
   return sum;
 }
 
-// WIDE: g is of all channels, not of the chunk's alone, which absolute sums need.
+// One block of 256 threads per tile, one half-warp per subtile, one thread per pixel. Reads the tile's list
+// from isect_splats, the packed splats and the pixels' gradients; adds to splat_gradients [P] atomically or
+// (DETERMINISTIC) writes entry_gradients [I]. WIDE: g sums over all channels and not over those of the chunk
+// alone, as absolute sums require.
 template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
 __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
     backward_kernel(const BackwardArguments args) {
@@ -139,7 +145,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
   wait_for_earlier_kernels();
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   const std::int64_t index = args.order.tile(static_cast<int>(blockIdx.x));
-  if (index < args.grid.tile_begin || index >= args.grid.tile_end) return;  // composited, but not owned
+  if (index < args.grid.tile_begin || index >= args.grid.tile_end) return;  // forward alone composited it
   const TilePlace tile = locate_tile(args.grid, index);
   const std::int64_t start = args.tile_offsets[tile.tile];
   if (args.tile_offsets[tile.tile + 1] == start) return;
@@ -150,7 +156,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
   shared.batch.init(thread);
   auto state = start_pixel<CHANNELS, WIDE>(shared, args, pixel, tile.camera);
   const int pixel_last = pixel.inside ? args.saved.last_ids[pixel.index] : 0;
-  int list_last = pixel_last;  // of the pixels that share a list
+  int list_last = pixel_last;  // the maximum over the pixels that share a list
   for (int step = DETERMINISTIC ? kHalfWarp : kHalfWarp / 2; step > 0; step /= 2) {
     list_last = max(list_last, __shfl_xor_sync(kFullWarp, list_last, step));
   }
@@ -246,7 +252,8 @@ void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream 
   }
 }
 
-// The gradients of each splat, a chunk of channels at a time.
+// Computes the gradients of all splats for one chunk of channels at a time. The constructor allocates what
+// deterministic gradients need and sorts the list by splat.
 class SplatGradientSums {
  public:
   SplatGradientSums(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
@@ -269,7 +276,7 @@ class SplatGradientSums {
             std::min(kChunkChannels, in_.n_channels - first)};
   }
 
-  // packed: zeros.
+  // Adds the gradients by the channels of the chunk to `packed` [P].
   void add(const ChannelChunk& chunk, bool absolute, PackedGradient* packed) const {
     if (empty_) return;
     if (entries_) {

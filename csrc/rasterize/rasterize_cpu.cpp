@@ -10,7 +10,8 @@
 namespace blitzgs::cpu {
 namespace {
 
-// Partial gradients held at once: a few megabytes, so that they are summed out of the cache.
+// The number of partial gradients (one per splat and tile) in memory at a time: a few megabytes, so that they
+// are still in the cache when they are summed.
 constexpr std::int64_t kPartialsPerChunk = 1 << 17;
 
 template <class T>
@@ -24,7 +25,7 @@ void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {
   std::fill_n(out.tile_work, grid.count(), 0);
 }
 
-// Length of each owned tile's list up to its last composited entry.
+// Writes to used [owned tiles] the length of each owned tile's list up to its last composited entry.
 template <class T>
 void find_used_entries(const RasterizeInput<T>& in, const std::int32_t* last_ids, std::int32_t* used) {
   const TileGrid& grid = in.grid;
@@ -41,12 +42,15 @@ void find_used_entries(const RasterizeInput<T>& in, const std::int32_t* last_ids
   });
 }
 
-// Owned tiles [begin, end) and the place of each one's partial gradients.
+// The owned tiles [begin, end) whose partial gradients are in memory together, and the number of these
+// gradients.
 struct Chunk {
   std::int64_t begin, end;
   std::int64_t partials;
 };
 
+// Divides the owned tiles into chunks and writes to places [owned tiles] the position of each tile's partial
+// gradients in the memory of its chunk.
 std::vector<Chunk> cut_chunks(const TileGrid& grid, const std::int32_t* used, std::int64_t* places) {
   std::vector<Chunk> chunks;
   for (std::int64_t tile = grid.tile_begin; tile < grid.tile_end; ++tile) {
@@ -61,8 +65,8 @@ std::vector<Chunk> cut_chunks(const TileGrid& grid, const std::int32_t* used, st
   return chunks;
 }
 
-// Adds a chunk's partial gradients to the sums [P, width], each splat by one thread, in the order of the
-// tiles.
+// Adds the partial gradients of a chunk to the sums [P, width]. One thread adds all those of a splat, in the
+// order of the tiles.
 template <class T>
 void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const std::int32_t* used,
                   const T* partials, int width, T* sums) {
@@ -101,7 +105,8 @@ void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
 
 }  // namespace
 
-// The prepared splats of float32; float64, which is for checking, prepares them again in the backward pass.
+// Memory for prepared splats in float32. In float64, which serves for checks, the backward pass prepares the
+// splats again.
 std::int64_t rasterize_splat_bytes(int) { return sizeof(PreparedSplat<float>); }
 
 bool rasterize_orders_tiles(const TileGrid&) { return false; }

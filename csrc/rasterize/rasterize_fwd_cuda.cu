@@ -18,11 +18,12 @@ struct ForwardArguments {
   TileGrid grid;
   TileOrder order;
   RasterizeOutput<float> out;
-  std::int64_t zero_splats, splats_per_block;  // of out.splat_gradients, to be zeroed on the way
-  const std::int64_t* known_splats;            // null, or how many of these splats are there
+  // The number of splats of out.splat_gradients that all blocks, and each block, set to zero.
+  std::int64_t zero_splats, splats_per_block;
+  const std::int64_t* known_splats;  // null, or the actual number of splats
 };
 
-// What four entries add to the colour of a pixel.
+// Adds the colours of four entries, times their weights, to the colour of a pixel.
 template <int CHANNELS>
 __device__ __forceinline__ void add_colors(const char* entries, const QuadOffsets& offsets,
                                            const QuadWeights& weights, float* color) {
@@ -58,12 +59,14 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
   args.out.last_ids[pixel.index] = last;
 }
 
-// At most so many 16-byte stores of zeros a thread; where tiles are too few for that, they are no help.
+// The most 16-byte zeros that a thread of forward_kernel writes. If there are too few tiles for this, a
+// memset clears the gradients.
 constexpr int kMostZeros = 16;
-constexpr int kQuads = kSplatGradient / 4;  // such stores for a splat
+constexpr int kQuads = kSplatGradient / 4;  // 16-byte zeros per splat
 
-// This block's share of the zeros that backward starts from. Compositing waits for instructions, not for
-// memory, so the stores cost next to nothing; they ask for no room in the L2 cache, which the splats need.
+// Sets this block's part of the splats' gradients to zero for the backward pass. Compositing is bound by
+// instructions and not by memory, so these stores cost almost nothing. __stcs marks them as the first to
+// leave the L2 cache, which the splats need.
 __device__ __forceinline__ void zero_share(const ForwardArguments& args, std::int64_t n_splats, int threads) {
   auto* quads = reinterpret_cast<float4*>(args.out.splat_gradients);
   const std::int64_t begin = blockIdx.x * args.splats_per_block * kQuads;
@@ -71,7 +74,10 @@ __device__ __forceinline__ void zero_share(const ForwardArguments& args, std::in
   for (std::int64_t i = begin + threadIdx.x; i < end; i += threads) __stcs(quads + i, float4{});
 }
 
-// The first blocks are the owned tiles; the rest, if wanted, write zeros.
+// Composites the image (docs/image.md, sections 3 and 5). One block of 256 threads per tile, one thread per
+// pixel. Reads the tile's list and the packed splats; writes renders [B, H, W, D] (the channels of the
+// chunk), transmittances, last_ids and tile_work. The first blocks are the owned tiles. With clear_rest there
+// is a block for each other tile, too, which writes zeros.
 template <int CHANNELS>
 __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const ForwardArguments args) {
   constexpr int kBatch = kForwardBatch;
@@ -107,7 +113,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
     return thread < kBatch && at < count ? args.isect_splats[start + at] : -1;
   };
   std::int32_t splat = splat_at(thread), next_splat = splat_at(thread + kBatch);
-  zero_share(args, zero_splats, Tile::kThreads);  // while the list is on its way
+  zero_share(args, zero_splats, Tile::kThreads);  // while the loads of the list are in flight
   batch.fetch(0, args.splats, args.chunk, splat, thread);
   for (int base = 0, buffer = 0; base < count; base += kBatch, buffer ^= 1) {
     if (thread < kBatch) batch.place(buffer, splat >= 0, tile, thread);

@@ -9,7 +9,7 @@
 namespace blitzgs {
 namespace {
 
-// Whether gradients of splats can be left packed.
+// Whether the backend has the packed table of splat gradients.
 #ifdef BLITZGS_BACKEND_CUDA
 constexpr bool kPacked = true;
 #else
@@ -72,7 +72,7 @@ struct Splats {
   }
 
   TileGrid grid;
-  std::int64_t n_splats, n_channels = 0;  // of the columns
+  std::int64_t n_splats, n_channels = 0;  // n_splats: the length of the columns
   SplatCount splat_count;
   Tensor means2d, conics, opacities, colors, isect_splats, tile_offsets;
   std::optional<Tensor> backgrounds;
@@ -80,7 +80,7 @@ struct Splats {
 
 using CompositedTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-// Zeroes splat_gradients, if there are any.
+// Runs the forward pass. It sets splat_gradients to zero if they are given.
 CompositedTensors composite(const Splats& splats, std::optional<Tensor> splat_gradients, bool clear_rest) {
   const TileGrid& grid = splats.grid;
   Tensor renders = make_empty(splats.means2d, {grid.n_cameras, grid.height, grid.width, splats.n_channels});
@@ -125,7 +125,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
   return std::tuple_cat(std::move(composited), std::tuple(splat_gradients));
 }
 
-// The groups of arguments of the backward ops, as Splats has them: splats (means2d, conics, splat_opacities,
+// Makes a Splats of the groups of arguments of the backward ops: splats (means2d, conics, splat_opacities,
 // colors) and lists (isect_splats, tile_offsets).
 Splats backward_splats(const char* op, const std::vector<Tensor>& splats,
                        const std::optional<Tensor>& backgrounds, const std::vector<Tensor>& lists,
@@ -137,8 +137,8 @@ Splats backward_splats(const char* op, const std::vector<Tensor>& splats,
   return {op, splats[0], splats[1], splats[2], splats[3], backgrounds, lists[0], lists[1], grid};
 }
 
-// What the backward ops need of the forward pass, checked and contiguous: (transmittances, last_ids,
-// packed_splats, tile_order), and the gradients of the images.
+// The outputs of the forward pass that the backward ops read, (transmittances, last_ids, packed_splats,
+// tile_order), and the gradients of the images, checked and contiguous.
 struct Composited {
   Composited(const char* op, const Splats& splats, const std::vector<Tensor>& composited,
              const Tensor& v_renders_in, const std::optional<Tensor>& v_alphas_in)
@@ -191,7 +191,7 @@ struct Composited {
   std::int64_t grid_count;
 
  private:
-  // How many were composited.
+  // The number of tiles that the forward pass composited.
   std::int64_t tiles() const { return order.size(0) > 0 ? order.size(0) - 1 : grid_count; }
 };
 

@@ -22,7 +22,7 @@ class HeapWorkspace final : public Workspace {
   std::vector<std::unique_ptr<char[]>> held_;
 };
 
-// Two splats on a 40 x 20 image: one round and near, one wide and far, listed in the wrong order.
+// Two splats on a 40 x 20 image: splat 0 is wide and far, splat 1 is round and near.
 template <class T>
 struct Scene {
   TileGrid grid = make_tile_grid(1, 40, 20, 16, 0, -1);

@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the CUDA rasteriser's forward and backward share: the order of tiles, packed splats, the arithmetic of
-// alpha, and how a block reads a batch of its tile's list.
+// Device code that the CUDA rasteriser's forward and backward kernels share: the order of the tiles, packed
+// splats, the arithmetic of alpha (docs/image.md, section 3), and how a block reads a batch of its tile's
+// list.
 //
-// A block is a tile, half a warp a 4x4 subtile of it, a lane a pixel. The block fetches the list in batches;
-// each thread tests its entry against every subtile, and from those tests each half-warp makes the list of
-// the entries it has to look at: a splat of a few pixels touches three of the sixteen subtiles of a 16x16
-// tile. The two halves of a warp walk different lists in step. The test is conservative, so it changes no
-// pixel.
+// A block composites a tile of 16x16 pixels, a half-warp a subtile of 4x4, a lane a pixel. The block copies
+// the tile's list to shared memory in batches. Each thread tests one entry against all sixteen subtiles, and
+// from these tests each half-warp makes the list of the entries that may touch its subtile: a splat of a few
+// pixels touches about three subtiles. The two halves of a warp visit different lists in lockstep. The test
+// is conservative, so it changes no pixel.
 #pragma once
 #include <cstdint>
 #include <stdexcept>
@@ -18,29 +19,32 @@
 
 namespace blitzgs::cuda {
 
-// In which order a launch takes its tiles. Blocks start in the order of their numbers, and the last to start
-// should be short, so that no multiprocessor is left with a long list when the others are done. Images end
-// with their near, sparse rows; but a rank's share of the tiles may end with the far rows of a view, so there
-// long lists come first. Which tile comes when changes no pixel. The order is made once: forward leaves it
-// for backward, which may differentiate fewer tiles than were composited.
+// The order in which the blocks of a launch take the tiles; it changes no pixel. Blocks start in the order of
+// their numbers. The tiles of the last blocks should have short lists, so that no multiprocessor still works
+// on a long list when the others are done. Whole images end with rows of near ground, whose lists are short.
+// The tiles of one rank may end with the far rows of a view, so there the tiles with long lists come first.
+// Forward makes the order and keeps it for backward, which may differentiate fewer tiles than were
+// composited.
 
-// By the power of two below their length; the first class has the longest lists, the last the empty ones.
+// Tiles are classified by the number of bits of the length of their list. The first class has the longest
+// lists, the last one the empty lists.
 inline constexpr int kLengthClasses = kTileOrderClasses;
 
-// The composited tiles by class: how many each class has, and which, in any order, n_tiles places for each.
-// Null where all tiles are composited, which come one after the other.
+// The composited tiles by class: the number of tiles in each class, and the tiles, in any order, with memory
+// for n_tiles in each class. Both pointers are null if all tiles are composited; the blocks then take the
+// tiles in the order of their numbers.
 struct TileOrder {
   std::int32_t* counts = nullptr;  // [kLengthClasses], 16-byte aligned
   std::int32_t* tiles = nullptr;   // [kLengthClasses, n_tiles]
   std::int64_t first;
   int n_tiles;
 
-  // Numbers of the order of so many of the tiles of a grid's images.
+  // The number of int32 values that the order of `composited` tiles of the grid needs.
   static std::int64_t words(const TileGrid& grid, std::int64_t composited) {
     return composited == grid.count() ? 0 : (1 + composited) * kLengthClasses;
   }
 
-  // In such memory, for tiles that are all among the composited ones.
+  // memory: [words()]. All tiles of the grid's range must be among the composited tiles.
   TileOrder(const TileGrid& grid, std::int64_t composited, std::int32_t* memory)
       : first(grid.tile_begin), n_tiles(static_cast<int>(grid.tile_end - grid.tile_begin)) {
     if (composited == grid.count()) return;
@@ -49,12 +53,12 @@ struct TileOrder {
     n_tiles = static_cast<int>(composited);
   }
 
-  // Before any tile is noted.
+  // Sets the counts to zero. Queued before the kernel that calls add().
   void clear(CudaStream stream) const {
     if (counts) zero("tile_order", counts, kLengthClasses, stream);
   }
 
-  // Notes tile number `local` of the owned ones; the whole warp takes part. Counts are zero at first.
+  // Adds tile number `local` of the owned tiles to its class. All lanes of the warp must call this.
   __device__ void add(const std::int64_t* tile_offsets, int local) const {
     const bool present = local < n_tiles;
     int length_class = -1;
@@ -74,10 +78,10 @@ struct TileOrder {
         static_cast<std::int32_t>(first + local);
   }
 
-  // Tiles that are to be added.
+  // The number of tiles that prepare_kernel has to add.
   int unordered() const { return counts ? n_tiles : 0; }
 
-  // The tile that a block takes, block < n_tiles.
+  // The tile that block number `block` < n_tiles takes.
   __device__ __forceinline__ std::int64_t tile(int block) const {
     if (!counts) return first + block;
     const std::int32_t* of_class = tiles;
@@ -101,13 +105,13 @@ inline constexpr float kInverseScale2 = 1.38629436112f;  // 1 / kFactorScale^2
 inline constexpr int kSubtile = 4;                       // edge in pixels
 inline constexpr int kHalfWarp = 16;
 
-// A splat as the kernels read it: one 32-byte sector, so a gather moves no byte it does not use. With
+// A splat as the kernels read it: one 32-byte sector, so that a gather reads no unused bytes. With
 // conic = L^T L (factor_conic), l11, l21, l22 are scaled by sqrt(log2(e) / 2), so that
 // log2(alpha) = log2_opacity - (l11 dx + l21 dy)^2 - (l22 dy)^2.
 struct __align__(32) PackedSplat {
   float x, y, l11, l21;
   float l22, log2_opacity;
-  float dx_per_dy;  // where alpha peaks along a row of pixels: dx = dx_per_dy * dy
+  float dx_per_dy;  // along a row of pixels at dy, alpha is largest at dx = dx_per_dy * dy
   float turn;       // the ellipse {log2(alpha) >= log2_opacity - r^2} reaches furthest right at dy = turn * r
 };
 
@@ -118,7 +122,7 @@ struct __align__(16) PackedGradient {
 };
 static_assert(sizeof(PackedGradient) == sizeof(SplatGradient));
 
-// Edge of the tiles that the kernels composite, and how many channels a launch does.
+// The edge of a tile in pixels, and the most channels that one launch composites.
 inline constexpr int kTileSize = 16, kChunkChannels = 4;
 
 inline void check_tile_size(const char* op, const TileGrid& grid) {
@@ -129,19 +133,19 @@ inline void check_tile_size(const char* op, const TileGrid& grid) {
 
 inline PackedSplat* packed_splats(const RasterizeAux& aux) { return static_cast<PackedSplat*>(aux.packed); }
 
-// The colours, behind all splats; null where there are too many channels to pack.
+// The packed colours, which follow the packed splats in memory; null if there are too many channels to pack.
 inline float4* packed_colors(const RasterizeAux& aux, int n_channels) {
   return n_channels <= kChunkChannels ? reinterpret_cast<float4*>(packed_splats(aux) + aux.splats) : nullptr;
 }
 
-// The channels of one launch: up to 4 of n_channels, from `first`.
+// The channels that one launch composites: `count` (at most 4) of n_channels, from channel `first` on.
 struct ChannelChunk {
   const float4* packed;  // packed_colors(), or null
-  const float* colors;   // [P, n_channels] otherwise
+  const float* colors;   // [P, n_channels], read if `packed` is null
   int n_channels, first, count;
 };
 
-// Asynchronous copies to shared memory; the thread that made them waits with copies_done().
+// Asynchronous copies to shared memory. The thread that starts them waits for them with copies_done().
 __device__ __forceinline__ void copy_quad(void* shared, const void* global) {
   const auto address = static_cast<std::uint32_t>(__cvta_generic_to_shared(shared));
   asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address), "l"(global) : "memory");
@@ -173,8 +177,8 @@ __device__ __forceinline__ float channel(const float4& c, int k) {
   return k == 0 ? c.x : k == 1 ? c.y : k == 2 ? c.z : c.w;
 }
 
-// To within 2 and 1 units in the last place; correctly rounded in a build with BLITZGS_EXACT_EXP, which is
-// there to measure the difference (benchmarks/bm_accuracy.py).
+// exp2_approx is exact to 2 units in the last place, reciprocal_approx to 1. A build with BLITZGS_EXACT_EXP
+// rounds both correctly; it serves to measure the difference (benchmarks/bm_accuracy.py).
 __device__ __forceinline__ float exp2_approx(float x) {
 #ifdef BLITZGS_EXACT_EXP
   return static_cast<float>(exp2(static_cast<double>(x)));
@@ -209,13 +213,13 @@ struct Tile {
   static constexpr int kMaskWords = (kSubtiles + 31) / 32;
 };
 
-// Where a thread's pixel lies.
+// The position of a thread's pixel.
 struct Pixel {
   int x, y;            // in the image
-  int subtile;         // in the tile
-  bool inside;         // of the image
+  int subtile;         // the index of its subtile in the tile
+  bool inside;         // whether the pixel is inside the image
   std::int64_t index;  // (camera, y, x) flattened
-  float dx, dy;        // of its centre from the tile's: multiples of 1/2, so exact
+  float dx, dy;        // from the tile's centre to the pixel's centre: multiples of 1/2, so exact
 };
 
 struct TilePlace {
@@ -226,7 +230,7 @@ struct TilePlace {
 __device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid, std::int64_t tile) {
   TilePlace place;
   place.tile = tile;
-  // Tiles are blocks of a launch, so their number has 32 bits.
+  // There is a block for each tile, so tile numbers fit 32 bits, in which division is faster.
   const auto number = static_cast<std::uint32_t>(tile), columns = static_cast<std::uint32_t>(grid.tiles_x);
   const auto per_image = static_cast<std::uint32_t>(grid.per_image());
   const std::uint32_t in_image = number % per_image;
@@ -236,7 +240,7 @@ __device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid, std::int6
   return place;
 }
 
-// A warp is two subtiles side by side.
+// Thread t composites pixel t % 16 of subtile t / 16. A warp has two subtiles side by side.
 __device__ __forceinline__ Pixel locate_pixel(const TileGrid& grid, const TilePlace& place, int thread) {
   constexpr int kColumns = Tile::kColumns;
   const int lane = thread % kHalfWarp;
@@ -257,13 +261,15 @@ __device__ __forceinline__ float clamp_between(float value, float low, float hig
   return fminf(fmaxf(value, low), high);
 }
 
-// The least integer >= value in the lowest bits, for |value| < 2^22.
+// The lowest bits of the result are those of the least integer >= scale * value + shift, for results below
+// 2^22 in magnitude: adding 1.5 * 2^23 shifts the fraction out of the significand.
 __device__ __forceinline__ std::uint32_t ceil_bits(float scale, float value, float shift) {
   return __float_as_uint(__fmaf_ru(scale, value, shift + 12582912.f));
 }
 
-// One bit per subtile, row by row: can alpha reach 1/255 at one of its pixel centres? Over each row of
-// subtiles, the ellipse of those points spans an interval of x with ends in closed form (as in math/tiles.h).
+// Sets one bit per subtile, row by row: whether alpha may reach 1/255 at one of the subtile's pixel centres.
+// The points with alpha >= 1/255 form an ellipse. Its part in a row of subtiles spans an interval of x whose
+// ends have a closed form (as in math/tiles.h).
 __device__ __forceinline__ void subtile_mask(const PackedSplat& splat, const TilePlace& place,
                                              std::uint32_t* masks) {
   constexpr int kColumns = Tile::kColumns;
@@ -290,7 +296,7 @@ __device__ __forceinline__ void subtile_mask(const PackedSplat& splat, const Til
     const float reach_right = sqrt_approx(fmaxf(rest_right, 0.f)) * inverse;
     const float end_left = splat.dx_per_dy * dy_left - reach_left + left;
     const float end_right = splat.dx_per_dy * dy_right + reach_right + right;
-    // Subtile c holds the pixels 4 c to 4 c + 3. A NaN bound does not bound.
+    // Subtile c has the pixels 4 c to 4 c + 3. fminf and fmaxf replace a NaN bound by the edge of the tile.
     const std::uint32_t skip_left =
         ceil_bits(0.25f, fminf(fmaxf(end_left, 1.f - kSubtile), static_cast<float>(kTileSize)), 0.f);
     const std::uint32_t skip_right =
@@ -300,7 +306,7 @@ __device__ __forceinline__ void subtile_mask(const PackedSplat& splat, const Til
   }
 }
 
-// Bit r of lane c's result is bit c of lane r's.
+// Transposes the 32 x 32 bits of a warp: bit r of the result of lane c is bit c of the argument of lane r.
 __device__ __forceinline__ std::uint32_t transpose_bits(std::uint32_t bits, int lane) {
   constexpr std::uint32_t kLow[5] = {0x55555555u, 0x33333333u, 0x0f0f0f0fu, 0x00ff00ffu, 0x0000ffffu};
 #pragma unroll
@@ -315,15 +321,16 @@ __device__ __forceinline__ std::uint32_t transpose_bits(std::uint32_t bits, int 
   return bits;
 }
 
-// A list entry in shared memory: what alpha needs, relative to the tile's centre, first.
+// A list entry in shared memory. The first six numbers are the splat relative to the tile's centre, for
+// log2_alpha().
 struct __align__(16) Entry {
   float l11, l21, u, l22;
   float v, log2_opacity, x, y;  // x, y: the mean
   float color[4];
 };
 
-// log2 of the unclipped alpha at a pixel. Written out with the fused operations, because forward and backward
-// must agree bit by bit on which pixels a splat touches.
+// log2 of the unclipped alpha at a pixel. The fused operations are explicit, because forward and backward
+// must agree bit by bit on the pixels that a splat touches.
 __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pixel) {
   const float4 a = reinterpret_cast<const float4*>(&entry)[0];
   const float2 b = reinterpret_cast<const float2*>(&entry)[2];
@@ -332,30 +339,34 @@ __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pix
   return __fmaf_rn(-u, u, __fmaf_rn(-v, v, b.y));
 }
 
-// Two batches of list entries in shared memory, one being copied while the other is composited, and for each
-// subtile the list of those it has to look at, as byte offsets so that the loops over them spend nothing on
-// addresses. The lists are filled up to whole quads, and to the length of the list that the warp's other half
-// walks, with an entry that touches nothing. Thread i < BATCH sees to entry i of each batch: fetch(first),
-// then for each batch place(it), barrier, fetch(next), list(it). One barrier is enough: fetch() overwrites
-// what was last read before it, and place() what was last read before the previous one.
+// Two batches of list entries in shared memory, so that one is copied while the other is composited, and for
+// each subtile the list of the batch's entries that may touch it. The lists hold byte offsets of entries, so
+// that the loops over them need no address arithmetic. Each list is padded with an entry that touches no
+// pixel to a multiple of four, and to the length of the list of the warp's other half.
+//
+// Thread i < BATCH copies and tests entry i of each batch. The order of calls is fetch(first batch), and then
+// for each batch place(this batch), barrier, fetch(next batch), list(this batch). One barrier per batch is
+// enough: the data that fetch() overwrites was last read before this barrier, and the data that place()
+// overwrites was last read before the previous one.
 template <int BATCH>
 struct EntryBatch {
   static constexpr int kWords = BATCH / 32;
-  static constexpr int kLaneBits = BATCH / kHalfWarp;  // entries that each lane lists
+  static constexpr int kLaneBits =
+      BATCH / kHalfWarp;  // entries of the batch that each lane of list() handles
   static constexpr std::uint32_t kNothing = BATCH * sizeof(Entry);
   Entry entries[2][BATCH + 1];
   std::uint32_t hits[2][Tile::kSubtiles][kWords];
   std::uint16_t lists[Tile::kSubtiles][BATCH + 4];
 
-  // Once per block, before the first barrier.
+  // Writes the entries that touch no pixel. Called once per block, before the first barrier.
   __device__ __forceinline__ void init(int thread) {
     if (thread < 2) {
       entries[thread][BATCH] = {0.f, 0.f, 0.f, 0.f, 0.f, -INFINITY, 0.f, 0.f, {0.f, 0.f, 0.f, 0.f}};
     }
   }
 
-  // Starts to copy entry `at` of a batch that no thread reads at the time; splat < 0 where the list has
-  // ended. `chunk` is what copy_color() takes.
+  // Starts to copy entry `at` to buffer `buffer`, which no thread may read at that time. splat < 0: the list
+  // has no such entry. `chunk` is an argument of copy_color().
   template <class Chunk>
   __device__ __forceinline__ void fetch(int buffer, const PackedSplat* splats, const Chunk& chunk,
                                         std::int32_t splat, int at) {
@@ -367,7 +378,8 @@ struct EntryBatch {
     copy_color(entries[buffer][at].color, chunk, splat);
   }
 
-  // Turns what fetch() copied into an entry and tests it; called by whole warps.
+  // Waits for the copy of entry `at`, converts it to an Entry and tests it against the subtiles. All lanes of
+  // a warp must call this.
   __device__ __forceinline__ void place(int buffer, bool present, const TilePlace& tile, int at) {
     const int lane = at & 31;
     copies_done();
@@ -388,8 +400,9 @@ struct EntryBatch {
     }
   }
 
-  // Writes the subtile's list, of the batch's first `limit` entries, and returns the number of quads that
-  // both halves of the warp walk. SHARED: both list what either has to look at (limit must agree).
+  // Writes the subtile's list from the batch's first `limit` entries, in reverse order if BACKWARDS. Returns
+  // the number of quads of the longer of the warp's two lists. SHARED: both halves of the warp list the
+  // entries that may touch either subtile; both must give the same limit.
   template <bool BACKWARDS, bool SHARED>
   __device__ __forceinline__ int list(int buffer, int subtile, int lane, int limit) {
     const int piece = BACKWARDS ? kHalfWarp - 1 - lane : lane;
@@ -407,7 +420,7 @@ struct EntryBatch {
     }
     const int n = __shfl_sync(kFullWarp, end, kHalfWarp - 1, kHalfWarp);
     std::uint16_t* target = lists[subtile] + (BACKWARDS ? end - count : end - 1);
-    while (bits) {  // the last of the piece first
+    while (bits) {  // from the last entry of this lane's piece to the first
       const int bit = 31 - __clz(bits);
       bits ^= 1u << bit;
       *target = static_cast<std::uint16_t>((first + bit) * static_cast<int>(sizeof(Entry)));
@@ -419,7 +432,7 @@ struct EntryBatch {
     return quads;
   }
 
-  // The lists' quads of offsets.
+  // The subtile's list as quads of offsets, for QuadOffsets.
   __device__ __forceinline__ const uint2* quads(int subtile) const {
     return reinterpret_cast<const uint2*>(lists[subtile]);
   }

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Compositing one tile, front to back, and what is made of it: the image, or the contributions of splats.
-// Compiled twice, plain and with AVX2; see tile_kernels.h.
+// Compositing one tile on the CPU, front to back (docs/image.md, sections 3 and 5). A sink takes the weights
+// alpha T: ColorSink makes the image, ContributionSink the contributions of splats. Compiled twice, plain and
+// with AVX2; see tile_kernels.h.
 #pragma once
 #include <algorithm>
 #include <atomic>
@@ -24,8 +25,8 @@ Lanes falloff(Lanes exponent) {
   }
 }
 
-// What a splat does to each pixel row of a tile: the exponent at (dx, row) is
-// -(l11 dx + shift)^2 + minus_w2, and pixels [first, last] of the row may be reached.
+// A splat on each pixel row of a tile: the exponent of alpha at (dx, row) is -(l11 dx + shift)^2 + minus_w2,
+// and the splat may touch pixels [first, last] of the row.
 template <class T>
 struct RowSpans {
   alignas(32) T dy[kMaxTileSize];
@@ -35,7 +36,7 @@ struct RowSpans {
   alignas(32) std::int32_t last[kMaxTileSize];
 };
 
-// Fills spans and returns the set of rows with a pixel in reach, one bit each.
+// Fills spans and returns the rows that the splat may touch, one bit each.
 template <class Lanes, class T>
 std::uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, RowSpans<T>& spans) {
   const T top = static_cast<T>(tile.y0) + T(0.5);
@@ -68,7 +69,7 @@ std::uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, 
   return rows;
 }
 
-// D > 0 fixes the number of channels, 0 reads it from the tile.
+// The number of channels: D if D > 0, else that of the tile.
 template <int D, class T>
 int channels(const TileJob<T>& tile) {
   if constexpr (D > 0) return D;
@@ -112,8 +113,9 @@ ForwardState<T> start_forward(const TileJob<T>& tile) {
   return state;
 }
 
-// A running pixel has transmittance > 0 (it starts at 1 and stays above the minimum). One that ends moves it
-// to `ended`, and zero keeps it from compositing anything further.
+// Ends pixels x + i of a row, for each bit i of `bits`. A pixel that has not ended has transmittance > 0 (it
+// starts at 1 and stays above the minimum). For a pixel that ends, the transmittance moves to `ended`, and a
+// transmittance of 0 marks it as ended.
 template <class T>
 void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
   for (; bits; bits &= bits - 1) {
@@ -124,7 +126,8 @@ void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
   }
 }
 
-// Composites a splat at eight pixels of a row and gives the sink their alpha T, zero where it is not drawn.
+// Composites a splat at eight pixels of a row and gives the sink their weights alpha T, zero for pixels at
+// which the splat is not composited.
 template <class Lanes, class T, class Sink>
 inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, std::int32_t entry, int row,
                       int x, ForwardState<T>& state, Sink& sink) {
@@ -166,12 +169,13 @@ void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
   }
 }
 
-// Lists name splats in no order that the hardware could foresee, so they are fetched some entries ahead. Both
-// loops write it out, because gcc drops calls of a function that does nothing but prefetch.
+// The hardware cannot predict which splats a list names, so the loops prefetch splats this many entries
+// ahead. Both loops contain the prefetch itself, because gcc drops calls of a function that only prefetches.
 constexpr std::int32_t kPrefetchDistance = 6;
 
-// Composites the tile's list and returns the number of entries processed. The sink gets begin(index), then
-// add(alpha T of eight pixels, first of them) for the pixels the splat may reach, then end(index).
+// Composites the tile's list and returns the number of entries processed. For each entry it calls
+// sink.begin(splat), then sink.add(alpha T of eight pixels, the first of these pixels) for the pixels that
+// the splat may touch, then sink.end(splat).
 template <class Lanes, class T, class Sink>
 std::int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink& sink) {
   RowSpans<T> spans;
@@ -193,7 +197,7 @@ std::int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink
   return entry;
 }
 
-// Adds the colours of splats up in the planes of the pixels.
+// Sums the colours of the splats, times their weights, in planes of pixels [D, plane].
 template <class Lanes, int D, class T>
 struct ColorSink {
   const TileJob<T>& tile;
@@ -211,7 +215,7 @@ struct ColorSink {
   void end(std::int32_t) const {}
 };
 
-// Returns the number of entries processed.
+// Composites one tile of the image and writes its pixels. Returns the number of entries processed.
 template <class Lanes, int D>
 std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
   using T = typename Lanes::Scalar;
@@ -222,7 +226,8 @@ std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
   return entries;
 }
 
-// Adds the contributions of splats up, in units of 2^-32: integers, so the order of tiles does not matter.
+// Sums the weights alpha T and the pixels of each splat. The weights are integers in units of 2^-32, so that
+// the order of the tiles does not change the sums.
 template <class Lanes, class T>
 struct ContributionSink {
   const ContributionSums& sums;
@@ -245,6 +250,7 @@ struct ContributionSink {
   }
 };
 
+// Composites one tile without colours and adds the contributions of its splats to `sums` (importance.h).
 template <class Lanes>
 void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const ContributionSums& sums) {
   using T = typename Lanes::Scalar;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What drives the CPU tile kernels: splats prepared for them, and the jobs of tiles.
+// The code that calls the CPU tile kernels: it prepares the splats and describes the tiles as jobs.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -61,7 +61,7 @@ const PreparedSplat<T>* pack_splats(const RasterizeInput<T>& in, PreparedSplat<T
   return splats;
 }
 
-// Memory for the splats that lasts as long as the workspace.
+// Allocates the prepared splats, aligned to 64 bytes, in the workspace.
 template <class T>
 PreparedSplat<T>* allocate_splats(std::int64_t n_splats, Workspace& workspace) {
   const std::size_t bytes = static_cast<std::size_t>(n_splats + 1) * sizeof(PreparedSplat<T>);
@@ -69,7 +69,7 @@ PreparedSplat<T>* allocate_splats(std::int64_t n_splats, Workspace& workspace) {
   return reinterpret_cast<PreparedSplat<T>*>((address + 63) / 64 * 64);
 }
 
-// The part of a job that is the tile's place in the images and its list.
+// A job with the tile's position in the images and its list. The caller sets the outputs and the memory.
 template <class T>
 TileJob<T> make_job(const RasterizeInput<T>& in, const PreparedSplat<T>* splats, std::int64_t tile) {
   const TileGrid& grid = in.grid;
@@ -91,7 +91,7 @@ TileJob<T> make_job(const RasterizeInput<T>& in, const PreparedSplat<T>* splats,
   return job;
 }
 
-// Memory of each worker for the pixels of its tile.
+// Scratch memory for the pixels of one tile per worker thread.
 template <class T>
 class TileMemory {
  public:

@@ -1,10 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// One tile, forward and backward, over the lane types of math/lanes.h. Compiled twice, plain and with AVX2;
-// everything here has internal linkage so that the two never mix.
+// The CPU kernels of one tile, forward (tile_forward.h) and backward, over the lane types of math/lanes.h.
+// They are compiled twice, plain and with AVX2; everything here has internal linkage, so that the linker
+// cannot mix the two.
 //
-// Splat by splat, front to back (backward: back to front), over the pixel rows the splat's ellipse reaches,
-// eight pixels at a time from the first pixel of its chord. The state of the pixels lives in scratch planes
-// that fit the first-level cache; rows are padded so that eight pixels can be read from any start.
+// A kernel takes the splats of the list one after the other, forward front to back, backward back to front.
+// For each splat it visits the pixel rows that the splat's ellipse meets, and in a row eight pixels at a time
+// from the first pixel inside the ellipse. The state of the pixels is in scratch planes that fit the
+// first-level cache. Rows are padded so that eight pixels can be loaded from any pixel of the row.
 #pragma once
 #include <algorithm>
 #include <bit>
@@ -19,8 +21,8 @@ namespace {
 template <class T>
 struct BackwardState {
   PlaneLayout layout;
-  T* transmittance;  // behind the entry being visited, then in front of it
-  T* behind;  // v_renders . (colour behind the entry, as seen from right behind it), background included
+  T* transmittance;  // in front of the entries visited so far
+  T* behind;         // v_renders . (the colour of those entries and the background, as seen with T = 1)
   T *v_render, *centres;
   std::int32_t* last;
   std::int32_t last_in_row[kMaxTileSize] = {};
@@ -55,7 +57,7 @@ BackwardState<T> start_backward(const TileJob<T>& tile) {
   return state;
 }
 
-// Sums over the pixels of one splat in one tile, lane by lane; g = alpha dL/dalpha.
+// The sums over the pixels of one splat in one tile, one partial sum per lane; g = alpha dL/dalpha.
 template <class Lanes, bool kAbs>
 struct GradientSums {
   Lanes g = Lanes::zero(), gu = Lanes::zero(), gy = Lanes::zero();
@@ -63,6 +65,7 @@ struct GradientSums {
   Lanes abs_x = Lanes::zero(), abs_y = Lanes::zero();
 };
 
+// Differentiates one entry at eight pixels of a row: adds to its sums and v_color, and updates the pixels.
 template <class Lanes, int D, bool kAbs, class T>
 inline void differentiate(const TileJob<T>& tile, const PreparedSplat<T>& splat, const T* splat_colors,
                           const RowSpans<T>& spans, std::int32_t entry, int row, int x,
@@ -108,7 +111,7 @@ inline void differentiate(const TileJob<T>& tile, const PreparedSplat<T>& splat,
   }
 }
 
-// The order of PartialGradient.
+// Turns the sums of one splat in one tile into its partial gradient, in the order of PartialGradient.
 template <class Lanes, bool kAbs, class T>
 void write_partial(const PreparedSplat<T>& splat, const GradientSums<Lanes, kAbs>& sums, const Lanes* v_color,
                    int n_channels, T* partial) {
@@ -127,7 +130,8 @@ void write_partial(const PreparedSplat<T>& splat, const GradientSums<Lanes, kAbs
   }
 }
 
-// Writes the partial gradient of each of the first n_entries entries; n_entries covers the tile's last_ids.
+// The gradient of compositing one tile: writes the partial gradient of each of the first n_entries entries to
+// partials [n_entries, partial_width]. n_entries must be at least the largest of the tile's last_ids.
 template <class Lanes, int D, bool kAbs>
 void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::Scalar* partials) {
   using T = typename Lanes::Scalar;

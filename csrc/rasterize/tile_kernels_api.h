@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the tile kernels share with the code that drives them: plain data, no inline arithmetic.
+// The interface of the CPU tile kernels to the code that calls them: plain data without inline arithmetic,
+// because the kernels are compiled with other instructions than their callers.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -9,11 +10,11 @@
 
 namespace blitzgs::cpu {
 
-constexpr int kMaxTileSize = 64;    // rows of a tile are the bits of a word
-constexpr int kPackedChannels = 5;  // what a cache line has room for
+constexpr int kMaxTileSize = 64;    // the rows of a tile are the bits of a 64-bit word
+constexpr int kPackedChannels = 5;  // channels that fit the cache line of a PreparedSplat
 
-// The exponent of a splat is -(u^2 + w^2) with u = l11 dx + l21 dy, w = l22 dy; its factors carry the root of
-// this scale. float32 works in powers of two.
+// The exponent of a splat is -(u^2 + w^2) with u = l11 dx + l21 dy, w = l22 dy. The factors l11, l21 and l22
+// are multiplied by the root of this scale: float32 computes alpha as a power of 2, float64 as a power of e.
 template <class T>
 struct ExponentScale;
 template <>
@@ -25,22 +26,22 @@ struct ExponentScale<double> {
   static constexpr double value = 0.5;
 };
 
-// A splat prepared for the kernels, one cache line in float32. Drawn where u^2 + w^2 <= cut, in rows within
-// half_height of y (-1: nowhere); a chord at dy is centred on x - shear dy and reaches
-// sqrt(cut - w^2) * inv_l11 + slack.
+// A splat prepared for the kernels, one cache line in float32. It may touch pixels with u^2 + w^2 <= cut, in
+// rows within half_height of y (-1: no row). In the row at dy, these pixels are centred on x - shear dy, with
+// a half width of sqrt(cut - w^2) * inv_l11 + slack.
 template <class T>
 struct alignas(64) PreparedSplat {
   T x, y, l11, l21, l22, opacity, cut, inv_l11, shear, half_height, slack;
   T color[kPackedChannels];
 };
 
-// The state of a tile's pixels: planes of tile_size rows of `stride` pixels.
+// The layout of the state of a tile's pixels: planes of tile_size rows of `stride` pixels.
 struct PlaneLayout {
   explicit PlaneLayout(int tile_size) : stride((tile_size + 15) / 8 * 8), plane(stride * tile_size) {}
   int stride, plane;
 };
 
-// Two planes, one per channel, and a row of pixel centres.
+// The scratch numbers of a tile: two planes, one plane per channel, and a row of pixel centres.
 inline std::size_t tile_memory(int tile_size, int n_channels) {
   const PlaneLayout layout(tile_size);
   return static_cast<std::size_t>(layout.plane) * (2 + n_channels) + layout.stride;
@@ -63,7 +64,8 @@ struct TileJob {
   std::int32_t* last_memory;  // PlaneLayout::plane numbers
 };
 
-// Layout of one splat's partial gradient from one tile: these, then D colours, then two absolute sums.
+// The layout of one splat's partial gradient from one tile: these six numbers, then D colours, then, with
+// absgrad, two absolute sums.
 enum PartialGradient { kMeanX, kMeanY, kConicA, kConicB, kConicC, kOpacity, kColor };
 constexpr int partial_width(int n_channels, bool absgrad) { return kColor + n_channels + (absgrad ? 2 : 0); }
 
@@ -71,7 +73,7 @@ template <class T>
 struct TileKernels {
   std::int32_t (*forward)(const TileJob<T>&);                      // returns the entries processed
   void (*backward)(const TileJob<T>&, T* partials);                // writes n_entries partial gradients
-  void (*contribute)(const TileJob<T>&, const ContributionSums&);  // adds to them, as other tiles do
+  void (*contribute)(const TileJob<T>&, const ContributionSums&);  // adds to the sums of all tiles
 };
 
 // Defined in rasterize_avx2.cpp; call only where the processor has AVX2 and FMA.

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a step reports to the host: the loss's sums, added up from the parts that the loss's kernel wrote, and
-// the costs of the rank's tiles. One launch beside the step writes the report into the memory of every rank
-// that reads it.
+// The report of a training step: the sums of the loss, added up from the parts that the photometric kernel
+// wrote, and the costs of this rank's tiles. One launch writes the report to the memory of every rank that
+// reads it.
 //
 //   parts double [B, K, 2], sums of |x - y| and of SSIM of each view in K parts -> l1 [B], ssim [B]
 //   tile_work int32 [tiles], of which [tile_begin, tile_end) are this rank's  -> tiles [tiles], only those
@@ -16,7 +16,7 @@ namespace blitzgs {
 
 constexpr int kMaxReportTargets = 16;
 
-// One for each rank that gets the report: memory of peers, or this rank's own.
+// The memory of one rank that gets the report, a peer's or this rank's own.
 template <class T>
 struct ReportTarget {
   T* l1;

@@ -8,7 +8,8 @@ namespace {
 
 constexpr int kReportThreads = 256;
 
-// Each of the first blocks adds up a view; the others copy the costs of tiles.
+// Writes the report (report.h). Each of the first B blocks sums the parts of a view; in the others a thread
+// copies the cost of a tile.
 __global__ void __launch_bounds__(kReportThreads)
     report_kernel(const __grid_constant__ Report<float> report) {
   const std::int64_t view = blockIdx.x;

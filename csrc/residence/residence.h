@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// What keeps a table larger than a GPU's memory in the memory of its host: which blocks some views may see,
-// and blocks on their way between the host's table and a pool on the device.
+// Ops for a table that is larger than the memory of a GPU. The table is in the memory of the host, and a pool
+// on the device holds some of its blocks. seen_blocks finds the blocks that some views may see; swap_blocks_
+// moves blocks between the table and the pool.
 //
-// A block is 256 consecutive rows (blocks/blocks.h). The pool has a place for some of the table's blocks,
-// each called a slot.
+// A block is 256 consecutive rows (blocks/blocks.h). A slot is the memory of one block in the pool.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -14,12 +14,12 @@
 namespace blitzgs {
 
 constexpr int kMaxSwapColumns = 48;
-// Twice that of cull_blocks, whose test is compiled elsewhere and may round differently.
+// Twice the slack of cull_blocks, because its test is compiled in another file and may round differently.
 constexpr float kSeenSlack = 2 * kBlockSlack;
 
-// bounds [n, kBlockBounds], of each block; seen [n]: bit v is set when view v may see a part of the block.
-// The test is that of cull_blocks with more slack, so cull_blocks reads no row of a block without the bit of
-// any of its views. Views differ in size here.
+// bounds [n, kBlockBounds], those of each block; seen [n]: bit v is set if view v may see a part of the
+// block. The test is that of cull_blocks with more slack, so cull_blocks reads no row of a block for which no
+// bit is set. Each view has its own image size.
 struct SeenBlocks {
   const float* bounds;
   std::int64_t n;
@@ -30,20 +30,21 @@ struct SeenBlocks {
   std::int32_t* seen;
 };
 
-// One column of the pool and of the table: blocks of `bytes` each.
+// One column of the pool and of the table, with `bytes` bytes per block.
 struct SwapColumn {
   std::byte *pool, *table;
   std::int64_t bytes;
   bool is_written;  // whether blocks that leave are written back
 };
 
-// Moves blocks between slots and the table. Slot slots[i] gives its block to block leaving[i] of the table
-// (-1: nobody wants it), then takes block coming[i] (-1: none). All slots, all leaving and all coming blocks
-// differ, and no block leaves and comes at once, so that moves may be made in any order.
+// Moves blocks between slots and the table. For each i, the contents of slot slots[i] are written to block
+// leaving[i] of the table (-1: not written), then the slot is filled with block coming[i] (-1: not filled).
+// All slots differ, as do all leaving and all coming blocks, and no block is both leaving and coming, so the
+// moves may be made in any order.
 //
-// On CUDA the columns of the table are pinned memory of the host, which the kernel reads and writes itself: a
-// slot's old and new contents travel at the same time, in both directions of the bus, and a launch is enough
-// for any number of blocks and columns.
+// On CUDA the columns of the table are in pinned memory of the host, which the kernel reads and writes
+// itself. The old and the new contents of a slot use both directions of the bus at the same time, and one
+// launch is enough for any number of blocks and columns.
 struct SwapBlocks {
   const std::int32_t *slots, *leaving, *coming;  // [n]
   std::int64_t n;

@@ -10,10 +10,12 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kThreads = 256, kWarps = kThreads / 32;
-// A warp moves kWords words of 16 bytes a lane at a time, so that enough of them are on the bus at once. The
-// grid is kept small: the kernel waits for the bus, and a step's kernels run beside it.
+// A lane moves kWords words of 16 bytes at a time, so that enough of them are in flight; a unit is what a
+// warp moves at a time. The grid is small because the kernel is bound by the bus, and the kernels of a
+// training step run at the same time.
 constexpr int kWords = 4, kUnit = 32 * kWords, kBlocks = 96;
 
+// seen [n] (residence.h), one thread per block of the table.
 __global__ void __launch_bounds__(kThreads) see_blocks(const SeenBlocks of) {
   __shared__ Frustum planes[kMaxViews];
   if (threadIdx.x < of.views) planes[threadIdx.x] = frustum_of(of, threadIdx.x);
@@ -22,7 +24,8 @@ __global__ void __launch_bounds__(kThreads) see_blocks(const SeenBlocks of) {
   if (block < of.n) of.seen[block] = views_that_see(of, planes, block);
 }
 
-// Moves `count` words, the lane's share of up to kUnit, between a slot and blocks of the table.
+// A warp moves up to kUnit words, of which `count` exist: from the slot to the leaving block, and from the
+// coming block to the slot. leaving, coming: null if there is none.
 __device__ __forceinline__ void move(uint4* slot, uint4* leaving, const uint4* coming, int lane, int count) {
   uint4 old[kWords], fresh[kWords];
 #pragma unroll
@@ -41,7 +44,8 @@ __device__ __forceinline__ void move(uint4* slot, uint4* leaving, const uint4* c
   }
 }
 
-// The warps take the units of a move's columns in turn, one move after the other.
+// Moves the blocks of `swap` (residence.h). The units of all columns of all moves are numbered; a warp moves
+// one unit at a time, in a loop. units: the number of units in a move.
 __global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, int units) {
   const int lane = threadIdx.x % 32;
   const std::int64_t warps = std::int64_t{gridDim.x} * kWarps;

@@ -32,7 +32,7 @@ Tensor seen_blocks(const Tensor& bounds, const Tensor& viewmats_in, const Tensor
   return seen;
 }
 
-// Checks a pair of columns, and returns the bytes of a block of theirs.
+// Checks a column of the pool and of the table, and returns the bytes of a block of this column.
 std::int64_t check_pair(const char* op, const Tensor& pool, const Tensor& table) {
   STD_TORCH_CHECK(pool.dim() >= 1 && pool.dim() == table.dim(), "blitzgs::", op,
                   ": columns must have rows, and as many axes in pool and table; got ", shape_of(pool),

@@ -49,6 +49,6 @@ TEST_CASE("views of their own sizes see blocks", "[residence]") {
   cpu::seen_blocks(
       {bounds.data(), 4, viewmats.data(), Ks.data(), sizes.data(), 2, 0.5f, 50.0f, 0.3f, seen.data()},
       workspace, nullptr);
-  // The block to the right projects to x = 450, which the wide second view alone reaches.
+  // The block to the right projects to x = 450, which is inside the wide second view only.
   REQUIRE(seen == std::vector<std::int32_t>{3, 2, 0, 0});
 }

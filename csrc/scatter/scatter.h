@@ -1,16 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
-// Splats on their way between ranks. Bit m of masks[p] sends splat p to rank m; the splats for one rank are a
-// group. All data are 32-bit words: a column of w words a splat is int32 [P, w].
+// The exchange of splats between ranks: packing and unpacking. Bit m of masks[p] sends splat p to rank m; the
+// splats for one rank are a group. All data are 32-bit words: a column with w words per splat is int32
+// [P, w].
 //
-//   scatter: columns, masks -> one group per rank, each column of a group consecutive; and places [runs, M]:
-//            where in each group the splats of each run of kPlaceSplats splats are. Within a block of
-//            kScatterBlock splats they keep their order; blocks may come in any order, so this is all that
-//            the way back needs.
-//   gather:  groups that arrived, one after the other -> columns.
+//   scatter: columns, masks -> one group per rank, in which each column is contiguous; and places [runs, M]:
+//            the positions in each group of the splats of each run of kPlaceSplats splats. The splats of a
+//            block of kScatterBlock splats keep their order in a group, but blocks may come in any order. The
+//            places are all that the sender needs to find its splats' gradients again.
+//   gather:  the groups that arrived, one after the other -> columns.
 //   sum:     values [S, F], groups in the layout of `scatter` one after the other -> columns [P, w], the sum
 //            over the groups of each splat in the order of ranks, starting from zero: deterministic.
 //
-// O(words moved). Splats beyond a group's announced size are dropped, whatever the masks say.
+// The cost is O(words moved). Splats beyond the given size of a group are dropped, whatever the masks say.
 #pragma once
 #include <cstdint>
 
@@ -46,21 +47,20 @@ BLITZGS_HD int lowest_bit(std::uint64_t bits) {
 #endif
 }
 
-// The splats of a run that went to one rank: where the first of them is among the rank's, and which they are.
-// The ops pass it as an int64.
+// The splats of a run that went to one rank. The ops pass it as an int64.
 struct alignas(8) SplatPlace {
-  std::int32_t first;
-  std::uint32_t bits;
+  std::int32_t first;  // the position of the first of them in the rank's group
+  std::uint32_t bits;  // bit i: splat i of the run is one of them
 
-  // splat: of the run, in [0, kPlaceSplats).
+  // splat: the index in the run, in [0, kPlaceSplats).
   BLITZGS_HD bool has(std::uint32_t splat) const { return (bits >> splat) & 1u; }
   BLITZGS_HD std::int64_t of(std::uint32_t splat) const {
     return first + count_bits(bits & ((1u << splat) - 1u));
   }
 };
 
-// Columns of one table, and where each begins in a splat of all of them; the last begin is the splat's
-// length.
+// The columns of some splats. begin: the offset of each column in a splat, in words; the last entry is the
+// number of words in a splat.
 template <class Word>
 struct SplatColumns {
   Word* data[kMaxSplatColumns];
@@ -68,13 +68,13 @@ struct SplatColumns {
   int count;
 };
 
-// Splats of each group and the splats before it; M groups.
+// The number of splats in each of M groups, and the number of splats in the groups before it.
 struct SplatGroups {
   std::int64_t size[kMaxRanks], start[kMaxRanks];
   int count;
 };
 
-// Where each column of each rank's group begins.
+// The address of each column of each rank's group.
 struct ScatterTargets {
   std::int32_t* words[kMaxRanks][kMaxSplatColumns];
 };
@@ -86,7 +86,7 @@ struct ScatterSplats {
   std::int64_t count;
 };
 
-// Values of splats, `width` apart, that came back from each rank that a splat went to.
+// Values of splats, `width` per splat, that came back from each rank that a splat went to.
 template <class T>
 struct SplatValues {
   const T* values;
@@ -95,17 +95,18 @@ struct SplatValues {
   const SplatPlace* places;
   SplatGroups groups;
 
-  // Calls f(pointer to a splat's values), for each rank in order.
+  // Calls f(pointer to the splat's values from a rank) for each rank that the splat went to, in order.
   template <class F>
   BLITZGS_HD void for_each(std::uint64_t splat, const F& f) const {
     const SplatPlace* run = places + splat / kPlaceSplats * groups.count;
     const auto in_run = static_cast<std::uint32_t>(splat % kPlaceSplats);
     std::uint64_t ranks = 0;
 #ifdef __CUDA_ARCH__
-#pragma unroll 4  // as many loads at once; the compiler's own choice is 16
+#pragma unroll 4  // four loads at a time; the compiler would choose 16
 #endif
     for (int m = 0; m < groups.count; ++m) ranks |= std::uint64_t{run[m].has(in_run)} << m;
-    // Most splats went to a single rank: this way the threads of a warp load their first at once.
+    // Most splats went to a single rank. With this loop the threads of a warp load their first values
+    // together.
     for (; ranks != 0; ranks &= ranks - 1) {
       const int m = lowest_bit(ranks);
       const std::int64_t at = run[m].of(in_run);

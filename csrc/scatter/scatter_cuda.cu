@@ -8,10 +8,11 @@ namespace blitzgs::cuda {
 
 namespace {
 
-// Values of a splat that a thread adds up at once: those of three colours, or a part of more.
+// The values of a splat that a thread sums: all 9 of a splat with three colour channels, or up to 16 of more.
 constexpr int kSplatValues = 9, kPartValues = 16;
 constexpr int kSumThreads = 256;
 
+// The scatter of splats (scatter.h), one block per kScatterBlock splats (scatter_device.cuh).
 template <int RANKS>
 __global__ void __launch_bounds__(kScatterBlock)
     scatter_kernel(const __grid_constant__ ScatterSplats splats, const __grid_constant__ SplatGroups groups,
@@ -20,7 +21,8 @@ __global__ void __launch_bounds__(kScatterBlock)
   scatter_block<kScatterBlock>(shared, splats, splats.count, {groups.size, groups.count}, targets, state);
 }
 
-// Block (x, y) copies a part of column y % count of group y / count.
+// The gather of splats (scatter.h): block (x, y) copies a part of column y % columns.count of group
+// y / columns.count, one thread per word.
 __global__ void gather_kernel(const std::int32_t* packed, const __grid_constant__ SplatGroups groups,
                               const SplatColumns<std::int32_t> columns) {
   const int m = blockIdx.y / columns.count, c = blockIdx.y % columns.count;
@@ -34,8 +36,8 @@ __global__ void gather_kernel(const std::int32_t* packed, const __grid_constant_
   }
 }
 
-// Stores `part` values of each splat, PITCH apart in shared memory, into splats of `width`. WIDTH: both, or
-// 0.
+// Writes `any_part` values of each splat from shared memory (PITCH floats per splat) to columns with
+// `any_width` values per splat. WIDTH: the value of both if it is known at compile time, or 0.
 template <int PITCH, int WIDTH>
 __device__ __forceinline__ void store_values(const float* from, int n_splats, int any_part, int any_width,
                                              float* to) {
@@ -46,11 +48,12 @@ __device__ __forceinline__ void store_values(const float* from, int n_splats, in
   }
 }
 
-// Values [VALUES * blockIdx.y, ...) of a block of splats. ALL: the splats have VALUES.
+// The sum over ranks (scatter.h). One thread per splat; the blocks of grid row y sum the values from
+// VALUES * blockIdx.y on, at most VALUES of them. ALL: each splat has exactly VALUES values.
 template <int VALUES, bool ALL>
 __global__ void __launch_bounds__(kSumThreads) sum_kernel(const __grid_constant__ SplatValues<float> in,
                                                           const __grid_constant__ SplatColumns<float> out) {
-  constexpr int kPitch = VALUES | 1;  // odd, so that a column of splats spreads over the banks
+  constexpr int kPitch = VALUES | 1;  // odd: the same value of different splats lies in different banks
   __shared__ float sums[kSumThreads * kPitch];
   const int value = ALL ? 0 : VALUES * static_cast<int>(blockIdx.y);
   const int n_values = ALL ? VALUES : min(VALUES, in.width - value);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// One block's splats to the ranks that need them. Runs of consecutive words leave for each rank and column,
-// in whole memory transactions but for their ends, so that a target across a link is written in few packets.
-// Only the place of a run is agreed on, with one atomic per block and rank.
+// The scatter of one block of splats to the ranks that need them. For each rank and column a warp writes one
+// run of consecutive words, in whole memory transactions except at its ends, so that a write across a link
+// takes few packets. Blocks agree on the positions of their runs with one atomic addition per block and rank.
 #pragma once
 #include <type_traits>
 
@@ -12,9 +12,9 @@ namespace blitzgs::cuda {
 
 inline constexpr int kScatterWarps = kScatterBlock / 32;
 static_assert(kPlaceSplats == 32, "a warp's splats are a run");
-inline constexpr int kFewRanks = 8;  // what most hosts have: needs less shared memory than kMaxRanks
+inline constexpr int kFewRanks = 8;  // enough for most hosts, with less shared memory than kMaxRanks
 
-// Calls f(integral constant: an upper bound of the ranks).
+// Calls f(integral constant: an upper bound on the number of ranks).
 template <class F>
 void dispatch_ranks(int n_ranks, const F& f) {
   if (n_ranks <= kFewRanks) {
@@ -29,21 +29,21 @@ struct ScatterShared {
   std::uint8_t list[RANKS][kScatterBlock];  // the block's splats that go to each rank, ascending
   int before[RANKS][kScatterWarps];
   int count[RANKS], base[RANKS];
-  std::int64_t target[RANKS];  // the splat of the rank's columns that the block's begin at
+  std::int64_t target[RANKS];  // the position of the block's first splat in the rank's columns
 };
 
-// How many splats go to each rank.
+// The number of splats that go to each rank.
 struct ScatterSizes {
   const std::int64_t* sizes;
   int n_ranks;
 };
 
-// What all blocks share: how far each group is filled (zeroed before), and what `scatter` returns.
+// The state that all blocks share.
 struct ScatterState {
-  std::int64_t* filled;
-  SplatPlace* places;
+  std::int64_t* filled;  // the number of positions of each group that blocks have taken; zero at the start
+  SplatPlace* places;    // the output of scatter
 
-  // Takes `count` places of group m; returns the first.
+  // Takes `count` positions of group m and returns the first.
   __device__ std::int64_t take(int m, int count) const {
     if (count == 0) return 0;
     return static_cast<std::int64_t>(
@@ -51,7 +51,7 @@ struct ScatterState {
   }
 };
 
-// Counts a warp's splats for each rank, whose masks the lanes bring.
+// Counts the splats of a warp that go to each rank. mask: that of this lane's splat.
 __device__ __forceinline__ void count_by_warp(int (*counts)[kScatterWarps], int slot, std::int64_t mask,
                                               int n_ranks) {
   for (int m = 0; m < n_ranks; ++m) {
@@ -60,7 +60,7 @@ __device__ __forceinline__ void count_by_warp(int (*counts)[kScatterWarps], int 
   }
 }
 
-// Turns one rank's counts into the counts before each warp; returns their sum.
+// Replaces one rank's counts by the sums of the counts before each warp, and returns the total.
 __device__ __forceinline__ int scan_warps(int* counts) {
   int sum = 0;
 #pragma unroll
@@ -72,17 +72,20 @@ __device__ __forceinline__ int scan_warps(int* counts) {
   return sum;
 }
 
-// Splats for one rank before splat `slot` of the block; `going` tells those of its warp.
+// The number of the block's splats for one rank before splat `slot`. going: the splats of its warp that go to
+// the rank, as bits.
 __device__ __forceinline__ int place_in_block(const int* before, int slot, unsigned going) {
   return before[slot / 32] + __popc(going & ((1u << slot % 32) - 1u));
 }
 
-// Words by which a warp has to start early for its stores to be whole 128-byte transactions.
+// The number of words between the last multiple of 128 bytes and an address. A warp that starts so many words
+// before the address stores whole 128-byte transactions.
 __device__ __forceinline__ int words_past_line(const void* address) {
   return static_cast<int>(reinterpret_cast<std::uintptr_t>(address) / 4 % 32);
 }
 
-// Loads are kAhead deep, as they come from the second-level cache at best.
+// A warp copies the `n` listed splats of one column to consecutive memory. Each lane has kAhead loads in
+// flight, because the values come from the second-level cache at best.
 template <int WIDTH>
 __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::uint8_t* list, int n,
                                          int any_width, std::int32_t* to) {
@@ -118,8 +121,8 @@ __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::ui
   }
 }
 
-// Scatters splats [kScatterBlock * blockIdx.x, ...) of n_splats, whatever splats.count says. All THREADS
-// threads of the block call this; the splats must be visible to all of them.
+// Scatters the kScatterBlock splats from kScatterBlock * blockIdx.x on, of n_splats (splats.count is not
+// read). All THREADS threads of the block call this.
 template <int THREADS, int RANKS>
 __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterSplats& splats,
                               std::int64_t n_splats, const ScatterSizes& groups,

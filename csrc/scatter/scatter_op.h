@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Arguments that the ops on scattered splats share, checked the same way.
+// The checked arguments that the ops on scattered splats share.
 #pragma once
 #include <limits>
 
@@ -29,7 +29,7 @@ inline std::int64_t total_splats(const SplatGroups& groups) {
   return groups.start[groups.count - 1] + groups.size[groups.count - 1];
 }
 
-// Appends a column of `width` words a splat.
+// Appends a column with `width` words per splat.
 template <class Word>
 void add_column(const char* op, SplatColumns<Word>& columns, Word* data, std::int64_t width) {
   STD_TORCH_CHECK(columns.count < kMaxSplatColumns, "blitzgs::", op, ": at most ", kMaxSplatColumns,
@@ -63,7 +63,7 @@ struct HeldSplats {
   ScatterSplats splats{};
 };
 
-// Places of splats in the groups of so many ranks, contiguous.
+// The places [runs, n_ranks] that scatter_splats returned, checked and contiguous.
 inline Tensor checked_places(const char* op, const Tensor& places, std::int64_t splats,
                              std::int64_t n_ranks) {
   check_shape(op, "places", places, {place_runs(splats), n_ranks});

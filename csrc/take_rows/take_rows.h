@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Makes a column of a table anew: row i becomes the old row rows[i], or the new row rows[i] - count.
+// Builds a new column of a table from an old one: row i of `out` is row rows[i] of `column` [count] if
+// rows[i] < count, and otherwise row rows[i] - count of `fresh`.
 //
-// Rows are bytes, `row_bytes` each; rows int64 [n], in [0, count + number of new rows). fresh: the new rows;
-// null: zeros. Reads and writes every row once.
+// Rows are `row_bytes` bytes each. rows int64 [n], in [0, count + number of rows in fresh). fresh null: new
+// rows are zeros. Each row of `out` is read and written once.
 #pragma once
 #include <cstddef>
 #include <cstdint>

@@ -8,7 +8,8 @@ namespace {
 
 constexpr int kThreads = 256;
 
-// A block copies kThreads rows; a thread copies one of the `units` words of a row at a time.
+// out [n] (take_rows.h). A block copies kThreads rows, a thread one word at a time. units: the words in a
+// row.
 template <class Word>
 __global__ void __launch_bounds__(kThreads) take_rows_kernel(const TakeRows take, std::uint32_t units) {
   __shared__ std::int64_t rows[kThreads];
@@ -34,6 +35,7 @@ __global__ void __launch_bounds__(kThreads) take_rows_kernel(const TakeRows take
   }
 }
 
+// Launches the kernel and returns true if the rows are whole, aligned numbers of words of this type.
 template <class Word>
 bool launch_if_whole(const TakeRows& take, CudaStream stream) {
   const auto places = reinterpret_cast<std::uintptr_t>(take.column) |

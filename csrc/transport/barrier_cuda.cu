@@ -25,8 +25,9 @@ __device__ std::int64_t look(const std::int64_t* flag) {
   return number;
 }
 
-// One block. A thread announces this rank to one peer and waits for that peer. Then the block adds the values
-// up and shows them to the host, which saves a launch.
+// The device barrier (transport.h), one block. It first writes this rank's values to all peers. Thread m then
+// tells peer m that this rank has arrived, and waits until peer m has. At last the block sums the values of
+// all ranks and writes them to the host's memory, which saves a launch.
 __global__ void __launch_bounds__(kBarrierThreads)
     barrier_kernel(const ControlWords control, std::int64_t number, const std::int64_t* values, int n_values,
                    std::int64_t first, std::uint64_t timeout, std::int64_t* host) {

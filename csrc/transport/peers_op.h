@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// The buffers of all ranks, checked the same way in every op that writes to them.
+// The checked buffers of all ranks, for the ops that write to them.
 #pragma once
 #include "scatter/scatter_op.h"
 #include "transport/transport.h"
 
 namespace blitzgs {
 
-// One buffer for each rank, all alike.
+// Checks that there is one buffer for each rank and that all have the same length and dtype.
 inline void check_peers(const char* op, const std::vector<Tensor>& buffers, ScalarType dtype) {
   const auto count = static_cast<std::int64_t>(buffers.size());
   STD_TORCH_CHECK(count >= 1 && count <= kMaxPeers, "blitzgs::", op, ": 1 to ", kMaxPeers,
@@ -16,7 +16,7 @@ inline void check_peers(const char* op, const std::vector<Tensor>& buffers, Scal
   }
 }
 
-// Where the columns of each rank's buffer begin when they are `capacity` splats long.
+// The addresses of the columns in each rank's buffer, for columns with a capacity of `capacity` splats.
 template <class Word>
 ScatterTargets peer_targets(const char* op, std::vector<Tensor>& buffers, const SplatColumns<Word>& columns,
                             std::int64_t capacity, int n_ranks) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Splats to the ranks that composite them, straight into these ranks' memory.
+// The op send_splats_ (transport.h): writes splats to the memory of the ranks that composite them.
 #include <algorithm>
 
 #include "common/cuda.cuh"
@@ -10,11 +10,11 @@ namespace blitzgs::cuda {
 
 namespace {
 
-// Blocks of a multiprocessor: enough to fill the links.
-constexpr int kSendBlocks = 2;
-constexpr int kSendPlaces = 6;  // with as many registers as if there were so many
+constexpr int kSendBlocks = 2;  // blocks per multiprocessor: enough to fill the links
+constexpr int kSendPlaces = 6;  // blocks per multiprocessor for which the compiler limits the registers
 
-// One warp, a lane a rank. If the splats of any rank do not fit somewhere, this rank sends none.
+// Computes the SendPlan from the totals of all ranks: one warp, one lane per rank. If the splats of any rank
+// exceed a capacity, this rank sends none.
 __global__ void plan_kernel(const __grid_constant__ SendArguments args) {
   const int m = threadIdx.x, n_ranks = args.n_ranks;
   const std::int64_t stride = project_totals(args.n_views, n_ranks), capacity = args.splats.count;
@@ -43,9 +43,9 @@ __global__ void plan_kernel(const __grid_constant__ SendArguments args) {
   out->groups.count = n_ranks;
 }
 
-// Warps take a block of splats and a rank at a time: the splats of the one for the other are one run of the
-// rank's columns (scatter_device.cuh). No warp waits for another, so that the links always have something to
-// do.
+// The jobs of send_kernel. A job is a block of kScatterBlock splats and a rank: the block's splats for this
+// rank become one run of the rank's columns (scatter_device.cuh). One warp does a job. Warps do not wait for
+// each other, so that the links are always busy.
 struct Jobs {
   std::int64_t first, step, end;
   int n_ranks;
@@ -59,11 +59,14 @@ struct Jobs {
   __device__ std::int64_t splat(std::int64_t job) const { return job / n_ranks * kScatterBlock; }
 };
 
-// How many of a run, which begins at place `first` of a group of `size`, the group has room for.
+// The number of splats of a run that fit the group, for a run of `count` splats from position `first` of a
+// group with `size` splats.
 __device__ int fitting_splats(int count, std::int64_t size, std::int64_t first) {
   return static_cast<int>(min(max(size - first, std::int64_t{0}), std::int64_t{count}));
 }
 
+// Writes the splats to the ranks of their masks, and the places [runs, M]. One warp per job, in a loop over
+// jobs.
 __global__ void __launch_bounds__(kScatterBlock, kSendPlaces)
     send_kernel(const __grid_constant__ ScatterSplats splats, const __grid_constant__ ScatterTargets targets,
                 const SendPlan* __restrict__ plan, const ScatterState state, int n_ranks) {
@@ -84,7 +87,7 @@ __global__ void __launch_bounds__(kScatterBlock, kSendPlaces)
       masks[run] = splat < n_splats ? static_cast<std::uint32_t>(splats.masks[splat]) : 0;
     }
     int count = 0;
-    SplatPlace place{0, 0};  // of run `lane`
+    SplatPlace place{0, 0};  // the place of run number `lane`
 #pragma unroll
     for (int run = 0; run < kScatterWarps; ++run) {
       const bool goes = masks[run] >> m & 1;

@@ -7,7 +7,7 @@
 namespace blitzgs {
 namespace {
 
-// Returns places, and the SendPlan: the number of splats that arrive here is its first word.
+// Returns the places and the SendPlan, whose first word is the number of splats that this rank receives.
 std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const Tensor& rank_masks,
                                        const Tensor& everyone, std::int64_t rank, std::vector<Tensor> buffers,
                                        std::int64_t capacity) {

@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// The sum of the leaves that each row of features reaches in the trees of a gradient-boosted model.
+// The prediction of a gradient-boosted model (the spawn gate): for each row of features, the sum over all
+// trees of the leaf that the row reaches.
 //
 //   features float32 [M, F], roots int32 [T], nodes [n], leaves int64 [n]  ->  sums int64 [M]
 //
-// A row goes left where its feature is below the threshold, and where it is NaN and the node says so. A node
-// without children is a leaf. Leaves are integers, so the order of the trees does not matter and both
-// backends give the same bits. The caller has checked that children and features are in range and that no
-// path is longer than `depth`. O(M T depth).
+// At a node, a row goes left if its feature is below the threshold, or if it is NaN and the node sends NaN
+// left. A node without children is a leaf. Leaves are integers, so the order of the trees does not matter and
+// both backends give the same bits. The caller must check that children and features are in range and that no
+// path is longer than `depth`. The cost is O(M T depth).
 #pragma once
 #include <cstdint>
 
@@ -16,7 +17,7 @@ namespace blitzgs {
 
 struct alignas(16) TreeNode {
   float threshold;
-  std::int32_t feature;      // twice its number, plus 1 where NaN goes left
+  std::int32_t feature;      // twice the index of the feature, plus 1 if NaN goes left
   std::int32_t left, right;  // -1 for a leaf
 };
 
@@ -30,7 +31,7 @@ struct TreeSumsArgs {
   std::int64_t* sums;
 };
 
-// `row` gives the features of a row by their numbers.
+// The sum for one row; row[i] is its feature i.
 template <class Row>
 BLITZGS_HD std::int64_t tree_sum_of(const TreeSumsArgs& args, const Row& row) {
   std::int64_t sum = 0;

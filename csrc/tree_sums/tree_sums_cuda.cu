@@ -5,15 +5,17 @@
 namespace blitzgs::cuda {
 namespace {
 
-// The threads of a block walk one tree after the other, so that its nodes stay in the L1 cache. A thread's
-// row lies in shared memory, one feature behind the other for all threads: no two lanes meet in a bank.
 constexpr int kThreads = 256;
 
+// A row of features in shared memory. Feature i of all threads is contiguous, so lanes have no bank
+// conflicts.
 struct StridedRow {
   const float* first;
   __device__ float operator[](int feature) const { return first[feature * kThreads]; }
 };
 
+// sums [M] (tree_sums.h), one thread per row. All threads of a block take the same tree at a time, so that
+// its nodes stay in the L1 cache.
 __global__ void __launch_bounds__(kThreads) tree_sums_kernel(const TreeSumsArgs args) {
   extern __shared__ float shared[];
   wait_for_earlier_kernels();

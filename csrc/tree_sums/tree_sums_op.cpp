@@ -7,7 +7,7 @@ namespace blitzgs {
 namespace {
 
 constexpr const char* kOp = "tree_sums";
-constexpr std::int64_t kMostFeatures = 32;  // a block has their values in shared memory
+constexpr std::int64_t kMostFeatures = 32;  // the features of a block's rows are in shared memory
 
 Tensor tree_sums(const Tensor& features_in, const Tensor& roots_in, const Tensor& nodes_in,
                  const Tensor& leaves_in, std::int64_t depth) {

@@ -1,17 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-// The view level: what a view leaves out of its active set before projection (paper, Section 3.3).
+// The view level (paper, Section 3.3): drops pairs of a row and a view from the active set before the
+// projection.
 //
 // LOD gate (Eq. 1 and 2): view v keeps row i iff level_i <= L_v(|mean_i - centre_v|). Eq. 1 rounds
 // log_f(d_0 / d) to the nearest integer, so level l is kept up to the distance reach_l = d_0 f^(1/2 - l);
 // level 0 at any distance, and a level beyond L_max(t) nowhere (reach < 0). Comparing squared distances
 // decides the same sets without a logarithm.
 //
-// Cull mask: view v leaves out row i iff the row's bit in column columns[v] of the cull matrix is set. The
-// matrix is stored by block and column (cull_mask.h).
+// Cull mask: view v drops row i iff the row's bit in column columns[v] of the cull matrix is set. The matrix
+// is stored by sector (cull_mask.h).
 //
-// The op clears the bits of (row, view) pairs that are left out, in the lists of the active set. Each row
-// decides for itself, in float32 and from caught-up means, so the sets depend neither on the order of the
-// rows nor on how they are divided among ranks. In place, one thread a row: deterministic. O(listed rows).
+// The op clears the bits of dropped pairs in `views`, in place. The decision for a row depends on this row
+// alone, in float32 and from caught-up means, so the sets depend neither on the order of the rows nor on how
+// they are divided among ranks. One thread handles a row: deterministic. The cost is O(listed rows).
 //
 // ids int32 [room] and views int32 [room], of which the first count [1] are valid; means [N, 3]; level uint8
 // [N]; viewmats [B, 4, 4], rigid; cull int32 [ceil(N / 256), columns, 8].
@@ -23,22 +24,22 @@
 
 namespace blitzgs {
 
-// What all rows of a launch are compared with.
+// The values that the rows of a launch are compared with, by view or by level.
 struct GateTable {
   float centres[kMaxViews][3];
   float reach2[kMaxLevels];         // squared; negative: the level is kept nowhere
-  std::int32_t columns[kMaxViews];  // of the cull matrix; negative: the view has no mask
+  std::int32_t columns[kMaxViews];  // columns of the cull matrix; negative: the view has no mask
 };
 
-// What is left out of B views of a table.
+// The rules by which rows of a table are dropped from B views.
 struct GateRules {
   const std::uint8_t* level;  // [N]
   const std::int32_t* cull;   // [sector_blocks(N), cull_columns, kSectorWords]; may be null
   std::int64_t n_rows, cull_columns;
   int n_views, n_levels;
   std::uint32_t lod_views;   // bits of the views that have an LOD gate
-  std::uint32_t cull_views;  // and of those that have a mask
-  GateTable table;           // without the centres, which the kernels work out
+  std::uint32_t cull_views;  // bits of the views that have a mask
+  GateTable table;           // without the centres, which the kernels compute
 };
 
 BLITZGS_HD bool leaves_out_any(const GateRules& rules) { return (rules.lod_views | rules.cull_views) != 0; }
@@ -47,13 +48,13 @@ struct ViewGateArgs {
   const std::int32_t* ids;
   std::int32_t* views;
   std::int64_t room;
-  const std::int32_t* count;  // CUDA: how many of the ids are valid, in device memory; null: all
+  const std::int32_t* count;  // CUDA: the number of valid ids, in device memory; null: all
   const float* means;
   const float* viewmats;
   GateRules rules;
 };
 
-// -R^T t of a rigid pose.
+// The camera centre -R^T t of a rigid pose.
 BLITZGS_HD void camera_centre(const float* viewmat, float* centre) {
   for (int axis = 0; axis < 3; ++axis) {
     double sum = 0;
@@ -77,7 +78,7 @@ BLITZGS_HD float reach2_of(const GateRules& rules, const GateTable& table, std::
   return table.reach2[level < last ? level : last];
 }
 
-// The views of `seen` whose masks leave a row out.
+// The views of `seen` whose masks drop a row.
 BLITZGS_HD std::uint32_t views_that_cull(const GateRules& rules, const GateTable& table, std::int64_t row,
                                          std::uint32_t seen) {
   std::uint32_t culled = 0;
@@ -89,6 +90,7 @@ BLITZGS_HD std::uint32_t views_that_cull(const GateRules& rules, const GateTable
   return culled;
 }
 
+// Applies the gate to entry i of the list.
 BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std::int64_t i) {
   const GateRules& rules = args.rules;
   const std::int64_t row = args.ids[i];
@@ -111,7 +113,8 @@ namespace cuda {
 void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
 }
 
-// Copies the table of the rules and works out the centres: the part of a thread of the block that calls this.
+// Fills `table` with the table of the rules and the camera centres. All threads of a block call this, each
+// for one level and one view.
 BLITZGS_HD void fill_gate_table(const GateRules& rules, const float* viewmats, int thread, GateTable& table) {
   if (thread < kMaxLevels) table.reach2[thread] = rules.table.reach2[thread];
   if (thread < rules.n_views) {

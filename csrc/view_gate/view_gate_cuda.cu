@@ -9,8 +9,9 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kResident = 6;  // CUDA blocks that fit into a multiprocessor of any supported GPU
+constexpr int kResident = 6;  // CUDA blocks that fit a multiprocessor of every supported GPU
 
+// Applies the gate (view_gate.h) to the list, one thread per entry in a grid-stride loop.
 __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const ViewGateArgs args) {
   __shared__ GateTable table;
   wait_for_earlier_kernels();
@@ -28,7 +29,7 @@ __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const V
 
 void gate_views(const ViewGateArgs& args, Workspace&, CudaStream stream) {
   if (args.room == 0) return;
-  // The lists have room for the whole table and few entries, so blocks take turns.
+  // The grid is limited because the list's capacity is the whole table and its valid entries are few.
   const std::int64_t most = kResident * multiprocessors();
   const auto blocks = static_cast<unsigned>(std::min<std::int64_t>(blocks_for(args.room, kThreads), most));
   launch_early("gate_views", gate_views_kernel, {blocks, kThreads, stream}, args);

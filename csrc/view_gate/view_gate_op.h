@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The arguments of ops that leave rows out of views: level [N], reach, lod_views, cull, columns.
+// The checked arguments of the ops that drop rows from views: level [N], reach, lod_views, cull, columns.
 #pragma once
 #include <optional>
 #include <vector>
@@ -9,7 +9,7 @@
 
 namespace blitzgs {
 
-// Rules, checked; their columns are kept alive during the call.
+// The checked rules, and the tensors that they point to, which must live during the call.
 struct HeldRules {
   Tensor level;
   std::optional<Tensor> cull;

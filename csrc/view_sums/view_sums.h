@@ -1,18 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the importance sweep keeps of a batch of at most kMostViews views: per visible Gaussian g, added up
-// over its splats i (g in the view v_i), which lie one behind the other,
+// The sums of the importance sweep (paper: the score s, c_rad, c_vis and the cull matrix) for a batch of at
+// most kMostViews views. For each visible Gaussian g the op adds over its consecutive splats i (g in the view
+// v_i):
 //
 //   score[g]   += round(w / (a + eps)^p / unit)   w = weights[i] / 2^32, a = pixels[i]; p is 1, 1/2 or 0; in
 //                                                 float64, to the nearest integer, ties to even
 //   seen[g]    += whether the splat has a radius
 //   counted[g] += counts[i]
-//   cull[g]     : the bit columns[v_i] is cleared where counts[i]; bit c is bit c % 32 of word c / 32
+//   cull[g]     : the bit columns[v_i] is cleared if counts[i]; bit c is bit c % 32 of word c / 32
 //
 //   weights int64 [P], pixels int32 [P], radii int32 [P, 2], camera_ids int32 [P], counts bool [P],
 //   visible_ids int32 [U], splat_offsets int32 [U + 1]; score int64 [N], seen and counted int32 [N],
 //   cull int32 [N, words]
 //
-// Sums of integers, each by one thread: exact, without atomics. O(P).
+// counts[i]: the splat is in its view's mass cut (mass_cut.h). The sums are integers, and one thread computes
+// those of a Gaussian, so they are exact and need no atomics. The cost is O(P).
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -43,7 +45,8 @@ struct ViewSumsArgs {
   std::int32_t columns[kMostViews];
 };
 
-// The term of a splat, in units of the score. `round` is the backend's, to the nearest even integer.
+// The summand of a splat, in units of the score. `round` rounds to the nearest integer, ties to even; each
+// backend has its own function for it.
 template <class Round>
 BLITZGS_HD std::int64_t score_term(const ViewSumsArgs& args, std::int64_t splat, const Round& round) {
   double term = static_cast<double>(args.weights[splat]) / 4294967296.0;

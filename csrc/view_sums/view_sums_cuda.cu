@@ -11,6 +11,7 @@ struct ToNearest {
   __device__ std::int64_t operator()(double value) const { return __double2ll_rn(value); }
 };
 
+// Adds to the sums (view_sums.h), one thread per visible Gaussian.
 __global__ void __launch_bounds__(kThreads) view_sums_kernel(const ViewSumsArgs args) {
   wait_for_earlier_kernels();
   const std::int64_t u = static_cast<std::int64_t>(blockIdx.x) * kThreads + threadIdx.x;

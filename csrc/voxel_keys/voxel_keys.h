@@ -4,7 +4,8 @@
 //   c = floor((p - origin) / voxel_size) per axis, clamped to [0, 2^21);  key = c.x | c.y << 21 | c.z << 42
 //
 // points [N, 3], origin 3 values in the unit of the points, keys int64 [N]. A point that is not finite gets
-// key -1. Deterministic, O(N). The division is done in double, so keys do not depend on the dtype's rounding.
+// the key -1. The division is done in double, so keys do not depend on the rounding of the dtype.
+// Deterministic, O(N).
 #pragma once
 #include <cmath>
 #include <cstdint>

@@ -5,6 +5,7 @@
 namespace blitzgs::cuda {
 
 namespace {
+// keys [n] (voxel_keys.h), one thread per point.
 template <class T>
 __global__ void voxel_keys_kernel(const T* points, std::int64_t n, VoxelGrid grid, std::int64_t* keys) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
