@@ -111,7 +111,7 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
     using Turn = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
     turn = static_cast<unsigned>(Turn(*pass.turn).fetch_add(1, ::cuda::memory_order_relaxed));
   }
-  const State everywhere = bin < kBins ? static_cast<State>(pass.histogram[bin]) : 0;
+  const State count_everywhere = bin < kBins ? static_cast<State>(pass.histogram[bin]) : 0;
   const std::int64_t n = *pass.n_items;
   const int width = pass.known_width ? *pass.known_width : pass.width, shift = pass.index * width;
   const auto digit_of = [&](Key key) { return static_cast<unsigned>(key) >> shift & ((1u << width) - 1); };
@@ -147,22 +147,22 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   using Word = ::cuda::atomic_ref<State, ::cuda::thread_scope_device>;
   State* const states = pass.states + bin;
   State* const own_state = states + block * static_cast<std::int64_t>(kBins);
-  std::uint32_t here = 0;
+  std::uint32_t count_here = 0;
   if (bin < kBins) {
 #pragma unroll
-    for (int w = 0; w < kWarps; ++w) here += counts[w * kBins + bin];
-    Word(*own_state).store((block ? kOwn : kThrough) | here, ::cuda::memory_order_relaxed);
+    for (int w = 0; w < kWarps; ++w) count_here += counts[w * kBins + bin];
+    Word(*own_state).store((block ? kOwn : kThrough) | count_here, ::cuda::memory_order_relaxed);
   }
-  const std::uint32_t until_here = sum_of_lanes_until(here, lane);
-  const State until_everywhere = sum_of_lanes_until(everywhere, lane);
+  const std::uint32_t sum_here = sum_of_lanes_until(count_here, lane);
+  const State sum_everywhere = sum_of_lanes_until(count_everywhere, lane);
   if (lane == 31) {
-    sums_here[warp] = until_here;
-    sums_everywhere[warp] = until_everywhere;
+    sums_here[warp] = sum_here;
+    sums_everywhere[warp] = sum_everywhere;
   }
   __syncthreads();
-  State target = until_everywhere - everywhere;
+  State target = sum_everywhere - count_everywhere;
   if (bin < kBins) {
-    std::uint32_t start = until_here - here;  // the position of the bin's first pair in this block
+    std::uint32_t start = sum_here - count_here;  // the position of the bin's first pair in this block
     for (int w = 0; w < warp; ++w) {
       start += sums_here[w];
       target += sums_everywhere[w];
@@ -190,7 +190,7 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   }
   if (bin < kBins) {
     const State before = count_before<kBins>(states, block);
-    if (block) Word(*own_state).store(kThrough | (before + here), ::cuda::memory_order_relaxed);
+    if (block) Word(*own_state).store(kThrough | (before + count_here), ::cuda::memory_order_relaxed);
     targets[bin] = target + before;
   }
 #pragma unroll

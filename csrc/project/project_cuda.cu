@@ -12,7 +12,7 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kWarps = kPrefilterThreads / 32, kMostOfWarp = kMostAtOnce / kWarps;
+constexpr int kWarps = kPrefilterThreads / 32, kMostWarpCandidates = kMostAtOnce / kWarps;
 constexpr int kBlocksPerMultiprocessor = 8;
 
 // Not inlined: the double-precision values in here would make the kernel's loop spill registers.
@@ -73,11 +73,11 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
     prefilter_kernel(const Inputs in, const Prefiltered kept, const RunningSum before) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ Frustum frusta[kMaxViews];
-  __shared__ std::uint32_t left_views[kWarps][kMostOfWarp];
-  __shared__ std::int32_t left_ids[kWarps][kMostOfWarp];
-  __shared__ int left[kWarps];
+  __shared__ std::uint32_t listed_views[kWarps][kMostWarpCandidates];
+  __shared__ std::int32_t listed_ids[kWarps][kMostWarpCandidates];
+  __shared__ int listed_by_warp[kWarps];
   const std::int64_t n_candidates = candidates_of(in);
-  const int at_once = prefiltered_at_once(n_candidates), of_warp = at_once / kWarps;
+  const int at_once = prefiltered_at_once(n_candidates), warp_candidates = at_once / kWarps;
   const std::int64_t n_turns = (n_candidates + at_once - 1) / at_once;
   if (blockIdx.x == 0 && threadIdx.x == 0 && n_turns == 0) *kept.count = 0;
   if (blockIdx.x >= n_turns) return;
@@ -91,9 +91,9 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
   for (;;) {
     const int turn = before.take_turn();
     if (turn >= n_turns) return;
-    const std::int64_t first = turn * std::int64_t{at_once} + warp * of_warp;
-    int n_left = 0;
-    for (int batch = 0; batch < of_warp; batch += 32 * kPrefilterBatch) {
+    const std::int64_t first = turn * std::int64_t{at_once} + warp * warp_candidates;
+    int n_listed = 0;
+    for (int batch = 0; batch < warp_candidates; batch += 32 * kPrefilterBatch) {
       std::uint32_t maybe[kPrefilterBatch];
       std::int32_t ids[kPrefilterBatch];
       quick_views(in, n_candidates, frusta, first + batch + lane, maybe, ids);
@@ -101,26 +101,26 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
       for (int k = 0; k < kPrefilterBatch; ++k) {
         const unsigned some = __ballot_sync(kFullWarp, maybe[k] != 0);
         if (maybe[k]) {
-          const int at = n_left + __popc(some & below);
-          left_views[warp][at] = maybe[k];
-          left_ids[warp][at] = ids[k];
+          const int at = n_listed + __popc(some & below);
+          listed_views[warp][at] = maybe[k];
+          listed_ids[warp][at] = ids[k];
         }
-        n_left += __popc(some);
+        n_listed += __popc(some);
       }
     }
-    if (lane == 0) left[warp] = n_left;
+    if (lane == 0) listed_by_warp[warp] = n_listed;
     __syncthreads();
-    int at = 0, of_block = 0;
+    int at = 0, listed_by_block = 0;
 #pragma unroll
     for (int other = 0; other < kWarps; ++other) {
-      if (other < warp) at += left[other];
-      of_block += left[other];
+      if (other < warp) at += listed_by_warp[other];
+      listed_by_block += listed_by_warp[other];
     }
-    const std::int64_t base = before.sum_before<kPrefilterThreads>(turn, of_block);
-    if (turn == n_turns - 1 && threadIdx.x == 0) *kept.count = base + of_block;
-    for (int i = lane; i < n_left; i += 32) {
-      kept.views[base + at + i] = left_views[warp][i];
-      kept.ids[base + at + i] = left_ids[warp][i];
+    const std::int64_t base = before.sum_before<kPrefilterThreads>(turn, listed_by_block);
+    if (turn == n_turns - 1 && threadIdx.x == 0) *kept.count = base + listed_by_block;
+    for (int i = lane; i < n_listed; i += 32) {
+      kept.views[base + at + i] = listed_views[warp][i];
+      kept.ids[base + at + i] = listed_ids[warp][i];
     }
   }
 }
@@ -182,11 +182,11 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
   const std::int64_t n_splats = fitting(capacity).splats, step = gridDim.x * std::int64_t{kSplatsOfBlock};
-  const std::int64_t of_block = blockIdx.x * std::int64_t{kSplatsOfBlock};
-  if (of_block >= n_splats) return;
+  const std::int64_t block_start = blockIdx.x * std::int64_t{kSplatsOfBlock};
+  if (block_start >= n_splats) return;
   load_cameras(in, cameras);
   __syncthreads();
-  for (std::int64_t begin = of_block; begin < n_splats; begin += step) {
+  for (std::int64_t begin = block_start; begin < n_splats; begin += step) {
 #pragma unroll 1
     for (int first = 0; first < kSplatsOfBlock; first += kColorThreads) {
       const std::int64_t i = begin + first + threadIdx.x;

@@ -61,18 +61,18 @@ struct Pending {
 __device__ __forceinline__ std::int32_t find_tiles(const Splat<float>& splat, int view, const Inputs& in,
                                                    const RankTiles& rank_tiles, std::int64_t* ranks,
                                                    Sums& sums) {
-  int current = -1;      // the rank of the last pieces of tile rows
-  unsigned of_rank = 0;  // tiles of these pieces: few splats have several ranks, so this saves atomics
+  int current = -1;            // the rank of the last pieces of tile rows
+  unsigned tiles_of_rank = 0;  // tiles of these pieces: few splats have several ranks, so this saves atomics
   const std::int32_t tiles =
       splat_tiles(splat, view, in.options, rank_tiles, ranks, [&](int rank, std::int64_t count) {
         if (rank != current) {
-          if (current >= 0) sums.add_tiles(current, of_rank);
+          if (current >= 0) sums.add_tiles(current, tiles_of_rank);
           current = rank;
-          of_rank = 0;
+          tiles_of_rank = 0;
         }
-        of_rank += static_cast<unsigned>(count);
+        tiles_of_rank += static_cast<unsigned>(count);
       });
-  if (current >= 0) sums.add_tiles(current, of_rank);
+  if (current >= 0) sums.add_tiles(current, tiles_of_rank);
   for (std::int64_t rest = *ranks; rest; rest &= rest - 1) {
     atomicAdd(&sums.rank_splats[__ffsll(rest) - 1], 1u);
   }
@@ -84,9 +84,9 @@ struct Group {
   std::uint32_t seen[kSplatThreads];  // the views in which each has a splat, as bits
   std::int32_t ids[kSplatThreads];
   std::int32_t before[kSplatThreads];  // of the Gaussians before it in the group: visible << 16 | splats
-  int of_warps[kWarps];
+  int warp_sums[kWarps];
   int next_turn;
-  std::int64_t of_turns_before;  // of all turns before: visible << 31 | splats
+  std::int64_t before_turn;  // of all turns before: visible << 31 | splats
 };
 
 // Returns the sum of `value` over the threads before this one and sets *all to the sum over the block. It
@@ -94,13 +94,13 @@ struct Group {
 __device__ __forceinline__ int sum_of_threads_before(int value, Group& group, int* all) {
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const int until = sum_of_lanes_until(value, lane);
-  if (lane == 31) group.of_warps[warp] = until;
+  if (lane == 31) group.warp_sums[warp] = until;
   __syncthreads();
   int before = until - value, total = 0;
 #pragma unroll
   for (int other = 0; other < kWarps; ++other) {
-    if (other < warp) before += group.of_warps[other];
-    total += group.of_warps[other];
+    if (other < warp) before += group.warp_sums[other];
+    total += group.warp_sums[other];
   }
   *all = total;
   return before;
@@ -131,9 +131,9 @@ __device__ __forceinline__ void write_splats(const Group& group, std::int64_t be
   for (int p = thread; p < n_pairs; p += kSplatThreads) {
     const int pair = pending.pairs[p], slot = pair / kMaxViews, view = pair % kMaxViews;
     if (pair == kNoSplat) continue;
-    const std::uint32_t of_slot = group.seen[slot];
+    const std::uint32_t views_of_slot = group.seen[slot];
     const std::int64_t i =
-        splats_before + (group.before[slot] & 0xffff) + __popc(of_slot & ((1u << view) - 1u));
+        splats_before + (group.before[slot] & 0xffff) + __popc(views_of_slot & ((1u << view) - 1u));
     if (i >= capacity.splats) continue;
     ids.gaussian_ids[i] = group.ids[slot];
     ids.camera_ids[i] = view;
@@ -180,7 +180,7 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
   }
   load_cameras(in, cameras);
   std::int64_t tiles = 0;
-  unsigned of_view = 0;  // splats of this warp in view number `lane`
+  unsigned splats_of_view = 0;  // splats of this warp in view number `lane`
   int turn = turns.first();
   if (turn < 0) {
     if (warp == 0 && writes) turns.add_up(n_turns);
@@ -216,18 +216,18 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     }
     for (int view = 0; view < in.n_views; ++view) {
       const unsigned seeing = __ballot_sync(kFullWarp, seen >> view & 1u);
-      if (lane == view) of_view += __popc(seeing);
+      if (lane == view) splats_of_view += __popc(seeing);
     }
     group.seen[thread] = seen;
     group.ids[thread] = id;
     __syncthreads();
-    int all;
-    group.before[thread] = sum_of_threads_before((seen != 0) << 16 | __popc(seen), group, &all);
-    const std::int64_t own = std::int64_t{all >> 16} << 31 | (all & 0xffff);
+    int group_sums;
+    group.before[thread] = sum_of_threads_before((seen != 0) << 16 | __popc(seen), group, &group_sums);
+    const std::int64_t turn_sums = std::int64_t{group_sums >> 16} << 31 | (group_sums & 0xffff);
     if (thread == 0) {
-      if (writes) turns.publish(turn, own);
-      sums.visible += all >> 16;
-      sums.splats += all & 0xffff;
+      if (writes) turns.publish(turn, turn_sums);
+      sums.visible += group_sums >> 16;
+      sums.splats += group_sums & 0xffff;
     }
     for (p = thread; p < n_pairs; p += kSplatThreads) {
       const int pair = pending.pairs[p];
@@ -243,21 +243,21 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     }
     int next = 0;
     if (thread == 0) {
-      if (writes) group.of_turns_before = turns.before(turn);
+      if (writes) group.before_turn = turns.before(turn);
       // The block takes its next turn only here, because other blocks wait until the taken turn is published.
       next = turns.next();
     }
     __syncthreads();
     if (writes) {
-      const std::int64_t before = group.of_turns_before;
+      const std::int64_t before = group.before_turn;
       write_splats(group, before, pending, n_pairs, capacity, ids, out);
-      if (turn == n_turns - 1 && thread == 0) end_splats(before + own, capacity, ids);
+      if (turn == n_turns - 1 && thread == 0) end_splats(before + turn_sums, capacity, ids);
     }
     if (thread == 0) group.next_turn = next;
     __syncthreads();
   }
   if (!totals) return;
-  if (of_view) atomicAdd(&sums.views[lane], of_view);
+  if (splats_of_view) atomicAdd(&sums.views[lane], splats_of_view);
   for (int step = 16; step > 0; step /= 2) tiles += __shfl_xor_sync(kFullWarp, tiles, step);
   if (lane == 0) atomicAdd(&sums.tiles, static_cast<unsigned long long>(tiles));
   __syncthreads();
