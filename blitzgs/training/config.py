@@ -92,6 +92,10 @@ class LodConfig:
     base_resolution: float = 0.001
 
 
+# The most that `schedule.images_per_view` makes a run longer.
+MOST_STRETCH = 4.0
+
+
 @dataclass(frozen=True)
 class ScheduleConfig:
     """The times of all events, counted in images; `scale` multiplies every time below.
@@ -99,6 +103,9 @@ class ScheduleConfig:
     Attributes:
         iterations: length of the run.
         scale: stretches or compresses the whole schedule without changing its shape.
+        images_per_view: a new run multiplies `scale` such that it sees every training view so often on
+            average, by 1 to `MOST_STRETCH`. The run's own configuration holds the product, and 0 here. With 0
+            or with `minutes` the length does not depend on the number of views.
         minutes: wall time of training that the schedule is fitted into (`blitzgs train --minutes`): the run
             measures its speed and changes its pace; `scale` stays 1. 0: no limit.
         pace: pairs (image of the run, factor): from that image on, `scale` is multiplied by the factor. A run
@@ -128,6 +135,7 @@ class ScheduleConfig:
 
     iterations: int = 30_000
     scale: float = 1.0
+    images_per_view: float = 0.0
     minutes: float = 0.0
     pace: tuple[tuple[int, float], ...] = ()
     adaptive: bool = False

@@ -15,7 +15,7 @@ from typing import Any, get_args
 
 from blitzgs.distributed.group import Transport
 from blitzgs.population.importance import ScoreRule
-from blitzgs.training.config import Config, ScheduleConfig
+from blitzgs.training.config import MOST_STRETCH, Config, ScheduleConfig
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ RANGES: Mapping[str, Range] = {
     "lod.base_resolution": Range(1e-6, 1),
     "schedule.iterations": Range(1, 1e9),
     "schedule.scale": SCALE,
+    "schedule.images_per_view": Range(0, 1e6),
     "schedule.minutes": Range(0, 1e6),
     "schedule.pace": Range(1e-4, 1e9),
     "schedule.adaptive_limit": Range(0, 1, high_open=True),
@@ -178,7 +179,8 @@ def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
     factors = [factor for _, factor in schedule.pace]
     if wrong := [factor for factor in factors if factor not in SCALE]:
         yield f"schedule.pace: its factors must be {SCALE}, got {wrong[0]}"
-    total = schedule.iterations * schedule.scale * max([1.0, *factors])
+    stretch = MOST_STRETCH if schedule.images_per_view > 0 else 1.0
+    total = schedule.iterations * schedule.scale * stretch * max([1.0, *factors])
     if not math.isnan(total) and total > MOST_IMAGES:
         yield (
             f"schedule.iterations: times schedule.scale must be at most {MOST_IMAGES:,} images, got "

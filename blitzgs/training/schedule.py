@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from blitzgs.training.config import OptimiserConfig, ScheduleConfig
+from blitzgs.training.config import MOST_STRETCH, OptimiserConfig, ScheduleConfig
 from blitzgs.training.pace import Pace
 
 EventKind = Literal[
@@ -50,6 +50,19 @@ def _with_places(config: ScheduleConfig) -> ScheduleConfig:
         return config
     t1, until, t2 = (*config.placed, *latest_times(config)[len(config.placed) :])
     return replace(config, t1=t1, densify_until=until, t2=t2)
+
+
+def stretched(config: ScheduleConfig, views: int) -> ScheduleConfig:
+    """Return a configuration whose `scale` contains what `images_per_view` asks for, which is 0 in it.
+
+    Args:
+        config: of a new run, or of a run that already has its scale.
+        views: number of training views.
+    """
+    factor = min(max(config.images_per_view * views / config.iterations, 1.0), MOST_STRETCH)
+    if config.minutes > 0:
+        factor = 1.0  # The minutes decide how long the run is.
+    return replace(config, scale=config.scale * factor, images_per_view=0.0)
 
 
 class Schedule:

@@ -32,7 +32,7 @@ from blitzgs.training.run import Progress
 from blitzgs.training.run_cameras import CAMERAS, save_cameras
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
-from blitzgs.training.schedule import Schedule
+from blitzgs.training.schedule import Schedule, stretched
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import keep_to_views
@@ -73,6 +73,7 @@ def set_up(
         )
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = run.restore(folder, ranks, home) if resume else None
+    config = replace(config, schedule=stretched(config.schedule, len(capture.train)))
     config = run.with_pace_of(config, None if restored is None else restored.config)
     schedule = Schedule(config.schedule)
     if restored is None:

@@ -217,9 +217,11 @@ class Trainer:
         """Log the start of the training: origin, population, views and ranks."""
         state, ranks = self.state, self.state.ranks
         views = {"train": len(state.capture.train), "test": len(state.capture.test)}
+        images = state.schedule.iterations
         text = (
             f"{state.population():,} Gaussians on {state.progress.level_count} levels; "
-            f"{views['train']} training views, {views['test']} held out"
+            f"{views['train']} training views, {views['test']} held out; "
+            f"{images:,} images, {images / views['train']:,.0f} per view"
         )
         if ranks.world_size > 1:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
-from blitzgs.training.schedule import Schedule
+from blitzgs.training.schedule import Schedule, stretched
 
 
 def all_events(config):
@@ -39,6 +39,18 @@ def test_one_field_scales_every_time(scale):
     expected = sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
     assert times == expected
     assert schedule.steps == math.floor(3_000 * scale + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("views", "minutes", "factor"), [(10, 0.0, 1.0), (45, 0.0, 3.0), (1_000, 0.0, 4.0), (45, 5.0, 1.0)]
+)
+def test_a_capture_of_many_views_gets_a_longer_schedule(views, minutes, factor):
+    config = ScheduleConfig(iterations=3_000, images_per_view=200.0, minutes=minutes)
+    longer = stretched(config, views)
+    assert Schedule(longer).iterations == 3_000 * factor
+    assert Schedule(stretched(ScheduleConfig(iterations=3_000), views)).iterations == 3_000
+    # The run's own configuration holds the result: a resumed run is not stretched again.
+    assert stretched(longer, views) == longer
 
 
 def test_events_do_not_depend_on_how_the_run_is_cut():

@@ -96,6 +96,22 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     assert second.state.progress.peak_gaussians == whole.state.progress.peak_gaussians
 
 
+def test_a_run_that_views_made_longer_is_resumed_with_either_configuration(tmp_path, monkeypatch):
+    asked = ["schedule.iterations=40", "schedule.images_per_view=20"]
+    stop_at_step_50(monkeypatch)
+    first, summary = train(tmp_path, *asked)
+    views = len(first.state.capture.train)
+    assert summary is None and first.state.schedule.iterations == 20 * views > 50
+    monkeypatch.undo()
+    own = run.load_config(tmp_path / "config.yaml")
+    assert own.schedule.images_per_view == 0 and own.schedule.scale == views / 2
+    with pytest.raises(ConfigError, match="schedule.scale: the checkpoint was trained with"):
+        train(tmp_path, asked[0], "schedule.images_per_view=19", resume=True)
+    Trainer(own, *tiny_scene(), tmp_path, Ranks(), resume=True).close()
+    second, summary = train(tmp_path, *asked, resume=True)
+    assert summary is not None and second.state.schedule.iterations == 20 * views
+
+
 def test_a_checkpoint_has_all_events_of_its_step(tmp_path):
     """In a batch, a checkpoint may be due an image before a density event of the same step."""
     times = ("schedule.densify_from=22", "schedule.checkpoint_every=20")
