@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads the op libraries once, when `blitzgs.ops` is first imported.
 
-BLITZGS_LIBRARY_DIR names another folder to load them from: that of a build with other options.
+The environment variable BLITZGS_LIBRARY_DIR names another folder to load them from, for a build with other
+options.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 
 import torch
 
-# In a checkout: the list of ops that the libraries were built with.
+# The list of ops in a checkout; it must be the one that the libraries were built with.
 REGISTRATION = Path(__file__).resolve().parents[1] / "csrc" / "registration.cpp"
 LIBRARY_DIR = Path(os.environ.get("BLITZGS_LIBRARY_DIR") or Path(__file__).parent / "_lib")
 
@@ -24,8 +25,8 @@ def load_libraries() -> None:
     """Register the CPU kernels, and the CUDA kernels when this torch can use a GPU.
 
     Raises:
-        ImportError: a library that is needed here was not built, or before the list of ops changed; says how
-            to build it.
+        ImportError: a library was not built, or was built before the list of ops changed; the message says
+            how to build it.
     """
     _load(LIBRARY_DIR / "libblitzgs_cpu.so")
     if torch.cuda.is_available():
@@ -41,12 +42,12 @@ def _load(path: Path) -> None:
     torch.ops.load_library(str(path))
     if REGISTRATION.exists() and schema_digest(path) != hashlib.sha256(REGISTRATION.read_bytes()).hexdigest():
         raise ImportError(
-            f"{path} was built before the ops changed ({REGISTRATION} is another now): run `make build`"
+            f"{path} was built before the ops changed (it does not match {REGISTRATION}): run `make build`"
         )
 
 
 def schema_digest(path: Path) -> str:
-    """Return the SHA-256 of the registration.cpp that a library was built with; "" if it does not say."""
+    """Return the SHA-256 of the registration.cpp that a library was built with; "" if it has none."""
     try:
         digest = ctypes.CDLL(str(path)).blitzgs_schema_digest
     except AttributeError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small charts as SVG, without a plotting package: lines over an axis, and maps of cells."""
+"""Draws small SVG charts without a plotting package: line charts, and maps of cells."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CELLS = 320
 def line_chart(
     lines: Mapping[str, Sequence[tuple[float, float]]], x_label: str, y_label: str, most: float | None = None
 ) -> str:
-    """Draw lines from zero up.
+    """Draw a line chart whose axes begin at zero.
 
     Args:
         lines: name -> (x, y), x and y >= 0.

@@ -83,13 +83,13 @@ class LazyDict(dict[str, Any]):
         return dict, (dict(self),)
 
     def _settled(self) -> Any:
-        """Compute what is left; returns the same dict, to be read as a plain one."""
+        """Compute all remaining values; return the same dict, which then is a plain one for readers."""
         for key in self:
             self[key]
         return super()
 
 
-# So that tree_map looks inside, as it does in plain dicts: a subclass of dict is a leaf to it.
+# Register the class, so that tree_map visits its values: an unregistered subclass of dict would be a leaf.
 pytree.register_pytree_node(
     LazyDict,
     lambda values: (list(values.values()), list(values)),

@@ -18,22 +18,21 @@ def l1_ssim(
     """Return ``(1 - w) mean |x - y| + w (1 - mean SSIM)``, the mean over views (Kerbl et al. 2023, eq. 7).
 
     SSIM has an 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2 and zero padding (Wang et al.
-    2004). The loss and its gradient are worked out together, in one pass over the images. Differentiable,
-    once, in `renders`.
+    2004). One pass over the images computes the loss and its gradient. Differentiable, once, in `renders`.
 
     Args:
         renders: x [..., H, W, 3], float32 (CPU also float64), nominal range [0, 1]: what
             `blitzgs.rasterization` returns.
         targets: y of the same shape, uint8 (value / 255) or the dtype of `renders`.
-        masks: [..., H, W], bool or uint8, 0 = excluded; windows centred elsewhere still see such a pixel. A
-            view without a pixel has loss 0.
+        masks: [..., H, W], bool or uint8, 0 = excluded; SSIM windows centred at other pixels still read such
+            a pixel. A view whose pixels are all excluded has loss 0.
         ssim_weight: w in [0, 1].
 
     Returns:
         A scalar, dtype of `renders`.
 
     Raises:
-        ValueError: shapes or devices that do not fit, or a weight outside [0, 1].
+        ValueError: shapes or devices do not fit, or the weight is outside [0, 1].
         RuntimeError: wrong dtypes.
     """
     if renders.dim() < 3 or renders.shape[-1] != 3 or targets.shape != renders.shape:
@@ -56,7 +55,7 @@ def l1_ssim(
 
 
 class _L1Ssim(torch.autograd.Function):
-    """The loss with its gradient by the images, which is made together with it."""
+    """The loss; its forward pass also computes the gradient by the images."""
 
     @staticmethod
     def forward(ctx: Any, renders: Tensor, targets: Tensor, masks: Tensor | None, weight: float) -> Tensor:

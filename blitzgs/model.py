@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Gaussians of one rank: a table of per-Gaussian columns that grow, shrink, permute and move together."""
+"""The Gaussians of one rank: a table of columns whose rows are added, removed and moved together."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from blitzgs.ops.take_rows import take_rows
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 EXP_AVGS = tuple(f"exp_avg.{name}" for name in PARAMETERS)
 EXP_AVG_SQS = tuple(f"exp_avg_sq.{name}" for name in PARAMETERS)
-# What new rows must bring; every other column starts at zero.
+# Columns that new rows must have; every other column starts with zeros.
 REQUIRED = (*PARAMETERS, "last_step", "id", "parent", "birth", "level")
 NO_PARENT = -1
 # The cull matrix, from the first importance pass on: which views leave a row out.
@@ -26,7 +26,7 @@ CULL = "cull"
 
 
 class RowExchange(Protocol):
-    """What `GaussianTable.exchange` needs of a job's ranks (`blitzgs.distributed.group.Ranks`)."""
+    """The methods of `blitzgs.distributed.group.Ranks` that `GaussianTable.exchange` needs."""
 
     world_size: int
 
@@ -39,14 +39,14 @@ class RowExchange(Protocol):
 
 @dataclass(frozen=True)
 class Column:
-    """What one column holds: the dtype and the shape of one row."""
+    """The dtype of a column and the shape of one of its rows."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
 
     @property
     def bytes(self) -> int:
-        """Of a row."""
+        """Bytes of one row."""
         return self.dtype.itemsize * math.prod(self.shape)
 
 
@@ -57,12 +57,12 @@ def schema(sh_degree: int) -> dict[str, Column]:
         sh_degree: highest spherical-harmonics degree D; `sh` has K = (D + 1)^2 coefficients.
 
     Returns:
-        means [3], quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam
-        moments `exp_avg.*` and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step that the
-        row's parameters and moments stand at);
-        id int64 (persistent, unique over ranks), parent int64 (-1: none), birth int32 (images seen when it
-        was born), level uint8 (octree level); grad_sum float32, grad_count int32, max_radii float32 (pixels):
-        density statistics since the last density event.
+        means [3], quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam moments
+        `exp_avg.*` and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step up to which the
+        row's parameters, and its moments, are current); id int64 (persistent, unique over ranks), parent
+        int64 (-1: none), birth int32 (images seen when it was born), level uint8 (octree level); grad_sum
+        float32, grad_count int32, max_radii float32 (pixels): density statistics since the last density
+        event.
     """
     f = torch.float32
     rows = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": ((sh_degree + 1) ** 2, 3)}
@@ -84,21 +84,22 @@ def schema(sh_degree: int) -> dict[str, Column]:
 
 
 def as_stored(name: str, column: Tensor) -> Tensor:
-    """Return what `GaussianTable.columns` has of a column [N, ...]: itself, but for `CULL`."""
+    """Return the form in which `GaussianTable.columns` stores a column [N, ...]: unchanged, except `CULL`."""
     return sectors_of_rows(column).view(-1, column.shape[1]) if name == CULL else column
 
 
 class GaussianTable:
     """One rank's Gaussians as named columns of equal length N.
 
-    The operations `append`, `keep`, `permute`, `renew` and `exchange` act on every column alike, one column
-    at a time, so that peak memory exceeds the table by one column and not by a second table.
+    The operations `append`, `keep`, `permute`, `renew` and `exchange` act on all columns, one column at a
+    time, so that peak memory exceeds the table by one column and not by a second table.
 
-    The column `CULL`, int32 [N, words] with a bit for each view, is stored by blocks of rows, as `cull` has
-    it, and transposed whenever it is set, read or moved.
+    The column `CULL`, int32 [N, words] with a bit for each view, is stored by blocks of rows, in the layout
+    of `cull`. It is transposed whenever it is set, read or moved.
 
     Attributes:
-        columns: as they are stored, by name; of `CULL` the memory of `cull`, [256 ceil(N / 256), words].
+        columns: the stored columns by name; `CULL` is stored as the memory of `cull`, [256 ceil(N / 256),
+            words].
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
@@ -157,7 +158,7 @@ class GaussianTable:
         self._store(name, tensor)
 
     def _store(self, name: str, tensor: Tensor) -> None:
-        """Make a tensor the column of a name. Every operation puts its new columns here, one by one."""
+        """Store a tensor as the column `name`; all operations store their new columns through this method."""
         self._hold(name, as_stored(name, tensor))
 
     def _to_change(self) -> list[str]:
@@ -171,7 +172,7 @@ class GaussianTable:
         return columns
 
     def _hold(self, name: str, stored: Tensor) -> None:
-        """Keep what is stored of a column."""
+        """Store a column that already has its stored form."""
         self.columns[name] = stored
 
     def __iter__(self) -> Iterator[str]:
@@ -184,18 +185,18 @@ class GaussianTable:
         return None if stored is None else stored.view(-1, 32 * stored.shape[1], SECTOR_WORDS)
 
     def row_of(self, name: str) -> Column:
-        """Return what a column holds."""
+        """Return the dtype and the row shape of a column."""
         column = self.columns[name]
         return Column(column.dtype, tuple(column.shape[1:]))
 
     @property
     def row_bytes(self) -> dict[str, int]:
-        """The bytes of a row in each column."""
+        """Bytes of one row, by column."""
         return {name: self.row_of(name).bytes for name in self}
 
     @property
     def device(self) -> torch.device:
-        """Where the columns live."""
+        """Device of the columns."""
         return self.columns["means"].device
 
     @property
@@ -264,19 +265,19 @@ class GaussianTable:
         self._select(order)
 
     def renew(self, rows: Tensor, new: Mapping[str, Tensor]) -> None:
-        """Keep, add and reorder in one go: row i becomes the old row `rows[i]`, or the new `rows[i] - N`.
+        """Select old and new rows: row i becomes the old row `rows[i]`, or the new row `rows[i] - N`.
 
         Args:
             rows: int64 [N'], each row at most once.
             new: as for `append`.
         """
         self._check_new(new)
-        # One after the other, so that no more than one column is there twice.
+        # One column after the other, so that at most one column is in memory twice.
         for name in self._to_change():
             self._store(name, take_rows(self[name], rows, new.get(name)))
 
     def exchange(self, destination_ranks: Tensor, ranks: RowExchange) -> None:
-        """Move every row to a rank. Collective: every rank calls it; rows arrive by source rank, in order.
+        """Move every row to a rank. Collective: every rank calls it. Rows arrive ordered by source rank.
 
         Args:
             destination_ranks: int64 [N], the rank each row goes to.

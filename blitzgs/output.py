@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that a user asked for: written whole or not at all, in the folder asked for, never onto an input.
+"""Writes output files: completely or not at all, inside the requested folder, and never over an input.
 
-Image names come from captures, that is from other programs: they may be absolute, climb out with `..`, or
-fall together once their suffix is exchanged. `OutputFolder` turns them into paths that do none of this.
+Image names come from captures, and so from other programs: they may be absolute, contain `..`, or become
+equal when their suffix is replaced. `OutputFolder` makes paths of them for which none of this is true.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 
-# Bytes of a file name that file systems agree on, less room for a suffix and a number.
+# Largest number of bytes in a file name on common file systems, minus those for a suffix and a number.
 _LONGEST_NAME = 200
 
 
 @contextmanager
 def new_file(path: Path, sync: bool = True) -> Iterator[Path]:
-    """Give a temporary file to fill; it takes its final name when the context ends without an error.
+    """Yield a temporary file to write; it gets its final name when the context ends without an error.
 
-    A reader of `path` sees the old file or the whole new one. Only a regular file is replaced.
+    A reader of `path` sees the old file or the complete new one. Only a regular file is replaced.
 
     Args:
         path: the final name; its folder must exist.
-        sync: wait until the disk has it, so that a power failure leaves one or the other as well.
+        sync: wait until the file is on disk, so that the same holds after a power failure.
 
     Yields:
         The temporary file, empty, in the same folder.
 
     Raises:
-        OSError: `path` is a link, a device or a folder, or cannot be written; what was there is untouched.
+        OSError: `path` is a link, a device or a folder, or cannot be written; an existing file is unchanged.
     """
     check_replaceable(path)
     partial = path.with_name(f".{secrets.token_hex(6)}.partial")
@@ -52,13 +52,13 @@ def new_file(path: Path, sync: bool = True) -> Iterator[Path]:
 
 
 def write_file(path: Path, content: bytes | str, sync: bool = True) -> None:
-    """Write a file whole or not at all; see `new_file`."""
+    """Write a file completely or not at all; see `new_file`."""
     with new_file(path, sync) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def check_replaceable(path: Path) -> None:
-    """Check that `path` is free or a regular file.
+    """Check that `path` does not exist or is a regular file.
 
     Raises:
         OSError: it is a link, a device, a folder or something else that must not be replaced.
@@ -74,14 +74,14 @@ def check_replaceable(path: Path) -> None:
 
 
 class OutputFolder:
-    """A folder that gets one file for each of some names; no file lands elsewhere or on an input."""
+    """A folder for one output file per name; no file is written outside it or over an input."""
 
     def __init__(self, root: Path, inputs: Iterable[Path] = ()) -> None:
-        """Note the folder; it is made by the first write.
+        """Prepare the folder; the first write creates it.
 
         Args:
             root: the folder.
-            inputs: files that must stay as they are.
+            inputs: files that must not be overwritten.
         """
         self.root = root
         self._inputs: dict[tuple[int, int], Path] = {}
@@ -94,14 +94,14 @@ class OutputFolder:
     def paths(self, names: Sequence[str], suffix: str, flat: bool = False) -> list[Path]:
         """Return a path below the folder for each name, all different, none of them an input.
 
-        `photos/a.jpg` becomes `photos/a` + suffix. Parts that lead elsewhere (`/`, `..`) are left out,
-        and so are the folders that all absolute names share. Where two names fall together, each keeps its
-        own suffix before the new one; where that does not tell them apart, later ones are numbered. The same
-        names give the same paths.
+        `photos/a.jpg` becomes `photos/a` + suffix. Parts that lead out of the folder (`/`, `..`) are dropped,
+        and so are the folders that all absolute names have in common. If two names would give the same path,
+        each keeps its own suffix before the new one; if they are still equal, later ones get a number. The
+        same names always give the same paths.
 
         Args:
-            names: of images, as their capture writes them.
-            suffix: of the new files, with its dot.
+            names: names of images, as in their capture.
+            suffix: suffix of the new files, with its dot.
             flat: put every file into the folder itself, `a/b.jpg` as `a_b.jpg` + suffix.
 
         Raises:
@@ -148,13 +148,13 @@ class OutputFolder:
                     f"{path} would lie among the inputs ({self._input_folders[place]}): choose another --out"
                 )
         check_replaceable(path)
-        # Another name of an input, by a hard link.
+        # The path may be another name of an input, by a hard link.
         source = self._inputs.get(identity) if (identity := _identity(path)) is not None else None
         if source is not None:
             raise OSError(f"{path} would overwrite the input {source}: choose another --out")
 
     def write(self, path: Path, content: bytes) -> None:
-        """Write one of `paths`; what the folder looks like is checked again."""
+        """Write the file of one of `paths`; the folder is checked again before."""
         self.check(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         self.check(path)
@@ -162,19 +162,19 @@ class OutputFolder:
 
 
 def _inner_parts(name: str, shared: int = 0) -> tuple[str, ...]:
-    """The parts of a name that stay inside a folder, without the first `shared`; at least one."""
+    """Return the parts of a name that stay inside a folder, without the first `shared`; at least one."""
     parts = [part for part in PurePath(name.replace("\0", "_")).parts if part not in ("/", "//", "..", ".")]
     return tuple(_shortened(part) for part in parts[shared:]) or ("image",)
 
 
 def _shared_parts(names: Sequence[str]) -> int:
-    """How many folders all of the names begin with."""
+    """Return the number of leading folders that all names have in common."""
     folders = [_inner_parts(name)[:-1] for name in names]
     return len(os.path.commonprefix(folders)) if folders else 0
 
 
 def _shortened(part: str) -> str:
-    """A part that a file system takes: what is too long is cut and gets a digest of the whole."""
+    """Return a part that file systems accept: a long one is cut, and a digest of the whole is appended."""
     data = os.fsencode(part)
     if len(data) <= _LONGEST_NAME:
         return part

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hot path of training and rendering: views in, images and compact gradients out, without autograd.
+"""Renders views of a table and computes the gradients of splats, without autograd.
 
-`forward` goes from the active Gaussians through projection, tile intersection and compositing to a `Frame`;
-`backward_splats` returns along the same route from image gradients to those of the projected splats. Nothing
-here is as long as the table: cost follows what the views see. Between projection and intersection a transport
-(`blitzgs.distributed.transport`) brings the splats to the ranks that composite them, and it returns their
-gradients.
+`forward` projects the active Gaussians, lists them by tile and composites them; the result is a `Frame`.
+`backward_splats` computes the gradients of the projected splats from the gradients of the images. No tensor
+here is as long as the table: the cost follows the Gaussians that the views see. Between projection and tile
+intersection, a transport (`blitzgs.distributed.transport`) sends the splats to the ranks that composite them,
+and later returns their gradients.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Views:
         return self.viewmats.shape[0]
 
     def as_arguments(self) -> tuple[Tensor, Tensor, int, int]:
-        """Return viewmats, Ks, width and height, as functions take them that know no views."""
+        """Return viewmats, Ks, width and height, for functions that take these as separate arguments."""
         return self.viewmats, self.Ks, self.width, self.height
 
 
@@ -65,8 +65,8 @@ class RenderOptions:
 
     Attributes:
         sh_degree: spherical-harmonics degree that is evaluated.
-        near_plane: what is nearer is not seen.
-        far_plane: what is farther is not seen.
+        near_plane: Gaussians with z <= near_plane are not seen.
+        far_plane: Gaussians with z > far_plane are not seen.
         eps2d: screen-space blur, pixels squared.
         antialiased: compensate that blur in the opacities.
         background: RGB behind everything.
@@ -88,11 +88,11 @@ class RenderOptions:
 
     @property
     def limits(self) -> tuple[float, float, float]:
-        """What tells whether a view may see a Gaussian at all: near plane, far plane and eps2d."""
+        """Near plane, far plane and eps2d, which decide whether a view may see a Gaussian."""
         return self.near_plane, self.far_plane, self.eps2d
 
     def projection(self, views: Views) -> ProjectionOptions:
-        """Return the options of projecting into views."""
+        """Return the options for projecting into these views."""
         return ProjectionOptions(
             width=views.width,
             height=views.height,
@@ -107,28 +107,28 @@ class RenderOptions:
 
 
 class Frame(NamedTuple):
-    """What `forward` rendered and what `backward_splats` needs of it.
+    """The images that `forward` rendered, and the data that `backward_splats` needs.
 
     Attributes:
         views: the views.
         options: the options.
-        projected: this rank's splats, of the Gaussians that it owns; P of them.
-        splats: what was composited: these, or those that the exchange brought here.
-        assignment: who composites which tiles; None: one rank does all.
-        way_back: of the gradients of the splats, to their owners; None: one rank owns all.
-        traffic: which splats went where; None: they stayed.
+        projected: the P splats of the Gaussians that this rank owns.
+        splats: the splats that this rank composited: its own, or those that it received.
+        assignment: the tiles of each rank; None: one rank composites all.
+        way_back: returns the gradients of splats to their owners; None: one rank owns all.
+        traffic: numbers of splats sent between the ranks; None: none were sent.
         visible: int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
         active: rows that were considered, and the views of each; None: all.
         backgrounds: [B, 3]; None: black.
-        isect_splats: int32 [I], splats by tile, front to back.
+        isect_splats: int32 [I], indices of splats by tile, front to back.
         tile_offsets: int64 [B * T + 1].
         renders: [B, H, W, 3]; like the next two undefined where other ranks composite.
-        transmittances: [B, H, W], share of the background that shows.
+        transmittances: [B, H, W], weight of the background in each pixel.
         last_ids: int32 [B, H, W], for the backward pass.
         tile_work: int32 [B * T], list entries each composited tile went through.
         packed_splats: uint8 [.., bytes], the splats as the backend's kernels read them.
         tile_order: int32 [.., 16], in which order the backend's kernels took the tiles.
-        gradients: where those of the splats are added up.
+        gradients: memory in which the gradients of the splats are summed.
     """
 
     views: Views
@@ -162,20 +162,21 @@ def forward(
     mark: Mark = unmarked,
     backward_follows: bool = False,
 ) -> Frame:
-    """Render views of a table whose active rows are up to date.
+    """Render views of a table whose active rows have no pending optimiser steps.
 
     Args:
         table: the Gaussians.
         views: at most 32 views.
         options: how to render.
-        active: rows to consider, and the views of each; None: all.
-        assignment: who composites which tiles; every rank of the job calls this with its table. None: render
-            all of the views from this table alone.
-        transport: brings the splats to the ranks that composite them. A transport that is kept estimates the
-            sizes of a frame from the frames before, so that the device need not wait for the host; the result
-            does not depend on it. None: a new one.
+        active: rows to consider, and the views of each; None: all rows in all views.
+        assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
+            tiles from this table alone.
+        transport: sends the splats to the ranks that composite them. A transport that is used for several
+            frames estimates the sizes of a frame from the frames before, so that the device need not wait for
+            the host; the result does not depend on it. None: a new one.
         mark: called at the end of each stage: "project", "exchange", "sort", "raster".
-        backward_follows: prepare for a backward pass, which is then faster; it works in any case.
+        backward_follows: prepare for a backward pass, which is then faster; the backward pass also works
+            without.
 
     Returns:
         The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
@@ -200,10 +201,10 @@ def render(
     mark: Mark = unmarked,
     backward_follows: bool = False,
 ) -> Frame | None:
-    """Do what `forward` does, once: queue all of it, then wait for the numbers.
+    """Make one attempt of `forward`: queue all work, then wait for the sizes.
 
     Returns:
-        The frame; None if there was too little room, for the active rows or in `attempt`.
+        The frame; None if the estimated sizes of the active rows or of `attempt` were too small.
     """
     inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
@@ -255,7 +256,7 @@ def render(
 def inputs_of(
     table: GaussianTable, views: Views, options: RenderOptions, active: ActiveRows | None = None
 ) -> ProjectionInputs:
-    """Return what is projected of a table."""
+    """Return the inputs of the projection of a table."""
     cameras = (views.viewmats, views.Ks)
     level = table["level"] if options.fade else None
     return ProjectionInputs(
@@ -264,30 +265,30 @@ def inputs_of(
 
 
 def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> list[int]:
-    """Return the tiles that this rank composites, as the ops take them."""
+    """Return the grid of tiles and this rank's range of it, as the ops take them."""
     tiles = (0, -1) if assignment is None else assignment.composited
     return [len(views), views.width, views.height, options.tile_size, *tiles]
 
 
 @lru_cache(maxsize=16)
 def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.device) -> Tensor | None:
-    """Return a colour for each of `count` views, [B, 3]; None: black. Kept, as its way to a GPU is a wait."""
+    """Return a colour for each of `count` views, [B, 3]; None: black. Cached, because an upload is a wait."""
     return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
 
 
 def backward_splats(
     frame: Frame, v_renders: Tensor, mark: Mark = unmarked, absolute: bool = False
 ) -> SplatGradients:
-    """Carry image gradients back to this rank's projected splats.
+    """Compute the gradients of this rank's projected splats from the gradients of the images.
 
     Args:
         frame: from `forward`.
-        v_renders: gradient of the loss by the images, [B, H, W, 3]; this rank's tiles matter.
+        v_renders: gradient of the loss by the images, [B, H, W, 3]; only this rank's tiles are read.
         mark: called at the end of each stage: "raster back", "exchange back".
-        absolute: also add up the absolute values of the pixels' gradients of means2d.
+        absolute: also sum the absolute values of the pixels' gradients of means2d.
 
     Raises:
-        RuntimeError: the ranks share memory, and a later frame has taken the place of this one's splats.
+        RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
     """
     views, options, splats, way_back = frame.views, frame.options, frame.splats, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.tiles

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bar for work that goes image by image."""
+"""A progress bar for work on a sequence of images."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Report = Callable[[int, int], None]
 
 @contextmanager
 def image_progress(what: str, shown: bool = True) -> Iterator[Report]:
-    """Show a bar on standard error while the context lasts, where that is a terminal.
+    """Show a bar on standard error while the context lasts, if standard error is a terminal.
 
     Args:
-        what: the work, for its label.
-        shown: False for no bar, as on all ranks but one.
+        what: label of the bar.
+        shown: False: show no bar, for ranks other than 0.
 
     Yields:
-        Call it with (images done, images in all).
+        A function to call with (images done, number of images).
     """
     console = Console(stderr=True)
     columns = (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The survey of views: what each Gaussian contributes to them, on any number of ranks, without a colour."""
+"""The survey of views: what each Gaussian contributes to each view, on any number of ranks."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from blitzgs.pipeline import RenderOptions, Views, inputs_of, tile_grid
 
 
 class Survey(NamedTuple):
-    """What this rank's P splats contribute to their views.
+    """The contributions of this rank's P splats to their views.
 
     Attributes:
         splats: the projected Gaussians.
         weights: int64 [P], sum of alpha T over the pixels in units of 2^-32.
-        pixels: int32 [P], the pixels at which a splat is composited.
+        pixels: int32 [P], the number of pixels at which a splat is composited.
     """
 
     splats: ProjectedSplats
@@ -39,20 +39,20 @@ def survey(
     transport: Transport | None = None,
     active: ActiveRows | None = None,
 ) -> Survey:
-    """Find what each Gaussian contributes to views of a table whose rows are up to date; no colour is shaded.
+    """Measure what each Gaussian contributes to views of a table without pending optimiser steps.
 
     Args:
         table: the Gaussians.
         views: at most 32 views.
-        options: how to render; of the colours, those of degree 0 are worked out and not used.
-        assignment: who composites which tiles; every rank of the job calls this with its table. None: this
-            rank alone.
-        transport: as for `forward`; not in half precision, because the image is surveyed.
+        options: how to render; colours of degree 0 are computed and not used.
+        assignment: the tiles of each rank; every rank of the job calls this with its table. None: this rank
+            composites all tiles.
+        transport: as for `forward`, but not in half precision, which would change the contributions.
         active: as for `forward`.
 
     Returns:
-        The splats of this rank's Gaussians with the sums over all tiles, wherever they were composited: the
-        same bits at any number of ranks.
+        The splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not depend
+        on the number of ranks.
     """
     if transport is None:
         transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ranks: process group, tile ownership, exchange and exact global selection."""
+"""Ranks: process group, division of tiles, exchange of splats, and exact selection over all ranks."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ranks of a job: who they are, how they talk, and how they fail together."""
+"""The ranks of a job: their devices, the collectives between them, and their common end on failure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Transport = Literal["auto", "peer", "collective"]
 _REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "min": dist.ReduceOp.MIN, "max": dist.ReduceOp.MAX}
 
 DEFAULT_TIMEOUT_SECONDS = 120.0
-# Starting up includes importing torch on every rank and, on NCCL, building the communicator.
+# Start-up includes importing torch on every rank and, with NCCL, building the communicator.
 STARTUP_TIMEOUT_SECONDS = 300.0
 
 
@@ -45,10 +45,10 @@ class Ranks:
         local_rank: index of this process on its host (selects the GPU).
         local_world_size: number of processes on this host.
         device: where this rank computes.
-        timeout_seconds: a rank that does not show up at a collective for this long ends the job.
+        timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
         shares_gpu: several ranks of this host compute on one GPU.
-        memory: shared between the ranks; None: splats travel by collectives.
-        transport: how splats travel, in words, for the log.
+        memory: memory that the ranks share; None: splats are sent by collectives.
+        transport: describes for the log how splats are sent.
     """
 
     rank: int = 0
@@ -73,25 +73,26 @@ class Ranks:
     ) -> Ranks:
         """Join the job that torchrun's environment describes: Gloo on the CPU, NCCL on CUDA.
 
-        NCCL knows no two ranks on one GPU: where ranks share one, Gloo carries what is on it, too.
+        NCCL does not support two ranks on one GPU. If ranks share GPUs, Gloo is used for CUDA tensors too.
 
         Args:
             device: "auto" (CUDA when this torch has a GPU), "cpu", "cuda" or "cuda:INDEX".
             timeout_seconds: see the class.
-            transport: of splats between ranks: "peer" writes them to the other GPUs' memory, "collective"
-                lets NCCL or Gloo carry them, "auto" prefers the former where it works.
-            share_gpus: where a host has fewer GPUs than ranks, deal them out in turn, so that ranks share
-                them: for development, as each then waits for the others' turns on the GPU.
+            transport: how splats are sent between ranks: "peer" writes them to the other GPUs' memory,
+                "collective" sends them by NCCL or Gloo, "auto" uses "peer" if it works and "collective"
+                otherwise.
+            share_gpus: if a host has fewer GPUs than ranks, let several ranks use one GPU, in turns; slow,
+                for development.
             tables_on_host: whether collectives will carry tensors that are on the CPU although the ranks
                 compute on CUDA.
 
         Returns:
-            The ranks; the trivial object when torchrun started a single process or none.
+            The ranks; without torchrun, or with a single process, an object with `world_size` 1.
 
         Raises:
-            ValueError: a CUDA device was asked for that does not exist, a transport that is not known, or
-                ranks of several hosts were to share GPUs.
-            RuntimeError: the other ranks did not appear, or "peer" was asked for and is impossible.
+            ValueError: the CUDA device does not exist, the transport is unknown, or `share_gpus` was set for
+                ranks of several hosts.
+            RuntimeError: the other ranks did not join, or "peer" was requested and is impossible.
         """
         if transport not in get_args(Transport):
             raise ValueError(f"transport must be one of {', '.join(get_args(Transport))}, not {transport!r}")
@@ -100,7 +101,7 @@ class Ranks:
         local_rank = int(os.environ.get("LOCAL_RANK", "0"))
         local_world_size = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
         if share_gpus and local_world_size < world_size:
-            # Hosts with enough GPUs would choose NCCL, the others Gloo.
+            # Hosts with enough GPUs would choose NCCL, and the others Gloo.
             raise ValueError(
                 f"share_gpus is for the ranks of one host, but {local_world_size} of {world_size} are on this"
                 " one; leave it out, and start no more processes per node than it has GPUs"
@@ -123,7 +124,7 @@ class Ranks:
 
     def _join(self, transport: Transport, tables_on_host: bool) -> None:
         if self.shares_gpu:
-            # Read at every mapping of shared memory.
+            # Torch reads this variable whenever it maps shared memory.
             os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
         nccl = self.device.type == "cuda" and not self.shares_gpu
         dist.init_process_group(
@@ -135,8 +136,8 @@ class Ranks:
             device_id=self.device if nccl else None,
         )
         self.barrier()
-        # The libraries' own timeouts say only which socket or operation; ours comes first and names a rank,
-        # and knows when one is at work on its host.
+        # The libraries' own timeouts name only a socket or an operation. The watchdog's timeout is shorter:
+        # it names a rank, and it waits for ranks that are busy on their host.
         margin = 2.0 * Watchdog.period_for(self.timeout_seconds) + 10.0
         dist.distributed_c10d._set_pg_timeout(
             timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin), dist.group.WORLD
@@ -162,11 +163,11 @@ class Ranks:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the job; when an error is on its way out, tell the other ranks what it was."""
+        """Leave the job; if an exception caused this, tell the other ranks its message."""
         if error is None:
             self.close()
         elif self.watchdog is not None:
-            # The group is left standing: taking it down could wait for ranks that are no longer there.
+            # Do not destroy the process group: that could wait for ranks that have ended.
             self.watchdog.report_failure(f"{type(error).__name__}: {error}")
             self.watchdog.stop()
 
@@ -180,7 +181,7 @@ class Ranks:
             dist.destroy_process_group()
 
     def _collective(self, name: str, call: Callable[[], T]) -> T:
-        """Run a collective; when it fails, say which rank broke it instead of which socket closed."""
+        """Run a collective; if it fails, raise an error that names the rank that caused it."""
         if self.watchdog is None:
             return call()
         self.watchdog.enter(name)
@@ -188,7 +189,7 @@ class Ranks:
             result = call()
         except torch.OutOfMemoryError:
             self.watchdog.leave()
-            raise  # this rank's own, and the message for the others
+            raise  # the error is this rank's own; its message is for the other ranks
         except RuntimeError as error:
             self.watchdog.leave()
             raise RuntimeError(f"{self.watchdog.diagnose(name)} ({error})") from error
@@ -196,7 +197,7 @@ class Ranks:
         return result
 
     def working(self, what: str) -> AbstractContextManager[None]:
-        """Tell the other ranks what this one does on its host for long, so that they wait; see `Watchdog`."""
+        """Announce long work on this rank's host, so that the other ranks wait for it; see `Watchdog`."""
         return nullcontext() if self.watchdog is None else self.watchdog.working(what)
 
     def all_reduce(self, tensor: Tensor, op: ReduceOp = "sum") -> Tensor:
@@ -206,30 +207,30 @@ class Ranks:
         return tensor
 
     def share(self, values: Tensor) -> Tensor:
-        """Show a few numbers to all ranks.
+        """Gather a few numbers from all ranks.
 
         Args:
             values: int64 [n] on `device`; the same n on all ranks, at most 256.
 
         Returns:
-            int64 [M, n], those of each rank.
+            int64 [M, n], the numbers of each rank.
         """
         if self.world_size == 1:
             return values[None]
         everyone = values.new_empty(self.world_size * len(values))
-        # Newer versions of torch have it under another name, and warn about this one.
+        # Newer versions of torch have this function under another name and warn about the old one.
         gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
         self._collective("share", lambda: gather(everyone, values))
         return everyone.view(self.world_size, -1)
 
     def exchange_counts(self, counts: Tensor) -> Tensor:
-        """Tell every rank how many items it will get from this one.
+        """Exchange the numbers of items that the ranks will send each other.
 
         Args:
             counts: int64 [M] or [M, C] on `device`; row m is what goes to rank m.
 
         Returns:
-            Same shape: row m is what comes from rank m.
+            A tensor of the same shape: row m is what comes from rank m.
         """
         if self.world_size == 1:
             return counts.clone()
@@ -238,15 +239,15 @@ class Ranks:
         return received
 
     def wait(self, event: torch.cuda.Event) -> None:
-        """Wait for work on the device, and so for the ranks that it waits for."""
+        """Wait on the host for an event of the device; the device may be waiting for other ranks."""
         self._collective("wait", event.synchronize)
 
     def read(self, tensor: Tensor) -> Any:
-        """Return a small tensor as nested lists; waits for the device, and so for the ranks it waits for."""
+        """Return a small tensor as nested lists; wait for the device, which may wait for other ranks."""
         return self.reading(lambda: to_host(tensor).tolist())
 
     def reading(self, call: Callable[[], T]) -> T:
-        """Return what a function does that waits for the device, and so for the ranks it waits for."""
+        """Return the result of a function that waits for the device, which may be waiting for other ranks."""
         return self._collective("read", call)
 
     def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
@@ -270,13 +271,13 @@ class Ranks:
         return result
 
     def exchange_rows(self, rows: Tensor, sent: Sequence[int]) -> tuple[Tensor, list[int]]:
-        """`all_to_all` with its own size exchange; returns the rows and how many came from each rank."""
+        """Exchange sizes, then call `all_to_all`; return the rows and how many came from each rank."""
         counts = self.exchange_counts(torch.tensor(list(sent), dtype=torch.int64, device=rows.device))
         received = counts.tolist()
         return self.all_to_all(rows, sent, received), received
 
     def all_gather(self, tensor: Tensor) -> list[Tensor]:
-        """Gather tensors of one shape from all ranks, in rank order. For small things."""
+        """Gather tensors of one shape from all ranks, in rank order; for small tensors."""
         if self.world_size == 1:
             return [tensor.clone()]
         parts = [torch.empty_like(tensor) for _ in range(self.world_size)]
@@ -306,7 +307,7 @@ class Ranks:
     def barrier(self) -> None:
         """Wait for all ranks."""
         if self.world_size > 1:
-            # An all-reduce whose result is read: on NCCL only that waits for the other ranks.
+            # An all-reduce whose result is read, because with NCCL only reading it waits for the other ranks.
             token = torch.zeros(1, device=self.device)
 
             def wait() -> None:
@@ -354,7 +355,7 @@ def _shorten(text: str, limit: int = 200) -> str:
 def _resolve_device(
     device: str, local_rank: int, local_world_size: int, share_gpus: bool
 ) -> tuple[torch.device, bool]:
-    """Return where a rank computes, and whether ranks of its host share GPUs."""
+    """Return a rank's device, and whether ranks of its host share GPUs."""
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
@@ -363,7 +364,7 @@ def _resolve_device(
     if place.type == "cpu":
         return place, False
     count = torch.cuda.device_count()
-    # All ranks of a host are given the same device, by number or not.
+    # All ranks of a host get the same argument `device`, with an index or without.
     shared = share_gpus and local_world_size > (count if place.index is None else 1)
     if place.index is None:
         place = torch.device("cuda", local_rank % max(count, 1) if shared else local_rank)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers that only the host reads, later: gathered from the ranks without holding up the step."""
+"""Gathers numbers from the ranks that only the host reads, later, without delaying the step."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which rank composites which tiles: contiguous ranges of equal measured cost (paper §3.1)."""
+"""Divides the tiles of a batch among the ranks by their measured cost (BlitzGS, section 3.1)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 
-# What a tile costs besides the list entries it goes through (its pixels are written and compared with the
-# image), in units of one entry.
+# Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
 TILE_COST = 8
-# Windows of the loss reach this far: 5 px from an owned pixel, and 5 more for its gradient.
+# The loss of an owned pixel reads pixels up to this distance: 5 px for its window, and 5 more for the
+# gradient.
 LOSS_HALO = 10
 # Costs that `divide` first adds up together.
 _STRETCH = 128
@@ -46,9 +46,9 @@ class TileRanges:
         width: image width in pixels.
         height: image height in pixels.
         tile_size: tile edge in pixels.
-        halo: a rank composites, besides its own tiles, those within this many pixels of them; what several
-            ranks composite has the same bits on each. `LOSS_HALO` where a loss is to be computed: no pixel
-            then has to be fetched. 0: its own alone.
+        halo: a rank also composites the tiles within this many pixels of its own; a tile that several ranks
+            composite has the same bits on each. With `LOSS_HALO` a rank can compute its loss without pixels
+            of other ranks. 0: only its own tiles.
     """
 
     bounds: tuple[int, ...]
@@ -75,8 +75,8 @@ class TileRanges:
     def composited(self, rank: int) -> tuple[int, int]:
         """Return the [first, one past last) tile that a rank composites: its own and those within `halo`.
 
-        A little more than those: whole stretches of tiles in the flattened order, never beyond the view.
-        Empty for a rank without tiles. The firsts ascend with the ranks.
+        The range may contain a few further tiles, because it is contiguous in the flattened order; it never
+        leaves the view. It is empty for a rank without tiles. The first tiles ascend with the ranks.
         """
         begin, end = self.of(rank)
         ring = -(-self.halo // self.tile_size)
@@ -110,11 +110,11 @@ class TileRanges:
 
 
 class TileAssignment:
-    """Who composites what in one rendering.
+    """The division of tiles among the ranks in one rendering.
 
     Attributes:
         ranks: the job; all its ranks render together.
-        ranges: the tiles of each.
+        ranges: the tiles of each rank.
         tiles: this rank's own [first, one past last) tile.
         composited: the [first, one past last) tile that this rank composites: its own and the halo around
             them.
@@ -130,7 +130,7 @@ class TileAssignment:
 
 
 class _ViewCost(NamedTuple):
-    """What the tiles of a view cost: the mean of each piece of `_grain(tiles)` of them, float16."""
+    """The costs of a view's tiles, stored as float16 means over pieces of `_grain(tiles)` tiles."""
 
     key: Hashable
     tiles: int
@@ -138,7 +138,7 @@ class _ViewCost(NamedTuple):
 
     @classmethod
     def of(cls, key: Hashable, cost: NDArray[np.float32]) -> _ViewCost:
-        """Keep the costs of a view's tiles."""
+        """Store the costs of a view's tiles."""
         grain, last = _grain(len(cost)), np.finfo(np.float16).max
         begins = np.arange(0, len(cost), grain)
         sums = np.add.reduceat(cost, begins, dtype=np.float32)
@@ -151,7 +151,7 @@ class _ViewCost(NamedTuple):
 
 
 def _grain(tiles: int) -> int:
-    """Return how many tiles of a view one number stands for."""
+    """Return over how many tiles of a view one stored cost averages."""
     return -(-tiles // _MOST_NUMBERS)
 
 
@@ -162,10 +162,10 @@ def _measured(sums: HostSum, keys: Sequence[Hashable], tiles: int, first: int) -
 
 
 class TileOwners:
-    """Divides the tiles of each batch by what they cost at the last visit of each view.
+    """Divides the tiles of each batch by their costs at the last visit of each view.
 
-    Every rank holds the same costs and so draws the same borders without asking the others. A view's costs
-    take 16 KB at most, and to divide a batch the host waits for nothing.
+    Every rank has the same costs, so all ranks compute the same division without communication. The costs of
+    a view take at most 16 KB. The host does not wait to divide a batch.
     """
 
     def __init__(self, ranks: Ranks) -> None:
@@ -176,7 +176,7 @@ class TileOwners:
         self._planned: dict[int, tuple[int, ...]] = {}
 
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
-        """Divide the tiles of the batch of a later step, as `divide` does, and remember the borders.
+        """Divide the tiles of the batch of a later step, as `divide` does, and store the division.
 
         Args:
             step: of the batch; plans of steps before it are kept until `forget_before`.
@@ -196,7 +196,7 @@ class TileOwners:
         self._planned = {other: bounds for other, bounds in self._planned.items() if other >= step}
 
     def columns(self) -> dict[str, Tensor]:
-        """What a resumed run needs to draw the same borders; the same on every rank.
+        """Return what a resumed run needs to make the same divisions; the same on every rank.
 
         Returns:
             views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: what was measured; ages int64
@@ -217,7 +217,7 @@ class TileOwners:
         }
 
     def restore(self, columns: Mapping[str, Tensor]) -> None:
-        """Go on from `columns`; plans for another number of ranks are left out."""
+        """Restore the state from `columns`; plans for another number of ranks are ignored."""
         if "ages" in columns:  # checkpoints of earlier versions have costs in another form
             self._restore_costs(columns)
         bounds = columns["bounds"]
@@ -243,14 +243,14 @@ class TileOwners:
         """Divide the tiles of a batch.
 
         Args:
-            keys: what tells the B views apart.
+            keys: identifies each of the B views.
             width: image width in pixels.
             height: image height in pixels.
             tile_size: tile edge in pixels.
             halo: see `TileRanges`.
 
         Returns:
-            Ranges whose costs differ by at most one tile from an equal share.
+            Ranges whose costs differ from equal shares by at most the cost of one tile.
         """
         unit = TileRanges((0,), len(keys), width, height, tile_size)
         cost = np.concatenate([self._cost(key, unit.tiles_per_view) for key in keys])
@@ -286,7 +286,7 @@ class TileOwners:
         return sums
 
     def _learn(self, costs: Sequence[_ViewCost]) -> None:
-        """Let borders follow from the costs of some views."""
+        """Use the costs of views for later divisions."""
         for cost in costs:
             self._costs.pop(cost.key, None)
             self._costs[cost.key] = cost
@@ -298,7 +298,7 @@ class TileOwners:
         if known is not None and known.tiles == tiles:
             return known.of_tiles()
         if tiles not in self._typical:
-            # What views share: the far (upper) tiles of oblique ones cost more than the near ones.
+            # Views have costs in common: in oblique views the far (upper) tiles cost more than the near ones.
             alike = (cost for cost in reversed(self._costs.values()) if cost.tiles == tiles)
             latest = [cost.of_tiles() for cost in islice(alike, _SIMILAR)] or [np.zeros(tiles, np.float32)]
             self._typical[tiles] = np.mean(latest, 0)
@@ -315,8 +315,8 @@ def divide(cost: NDArray[Any], parts: int) -> tuple[int, ...]:
     Returns:
         M + 1 ascending bounds, 0 and n included; each is the one nearest to its share of the total.
     """
-    # Stretch by stretch, then within those that are cut: a running sum of all takes four times as long, and
-    # every step waits for it.
+    # First sum whole stretches, then only the stretches that contain a bound. A running sum over all tiles
+    # takes four times as long, and every step waits for it.
     stretches = np.add.reduceat(cost, np.arange(0, len(cost), _STRETCH), dtype=np.float64)
     ends = np.concatenate(([0.0], stretches.cumsum()))
     bounds = [0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered pixels on the move: whole images for evaluation."""
+"""Collects rendered pixels from all ranks into whole images, for evaluation."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from blitzgs.distributed.ownership import TileRanges
 
 
 def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destination: int) -> None:
-    """Bring all pixels of a rendering to one rank, in place there; they arrive bit for bit.
+    """Send all pixels of a rendering to one rank, which stores them in its `renders`, bit for bit.
 
     Args:
         renders: [B, H, W, C], contiguous; valid in this rank's tiles.
-        ranges: who owns which tiles.
+        ranges: the tiles of each rank.
         ranks: the job.
         destination: the rank whose `renders` is complete afterwards.
     """
@@ -38,7 +38,8 @@ def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destinatio
 def _pixels(stretches: list[tuple[int, int]], ranges: TileRanges, device: torch.device) -> Tensor:
     """List the flat pixel indices of stretches of tiles, tile by tile, tile_size^2 each.
 
-    Tiles that stick out of the image repeat their border pixels: the same on both ends of the exchange.
+    Tiles that extend beyond the image repeat its border pixels, in the same way on the sender and the
+    receiver.
     """
     parts = [torch.arange(low, high, device=device) for low, high in stretches]
     tiles = torch.cat(parts) if parts else torch.empty(0, dtype=torch.int64, device=device)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exact selection over all ranks: the k smallest keys, and the shortest prefix that holds a share of a mass.
 
-Both find a threshold by refining a histogram of the float's bits, a few thousand integers summed over the
-ranks per round, so no rank ever sees the others' scores. Everything summed is an integer: the same rows are
-selected, bit for bit, at every world size. Equal scores are told apart by id.
+Both find a threshold by refining a histogram of the float's bits. Each round sums a few thousand integers
+over the ranks, so no rank needs the others' scores. All sums are integers, so the same rows are selected at
+every world size. Ids decide between equal scores.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
     Args:
         keys: float32 [N_rank], no NaN; infinities are allowed.
         ids: int64 [N_rank], >= 0, unique over all ranks.
-        k: how many; with more than there are rows, all.
+        k: number of rows to mark; all rows if k exceeds their number.
         ranks: the job.
 
     Returns:
@@ -80,7 +80,7 @@ def mass_prefix(
     segments: Tensor | None = None,
     n_segments: int = 1,
 ) -> Tensor:
-    """Mark the smallest set of rows, by descending score (ties by id), that holds a share of the mass.
+    """Mark the fewest rows, by descending score (ties by id), that hold a share of the total score.
 
     Args:
         scores: float32 [N_rank], finite, >= 0.
@@ -108,7 +108,7 @@ def mass_prefix(
     if segments is None:
         segments = torch.zeros_like(ids)
     bits = scores.clamp(min=0.0).view(torch.int32).to(torch.int64)
-    # Ascending in this key is descending in the score.
+    # An ascending order of these keys is a descending order of the scores.
     keys = (1 << 31) - 1 - bits
     mantissas = (bits & ((1 << _MANTISSA_BITS) - 1)) | ((bits >> _MANTISSA_BITS > 0).long() << _MANTISSA_BITS)
     threshold, left = _mass_threshold(keys, mantissas, share, segments, n_segments, ranks)
@@ -131,16 +131,16 @@ def integer_mass_prefix(
     ranks: Ranks,
     n_segments: int,
 ) -> Tensor:
-    """`mass_prefix` of integers: the items of each segment by descending weight, ties by id.
+    """Mark the fewest items of each segment, by descending weight, that hold a share of its total.
 
-    One rank does not wait for its device; several wait once, and exchange one histogram of all segments a
-    round.
+    This is `mass_prefix` for integers. With one rank the host does not wait for the device. Several ranks
+    wait once, and exchange one histogram of all segments per round.
 
     Args:
         weights: int64 [P], not negative; a segment's sum over all ranks must be below 2^62.
         segments: int32 [P] in [0, n_segments).
-        owners: int32 [P], whose weights they are.
-        ids: int64 [N], >= 0, of the owners; unique over all ranks within a segment.
+        owners: int32 [P], the row that each weight belongs to.
+        ids: int64 [N], >= 0, ids of the rows; unique over all ranks within a segment.
         fraction: share of the total of all ranks, in [0, 1]; its decimal value counts, of at most 9 places.
         ranks: the job.
         n_segments: number of segments.
@@ -287,7 +287,7 @@ def _with_ties(
     chosen = keys < limit
     counts = torch.zeros_like(left).index_add_(0, segments[tied], torch.ones_like(tied))
     if not bool((ranks.all_reduce(counts) > left).any()):
-        # The usual case: there is enough for all.
+        # The usual case: all tied rows are selected.
         chosen[tied] = True
         return chosen
     last, _ = _kth(ids[tied], _ID_DIGITS, left, segments[tied], ranks)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which rank owns which Gaussian: positions of the global order, dealt round-robin (paper §3.1)."""
+"""Divides the Gaussians among the ranks: round-robin by position in a global order (BlitzGS, section 3.1)."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from blitzgs.distributed.group import Ranks
 
 
 def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
-    """Position in the global order of each row of one shard.
+    """Return the position in the global order of each row of one shard.
 
-    The global order takes row 0 of every rank, then row 1 of every rank, and so on, leaving out the ranks
-    that have run out. A table dealt round-robin therefore keeps its order, and shards whose sizes differ by
-    at most one (the larger ones first) already hold exactly the positions = rank (mod M).
+    The global order is row 0 of every rank, then row 1 of every rank, and so on; ranks without further rows
+    are skipped. So a table that was divided round-robin keeps its order. Shards whose sizes differ by at most
+    one (the larger ones first) already have exactly the positions = rank (mod M).
 
     Args:
         sizes: rows on each rank, M values.
-        rank: the shard asked about.
+        rank: the rank of the shard.
 
     Returns:
         int64 [sizes[rank]], ascending.
@@ -34,13 +34,13 @@ def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
 
 
 def shard_sizes(rows: int, ranks: Ranks) -> list[int]:
-    """Rows on each rank now."""
+    """Return the present number of rows on each rank. Collective."""
     counts = ranks.all_gather(torch.tensor([rows], dtype=torch.int64, device=ranks.device))
     return [int(count.item()) for count in counts]
 
 
 def imbalance(sizes: Sequence[int]) -> float:
-    """Largest over smallest shard; infinite when one is empty and another is not, 1 when all are."""
+    """Return largest over smallest shard; infinite if only some shards are empty, 1 if all are."""
     if max(sizes) == 0:
         return 1.0
     return max(sizes) / min(sizes) if min(sizes) else float("inf")

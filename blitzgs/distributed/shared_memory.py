@@ -3,18 +3,18 @@
 
 Each rank owns memory that all others have mapped (NVLink or PCIe peer access):
 
-- control words, which are few: the number of the last barrier that each rank reached, and the numbers that it
-  brought to it;
+- a few control words: the number of the last barrier that each rank reached, and the numbers that it wrote
+  for this barrier;
 - a buffer that grows, for the transport of splats (`blitzgs.distributed.transport.peer`);
-- a board, for what ranks show each other's hosts (`HostSum`), on a stream and with barriers of its own beside
-  the step.
+- a board, on which ranks publish numbers for the hosts (`HostSum`); it has its own stream and its own
+  barriers.
 
-A barrier holds up streams, not hosts: work queued behind it, on any rank, finds done what any rank queued
-before it. There are two places for the numbers that ranks bring to a barrier, used in turn, because a rank
-that has left a barrier may not have read its numbers yet when another brings the next ones. They are read
-before the rank queues the next barrier with numbers. So it is with the board and the barriers beside the
-step. Sums of the numbers lie where no other rank ever writes: a rank's own second such barrier overwrites
-them.
+A barrier delays streams, not hosts: work that any rank queues after a barrier begins when all work that the
+ranks queued before it has ended. The numbers of a barrier have two places, which are used in turn: a rank
+that has left a barrier may not have read its numbers yet when another rank writes those of the next barrier.
+A rank must queue the reading of the numbers before it queues the next barrier with numbers. The same holds
+for the board and its barriers. The sums of the numbers are stored where no other rank writes; the rank's own
+second barrier with numbers after this one overwrites them.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 
 T = TypeVar("T")
 MAX_PEERS = 16
-# Numbers that a rank may bring to a barrier; there are two places for them, and for their sums.
+# Largest number of values that a rank may write for a barrier; there are two places for them, and for their
+# sums.
 MAX_VALUES = 256
 _LEAST_WORDS = 1 << 20
 _LEAST_BOARD = 1 << 16
 
 
 class Job(Protocol):
-    """What shared memory needs to know of the job (`blitzgs.distributed.group.Ranks`)."""
+    """The methods of `blitzgs.distributed.group.Ranks` that shared memory needs."""
 
     rank: int
     world_size: int
@@ -53,13 +54,14 @@ class Job(Protocol):
 
 
 class Shared(NamedTuple):
-    """Numbers that all ranks brought to a barrier.
+    """The numbers that all ranks wrote for a barrier.
 
     Attributes:
-        everyone: int64 [M, n], those of each rank; valid until the next such barrier.
-        sums: int64 [n], over the ranks; valid until this rank queues the second such barrier after this.
-        host: `everyone` on the CPU, once what was queued on the current stream was waited for; as long as
-            the sums.
+        everyone: int64 [M, n], the numbers of each rank; valid until the next barrier with numbers.
+        sums: int64 [n], sums over the ranks; valid until this rank queues the second barrier with numbers
+            after this.
+        host: `everyone` on the CPU, valid after the work queued on the current stream has ended, and as long
+            as `sums`.
     """
 
     everyone: Tensor
@@ -68,7 +70,7 @@ class Shared(NamedTuple):
 
 
 def control_words(world_size: int) -> int:
-    """Length of a rank's control words, int64: barriers, numbers and sums, barriers beside the step."""
+    """Return the number of a rank's control words: barriers, numbers and sums, barriers of the board."""
     return world_size + 2 * MAX_VALUES * (world_size + 1) + world_size
 
 
@@ -84,7 +86,7 @@ class SharedMemory:
 
     Attributes:
         buffers: int32 [words] of each rank, mapped here.
-        generation: how often splats were written into the buffers: tells whose these are.
+        generation: how many times splats were written into the buffers; identifies the frame they belong to.
     """
 
     def __init__(
@@ -115,27 +117,27 @@ class SharedMemory:
         return mapped
 
     def barrier(self) -> None:
-        """Hold up the current stream until all ranks' have come here."""
+        """Delay the current stream until the streams of all ranks have reached this barrier."""
         self._barrier(None, self.world_size, None)
 
     def side_barrier(self) -> None:
-        """Be a barrier on the stream beside the step, whatever barriers the step is at."""
+        """Queue a barrier of the board on its stream, independent of the barriers of the step."""
         self._side_barriers += 1
         torch.ops.blitzgs.device_barrier_(
             self._side_control, self.rank, self._side_barriers, None, self.world_size, self.timeout_seconds
         )
 
     def share(self, values: Tensor) -> Shared:
-        """Be a barrier, and show the other ranks numbers.
+        """Queue a barrier that also gathers numbers from all ranks.
 
         Args:
             values: int64 [n], n <= MAX_VALUES, the same n on all ranks.
         """
-        # A rank may have left the last barrier and not have read its numbers yet.
+        # Use the other place: a rank may have left the last barrier without having read its numbers yet.
         place = self._shared % 2
         self._shared += 1
         count, numbers = self.world_size, len(values)
-        # The sums come behind the numbers: always in the same words, where no other rank ever writes.
+        # The sums are stored behind the numbers, always in the same words, where no other rank writes.
         first = count + place * MAX_VALUES * (count + 1) + count * (MAX_VALUES - numbers)
         host = self._host[place, : count * numbers].view(count, numbers)
         self._barrier(values, first, host)
@@ -143,12 +145,13 @@ class SharedMemory:
         return Shared(brought[:count], brought[count], host)
 
     def boards(self, words: int) -> list[Tensor]:
-        """Return every rank's board, float32 [words], for the next barrier beside the step. Collective.
+        """Return every rank's board, float32 [words], for the next barrier of the board. Collective.
 
-        What is written there before that barrier is to be copied, on the same stream, before the one after.
+        What ranks write there before that barrier must be copied, on the same stream, before the following
+        barrier.
         """
         if not self._boards or len(self._boards[0]) < 2 * words:
-            # Behind its last barrier no rank writes to this rank's board any more.
+            # After the last barrier no rank writes to this rank's board any more.
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = []
             self._places.clear()
@@ -168,22 +171,22 @@ class SharedMemory:
         )
 
     def reserve(self, words: int) -> None:
-        """Make every rank's buffer hold `words` 32-bit words. Collective: all ranks ask for the same.
+        """Enlarge every rank's buffer to `words` 32-bit words, the same on all ranks. Collective.
 
-        What the buffers held is lost.
+        The contents of the buffers are lost.
         """
         if self.buffers and len(self.buffers[0]) >= words:
             return
         mine = symmetric.empty(-(-words // 4096) * 4096, dtype=torch.int32, device=self.device)
-        # It is zeroed in stream order, which must be over before any peer can write; and what this rank has
-        # queued may still read the other ranks' old buffers, which they give up when all have come to the
-        # mapping.
+        # The new buffer is zeroed in stream order; this must end before a peer writes to it. Also, this
+        # rank's queued work may still read the other ranks' old buffers, which are freed when all ranks have
+        # reached the mapping.
         torch.cuda.current_stream(self.device).synchronize()
         self.buffers = self._map("rows", mine)
 
 
 def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
-    """Set up shared memory between all ranks, or say, the same on every rank, why that is impossible.
+    """Set up shared memory between all ranks, or return why that is impossible, the same on every rank.
 
     Collective.
 
@@ -210,7 +213,7 @@ def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
 
 
 def _obstacle(places: list[tuple[str, Any]], job: Job) -> str | None:
-    """Say what keeps a rank from the others' memory."""
+    """Return why a rank cannot reach the others' memory; None if it can."""
     hosts, devices = {host for host, _ in places}, [device for _, device in places]
     mine = job.device.index
     if None in devices:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ends a job whose ranks no longer move together, and says which rank is to blame.
+"""Ends a job in which a rank no longer arrives at collectives, and names that rank.
 
 Each rank publishes what it is doing in the job's key-value store, from a thread of its own. A rank that has
-waited in a collective for longer than the timeout reads what the others published, prints which of them
-never arrived, and exits; torchrun then ends the job. A rank that raises publishes its error first, so that
-the others report the culprit's message and not a closed socket; those that wait for it end at once. A rank
-that works on its host for long, on a slow disk for instance, says so, and the others wait for it as long as
-it shows signs of life.
+waited in a collective for longer than the timeout reads what the others published, prints which of them never
+arrived, and exits; torchrun then ends the job. A rank that raises publishes its error first, so that the
+others print its message instead of a message about a closed socket; ranks that wait for it end at once. A
+rank that works on its host for long, for example on a slow disk, announces this, and the others wait for it
+as long as it keeps publishing.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from datetime import timedelta
 from torch._C._distributed_c10d import PrefixStore, TCPStore
 
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
-# How long a rank goes on waiting when another is known to have failed.
+# How long a rank continues to wait after another rank has reported a failure.
 GRACE_SECONDS = 4.0
-# The longest that ranks wait for one that is alive and has said what it is busy with.
+# Longest time that ranks wait for a rank that keeps publishing and has announced its work.
 BUSY_SECONDS = 3600.0
 
 
 def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
-    """Connect to the job's key-value store, where MASTER_ADDR and MASTER_PORT say.
+    """Connect to the job's key-value store at MASTER_ADDR and MASTER_PORT.
 
-    Keys carry `name` and the number of the restart: torchrun keeps the store over restarts, and a new rank
-    must not find the addresses of the one it replaces.
+    Keys have a prefix of `name` and the number of the restart: torchrun keeps the store over restarts, and a
+        new rank must
+    not read the addresses of the rank that it replaces.
 
     Args:
-        name: of this use of the store.
-        host: whether this process serves the store when torchrun's agent does not.
+        name: name of this use of the store.
+        host: whether this process serves the store if torchrun's agent does not.
         timeout_seconds: for connecting and waiting.
     """
     held_by_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
@@ -55,11 +56,11 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
 
 @dataclass(frozen=True)
 class _Report:
-    """What a rank has last published.
+    """The latest report of a rank.
 
     Attributes:
-        calls: collectives entered.
-        name: of the last one.
+        calls: number of collectives entered.
+        name: name of the last one.
         stamp: when it was published, seconds since 1970 by the rank's own clock.
         busy: the work on its host, or an empty string.
     """
@@ -71,7 +72,7 @@ class _Report:
 
 
 class Watchdog:
-    """The progress of one rank, published every few seconds and checked against the other ranks'.
+    """Publishes the progress of one rank every few seconds, and compares it with that of the other ranks.
 
     Args:
         rank: this rank.
@@ -84,7 +85,7 @@ class Watchdog:
         self.world_size = world_size
         self.timeout_seconds = timeout_seconds
         self.period = self.period_for(timeout_seconds)
-        # A connection of its own: the process group's may block inside a collective.
+        # A separate connection, because the process group's may block inside a collective.
         self.store = open_store("watchdog", host=False, timeout_seconds=30)
         self.lock = threading.Lock()
         self.calls = 0
@@ -118,7 +119,7 @@ class Watchdog:
 
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
-        """Tell the others that this rank is busy on its host while the context lasts, and with what."""
+        """Announce to the other ranks, while the context lasts, with what this rank is busy on its host."""
         before, self.busy = self.busy, what
         self._try_to_publish()
         try:
@@ -128,7 +129,7 @@ class Watchdog:
             self._try_to_publish()
 
     def report_failure(self, message: str) -> None:
-        """Publish why this rank is about to end, for the others to quote; the first of the job counts."""
+        """Publish why this rank is about to end; the others print the first such message of the job."""
         try:
             with self.lock:
                 self.store.compare_set("failure", "", f"rank {self.rank} failed: {message}")
@@ -141,8 +142,8 @@ class Watchdog:
         self.thread.join(timeout=5)
 
     def diagnose(self, name: str) -> str:
-        """Say which rank broke the collective `name`, as far as the store knows."""
-        # The culprit's own message may still be on its way, and a rank that lives reports within a period.
+        """Return a message that names the rank that broke the collective `name`, if the store has it."""
+        # The failed rank's message may not have arrived yet, and a live rank publishes within one period.
         for _ in range(10 + int(5 * self.period)):
             with suppress(RuntimeError):
                 self._listen()
@@ -169,14 +170,14 @@ class Watchdog:
         return None
 
     def _listen(self) -> dict[int, _Report]:
-        """Read what the other ranks have published, and note which of them show signs of life."""
+        """Read the other ranks' reports, and note which reports are new."""
         reports = {}
         with self.lock:
             for rank in range(self.world_size):
                 if rank != self.rank and self.store.check([f"progress/{rank}"]):
                     reports[rank] = _Report(*json.loads(self.store.get(f"progress/{rank}")))
         for rank, report in reports.items():
-            # By this host's clock: those of other hosts may go wrong.
+            # Measure by this host's clock, because the clocks of other hosts may be wrong.
             if rank not in self._heard or self._heard[rank][0] != report.stamp:
                 self._heard[rank] = (report.stamp, time.monotonic())
         return reports
@@ -199,7 +200,7 @@ class Watchdog:
         return "; ".join(late)
 
     def _waits_for_work(self) -> str:
-        """Say what all late ranks are busy with; empty where one of them is silent or has said nothing."""
+        """Describe the work of all late ranks; empty if one of them is silent or has announced none."""
         work = []
         for rank, report in self._listen().items():
             if self._is_silent(rank) or (report.calls < self.calls and not report.busy):
@@ -226,7 +227,7 @@ class Watchdog:
                     continue
                 self._listen()
                 waited, limit = time.monotonic() - since, self.timeout_seconds
-                # A rank that has failed comes to no collective any more; Gloo may yet say so itself.
+                # A failed rank will not arrive at any collective. Gloo may still report that first.
                 if waited > GRACE_SECONDS and self._first_failure():
                     limit = min(limit, GRACE_SECONDS)
                 if (
@@ -237,14 +238,14 @@ class Watchdog:
                     self._excused = time.monotonic()
                     self._announce(work, waited)
                     continue
-                # A rank that has ended its work needs a while to arrive, and to say that it has.
+                # A rank that has finished its work needs some time to arrive and to publish that.
                 if time.monotonic() - max(since, self._excused) > limit:
                     self._abort(f"waited {limit:.0f} s in {self.name}")
             except RuntimeError:
                 return  # the store's host is gone; the collectives report that themselves
 
     def _announce(self, work: str, waited: float) -> None:
-        """Say about once a minute what this rank waits for."""
+        """Print about once a minute what this rank waits for."""
         if time.monotonic() - self._announced > 60:
             self._announced = time.monotonic()
             text = f"rank {self.rank}: has waited {waited:.0f} s in {self.name} for {work}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The public renderer: gsplat's call over the ops of BlitzGS, and one from parameters as they are learned."""
+"""The public renderer: `rasterization` with gsplat's arguments, and `raw_rasterization` of raw parameters."""
 
 from blitzgs.rendering.call import rasterization
 from blitzgs.rendering.raw import raw_rasterization

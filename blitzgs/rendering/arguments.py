@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `blitzgs.rasterization` takes, checked by name and without its leading dimensions."""
+"""Checks the arguments of `blitzgs.rasterization` and folds their batch dimensions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from blitzgs.rendering.covariances import Decomposed, decompose
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
-# Further arguments of gsplat's calls (1.5.3 and later) and their defaults, which alone are supported.
+# Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
 GSPLAT_DEFAULTS: dict[str, Any] = {
     "with_ut": False,
     "with_eval3d": False,
@@ -38,7 +38,7 @@ GSPLAT_DEFAULTS: dict[str, Any] = {
 
 
 class Scene(NamedTuple):
-    """N Gaussians and the C views they are seen from.
+    """N Gaussians and C views of them.
 
     Attributes:
         means: [N, 3].
@@ -48,7 +48,8 @@ class Scene(NamedTuple):
         colors: SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone.
         viewmats: [C, 4, 4].
         Ks: [C, 3, 3].
-        covariances: given instead of quats and scales, which are then those of the decomposed ones.
+        covariances: covariances given instead of quats and scales; quats and scales then are their
+            decomposition.
     """
 
     means: Tensor
@@ -63,16 +64,16 @@ class Scene(NamedTuple):
 
 @dataclass(frozen=True)
 class Gaussians:
-    """What a call renders: S scenes of N Gaussians and C views each, I = S C images.
+    """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images.
 
     Attributes:
-        scenes: the scenes, S >= 1. Of a call without a batch, the tensors of the caller themselves, so that a
-            leaf stays one.
-        colors: those of all scenes, as the caller gave them.
-        opacities: likewise.
+        scenes: the scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf
+            stays a leaf.
+        colors: colours of all scenes, as given by the caller.
+        opacities: opacities of all scenes, as given by the caller.
         sh_degree: degree of the SH that are evaluated; None: colours are values, or not rendered.
-        per_view: whether every view has colours of its own.
-        lead: the dimensions of the batch, and C.
+        per_view: whether every view has its own colours.
+        lead: the batch dimensions, and C.
         raw: whether scales and opacities are before their activation.
         named: the arguments of the call that have to be finite, a tensor for each scene.
     """
@@ -88,26 +89,26 @@ class Gaussians:
 
     @property
     def views(self) -> int:
-        """How many views C each scene is seen from."""
+        """Number of views C of each scene."""
         return self.lead[-1]
 
     @property
     def images(self) -> int:
-        """How many images I there are."""
+        """Number of images I."""
         return math.prod(self.lead)
 
     @property
     def count(self) -> int:
-        """How many Gaussians N a scene has."""
+        """Number of Gaussians N of each scene."""
         return self.opacities.shape[-1]
 
 
 def check_further(function: str, further: dict[str, Any]) -> None:
-    """Refuse what is no argument of gsplat's, and values of those that are but have no counterpart here.
+    """Check further keyword arguments: only gsplat's names with gsplat's default values are accepted.
 
     Raises:
-        TypeError: an argument that gsplat does not have either.
-        ValueError: a value other than gsplat's default.
+        TypeError: gsplat has no such argument.
+        ValueError: the value is not gsplat's default.
     """
     for name, value in further.items():
         if name not in GSPLAT_DEFAULTS:
@@ -120,7 +121,7 @@ def check_further(function: str, further: dict[str, Any]) -> None:
 
 
 def check_options(render_mode: str, rasterize_mode: str, camera_model: str, tile_size: int) -> None:
-    """Check the arguments that are no tensors.
+    """Check the arguments that are not tensors.
 
     Raises:
         ValueError: one has an unknown value.
@@ -138,15 +139,15 @@ def check_options(render_mode: str, rasterize_mode: str, camera_model: str, tile
 
 
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
-    """Check that arguments are tensors and on one device.
+    """Check that arguments are tensors on one device.
 
     Args:
-        required: by name.
-        optional: by name; some may be None.
+        required: arguments by name.
+        optional: further arguments by name, which may be None.
 
     Raises:
-        TypeError: one is an array of another library.
-        ValueError: one is on another device: a kernel would read memory that it cannot reach.
+        TypeError: an argument is not a tensor, but for example an array of another library.
+        ValueError: an argument is on another device, whose memory the kernels could not read.
     """
     device, first = None, ""
     for name, value in (*required.items(), *optional.items()):
@@ -172,7 +173,7 @@ def gaussians_of(
     with_colors: bool,
     raw: bool = False,
 ) -> Gaussians:
-    """Check shapes and fold the dimensions of the batch into one.
+    """Check shapes and fold the batch dimensions into one.
 
     Args:
         means: as for `blitzgs.rasterization`, like the next seven.
@@ -198,7 +199,7 @@ def gaussians_of(
     _require("means", means, (*batch, N, 3), "[..., N, 3]")
     _require("quats", quats, (*batch, N, 4), "[..., N, 4]")
     _require("scales", scales, (*batch, N, 3), "[..., N, 3]")
-    _require("opacities", opacities, (*batch, N), "[..., N]")  # any other might broadcast
+    _require("opacities", opacities, (*batch, N), "[..., N]")  # another shape might broadcast
     _require("viewmats", viewmats, (*batch, C, 4, 4), "[..., C, 4, 4]")
     _require("Ks", Ks, (*batch, C, 3, 3), "[..., C, 3, 3]")
     if colors is None and with_colors:
@@ -222,7 +223,7 @@ def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
     count = math.prod(batch)
     if count == 0:
         raise ValueError(f"the batch {[*batch]} is empty")
-    # One unbind each: its gradient is one stack, not a sum of tensors as large as the batch.
+    # Unbind each tensor once: the gradient of this is one stack, not a sum of tensors as large as the batch.
     columns = (
         [None] * count if t is None else t.reshape(count, *t.shape[len(batch) :]).unbind(0) for t in whole[:7]
     )
@@ -270,7 +271,7 @@ def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree:
 
 
 def background_rows(backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str) -> Tensor | None:
-    """Return what lies behind each image, [I, D + depth], from [..., C, D].
+    """Return the background of each image, [I, D + depth], from `backgrounds`, [..., C, D].
 
     Raises:
         ValueError: the shape does not fit.

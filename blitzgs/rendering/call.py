@@ -63,11 +63,12 @@ def rasterization(
     Args:
         means: [..., N, 3] in world units, float32, or float64 on the CPU.
         quats: [..., N, 4] (w, x, y, z), need not be normalised. Not read, and may be None, with `covars`.
-        scales: [..., N, 3] standard deviations (after the exponential). Likewise.
+        scales: [..., N, 3] standard deviations (after the exponential). Not read, and may be None, with
+            `covars`.
         opacities: [..., N] in [0, 1] (after the sigmoid).
         colors: with `sh_degree`, SH coefficients [..., N, K, 3], or per view [..., C, N, K, 3], which is
-            slower; otherwise values of any channel count, [..., N, D] or per view [..., C, N, D]. None for
-            the render modes D and ED.
+            slower; otherwise values of any channel count, [..., N, D] or per view [..., C, N, D]. May be None
+            for the render modes D and ED.
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
         Ks: [..., C, 3, 3] intrinsics in px.
         width: image width in px.
@@ -83,39 +84,43 @@ def rasterization(
             fastest there.
         backgrounds: [..., C, D] behind everything; None for zero. Depth channels have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
-        sparse_grad: whether means, quats and scales, and with `sh_degree` opacities and colors that are
-            leaves, get sparse gradients, over the visible Gaussians alone. Dense ones cost a pass over all N.
+        sparse_grad: whether means, quats and scales, and with `sh_degree` also opacities and colors that are
+            leaves, get sparse gradients, which have only the visible Gaussians. Dense gradients cost a pass
+            over all N.
         absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased".
         channel_chunk: accepted and not needed: any channel count is rendered in one pass.
-        distributed: whether Gaussians and views are divided among the ranks of the process group: each rank
-            gives its own, as many views as the others, and gets the images of its views, of the Gaussians of
-            all ranks. Every rank has to call this, and to run its backward pass. As in gsplat, meta's splats
-            are of this rank's Gaussians in the views of all ranks, and its lists of what this rank renders.
+        distributed: whether Gaussians and views are divided among the ranks of the process group. Each rank
+            passes its own Gaussians and views, the same number of views as the others, and gets the images of
+            its own views, which show the Gaussians of all ranks. Every rank must make this call and run its
+            backward pass. As in gsplat, meta's splats are those of this rank's Gaussians in the views of all
+            ranks, and its tile lists belong to this rank's images.
         camera_model: only "pinhole" is supported.
         segmented: accepted and not needed: it selects a sort in gsplat, never the result.
-        covars: [..., N, 3, 3] covariances instead of quats and scales, of which the upper triangles are read.
-            Each is decomposed once, which costs more than the rest of the call: quats and scales are faster.
-        further: arguments of gsplat's that have no counterpart; only their defaults pass.
+        covars: [..., N, 3, 3] covariances instead of quats and scales; only their upper triangles are read.
+            They are decomposed, which costs more than the rest of the call; quats and scales are faster.
+        further: gsplat's arguments that are not supported; only their default values are accepted.
 
     Returns:
         Images [..., C, H, W, D] (depth last), alphas [..., C, H, W, 1], and meta: batch_ids, camera_ids,
         gaussian_ids (None unless packed; ordered by image, then Gaussian), radii, means2d, depths, conics,
         opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets (int64),
         width, height, tile_size, n_batches, n_cameras. The image depends on means2d, conics, opacities and,
-        where depth is rendered, depths, so they take `retain_grad()`. Splats whose alpha is below 1/255 on
-        all pixels of the image are not there, though gsplat counts some of them as visible (0.1 % more).
-        `meta["non_finite"]` has what was not rendered because it is NaN or infinite: a dict of the indices of
-        Gaussians and views by argument. Meta is a `LazyDict`: what the image does not need is worked out when
-        it is first read.
+        where depth is rendered, depths, so `retain_grad()` works on them. Splats whose alpha is below 1/255
+        at all pixels of the image are left out, though gsplat counts some of them as visible (0.1 % more).
+        `meta["non_finite"]` is a dict from the names of arguments to the indices of Gaussians or views that
+        were not rendered because they are NaN
+        or infinite. Meta is a `LazyDict`: entries that the image does not need are computed when they are
+            first read.
 
     Warns:
-        RuntimeWarning: an argument has values that are NaN or infinite (on CUDA found in every 32nd call).
+        RuntimeWarning: an argument has values that are NaN or infinite (on CUDA, every 32nd call checks
+            this).
 
     Raises:
-        TypeError: an array of another library where a tensor is needed, or an argument that gsplat has not.
-        ValueError: an argument that is not supported or does not fit, by name.
-        RuntimeError: a wrong dtype that a kernel found.
+        TypeError: an argument is not a tensor, or gsplat has no such argument.
+        ValueError: an argument is not supported or has a wrong shape or value; the message names it.
+        RuntimeError: a tensor has a wrong dtype.
     """
     check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
@@ -125,7 +130,7 @@ def rasterization(
         required |= {"quats": quats, "scales": scales}
     check_tensors(required, {"colors": colors, "backgrounds": backgrounds, "covars": covars})
     if covars is not None:
-        # Their places are taken by what the covariances are decomposed into.
+        # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
     assert quats is not None and scales is not None
     gaussians = gaussians_of(

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gaussians given by covariances instead of rotations and scales.
 
-The kernels find what a view sees from rotations and scales, so each covariance is decomposed once, without
-gradients: those of an eigenvalue decomposition are infinite where two axes are alike. The shape of each splat
-on the screen, which the image depends on, is then worked out from the covariance itself.
+The kernels find the visible Gaussians from rotations and scales, so each covariance is decomposed, without
+gradients: the gradient of an eigenvalue decomposition is infinite if two axes are equal. The shape of each
+splat on the screen, on which the image depends, is then computed from the covariance itself, with gradients.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs
 
 @dataclass(frozen=True)
 class Decomposed:
-    """Covariances, and the rotations and scales they are of.
+    """Covariances and their rotations and scales.
 
     Attributes:
-        upper: [N, 6]: xx, xy, xz, yy, yz, zz, which gradients go to.
-        quats: [N, 4], of a constant.
-        scales: [N, 3], of a constant; NaN where a covariance is not finite.
+        upper: [N, 6]: xx, xy, xz, yy, yz, zz; they get gradients.
+        quats: [N, 4], without gradients.
+        scales: [N, 3], without gradients; NaN if the covariance is not finite.
     """
 
     upper: Tensor
@@ -32,14 +32,14 @@ class Decomposed:
 
 
 def decompose(covars: Tensor) -> Decomposed:
-    """Decompose covariances [N, 3, 3]; what lies below their diagonals is not read, as in gsplat."""
+    """Decompose covariances [N, 3, 3]; only their upper triangles are read, as in gsplat."""
     upper = covars[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     with torch.no_grad():
         matrices = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3).double()
         finite = matrices.isfinite().all(dim=(1, 2))
         matrices = torch.where(finite[:, None, None], matrices, torch.eye(3, device=covars.device).double())
         variances, axes = torch.linalg.eigh(matrices)
-        # A rotation keeps orientation; which way the axis of an eigenvector points says nothing.
+        # The sign of an eigenvector is arbitrary, but a rotation must have the determinant 1.
         axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
         scales = variances.clamp(min=0).sqrt().masked_fill_(~finite[:, None], torch.nan)
         return Decomposed(upper, _quaternions(axes).to(covars.dtype), scales.to(covars.dtype))

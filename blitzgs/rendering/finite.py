@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NaN and infinite input: its Gaussians or views are not rendered, and the caller is told."""
+"""Finds NaN and infinite input, whose Gaussians or views are not rendered, and warns the caller."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torch import Tensor
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.layout import Layout
 
-# On CUDA the parameters are looked through in the first of so many calls of a size: it takes a pass over all
-# of them, and what is not finite stays so.
+# On CUDA, the first of this many calls of a size checks the parameters: the check is a pass over all of them,
+# and values that are not finite stay so.
 EVERY_CUDA_CALLS = 32
 COLOURS = ("colors", "sh0", "shN")
 
 
 @torch.no_grad()
 def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Return what is not finite, by argument: indices int64 [M] of Gaussians, or of views.
+    """Return, by argument, the indices int64 [M] of Gaussians or views whose values are not finite.
 
-    Indices count through the scenes of a batch. An argument that is finite has no entry.
+    Indices count through all scenes of a batch. Arguments whose values are all finite have no entry.
     """
     found = {}
     for name, tensors in gaussians.named.items():
@@ -47,10 +47,10 @@ def _finite(values: Tensor, name: str, raw: bool) -> Tensor:
 
 
 def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> None:
-    """Warn, naming the arguments, where something is not finite and so is not rendered.
+    """Warn about arguments with values that are not finite; their Gaussians or views are not rendered.
 
-    A few sums tell whether to look closer. SH, which are most of a Gaussian, are looked at in visible rows
-    alone.
+    A few sums tell whether a closer check is needed. SH coefficients, the largest part of a Gaussian, are
+    only checked for visible Gaussians.
     """
     first = gaussians.named["means"][0]
     if first.is_cuda and next(_calls(first.device, first.shape[0])) % EVERY_CUDA_CALLS:
@@ -75,5 +75,5 @@ def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> N
 
 @lru_cache(maxsize=64)
 def _calls(_device: torch.device, _gaussians: int) -> count[int]:
-    """Return what counts the calls with so many Gaussians."""
+    """Return the counter of calls with this number of Gaussians."""
     return count()

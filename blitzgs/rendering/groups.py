@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projection of any number of scenes and views: what one launch takes is projected together."""
+"""Projects any number of scenes and views, in groups of what one launch can take."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Group:
     Attributes:
         inputs: of the projection.
         first_image: number of its first view among the images of the call.
-        covariances: given instead of quats and scales; None: those were.
+        covariances: covariances, if the caller gave them instead of quats and scales.
     """
 
     inputs: ProjectionInputs
@@ -33,12 +33,12 @@ class Group:
 
 
 def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
-    """Return what is projected together: one group for one scene of up to 32 views with common colours."""
+    """Divide the views into groups; one scene of up to 32 views with common colours is one group."""
     groups = []
     sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
     most = 1 if sh_per_view else MOST_VIEWS
     for s, scene in enumerate(gaussians.scenes):
-        # A split of nothing to be split would still cost the host a node of the graph.
+        # Do not split a single group: the split would add a node to autograd's graph.
         views = [(scene.viewmats, scene.Ks)]
         if gaussians.views > most:
             views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
@@ -65,9 +65,9 @@ def project_groups(
     """Return the splats of all images, those of a group after those of the groups before.
 
     Args:
-        groups: what is projected.
+        groups: the groups to project.
         sparse_grad: see `blitzgs.ops.project.project`.
-        ready: what the projection of the one group returned, if it is there already.
+        ready: the splats of the only group, if they have been computed already.
 
     Returns:
         Splats whose camera_ids number all images of the call. Of several groups, visible_ids and

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checked Gaussians to images: projected in groups, laid out, listed by tile and composited at once."""
+"""Renders checked Gaussians: projects them in groups, arranges the splats, lists them by tile, composites."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from blitzgs.rendering.layout import Layout
 from blitzgs.rendering.meta import Lists, make_meta
 from blitzgs.rendering.ranks import Job, send_splats
 
-# What the CUDA kernels composite; for any other size, meta's lists are of the tiles asked for alone.
+# The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
 CUDA_TILE_SIZE = 16
 
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """What is composited of the splats, and what is told of them; see `blitzgs.rasterization`.
+    """The options of compositing and of `meta`; see `blitzgs.rasterization`.
 
     Attributes:
-        render_mode: what the channels are.
+        render_mode: which channels are rendered.
         backgrounds: [I, channels] or None.
-        packed: whether `meta` has splats, else all Gaussians.
+        packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
         sparse_grad: whether gradients are sparse.
-        absgrad: whether the backward pass tells absolute gradients.
+        absgrad: whether the backward pass also returns absolute gradients.
     """
 
     render_mode: str
@@ -52,15 +52,15 @@ def render(
     sizes: Sizes | None = None,
     job: Job | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render; returns what `blitzgs.rasterization` does.
+    """Render images; return the results of `blitzgs.rasterization`.
 
     Args:
-        function: name of the public call, for warnings.
-        gaussians: what is rendered.
-        project: how it is projected.
-        image: how it is composited.
-        sizes: how much room splats and lists need, if that is known.
-        job: the ranks among which the Gaussians and their views are divided; None: all of them are here.
+        function: name of the public function, for warnings.
+        gaussians: the Gaussians and views.
+        project: options of the projection.
+        image: options of compositing.
+        sizes: the numbers of splats and list entries, if they are known.
+        job: the ranks among which the Gaussians and views are divided; None: this process has all of them.
     """
     compiling = torch.compiler.is_compiling()
     by_value = gaussians.colors is not None and gaussians.sh_degree is None
@@ -104,7 +104,7 @@ def _queued(
     image: ImageOptions,
     sizes: Sizes | None,
 ) -> Rendered | None:
-    """Have all of it queued on CUDA before the host knows how many splats there are, if that can be done."""
+    """Queue all work on CUDA before the host knows the number of splats; None if that is not possible."""
     means = group.inputs.gaussians[0]
     # Hooks on saved tensors (checkpointing) want the same shapes each time, without room behind splats.
     if (
@@ -127,7 +127,7 @@ def _queued(
 def _laid(
     layout: Layout, gaussians: Gaussians, project: ProjectionOptions, image: ImageOptions
 ) -> dict[str, Tensor]:
-    """Return what is rendered as it lies in meta."""
+    """Return the rendered columns of splats in the layout of `meta`."""
     splats = layout.splats
     means2d, conics, opacities, depths = layout.lay(
         splats.means2d, splats.conics, splats.opacities, splats.depths
@@ -140,7 +140,7 @@ def _laid(
 def _lists(
     splats: ProjectedSplats, images: int, project: ProjectionOptions, ready: Rendered | None, count: int
 ) -> tuple[Lists, Lists]:
-    """Return the tiles' lists for meta, and those that are composited; count: entries, -1: not known."""
+    """Return the tile lists for meta and those to composite; `count`: number of entries, -1: unknown."""
     width, height, tile_size = project.width, project.height, project.tile_size
     if ready is not None:
         lists = Lists(ready.isect_splats, ready.tile_offsets, width, height, tile_size)
@@ -173,7 +173,7 @@ def _without_non_finite(gaussians: Gaussians) -> Gaussians:
 
 
 def _channels(splats: ProjectedSplats, layout: Layout, gaussians: Gaussians, render_mode: str) -> Tensor:
-    """Return what is composited, per splat [P, D]."""
+    """Return the channels to composite, [P, D]."""
     if gaussians.colors is None or gaussians.sh_degree is not None:
         return _channels_of_splats(splats, gaussians, render_mode)
     N = gaussians.count
@@ -185,7 +185,7 @@ def _channels(splats: ProjectedSplats, layout: Layout, gaussians: Gaussians, ren
 
 
 def _channels_of_splats(splats: ProjectedSplats, gaussians: Gaussians, render_mode: str) -> Tensor:
-    """Return what is composited of splats that have all of it: depths, or colours of SH."""
+    """Return the channels to composite if the splats have them all: depths, or colours from SH."""
     if gaussians.colors is None:
         return splats.depths[:, None]
     return _with_depth(splats.colors, splats, render_mode)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a call's splats stand in `meta`: one after the other, or in [..., C, N, ...] of all Gaussians.
+"""Arranges a call's splats for `meta`: one after the other, or as [..., C, N, ...] for all Gaussians.
 
-The ops have splats by Gaussian, then view; packed, `meta` has them by image, then Gaussian. What `meta` shows
-of them lies on the way from the projection to the image, as in gsplat: splats are laid out, and what is
-rendered is taken from there, so that the tensors in `meta` get gradients.
+The ops order splats by Gaussian, then view; packed `meta` orders them by image, then Gaussian. As in gsplat,
+the image is rendered from the tensors in `meta`, so that these get gradients: splats are first arranged for
+`meta`, and the columns to render are taken from there.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from blitzgs.ops.projection import ProjectedSplats
 
 
 class Layout:
-    """Where P splats stand in `meta`.
+    """The arrangement of P splats in `meta`.
 
     Attributes:
         splats: the splats; camera_ids number all images of the call, gaussian_ids the Gaussians of a scene.
-        packed: whether `meta` has splats, else all Gaussians.
-        places: int64 [P], where each splat stands; None: splats stand as they are.
-        shape: dimensions before those of a splat's values.
+        packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
+        places: int64 [P], flat index of each splat in `meta`; None: the order is unchanged.
+        shape: leading dimensions in `meta`, before those of a splat's values.
     """
 
     def __init__(self, splats: ProjectedSplats, lead: tuple[int, ...], count: int, packed: bool) -> None:
-        """Lay splats out.
+        """Compute the arrangement.
 
         Args:
             splats: as the attribute.
-            lead: dimensions of the batch, and C.
+            lead: batch dimensions, and C.
             count: Gaussians N of a scene.
-            packed: whether `meta` has splats, else all Gaussians.
+            packed: as the attribute.
         """
         self.splats, self.packed = splats, packed
         self._images: Tensor | None = None
@@ -49,7 +49,7 @@ class Layout:
             self.places = torch.empty_like(order)
             self.places[order] = torch.arange(len(order), device=order.device)
 
-    # Made when first asked for; functools.cached_property takes a lock, which torch.compile cannot trace.
+    # Computed on first use. functools.cached_property takes a lock, which torch.compile cannot trace.
     @property
     def images(self) -> Tensor:
         """The image of each splat, int64 [P]."""
@@ -65,7 +65,7 @@ class Layout:
         return self._gaussians
 
     def lay(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """Return splats' values [P, ...] as [*shape, ...]; zero where a view does not see a Gaussian."""
+        """Arrange values of splats, [P, ...], as [*shape, ...]; entries without a splat are zero."""
         if self.places is None:
             return values
         if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
@@ -74,7 +74,7 @@ class Layout:
         return laid
 
     def take(self, *laid: Tensor) -> tuple[Tensor, ...]:
-        """Return what splats have of [*shape, ...]: [P, ...] each."""
+        """Take the values of splats, [P, ...], from [*shape, ...]; the inverse of `lay`."""
         if self.places is None:
             return laid
         if torch.compiler.is_compiling():
@@ -83,9 +83,9 @@ class Layout:
         return taken
 
     def lay_opacities(self, opacities: Tensor) -> Tensor:
-        """Return the splats' opacities as [..., C, N], over those given, [..., N], of what no view sees.
+        """Arrange the splats' opacities as [..., C, N].
 
-        As in gsplat, whose dense opacities are those of all Gaussians.
+        Entries without a splat have the given opacities, [..., N], as in gsplat.
         """
         assert self.places is not None  # they are given where all Gaussians are laid out
         if torch.compiler.is_compiling():
@@ -111,7 +111,7 @@ def _taken(places: Tensor, shape: tuple[int, ...], laid: Tensor) -> Tensor:
 
 
 class _Lay(torch.autograd.Function):
-    """Splats to where they stand; no two at one place, so the gradient is taken from there."""
+    """`Layout.lay`; no two splats have the same place, so the gradient is gathered from the places."""
 
     @staticmethod
     def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *values: Tensor) -> tuple[Tensor, ...]:
@@ -127,7 +127,7 @@ class _Lay(torch.autograd.Function):
 
 
 class _LayOver(torch.autograd.Function):
-    """As `_Lay`, over values that all Gaussians have, [..., N]."""
+    """`Layout.lay_opacities`."""
 
     @staticmethod
     def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
@@ -147,7 +147,7 @@ class _LayOver(torch.autograd.Function):
 
 
 class _Take(torch.autograd.Function):
-    """The inverse of `_Lay`."""
+    """`Layout.take`, the inverse of `_Lay`."""
 
     @staticmethod
     def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *laid: Tensor) -> tuple[Tensor, ...]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `blitzgs.rasterization` tells besides its images: gsplat's `meta`."""
+"""Makes the `meta` of `blitzgs.rasterization`, with gsplat's keys."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from blitzgs.rendering.layout import Layout
 
 @dataclass(frozen=True)
 class Lists:
-    """Which splats the tiles of all images composite.
+    """The splats that each tile of all images composites.
 
     Attributes:
-        splats: int32, splat indices; entries past the last offset mean nothing.
-        offsets: int64 [I T + 1].
-        width: of the images in px.
-        height: likewise.
+        splats: int32, splat indices; entries past the last offset are undefined.
+        offsets: int64 [I T + 1], where each tile's list begins.
+        width: image width in px.
+        height: image height in px.
         tile_size: edge of a tile in px.
     """
 
@@ -37,16 +37,16 @@ class Lists:
 
     @property
     def tiles_x(self) -> int:
-        """Tiles next to each other."""
+        """Number of tiles in a row."""
         return -(-self.width // self.tile_size)
 
     @property
     def tiles_y(self) -> int:
-        """Tiles below each other."""
+        """Number of tiles in a column."""
         return -(-self.height // self.tile_size)
 
     def listed(self) -> Tensor:
-        """Return the splats without the entries that mean nothing: there are some where splats are hidden."""
+        """Return `splats` without the undefined entries, which exist if splats are hidden."""
         if torch.compiler.is_compiling():  # they were counted
             return self.splats
         return self.splats[: int(self.offsets[-1])]
@@ -60,17 +60,17 @@ def make_meta(
     lead: tuple[int, ...],
     arrived: ProjectedSplats | None,
 ) -> dict[str, Any]:
-    """Return `meta`; what the image did not need is worked out when it is first read.
+    """Return `meta`; entries that the image did not need are computed when they are first read.
 
-    Under `torch.compile` it is a plain dict: what the caller does not read is not computed.
+    Under `torch.compile` it is a plain dict, and the compiler removes entries that the caller does not read.
 
     Args:
-        gaussians: the call's.
-        layout: of its splats.
-        laid: what is rendered, as it lies in `meta`.
-        lists: of the tiles.
-        lead: dimensions of the batch, and the views that are rendered here.
-        arrived: the splats that the lists are of, where ranks have exchanged them; None: those laid out.
+        gaussians: the checked arguments of the call.
+        layout: arrangement of the splats.
+        laid: the rendered columns in this arrangement.
+        lists: the tile lists.
+        lead: batch dimensions, and the number of views that are rendered here.
+        arrived: the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`.
     """
     splats, packed = layout.splats, layout.packed
     views = gaussians.views

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rasterization(distributed=True)`: ranks that each have some of the Gaussians and some of the views.
+"""`rasterization(distributed=True)`: each rank has some of the Gaussians and some of the views.
 
-As in gsplat (and Grendel, Zhao et al. 2024), every rank projects its Gaussians into the views of all ranks
-and sends each splat to the rank whose view it is of; gradients return the same way. The collectives are those
-of the process group that the program has started. (Training of BlitzGS divides images by tiles instead, with
-the transports of `blitzgs.distributed`.)
+As in gsplat (and Grendel-GS, Zhao et al. 2024), every rank projects its Gaussians into the views of all ranks
+and sends each splat to the rank that renders its view; gradients are sent back. The collectives use the
+process group that the program has started. (The trainer of BlitzGS divides images by tiles instead, with the
+transports of `blitzgs.distributed`.)
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Job(NamedTuple):
     """The ranks of a call.
 
     Attributes:
-        rank: of this process.
+        rank: rank of this process.
         size: number of ranks M.
-        views: C, of each rank.
+        views: number of views C of each rank.
     """
 
     rank: int
@@ -43,14 +43,14 @@ def gather_views(gaussians: Gaussians, same: Sequence[Any]) -> tuple[Gaussians, 
 
     Args:
         gaussians: one scene, with the rank's own views.
-        same: what all ranks have to give alike.
+        same: values that must be equal on all ranks.
 
     Returns:
-        The Gaussians, and the job; None: there is one rank.
+        The Gaussians, and the job; None if there is one rank.
 
     Raises:
-        ValueError: on every rank, the ranks differ in `same`, in their number of views, or in whether
-            Gaussians or poses need gradients: some would wait for others forever.
+        ValueError: on every rank: the ranks differ in `same`, in their number of views, or in whether
+            Gaussians or poses need gradients. Some ranks would then wait for others forever.
     """
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return gaussians, None
@@ -66,7 +66,7 @@ def gather_views(gaussians: Gaussians, same: Sequence[Any]) -> tuple[Gaussians, 
 
 
 def _require_same(given: tuple[Any, ...], device: torch.device) -> None:
-    """Compare a number that stands for what is given; only where it differs is all of it exchanged."""
+    """Compare a hash of the values over the ranks; exchange all values only if the hashes differ."""
     own = torch.tensor([zlib.crc32(repr(given).encode())], device=device)
     sums = [torch.empty_like(own) for _ in range(dist.get_world_size())]
     dist.all_gather(sums, own)
@@ -81,16 +81,16 @@ def _require_same(given: tuple[Any, ...], device: torch.device) -> None:
 
 
 def send_splats(splats: ProjectedSplats, channels: Tensor, job: Job) -> tuple[ProjectedSplats, Tensor]:
-    """Send each splat to the rank whose view it is of. Collective; so is its backward pass.
+    """Send each splat to the rank that renders its view. Collective, as is its backward pass.
 
     Args:
         splats: of this rank's Gaussians in the views of all ranks.
-        channels: what is composited of them, [P, D].
+        channels: channels to composite, [P, D].
         job: the ranks.
 
     Returns:
-        The splats that this rank's views see, by (rank, Gaussian, view), and their channels. Only what lists
-        and images need of them is there.
+        The splats of this rank's views, ordered by (rank, Gaussian, view), and their channels. Only the
+        columns that tile lists and images need are valid.
     """
     images = splats.camera_ids.long()
     ranks = images // job.views
@@ -127,7 +127,7 @@ def _gathered(values: Tensor, job: Job) -> Tensor:
 
 
 class _SendSplats(torch.autograd.Function):
-    """Splats to their ranks, gradients to where the splats came from."""
+    """Sends splats to other ranks; the backward pass sends their gradients back."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, sent: list[int], received: list[int]) -> Tensor:
@@ -141,7 +141,7 @@ class _SendSplats(torch.autograd.Function):
 
 
 class _GatherViews(torch.autograd.Function):
-    """The poses of all ranks; a pose's gradient is the sum of what all ranks found."""
+    """Gathers the poses of all ranks; the gradient of a pose is the sum over all ranks."""
 
     @staticmethod
     def forward(ctx: Any, viewmats: Tensor, job: Job) -> Tensor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs.raw_rasterization`: from the parameters that are learned, at the cost of what is visible."""
+"""`blitzgs.raw_rasterization`: renders raw parameters, at a cost that follows the visible Gaussians."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from blitzgs.rendering.images import ImageOptions, render
 
 
 class CatchesUp(Protocol):
-    """An optimiser whose parameters may be behind: `blitzgs.optim.LazyAdam`."""
+    """An optimiser that may have pending steps, such as `blitzgs.optim.LazyAdam`."""
 
     def catch_up(self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None) -> None:
-        """Bring rows of parameters up to date."""
+        """Apply the pending steps of rows of parameters."""
 
 
 def raw_rasterization(
@@ -53,9 +53,11 @@ def raw_rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
 
-    The same as `blitzgs.rasterization` of `exp(scales)`, `sigmoid(opacities)` and `cat([sh0, shN], 1)`,
-    without any of these in memory: what the views see is found first, and only that is gathered, activated
-    and rendered. Gradients are sparse, over the visible Gaussians alone: the parameters have to be leaves.
+    The result is that of `blitzgs.rasterization` with `exp(scales)`, `sigmoid(opacities)` and `cat([sh0,
+    shN], 1)`, but
+    none of these tensors is made: the function first finds the visible Gaussians, and only gathers, activates
+        and renders
+    these. Gradients are sparse and have only the visible Gaussians, so the parameters must be leaves.
 
     Args:
         means: [N, 3] in world units, float32, or float64 on the CPU.
@@ -63,7 +65,7 @@ def raw_rasterization(
         scales: [N, 3] logarithms of standard deviations.
         opacities: [N] logits.
         sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
-        shN: [N, K - 1, 3], the others.
+        shN: [N, K - 1, 3], the other SH coefficients.
         viewmats: [C, 4, 4] world to camera, a rotation and a translation.
         Ks: [C, 3, 3] intrinsics in px.
         width: image width in px.
@@ -72,15 +74,16 @@ def raw_rasterization(
         far_plane: likewise.
         radius_clip: likewise.
         eps2d: likewise.
-        sh_degree: degree to evaluate, 0 to 3; None: the highest there is.
+        sh_degree: degree to evaluate, 0 to 3; None: the highest degree that the coefficients have.
         tile_size: as for `blitzgs.rasterization`, like the next two.
         backgrounds: likewise.
         render_mode: likewise.
         sparse_grad: False: dense gradients, for optimisers that take no others.
         absgrad: as for `blitzgs.rasterization`, like the next.
         rasterize_mode: likewise.
-        optimizers: those of the parameters, by name or not. `blitzgs.optim.LazyAdam` among them catch up what
-            is read here: the geometry of all Gaussians, and the SH of those that are visible.
+        optimizers: the parameters' optimisers, as a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
+            among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
+            the visible ones.
 
     Returns:
         As `blitzgs.rasterization(..., packed=True)`.
@@ -143,13 +146,13 @@ def _check_harmonics(harmonics: list[Tensor], count: int) -> None:
 
 @torch.no_grad()
 def _visible(calls: list[ProjectionInputs]) -> tuple[Tensor, Sizes | None]:
-    """Return the Gaussians that some view sees, int32 [U], and the splats there will be of them.
+    """Return the Gaussians that at least one view sees, int32 [U], and the sizes of their rendering.
 
     Args:
-        calls: what is projected, into at most 32 views each.
+        calls: inputs of the projections, with at most 32 views each.
 
     Returns:
-        Ascending ids; how many Gaussians, splats and intersections there are, if all are of one call.
+        Ascending ids; and, with a single call, the numbers of Gaussians, splats and tile entries.
     """
     parts = [project_splats(inputs) for inputs in calls]
     if len(parts) > 1:
@@ -158,7 +161,7 @@ def _visible(calls: list[ProjectionInputs]) -> tuple[Tensor, Sizes | None]:
 
 
 class _Visible(torch.autograd.Function):
-    """The rows `ids` of tables; their gradients are sparse, or dense where that is wanted."""
+    """Gathers the rows `ids` of tables; the tables' gradients are sparse, or dense if `sparse` is False."""
 
     @staticmethod
     def forward(ctx: Any, ids: Tensor, sparse: bool, *tables: Tensor) -> tuple[Tensor, ...]:
