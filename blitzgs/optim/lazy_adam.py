@@ -28,8 +28,7 @@ class LazyAdam(torch.optim.Optimizer):
     closed form whatever their number, and gives them the values of `torch.optim.Adam` to rounding
     (csrc/lazy_adam/lazy_adam.h). Call it
     before the parameters are read: before a view is rendered, before a strategy reads the parameters, and
-        before
-    evaluation. With a dense gradient, `step` is a step of plain Adam.
+    before evaluation. With a dense gradient, `step` is a step of plain Adam.
 
     Parameters are [N, ...], contiguous, float32, or float64 on the CPU. Learning rates are rounded to
     float32. A parameter of SH coefficients may give its first coefficient (three values a row) another
@@ -226,6 +225,12 @@ class LazyAdam(torch.optim.Optimizer):
         if len(counts) != 1:
             raise ValueError(f"LazyAdam.append: the numbers of new rows differ: {sorted(counts)}")
         (count,) = counts
+        for name, group in named.items():
+            new, old = rows[name].shape, group["params"][0].shape
+            if new[1:] != old[1:]:
+                raise ValueError(
+                    f"LazyAdam.append: new rows of {name} must be {[count, *old[1:]]}, got {list(new)}"
+                )
 
         def grow(name: str, old: Tensor) -> Tensor:
             return torch.cat([old, rows[name].to(old)])
@@ -236,9 +241,19 @@ class LazyAdam(torch.optim.Optimizer):
         return self._renew(named, grow, grow_state)
 
     def keep(self, mask: Tensor) -> dict[str, Parameter]:
-        """Keep the rows where `mask`, bool [N], is true; return the new parameters as `append` does."""
+        """Keep the rows where `mask`, bool [N], is true; return the new parameters as `append` does.
+
+        Raises:
+            ValueError: the mask has another dtype, or not one entry for each row.
+        """
         if mask.dtype != torch.bool:
             raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
+        for name, group in self._named().items():
+            if mask.shape != group["params"][0].shape[:1]:
+                raise ValueError(
+                    f"LazyAdam.keep: mask must be [{len(group['params'][0])}], a value for each row of "
+                    f"{name}, got {list(mask.shape)}"
+                )
         return self.permute(mask.nonzero()[:, 0])
 
     def permute(self, order: Tensor) -> dict[str, Parameter]:

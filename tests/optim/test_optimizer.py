@@ -247,6 +247,19 @@ def test_wrong_use_is_refused():
         optimizer.step()
 
 
+def test_rows_that_do_not_fit_change_nothing():
+    """Neither is a row lost by a mask that is too short, nor one parameter longer than the others."""
+    means, sh = torch.ones(4, 3, requires_grad=True), torch.ones(4, 16, 3, requires_grad=True)
+    optimizer = LazyAdam([{"params": [means], "name": "means"}, {"params": [sh], "name": "sh"}])
+    for length in (3, 5):
+        with pytest.raises(ValueError, match=rf"mask must be \[4\], .* of means, got \[{length}\]"):
+            optimizer.keep(torch.arange(length) < 2)
+    with pytest.raises(ValueError, match=r"new rows of sh must be \[2, 16, 3\], got \[2, 9, 3\]"):
+        optimizer.append({"means": torch.ones(2, 3), "sh": torch.ones(2, 9, 3)})
+    assert optimizer.param_groups[0]["params"][0] is means and optimizer.param_groups[1]["params"][0] is sh
+    assert all(len(new) == 2 for new in optimizer.keep(torch.arange(4) < 2).values())
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_tables_that_are_full_begin_anew_and_nothing_is_lost(backend, monkeypatch):
     monkeypatch.setattr(drift, "CAPACITY", 40)
