@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the population of Gaussians grows and shrinks."""
+"""The population of Gaussians: first Gaussians, density control, importance, pruning, spawn gate, lineage."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Candidates of densification: what is known of a Gaussian before it is born (paper, spawn gate)."""
+"""Candidates of densification and their features, from which the spawn gate predicts survival (BlitzGS)."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Candidates:
 
     Attributes:
         parents: int64 [M], persistent ids of the Gaussians to be cloned or split.
-        is_split: bool [M].
+        is_split: bool [M], whether the candidate is split; false: cloned.
         features: float32 [M, F], see `FEATURES`.
-        time: of the event, in images.
+        time: time of the event, in images.
     """
 
     parents: Tensor
@@ -44,7 +44,7 @@ class Candidates:
     time: int
 
 
-# Tells which candidates are not to be born, bool [M]; every rank calls it, with or without candidates.
+# A veto returns which candidates are withheld, bool [M]; every rank calls it, also without candidates.
 Veto = Callable[[Candidates, Ranks], Tensor]
 
 
@@ -60,19 +60,20 @@ def spawn_features(
     """Return the features of candidates at a density event, before its statistics are reset.
 
     Args:
-        table: this rank's Gaussians, caught up.
-        rows: int64 [M], their parents.
-        is_split: bool [M].
-        time: of the event, in images.
-        extent: of the scene, in the unit of the means.
+        table: this rank's Gaussians, without pending optimiser steps.
+        rows: int64 [M], rows of the candidates' parents.
+        is_split: bool [M], whether the candidate is split; false: cloned.
+        time: time of the event, in images.
+        extent: extent of the scene, in the unit of the means.
         level_count: number of octree levels.
 
     Returns:
         float32 [M, 10]: mean gradient over the views that saw the parent (half-image units), the parent's
-        opacity, the mean of its three scales relative to extent, its age in images, those views' number, the
-        child's octree level (the parent's, one more for a split), the time, and whether it is a split; then
-        the root of Adam's mean squared gradient of the parent's colour, which grows with its weight in the
-        images, and the ratio of the parent's smallest to its largest scale.
+        opacity, the mean of its three scales relative to extent, its age in images, the number of these
+        views, the child's octree level (the parent's, one more for a split), the time, and whether it is a
+        split. These eight are the paper's. Then the root of Adam's mean squared gradient of the parent's
+        colour, which grows with the parent's weight in the images, and the ratio of the parent's smallest to
+        its largest scale.
     """
     views = table["grad_count"][rows]
     level = table["level"][rows].int()

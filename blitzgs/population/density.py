@@ -22,27 +22,28 @@ from blitzgs.view.blocks import morton_order
 
 SPLIT_SHRINK = 1.6
 CHILDREN_OF_A_SPLIT = 2
-# Columns, once there are any, that children have of their parent.
+# Columns that children inherit from their parent, if the table has these columns.
 INHERITED = (PHI, CULL, FLOOR)
-# Columns that gather what happens between density events.
+# Columns with the statistics since the last density event.
 STATISTICS = ("grad_sum", "grad_count", "max_radii")
 _ID_MASK = (1 << 63) - 1
 
 
 @dataclass(frozen=True)
 class DensityRules:
-    """What one density event does, with lengths already in the scene's unit.
+    """The thresholds of a density event, with lengths in the unit of the means.
 
     Attributes:
         grad_threshold: mean 2D-mean gradient norm (half-image units) from which a Gaussian is densified.
         clone_scale: Gaussians with a largest axis up to this are cloned, larger ones split.
-        min_opacity: Gaussians below are pruned.
-        max_screen_radius: pixels; Gaussians larger on screen since the last event are pruned. None: not.
-        max_scale: Gaussians with a larger axis are pruned. None: not.
-        max_gaussians: the event's growth stops here. None: no cap.
-        min_observations: a Gaussian is judged once it has been seen this often; until then its statistics go
-            on growing over events. A mean of few gradients is noise, and the largest of many such means would
-            turn noise into Gaussians.
+        min_opacity: Gaussians of lower opacity are pruned.
+        max_screen_radius: pixels; Gaussians with a larger radius since the last event are pruned. None: none
+            are.
+        max_scale: Gaussians with a larger axis are pruned. None: none are.
+        max_gaussians: limit of the population after the event. None: no limit.
+        min_observations: a Gaussian is judged when it has at least this many gradients; with fewer, its
+            statistics are kept for the next event. A mean of few gradients is noisy, and the largest of many
+            noisy means would make Gaussians without need.
     """
 
     grad_threshold: float
@@ -56,15 +57,15 @@ class DensityRules:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What an event did on this rank.
+    """What a density event did on this rank, as numbers of Gaussians.
 
     Attributes:
         cloned: copies made.
-        split: Gaussians that gave way to two.
-        pruned: Gaussians taken out.
-        held_back: candidates, or with relocation copies, that the cap kept back.
-        vetoed: candidates that the veto kept back.
-        relocated: dead Gaussians for which copies of live ones stand in, which count as cloned.
+        split: Gaussians that were replaced by two children.
+        pruned: Gaussians removed.
+        held_back: candidates (with relocation: copies) that the limit of the population held back.
+        vetoed: candidates that the veto withheld.
+        relocated: dead Gaussians that were replaced by copies of live ones; the copies count as cloned.
     """
 
     cloned: int
@@ -88,26 +89,27 @@ def densify(
     veto: Veto | None = None,
     lineage: Lineage | None = None,
 ) -> DensityReport:
-    """Run one density event on a table whose rows have all been caught up, and reset the statistics it used.
+    """Run one density event on a table without pending steps, and reset the statistics that it used.
 
-    A candidate has been seen `min_observations` times, and its mean gradient `grad_sum / grad_count` reaches
-    the threshold. A small one gets a copy; a
-    large one gives way to two children drawn from it, 1.6 times smaller. Children take their parent's level
-    (copy) or the next one (split), its phi and cull row, fresh moments, and an id that follows from the
-    parent's id, `time` and the child's slot alone, as do their random positions: the outcome does not depend
-    on the order of the rows.
+    A candidate is a Gaussian with at least `min_observations` gradients whose mean, `grad_sum / grad_count`,
+    reaches the threshold. A small candidate gets a copy. A large one is replaced by two children that are
+    drawn from it and are 1.6 times smaller (Kerbl et al. 2023, section 5). A copy has its parent's octree
+    level, a child of a split the next one. Both have the parent's phi and cull row, and moments of zero.
+    Their ids and random positions depend only on the parent's id, `time` and the child's slot, so the result
+    does not depend on the order of the rows.
+
     Pruning applies to old and new rows; a new row has no screen radius yet.
 
     Args:
         table: changed in place; left in `morton_order`.
         rules: thresholds.
-        time: of the event, in images.
-        step: the optimiser step just taken; new rows stand there.
-        seed: of the run.
-        level_count: number of octree levels K; children stay below.
-        ranks: whose tables together make the population; every rank calls this.
-        extent: of the scene, in the unit of the means; for the candidates' features alone.
-        veto: tells which candidates do not grow; None: all do.
+        time: time of the event, in images.
+        step: the latest optimiser step; new rows are current up to it.
+        seed: seed of the run.
+        level_count: number of octree levels K; levels of children stay below it.
+        ranks: the job, whose tables together are the population; every rank calls this.
+        extent: extent of the scene, in the unit of the means; only used for the candidates' features.
+        veto: returns which candidates are withheld; None: none are.
         lineage: logs births and deaths, or None.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
@@ -151,7 +153,7 @@ def densify(
 
 @torch.no_grad()
 def cap_opacities(table: GaussianTable, opacity: float) -> None:
-    """Cap the opacities of all rows, which must have been caught up, and clear the moments of all opacities.
+    """Cap the opacities of all rows and set the moments of all opacities to zero; no step may be pending.
 
     Args:
         table: changed in place.
@@ -164,7 +166,7 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
 
 @torch.no_grad()
 def decay_opacities(table: GaussianTable, share: float) -> None:
-    """Take a share of its opacity from every row, all of which must have been caught up.
+    """Reduce the opacity of every row by a share of itself; no optimiser step may be pending.
 
     The logit l of the opacity o becomes that of (1 - share) o: l + log(1 - share) - log(1 + share e^l), which
     neither cancels where o is close to 1 nor overflows.
@@ -174,7 +176,7 @@ def decay_opacities(table: GaussianTable, share: float) -> None:
         share: in [0, 1).
     """
     if share > 0:
-        # In float64, so that CPU and GPU round to the same.
+        # In float64, so that CPU and GPU round to the same float32 numbers.
         logits = table["opacities"].double()
         table["opacities"].copy_(logits + (math.log1p(-share) - softplus(logits + math.log(share))))
 
@@ -235,7 +237,7 @@ def _shrink(children: dict[str, Tensor], seed: int, time: int) -> None:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Return the rotation matrices [M, 3, 3] of quaternions (w, x, y, z) [M, 4], normalised first."""
+    """Normalise quaternions (w, x, y, z) [M, 4] and return their rotation matrices [M, 3, 3]."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-30)).unbind(1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -246,7 +248,7 @@ def rotations(quats: Tensor) -> Tensor:
 
 
 def death_causes(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRules) -> Tensor:
-    """Tell why rows have to go: `Cause.OPACITY`, else `Cause.SIZE` (screen or world); 0: they stay."""
+    """Return why each row is pruned: `Cause.OPACITY`, else `Cause.SIZE` (screen or world); 0: it is kept."""
     logit = math.log(rules.min_opacity / (1.0 - rules.min_opacity)) if rules.min_opacity > 0 else -math.inf
     causes = torch.zeros_like(rows["level"])
     if rules.max_scale is not None:
@@ -268,7 +270,7 @@ def _log(
     extent: float,
     level_count: int,
 ) -> None:
-    """Log an event, before its rows are taken out and its statistics reset."""
+    """Log an event, before its rows are removed and its statistics are reset."""
     clones, splits = parents
     rows = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
     is_split = torch.arange(len(rows), device=rows.device) >= len(clones)

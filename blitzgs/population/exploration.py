@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Almost transparent Gaussians wander, so that they find a place where the photographs need them."""
+"""Random noise on the positions of almost transparent Gaussians, which explore the scene (3DGS-MCMC)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from blitzgs.ops.position_noise import position_noise_
 class PositionNoise:
     """The noise term of 3DGS-MCMC (Kheradmand et al. 2024, eq. 8), for the Gaussians that a step sees.
 
-    Their noise is a length times the position rate times a squared length; divided by the squared extent it
-    no longer depends on the unit of the world.
+    In 3DGS-MCMC, the noise depends on the unit of length, because it contains the covariance, a squared
+    length. Here it is divided by the squared extent of the scene, so that it does not.
     """
 
     def __init__(self, factor: float, extent: float, threshold: float, seed: int) -> None:
@@ -21,15 +21,15 @@ class PositionNoise:
 
         Args:
             factor: `optimiser.position_noise`.
-            extent: of the scene, in the unit of the means.
-            threshold: opacity at which half of the noise is left; Gaussians below it are pruned.
-            seed: of the run.
+            extent: extent of the scene, in the unit of the means.
+            threshold: opacity at which the noise falls to a half; Gaussians below it are pruned.
+            seed: seed of the run.
         """
         self._factor, self._extent = factor, extent
         self._threshold, self._seed = threshold, seed
 
     def add(self, table: GaussianTable, visible_ids: Tensor, step: int, position_rate: float) -> None:
-        """Move the rows `visible_ids` (int32 [U]), whose parameters stand at `step` (from 1).
+        """Add noise to the means of rows `visible_ids` (int32 [U]), which are current up to `step`.
 
         `position_rate` is the step's learning rate of the means, in their unit.
         """

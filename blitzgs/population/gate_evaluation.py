@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a gate tells which spawns of a run survive: transfer AUC, survival by birth time and by region."""
+"""Evaluates how well a gate predicts survival in other runs: AUC, survival by birth time and by region."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from blitzgs.population.gate_fit import Spawns, judge
 from blitzgs.population.spawn_gate import SpawnGate
 
 COHORTS = 15
-# Cells of a map along its longer side, and the spawns without which a cell says nothing.
+# Cells of a map along its longer side, and the smallest number of spawns for which a cell has a value.
 CELLS, LEAST_IN_CELL = 32, 30
 
 
 def evaluate(gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, folder: Path) -> list[dict[str, Any]]:
-    """Judge a gate on runs, and draw survival.svg and regions_NAME.svg.
+    """Evaluate a gate on runs, and draw survival.svg and regions_NAME.svg.
 
     Args:
         gate: the gate.
-        runs: each with a schedule of its own, perhaps, such as a conservative one.
-        gate_from: only spawns born from here on are in the maps, images; those that a gate would judge.
-        folder: gets the pictures.
+        runs: the runs; their schedules may differ.
+        gate_from: time in images from which on a gate judges spawns; only later spawns are in the maps.
+        folder: folder for the pictures.
 
     Returns:
         For each run: `gate_fit.judge` of all its spawns and, as `judged`, of those that a gate would judge
-        (where some of these survived and some did not), whether the gate was fitted on its scene, the share
+        (if some of these survived and some did not), whether the gate was fitted on its scene, the share
         of initial Gaussians and of each birth cohort that survived, and `regions`.
     """
     results, curves = [], {}
@@ -74,9 +74,9 @@ def survival_by_cohort(run: Spawns) -> list[dict[str, float]]:
 def region_rates(
     run: Spawns, scores: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Return survival by region, seen from the side that shows most.
+    """Return survival by region, in the projection of the scene with the largest area.
 
-    The predicted survivors are as many as there were, those of the highest scores.
+    The predicted survivors are the spawns of the highest scores, as many as actually survived.
 
     Returns:
         Which cells have enough spawns, bool [rows, columns]; their actual and predicted shares of survivors,
@@ -103,7 +103,7 @@ def region_rates(
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float | None:
-    """Return Pearson's r; None where one of the two does not vary."""
+    """Return Pearson's correlation coefficient r; None if one of the two is constant."""
     if len(a) < 2 or a.std() == 0 or b.std() == 0:
         return None
     return float(np.corrcoef(a, b)[0, 1])

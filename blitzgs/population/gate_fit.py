@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fits and judges spawn gates on lineage: which candidates' children survived to the final model."""
+"""Fits spawn gates on lineage, and evaluates them: do a candidate's children survive to the final model?"""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from blitzgs.population.candidates import FEATURES
 from blitzgs.population.lineage import ABOUT, read_lineage
 from blitzgs.population.spawn_gate import GateInfo, write_info
 
-# Births of a scene that a fit takes at most, drawn evenly.
+# Largest number of births that a fit takes from a scene, drawn evenly.
 MOST_ROWS = 4_000_000
 PARAMETERS = {
     "objective": "binary:logistic",
@@ -31,9 +31,10 @@ PARAMETERS = {
     "base_score": 0.5,
 }
 ROUNDS = 150
-# Share of the rows that a leaf needs: what holds for fewer is a scene's own, and lowers the AUC on others.
+# Smallest share of the rows for a leaf. Leaves with fewer rows fit peculiarities of a scene, which lowers the
+# AUC on other scenes.
 LEAF_SHARE = 1 / 500
-# Share of a lone scene's births, by parent, that judge the fit on the others.
+# With a single scene: share of its births, by parent, that are held out to evaluate the fit on the others.
 HELD_OUT = 0.25
 
 
@@ -42,9 +43,9 @@ class Spawns:
     """The spawns of one run, K of them, without its initial Gaussians.
 
     Attributes:
-        name: of the run.
+        name: name of the run.
         scene: fingerprint of its capture.
-        schedule: fields of its configuration.
+        schedule: fields of its configuration that decide how long Gaussians live.
         features: float32 [K, F], see `candidates.FEATURES`; NaN where the log is older than a feature.
         survived: bool [K].
         parents: int64 [K].
@@ -82,11 +83,11 @@ def read_spawns(folder: Path) -> Spawns:
     """Read the spawns of a finished run from its lineage.
 
     Args:
-        folder: that of the lineage.
+        folder: folder of the lineage.
 
     Raises:
         FileNotFoundError: there is no lineage.
-        ValueError: nothing was born, or all or none of it survived.
+        ValueError: there are no spawns, or all or none of them survived.
         ImportError: pyarrow is not installed.
     """
     tables = read_lineage(folder)
@@ -119,7 +120,7 @@ def feature_columns(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
 
 
 def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
-    """Return the area under the ROC curve: the chance that a positive scores higher, ties counting half."""
+    """Return the area under the ROC curve: the probability that a positive scores higher; ties count half."""
     _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
     ends = counts.cumsum()
     ranks = (ends - (counts - 1) / 2)[inverse]
@@ -135,15 +136,16 @@ def best_feature(spawns: Spawns) -> tuple[str, float]:
 
 
 def fit(runs: Sequence[Spawns], path: Path, seed: int = 0) -> dict[str, Any]:
-    """Fit a gate on all runs, and measure how such a gate does on scenes that it has not seen.
+    """Fit a gate on all runs, and measure how well such a gate predicts on scenes that it was not fitted on.
 
-    With several scenes, one after the other is left out, a gate is fitted on the runs of the others and
-    judged on its spawns. With a single scene, a quarter of the parents is held out instead.
+    With several scenes, each scene is left out once: a gate is fitted on the runs of the other scenes and
+        evaluated on the
+    spawns of this one. With a single scene, a quarter of the parents is held out instead.
 
     Args:
-        runs: at least one.
-        path: of the model, `NAME.json`; its metadata lie beside it.
-        seed: of the draws of rows.
+        runs: at least one run.
+        path: path of the model, `NAME.json`; its metadata are written beside it.
+        seed: seed of the draws of rows.
 
     Returns:
         The figures that go into the metadata: for each run held out, the AUC of the gate, that of the best

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many Gaussians a run may have: what the photographs can resolve, and what the memory can hold."""
+"""Limits the number of Gaussians by what the photographs resolve and by what the memory holds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
 from blitzgs.view.host_table import available_bytes
 
-# Share of the memory that growth may fill; the rest is for what a step needs at its worst.
+# Share of the memory that growth may fill; the rest is a reserve for the largest needs of a step.
 MEMORY_SHARE = 0.9
 
 
@@ -21,8 +21,8 @@ class GrowthLimit:
 
     Attributes:
         count: Gaussians, over all ranks.
-        reason: what sets the limit, for the log: "memory" or the option, "population.max_gaussians",
-            "population.pixels_per_gaussian" or "population.gaussians_per_point".
+        reason: the limit that applies, for the log: "memory", or the configuration field
+            "population.max_gaussians", "population.pixels_per_gaussian" or "population.gaussians_per_point".
     """
 
     count: int
@@ -41,10 +41,11 @@ def growth_limit(
 
     Args:
         max_gaussians: a fixed limit; 0: none.
-        pixels: of all training photographs together.
-        pixels_per_gaussian: how many of them a Gaussian needs as its evidence; 0: no such limit.
-        points: of the reconstruction, which found them where the photographs show detail; 0: no such limit.
-        gaussians_per_point: how many Gaussians a point is evidence for; 0: no such limit.
+        pixels: number of pixels of all training photographs.
+        pixels_per_gaussian: number of pixels for each Gaussian; 0: no such limit.
+        points: number of points of the reconstruction, which has more points where there is more detail; 0:
+            no such limit.
+        gaussians_per_point: number of Gaussians for each point; 0: no such limit.
         memory_count: from `memory_limit`; None: no such limit.
     """
     limits = []
@@ -62,11 +63,13 @@ def growth_limit(
 
 
 def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
-    """Predict how many Gaussians all ranks together can hold; None where the CPU computes.
+    """Predict how many Gaussians fit into the memory of all ranks; None if the CPU computes. Collective.
 
-    What counts is the memory of the GPUs or, where the tables are there, of the hosts. A density event makes
-    a second copy of one column at a time, and a step needs scratch memory on the GPU that grows with the
-    population: the most that was seen beyond the table so far, per Gaussian. Every rank calls this.
+    The memory is that of the GPUs, or of the hosts if the tables are stored there. A density event makes a
+    second copy of
+    one column at a time. A step also needs scratch memory on the GPU, which is assumed to grow with the
+        population: the
+    largest amount so far beyond the table, per Gaussian.
     """
     if ranks.device.type != "cuda":
         return None
@@ -90,11 +93,11 @@ def rows_that_fit(rows: int, row_bytes: int, widest_column: int, available: int,
     """Return how many rows of a table fit into memory.
 
     Args:
-        rows: that the table has now.
-        row_bytes: of one row in all columns.
+        rows: present number of rows of the table.
+        row_bytes: bytes of one row in all columns.
         widest_column: bytes of one row in the widest column, which is copied when the table grows.
         available: bytes for the table and everything else.
-        scratch: bytes needed at the worst beyond the table of today.
+        scratch: largest number of bytes needed so far beyond the present table.
     """
     each = row_bytes + widest_column + scratch / max(rows, 1)
     return int(MEMORY_SHARE * available / each)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The importance pass: one sweep over all training views that scores every Gaussian (paper §3.2).
+"""The importance pass: one sweep over all training views that scores every Gaussian (BlitzGS, section 3.2).
 
 For view v and Gaussian i, w is the sum of alpha T over the pixels at which the renderer composites i, a is
 their number, c_rad tells whether i is visible, and c_vis whether it is in the smallest set, by descending w
@@ -9,8 +9,9 @@ their number, c_rad tells whether i is visible, and c_vis whether it is in the s
     phi_i   = (number of v with c_vis) / (number of v with c_rad + PHI_EPS)
     cull_iv = not c_vis
 
-"density" is the paper's. It rewards what a Gaussian gives each pixel, not how many pixels it covers, so large
-ones go first; "weight" is what an image loses with a Gaussian.
+"density" is the paper's score. It is the contribution per pixel, however many pixels a Gaussian covers, so
+large Gaussians are pruned first. "weight" is the total contribution, which the images lose if the Gaussian
+is pruned.
 
 The views see the Gaussians of all ranks. All sums are integers, so every result has the same bits at any
 world size and for any division of the work.
@@ -43,7 +44,7 @@ VIEW_MASS = 0.99
 PHI = "phi"
 _WORD = 32
 ScoreRule = Literal["density", "root", "weight"]
-# How a view's term grows with its pixels, of which there are less than 2^31: bits before the point.
+# Bits before the binary point of a view's term, for fewer than 2^31 pixels.
 _TERM_BITS: dict[ScoreRule, int] = {"density": 0, "root": 16, "weight": 31}
 
 
@@ -56,9 +57,9 @@ class ViewBatch:
     """Views of one image size that are surveyed together.
 
     Attributes:
-        columns: of the cull matrix, one for each view, ascending.
-        views: the same views.
-        keys: what `TileOwners` knows the views by; None: their columns.
+        columns: the views' columns in the cull matrix, ascending.
+        views: the views.
+        keys: keys of the views in `TileOwners`; None: their columns.
     """
 
     columns: Sequence[int]
@@ -68,7 +69,7 @@ class ViewBatch:
 
 @dataclass(frozen=True)
 class Importance:
-    """What a sweep found of this rank's N Gaussians.
+    """The result of a sweep for this rank's N Gaussians.
 
     Attributes:
         score: float32 [N], summed over the views.
@@ -82,7 +83,7 @@ class Importance:
     cull: Tensor
 
     def store(self, table: GaussianTable, with_cull: bool) -> None:
-        """Make phi, and cull where it is used, columns of the table, which then move with its rows."""
+        """Store phi and, if `with_cull`, the cull matrix as columns of the table."""
         table[PHI] = self.phi
         table.columns.pop(CULL, None)
         if with_cull:
@@ -100,18 +101,18 @@ def sweep(
     lod: SceneGate | None = None,
     stops: Callable[[], bool] | None = None,
 ) -> Importance:
-    """Score the Gaussians by what they contribute to V views. Collective: every rank calls it.
+    """Score the Gaussians by their contributions to V views. Collective: every rank calls it.
 
     Args:
-        scene: this rank's Gaussians, caught up.
+        scene: this rank's Gaussians, without pending optimiser steps.
         batches: the views, each once, in the same batches on every rank.
         n_views: V, columns of the cull matrix.
         options: how the views are rendered.
         ranks: the job.
-        owners: knows what tiles cost, to divide them well; the result does not depend on it.
-        rule: of the score.
-        lod: leaves Gaussians out of views as rendering does: they contribute nothing there and hide nothing;
-            None: none are left out.
+        owners: divides the tiles by their costs; the result does not depend on it.
+        rule: rule of the score.
+        lod: leaves Gaussians out of views as rendering does; there they contribute nothing and hide nothing.
+            None: no gate.
         stops: whether to give up, asked before each batch but the first; the same answer on every rank. None:
             never.
 
@@ -138,7 +139,7 @@ def is_culled(cull: Tensor, column: int) -> Tensor:
 
 
 def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> TileAssignment | None:
-    """Divide the tiles of a batch among the ranks; no loss looks beyond their borders."""
+    """Divide the tiles of a batch among the ranks, without a halo, which only a loss needs."""
     if owners.ranks.world_size == 1:
         return None
     views, keys = batch.views, batch.columns if batch.keys is None else batch.keys
@@ -147,11 +148,11 @@ def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Til
 
 
 class _Sums:
-    """What the views surveyed so far add up to, for N Gaussians."""
+    """The sums over the views surveyed so far, for N Gaussians."""
 
     def __init__(self, count: int, n_views: int, device: torch.device, rule: ScoreRule) -> None:
         self._rule = rule
-        # Terms are integers in units that let those of all views be added up in 62 bits.
+        # Terms are integers in a unit for which the sum over all views fits into 62 bits.
         self._unit = 2.0 ** -min(48, 62 - n_views.bit_length() - _TERM_BITS[rule])
         self._sums = ViewSums(
             torch.zeros(count, dtype=torch.int64, device=device),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first Gaussians: voxels of the SfM cloud at several resolutions."""
+"""Makes the first Gaussians from voxels of the SfM cloud at several resolutions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from blitzgs.ops.voxel_keys import voxel_keys
 from blitzgs.view.levels import Levels
 
 SH_C0 = 0.28209479177387814
-# Two voxel centres may coincide; their Gaussians still need a size. Relative to the coarsest voxel.
+# Smallest size of a first Gaussian, relative to the coarsest voxel: two voxel centres may coincide.
 SMALLEST_SPACING = 1e-4
 _CELL_BITS = 21
 
@@ -84,7 +84,7 @@ def octree_gaussians(
 
 
 def _grid_origin(points: Tensor, levels: Levels) -> Tensor:
-    """Lower corner of the grids: below every point, unless stray points would overflow the finest grid."""
+    """Return the lower corner of the grids: below all points, unless outliers overflow the finest grid."""
     reach = levels.voxel_size_of(levels.count - 1) * 2 ** (_CELL_BITS - 1)
     return torch.maximum(points.amin(dim=0), points.median(dim=0).values - reach)
 
@@ -92,7 +92,7 @@ def _grid_origin(points: Tensor, levels: Levels) -> Tensor:
 def _voxels(points: Tensor, colors: Tensor, origin: Tensor, size: float) -> tuple[Tensor, Tensor]:
     """Return centres and mean colours (0..255) of the occupied voxels, float64 [C, 3] each, in key order.
 
-    Stray points beyond the grid are left out: their clamped cells would be somewhere else.
+    Outliers beyond the grid are left out, because their clamped cells would be at another position.
     """
     inside = ((points >= origin) & (points < origin + size * 2**_CELL_BITS)).all(dim=1)
     keys, cell_of = voxel_keys(points[inside], origin.tolist(), size).unique(return_inverse=True)
@@ -104,7 +104,7 @@ def _voxels(points: Tensor, colors: Tensor, origin: Tensor, size: float) -> tupl
 
 
 def _share_of_cameras(means: Tensor, centres: Tensor, farthest: float) -> Tensor:
-    """Share of the cameras within `farthest` of each mean, float64 [C]."""
+    """Return the share of the cameras within `farthest` of each mean, float64 [C]."""
     if math.isinf(farthest):
         return torch.ones(len(means), dtype=torch.float64)
     places = means.to(centres.device)
@@ -115,7 +115,7 @@ def _share_of_cameras(means: Tensor, centres: Tensor, farthest: float) -> Tensor
 
 
 def _spacing(means: Tensor) -> Tensor:
-    """Mean distance of the 3 nearest neighbours, float64 [C]; of fewer when there are fewer points."""
+    """Return the mean distance to the 3 nearest neighbours (or fewer, if there are fewer), float64 [C]."""
     neighbours = min(3, len(means) - 1)
     if neighbours == 0:
         return torch.ones(1, dtype=torch.float64)

@@ -8,9 +8,9 @@ their names:
   (NaN for the initial model but for `time`, 0);
 - deaths: id, time (in images), cause (`Cause`).
 
-A Gaussian that has no death is alive. At each checkpoint births - deaths must be the live population, in
-number and in the sum of the hashes of all ids, or the run fails. A run that goes on from a checkpoint drops
-the parts written after it.
+A Gaussian without a death is alive. At each checkpoint, births - deaths must equal the live population, in
+number and in the sum of the hashes of all ids, or the run fails. A run that is resumed from a checkpoint
+deletes the parts written after it.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from blitzgs.ops.counter_random import hash_keys
 from blitzgs.output import new_file, write_file
 from blitzgs.population.candidates import FEATURES
 
-# What was trained: the capture's name and fingerprint, and the schedule under which its Gaussians lived.
+# File that describes the run: the capture's name and fingerprint, and the schedule.
 ABOUT = "about.json"
 _PART = re.compile(r"(births|deaths)_(\d{8})_(\d{4})_(\d{4})\.parquet")
-# Rows that stay in the memory of the device, some 60 bytes each, before they are written behind the training;
-# what is left at a checkpoint holds it up.
+# Number of rows, some 60 bytes each, that are kept in device memory before a thread writes them during
+# training. The remaining rows are written at a checkpoint, which waits for them.
 _MOST_PENDING = 1 << 17
 # The columns of each table, in order: those that are kept as int64, with their types in the log, and those of
 # float32.
@@ -53,7 +53,7 @@ class Cause(enum.IntEnum):
 
     OPACITY = 1  # too transparent at a density event
     SIZE = 2  # too large there, on screen or in the world
-    SPLIT = 3  # gave way to its children
+    SPLIT = 3  # replaced by its children
     PASS_1 = 4  # not drawn by the first importance pass
     PASS_2 = 5  # outside the mass that the second pass keeps
     LATE_OPACITY = 6  # within it, but too transparent
@@ -72,7 +72,7 @@ class Births:
         ids: int64 [M].
         parents: int64 [M].
         means: float32 [M, 3].
-        features: float32 [M, F], of the candidates that they come from.
+        features: float32 [M, F], features of the candidates.
     """
 
     ids: Tensor
@@ -83,11 +83,11 @@ class Births:
 
 @dataclass(frozen=True)
 class Ledger:
-    """What was born and died so far, over all ranks; part of a checkpoint.
+    """Totals of births and deaths so far, over all ranks; part of a checkpoint.
 
     Attributes:
-        births: number.
-        deaths: number.
+        births: number of births.
+        deaths: number of deaths.
         id_sum: sum of the hashed ids of births less that of deaths, modulo 2^64, as a signed integer.
     """
 
@@ -102,14 +102,14 @@ class Lineage:
     def __init__(
         self, folder: Path, ranks: Ranks, step: int, ledger: Ledger, about: dict[str, Any] | None = None
     ) -> None:
-        """Begin, or go on from a checkpoint. Collective.
+        """Begin a log, or continue one from a checkpoint. Collective.
 
         Args:
-            folder: of the parts, made if missing; of all ranks.
+            folder: folder of the parts of all ranks, made if missing.
             ranks: the job.
-            step: optimiser step of the checkpoint; parts of later ones are deleted. 0: all are.
-            ledger: of the checkpoint.
-            about: what is trained, for the file `ABOUT`.
+            step: optimiser step of the checkpoint; parts of later steps are deleted. 0: all parts are.
+            ledger: ledger of the checkpoint.
+            about: description of the run, for the file `ABOUT`.
 
         Raises:
             ImportError: pyarrow is not installed.
@@ -132,7 +132,7 @@ class Lineage:
         self._unwritten: list[tuple[str, dict[str, Tensor], OSError]] = []
 
     def describe(self, about: dict[str, Any]) -> None:
-        """Say what is trained, for the file `ABOUT`; one rank calls this."""
+        """Write the description of the run to the file `ABOUT`; one rank calls this."""
         write_file(self._folder / ABOUT, json.dumps(about, indent=1) + "\n")
 
     def born(self, births: Births, step: int) -> None:
@@ -147,7 +147,7 @@ class Lineage:
         Args:
             ids: int64 [M].
             causes: [M], values of `Cause`.
-            time: of the event, in images.
+            time: time of the event, in images.
             step: optimiser step.
         """
         self._count(ids, births=False)
@@ -155,14 +155,16 @@ class Lineage:
         self._log("deaths", columns, torch.empty(len(ids), 0, device=ids.device), step)
 
     def settle(self, ids: Tensor, step: int) -> Ledger:
-        """Write what is pending and check the books, before a checkpoint is written. Collective.
+        """Write all pending rows and check that births - deaths is the population. Collective.
+
+        Call this before a checkpoint is written.
 
         Args:
-            ids: int64 [N], of this rank's live Gaussians.
+            ids: int64 [N], ids of this rank's live Gaussians.
             step: optimiser step.
 
         Returns:
-            The ledger up to now.
+            The present ledger.
 
         Raises:
             LineageError: on every rank, when births - deaths is not the live population.
@@ -200,7 +202,7 @@ class Lineage:
         self._writing.clear()
 
     def close(self) -> None:
-        """Stop writing; what was not settled is lost, as is the training since then."""
+        """Stop writing; rows since the last `settle` are lost, as is the training since then."""
         self._writer.shutdown(wait=True, cancel_futures=True)
 
     def _count(self, ids: Tensor, births: bool) -> None:
@@ -209,14 +211,14 @@ class Lineage:
         self._sums[2] += sign * hash_keys(ids).sum()
 
     def _log(self, table: str, ints: tuple[Tensor, ...], floats: Tensor, step: int) -> None:
-        # Copies, on the device: the host waits once for very many rows, not at every event.
+        # Keep copies on the device, so that the host waits once for many rows and not at every event.
         self._pending[table].append(_Block(torch.stack(ints, 1), floats))
         self._rows += len(floats)
         if self._rows > _MOST_PENDING:
             self._flush(step)
 
     def _flush(self, step: int) -> None:
-        """Have the pending rows written by another thread."""
+        """Let another thread write the pending rows."""
         for table, blocks in self._pending.items():
             if not blocks:
                 continue
@@ -229,10 +231,10 @@ class Lineage:
     def _write(self, name: str, columns: dict[str, Tensor]) -> None:
         arrow, parquet = self._parquet
         try:
-            # On the disk when `settle` returns: the checkpoint that follows counts on it.
+            # The file must be on disk when `settle` returns, because the checkpoint refers to it.
             with new_file(self._folder / name) as partial:
                 table = arrow.table({key: column.numpy() for key, column in columns.items()})
-                # Ids and floats hardly repeat: a dictionary would take longer and save nothing.
+                # Ids and floats hardly repeat, so a dictionary would take time and save nothing.
                 parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
         except OSError as error:
             self._unwritten.append((name, columns, error))
@@ -246,7 +248,7 @@ class _Block(NamedTuple):
 
 
 def _columns(table: str, blocks: list[_Block]) -> dict[str, Tensor]:
-    """Bring rows to the CPU, as the columns of the log."""
+    """Copy rows to the CPU and return them as the columns of the log."""
     ints = torch.cat([block.ints for block in blocks]).t().contiguous().cpu()
     floats = torch.cat([block.floats for block in blocks]).t().contiguous().cpu()
     typed = {name: column.to(dtype) for (name, dtype), column in zip(_INTS[table].items(), ints, strict=True)}
@@ -286,7 +288,7 @@ def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def initial_births(ids: Tensor, parents: Tensor, means: Tensor) -> Births:
-    """Return the births of a model's first Gaussians, which were no candidates."""
+    """Return the births of a model's first Gaussians, whose features are NaN."""
     features = torch.full((len(ids), len(FEATURES)), torch.nan, device=ids.device)
     features[:, FEATURES.index("time")] = 0
     return Births(ids, parents, means, features)
@@ -303,7 +305,7 @@ def ledger_state(ledger: Ledger) -> dict[str, int]:
 
 
 def _wrapped(value: int) -> int:
-    """Take an integer modulo 2^64, signed."""
+    """Return an integer modulo 2^64, as a signed integer."""
     return (value + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
@@ -312,7 +314,7 @@ def _same_number(ledger: Ledger, live: int) -> str:
 
 
 def import_pyarrow() -> tuple[ModuleType, ModuleType]:
-    """Return pyarrow and pyarrow.parquet, or say what to install."""
+    """Return pyarrow and pyarrow.parquet; raise ImportError with the remedy if they are not installed."""
     try:
         import pyarrow
         import pyarrow.parquet

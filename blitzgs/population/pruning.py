@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two pruning passes of the paper (§3.2): which Gaussians stay, the same at every world size."""
+"""The two pruning passes (BlitzGS, section 3.2), with the same result at every world size."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from blitzgs.distributed.selection import mass_prefix, sampling_keys, smallest
 def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:
     """Draw the Gaussians that pass 1 keeps: without replacement, with probability proportional to score.
 
-    The floor(keep N) smallest of -log(u) / score stay (exponential races, Efraimidis and Spirakis 2006),
-    where u depends on (seed, event, id) alone. A score of zero is kept only when all positive ones are.
+    The Gaussians with the floor(keep N) smallest values of -log(u) / score are kept (exponential races,
+    Efraimidis and Spirakis 2006), where u depends only on (seed, event, id). A Gaussian with score zero is
+    kept only if all with positive scores are.
 
     Args:
         score: float32 [N_rank], >= 0.
         ids: int64 [N_rank], persistent.
         keep: share of all ranks' N Gaussians, in [0, 1]; its decimal value counts.
-        seed: of the run.
+        seed: seed of the run.
         event: number that differs between draws, such as the time of the pass.
         ranks: the job; every rank calls this.
 
@@ -34,14 +35,14 @@ def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: i
 
 
 def top_by_score(score: Tensor, ids: Tensor, mass: float, keep: float, ranks: Ranks) -> Tensor:
-    """Choose the Gaussians whose scores pass 2 keeps: a prefix by descending score.
+    """Choose the Gaussians that pass 2 keeps: a prefix of the order by descending score.
 
     Args:
         score: float32 [N_rank], finite, >= 0.
         ids: int64 [N_rank], persistent; they decide between equal scores.
-        mass: the prefix is the smallest that holds this share of the total score of all ranks, in [0, 1];
-        keep: or, where that is shorter, it has floor(keep N) of all ranks' N Gaussians; in [0, 1], its
-            decimal value counts.
+        mass: the prefix is the shortest that holds this share of the total score of all ranks, in [0, 1].
+        keep: the prefix has at most floor(keep N) of all ranks' N Gaussians; in [0, 1], its decimal value
+            counts.
         ranks: the job; every rank calls this.
 
     Returns:

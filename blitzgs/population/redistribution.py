@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps the shards of a model equally long: rows move, with everything known about them (paper §3.1)."""
+"""Redistributes the rows of a model so that the ranks' shards have equal lengths (BlitzGS, section 3.1)."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from blitzgs.model import GaussianTable
 
 
 def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = 1.1) -> bool:
-    """Deal the rows anew when the shards have become unequal: position p of the global order to rank p mod M.
+    """If the shards have become unequal, move the row at position p of the global order to rank p mod M.
 
-    Collective: every rank calls it. All columns move; the order of the rows is the global order.
+    Collective: every rank calls it. All columns are moved; each shard has its rows in the global order.
 
     Args:
         table: this rank's shard, changed in place.
         ranks: the job.
-        max_imbalance: largest over smallest shard up to which nothing happens; 0 deals in any case.
+        max_imbalance: nothing happens up to this ratio of the largest to the smallest shard; 0: always
+            redistribute.
 
     Returns:
-        Whether rows were dealt.
+        Whether rows were redistributed.
     """
     if ranks.world_size == 1:
         return False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relocation (3DGS-MCMC): dead Gaussians become copies of live ones, which share what the live one did."""
+"""Relocation (3DGS-MCMC): replaces dead Gaussians by copies of live ones."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from blitzgs.population.density import (
 from blitzgs.population.lineage import Births, Cause, Lineage
 from blitzgs.view.blocks import morton_order
 
-# Of one Gaussian in one event, itself included; the paper's code has the same limit.
+# Largest number of copies of one Gaussian in one event, itself included; 3DGS-MCMC's code has the same limit.
 MOST_COPIES = 51
-# Opacities are drawn by as integers in units of 2^-31, whose sums no order of adding changes.
+# Opacities are the weights of the draw, as integers in units of 2^-31, so that sums do not depend on the
+# order.
 _WEIGHT_BITS = 31
 
 
@@ -44,29 +45,31 @@ def relocate(
     level_count: int = 1,
     lineage: Lineage | None = None,
 ) -> DensityReport:
-    """Move the dead Gaussians of a table whose rows have all been caught up onto live ones, and let it grow.
+    """Replace dead Gaussians by copies of live ones, and let the population grow; no step may be pending.
 
-    Dead are those that density control would prune. As many copies are made as keep the population, and
-    `growth` more, drawn from the live ones by their opacity (Kheradmand et al. 2024, "3D Gaussian Splatting
-    as Markov Chain Monte Carlo", section 3.4). A Gaussian and its copies lie at one place and share opacity
-    and size such that together they look as it did (`shared`). Both begin with fresh moments. Copies have the
-    level, phi and cull row of what they are copies of, and no statistics. Draws and ids follow from (seed,
-    time, id) alone, so that the outcome depends neither on the order of the rows nor on the number of ranks.
+    Dead Gaussians are those that density control would prune. The number of copies is that of the dead plus
+    the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity
+    (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", section 3.4). A Gaussian and
+    its copies have one position, and share opacity and size such that together they look like the Gaussian
+    before (`shared`). All of them get moments of zero. Copies have the level, phi and cull row of the
+    Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
+    depends neither on the order of the rows nor on the number of ranks.
 
     Args:
         table: changed in place; left in `morton_order`.
-        rules: who is dead, and the cap of the growth.
+        rules: thresholds for dead Gaussians, and the limit of the population.
         growth: share of the population that the event adds.
-        time: of the event, in images.
-        step: the optimiser step just taken; new rows stand there.
-        seed: of the run.
-        ranks: whose tables together make the population; every rank calls this.
-        extent: of the scene, in the unit of the means; for the lineage's features alone.
-        level_count: number of octree levels; for the same.
+        time: time of the event, in images.
+        step: the latest optimiser step; new rows are current up to it.
+        seed: seed of the run.
+        ranks: the job, whose tables together are the population; every rank calls this.
+        extent: extent of the scene, in the unit of the means; only used for the lineage's features.
+        level_count: number of octree levels; only used for the lineage's features.
         lineage: logs births and deaths, or None.
 
     Returns:
-        The report; `cloned` counts all copies on this rank, `relocated` the dead that they stand in for.
+        The report; `cloned` is the number of all copies on this rank, `relocated` that of the dead they
+        replace.
     """
     causes = death_causes(table.columns, table["max_radii"], rules)
     dead = causes != 0
@@ -95,9 +98,10 @@ def relocate(
 
 
 def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Return opacity and scales of each of N Gaussians at one place that together look as one did.
+    """Return opacity and scales for N Gaussians at one position that together look like one Gaussian.
 
-    Along a line through the centre, the integral of what N Gaussians composite is that of the one: with
+    Along a line through the centre, the integral of what the N Gaussians composite equals that of the one
+        Gaussian: with
     o' = 1 - (1 - o)^(1/N),
 
         s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k + 1)
@@ -127,20 +131,20 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
 def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: Ranks) -> Tensor:
     """Draw `count` times in proportion to weights, over all ranks.
 
-    The expectation of each row is that of a multinomial draw, count w / sum(w). Its whole part is certain,
-    and its fraction is drawn for without replacement: as random as it has to be, and exactly `count` in all,
-    but that no row is drawn `MOST_COPIES` times.
+    The expectation for each row is count w / sum(w), as in a multinomial draw. A row gets the integer part of
+    this number for certain; the fractional parts are drawn without replacement. This has the least variance,
+    and exactly `count` draws in all, except that no row is drawn `MOST_COPIES` times.
 
     Args:
         weights: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks.
         count: below 2^31.
         ids: int64 [N_rank], persistent.
-        seed: of the run.
-        time: of the event, in images.
+        seed: seed of the run.
+        time: time of the event, in images.
         ranks: the job; every rank calls this.
 
     Returns:
-        int64 [N_rank], how often each was drawn; the same for the same ids at every world size. Zeros where
+        int64 [N_rank], how often each row was drawn, the same for the same ids at every world size. Zeros if
         all weights are 0.
     """
     total = int(ranks.all_reduce(weights.sum()))
@@ -148,16 +152,16 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
         return torch.zeros_like(weights)
     whole = weights * count // total
     rest = count - int(ranks.all_reduce(whole.sum()))
-    # Other draws use their event's time, from 0 up: a negative one gives keys of its own.
+    # Other draws use their event's time, which is >= 0, so a negative number gives separate keys.
     keys = sampling_keys((weights * count % total).float(), ids, seed, -1 - time)
     return (whole + smallest(keys, ids, rest, ranks)).clamp(max=MOST_COPIES - 1)
 
 
 def _share(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
-    """Give the rows `sources` what is theirs when they become so many, and fresh moments, in place."""
+    """Set opacities and scales of the rows `sources` to their shares, and their moments to zero."""
     opacities, scales = shared(table["opacities"][sources], table["scales"][sources], copies)
     if min_opacity > 0:
-        # Sharing must not put a Gaussian that was just above the limit below it: it would count as dead.
+        # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead.
         opacities = opacities.clamp(min=math.log(min_opacity / (1.0 - min_opacity)))
     table["opacities"][sources] = opacities.float()
     table["scales"][sources] = scales.float()
@@ -166,9 +170,9 @@ def _share(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: f
 
 
 def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step: int) -> dict[str, Tensor]:
-    """Return new rows, copies of `rows`, in which each source is repeated as often as `counts` says."""
+    """Return new rows that copy each of `rows` as often as `counts` has it."""
     first = counts.cumsum(0) - counts
-    # Slots behind those of clones and splits, which may have the same parents in the same event.
+    # Use slots after those of clones and splits, which may have the same parents in the same event.
     slots = torch.arange(len(rows), device=rows.device) - first.repeat_interleave(counts)
     slots += CHILDREN_OF_A_SPLIT + 1
     inherited = [*PARAMETERS, "level", *(name for name in INHERITED if name in table)]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The smallest scales that the photographs can tell apart: no Gaussian gets thinner than a share of a pixel.
+"""Limits the scales of Gaussians from below, by a share of a pixel of the finest training view.
 
 Mip-Splatting (Yu et al. 2024, section 4.1) convolves every Gaussian with a filter of the size of its sampling
-interval, the width of a pixel at its depth in the view that samples it most finely. A floor under the scales
-bounds their frequencies alike, and needs no work where Gaussians are projected, exported or viewed.
+interval, the width of a pixel at its depth in the view that samples it most finely. A floor of the scales
+limits the frequencies in the same way, and projection, export and viewers need not know it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from blitzgs.model import GaussianTable
 from blitzgs.pipeline import Views
 
 FLOOR = "scale_floor"
-# Part of the image's size by which a mean may lie outside and still count as sampled.
+# A mean may be outside the image by this share of its size and still count as sampled.
 MARGIN = 0.15
-# The logarithm of a floor that never binds; finite, as all columns of a checkpoint are.
+# Logarithm of a floor that has no effect. It is finite, because all columns of a checkpoint must be.
 _NO_FLOOR = -80.0
 
 
@@ -33,11 +33,11 @@ def scale_floors(means: Tensor, views: Iterable[Views], near_plane: float, pixel
 
     Args:
         means: [N, 3].
-        views: of the training, in groups of one image size.
+        views: the training views, in groups of one image size.
         near_plane: in the unit of the means.
         pixels: standard deviation in pixels.
     """
-    # Axis by axis in float64: the rounded result does not depend on how many rows a rank has.
+    # Compute in float64, axis by axis, so that the rounded result does not depend on the number of rows.
     x, y, z = means.double().unbind(1)
     interval = torch.full_like(x, torch.inf)
     for group in views:

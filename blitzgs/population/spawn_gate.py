@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spawn gate: withholds the candidates of densification that a predictor ranks lowest (paper §3.2).
+"""The spawn gate: withholds the candidates that a predictor ranks lowest (BlitzGS, section 3.2).
 
 A gate is a gradient-boosted tree model in XGBoost's JSON, `NAME.json`, and beside it `NAME.meta.json` with
-what it was fitted on (`GateInfo`). Only the order of its scores counts, so that one predictor serves scenes
-with very different numbers of candidates. The trees are evaluated here, in integers: the same order on every
-device and at every world size, and training needs no XGBoost.
+what it was fitted on (`GateInfo`). Only the order of its scores is used, so one predictor suits scenes with
+very different numbers of candidates. BlitzGS evaluates the trees itself, in integers, so the order is the
+same on every device and at every world size, and training does not need XGBoost.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from blitzgs.ops.tree_sums import tree_sums
 from blitzgs.population.candidates import FEATURES, Candidates
 
 FORMAT = 1
-# Names the gate that comes with BlitzGS, for configs/compact.yaml.
+# Name of the gate that is included in BlitzGS, for configs/compact.yaml.
 DEFAULT = "default"
 _SHIPPED = Path(__file__).with_name("gates") / "compact.json"
-# Leaf values enter as integers in units of 2^-32.
+# Leaf values are rounded to integers in units of 2^-32.
 _LEAF_BITS = 32
 
 
 class GateError(ValueError):
-    """A gate's files are missing, damaged or of another kind; says which and why."""
+    """A gate's files are missing, damaged or of another kind; the message names the file and the reason."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class GateInfo:
 
     Attributes:
         features: names of the model's inputs, in order.
-        schedule: fields of the configuration under which its Gaussians lived.
+        schedule: fields of the configurations of the runs that it was fitted on.
         scenes: {"name": fingerprint} of the captures.
-        auc: what was measured, see `blitzgs.population.gate_fit`.
+        auc: measured figures, see `blitzgs.population.gate_fit`.
     """
 
     features: tuple[str, ...]
@@ -61,7 +61,7 @@ def gate_file(name: str) -> Path:
 
 
 def info_path(path: Path) -> Path:
-    """Return where the metadata of a model file lie."""
+    """Return the path of the metadata of a model file."""
     return path.with_suffix(".meta.json")
 
 
@@ -132,10 +132,10 @@ class SpawnGate:
 
 
 class RankVeto:
-    """Vetoes the share of the candidates, clones and splits apart, with the lowest scores over all ranks."""
+    """Vetoes the share of clones, and of splits, with the lowest scores over all ranks."""
 
     def __init__(self, gate: SpawnGate, rate: float) -> None:
-        """Veto by a gate's scores; `rate` is the share, in [0, 1]."""
+        """Veto by a gate's scores; `rate` is the vetoed share, in [0, 1]."""
         self._gate, self._rate = gate, rate
 
     def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
@@ -144,7 +144,7 @@ class RankVeto:
 
 
 class RandomVeto:
-    """Vetoes as many candidates at random, the same ones at every world size."""
+    """Vetoes a share of clones, and of splits, at random, the same ones at every world size."""
 
     def __init__(self, rate: float, seed: int) -> None:
         """Veto a share `rate` of the candidates."""
@@ -161,8 +161,8 @@ def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Rank
 
     Args:
         scores: float32 [M].
-        candidates: of this rank.
-        rate: in [0, 1]; its decimal value counts.
+        candidates: candidates of this rank.
+        rate: vetoed share in [0, 1]; its decimal value counts.
         ranks: the job; every rank calls this.
 
     Returns:
@@ -211,7 +211,7 @@ class _Trees:
 
     @classmethod
     def of(cls, model: dict[str, Any]) -> _Trees:
-        """Take the trees out of a model."""
+        """Read the trees of a model."""
         learner = model["learner"]
         objective, count = learner["objective"]["name"], int(learner["learner_model_param"]["num_feature"])
         if objective != "binary:logistic" or count != len(FEATURES):
@@ -251,7 +251,7 @@ def _depth(left: list[int], right: list[int]) -> int:
     """Return how many comparisons the longest path through a tree has.
 
     Raises:
-        ValueError: the children of a node lie outside the tree, or it is no tree.
+        ValueError: a child of a node is outside the tree, or the nodes do not form a tree.
     """
     depth, level, met = 0, [0], 1
     while level := [child for node in level for child in (left[node], right[node]) if left[node] >= 0]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of spawns: a run's lineage reduced to one small file from which a gate can be fitted elsewhere."""
+"""Samples of spawns: reduces a run's lineage to one small file from which a gate can be fitted elsewhere."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from blitzgs.population.gate_fit import Spawns, feature_columns
 from blitzgs.population.lineage import import_pyarrow
 
 SUFFIX = ".parquet"
-# Rows of a sample; a row takes some 40 bytes.
+# Number of rows of a sample; a row takes some 40 bytes.
 MOST_ROWS = 250_000
 _ABOUT = b"blitzgs.spawns"
-# Names the draw of parents; nothing else draws by parent under this seed.
+# Seed of the draw of parents; no other draw uses it.
 _SEED = 0x5A3B1E
 _AXES = ("x", "y", "z")
 
@@ -30,8 +30,8 @@ def write_sample(run: Spawns, path: Path, most: int = MOST_ROWS) -> float:
 
     Args:
         run: the spawns of a run.
-        path: the file, `NAME.parquet`.
-        most: how many rows to expect; with fewer spawns than this all are written.
+        path: path of the file, `NAME.parquet`.
+        most: expected number of rows; if there are fewer spawns, all are written.
 
     Returns:
         The share of the parents that was drawn.
