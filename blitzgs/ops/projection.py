@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A projection's arguments in groups, as the ops take them, and the splats that it returns."""
+"""Groups the arguments of a projection as the ops take them, and holds the splats that it returns."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VIEW_TOTALS = 4
 
 
 class ProjectedSplats(NamedTuple):
-    """What the views see, ordered by (Gaussian, view): P splats of U different Gaussians."""
+    """P splats of U different Gaussians, ordered by (Gaussian, view)."""
 
     gaussian_ids: Tensor  # int32 [P]
     camera_ids: Tensor  # int32 [P]
@@ -34,26 +34,27 @@ class ProjectedSplats(NamedTuple):
     colors: Tensor  # [P, 3]; [0, 3] without SH
     radii: Tensor  # int32 [P, 2]: half width and height of the box around alpha >= 1/255, rounded up
     tiles_touched: Tensor  # int32 [P]
-    rank_masks: Tensor  # int64 [P]: bit m set where rank m wants the splat; [0] where no rank asked
+    rank_masks: Tensor  # int64 [P]: bit m is set if rank m composites the splat; [0] without `rank_tiles`
     counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
 
 
 def splats_of(columns: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
-    """Return the splats that lie in columns with room behind them.
+    """Return the valid splats of columns that were allocated with more capacity.
 
     Args:
-        columns: those of `ProjectedSplats` but the last, and perhaps more.
+        columns: the columns of `ProjectedSplats` but the last; further ones are ignored.
         counts: `ProjectedSplats.counts`.
     """
     visible, splats = counts[:2].tolist()
     lengths = (splats, splats, visible, visible + 1, *(splats,) * 8)
-    # No views to autograd: a Function may return those, but a caller could not change them in place.
+    # Hide from autograd that these are views: a Function may return views, but its caller could not change
+    # them in place.
     with torch._C._AutoDispatchBelowADInplaceOrView():
         return ProjectedSplats._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
 
 
 class Splats(NamedTuple):
-    """Splats as compositing sees them; P of them.
+    """P splats with the columns that compositing reads.
 
     Attributes:
         means2d: [P, 2] pixels.
@@ -62,7 +63,7 @@ class Splats(NamedTuple):
         colors: [P, D].
         depths: [P].
         camera_ids: int32 [P].
-        ids: int64 [P], persistent: what breaks ties of depth.
+        ids: int64 [P], persistent ids of the Gaussians, which order splats of equal depth.
     """
 
     means2d: Tensor
@@ -74,12 +75,12 @@ class Splats(NamedTuple):
     ids: Tensor
 
     def first(self, count: int) -> Splats:
-        """Return the first `count` of them."""
+        """Return the first `count` splats."""
         return Splats(*(column[:count] for column in self))
 
 
 class ProjectionOptions(NamedTuple):
-    """How Gaussians are projected; the arguments of `project` of these names."""
+    """How Gaussians are projected; each field is the argument of `project` of this name."""
 
     width: int
     height: int
@@ -95,7 +96,7 @@ class ProjectionOptions(NamedTuple):
 
     @classmethod
     def of(cls, ints: Sequence[int], floats: Sequence[float]) -> ProjectionOptions:
-        """Return what `ints` and `floats` were of."""
+        """Return the options from which `ints` and `floats` were made."""
         width, height, tile_size, sh_degree, antialiased, raw = ints
         near_plane, far_plane, eps2d, radius_clip, *fade = floats
         return cls(
@@ -105,14 +106,14 @@ class ProjectionOptions(NamedTuple):
 
     @property
     def ints(self) -> list[int]:
-        """As the ops take them, with `floats`."""
+        """Return the integer options in the order in which the ops take them."""
         return [
             self.width, self.height, self.tile_size, self.sh_degree, int(self.antialiased), int(self.raw)
         ]  # fmt: skip
 
     @property
     def floats(self) -> list[float]:
-        """As the ops take them, with `ints`."""
+        """Return the float options in the order in which the ops take them."""
         return [self.near_plane, self.far_plane, self.eps2d, self.radius_clip, *self.fade]
 
 
@@ -134,16 +135,16 @@ class WeightedViews(NamedTuple):
 
 
 class ProjectionInputs(NamedTuple):
-    """What is projected, in the groups of arguments that the ops take.
+    """The inputs of a projection, in the groups of arguments that the ops take.
 
     Attributes:
-        gaussians: means, quats, scales, opacities and, unless there are none, sh.
+        gaussians: means, quats, scales, opacities and, if given, sh.
         cameras: viewmats, Ks.
-        options: the rest.
-        active: which Gaussians to consider, `ActiveRows`: ids, the views of each, how many ids there are,
-            of how many blocks; those behind the first may be left out. Empty: all Gaussians in all views.
-        ids: int64 [N], persistent, of the Gaussians; None: the splats' are not wanted.
-        level: uint8 [N], octree levels, where opacities fade by them (`ProjectionOptions.fade`); else None.
+        options: all other options.
+        active: the Gaussians to consider: the fields of `ActiveRows` (ids, views, length, blocks), of which
+            only ids are required. Empty: all Gaussians in all views.
+        ids: int64 [N], persistent ids of the Gaussians; None: do not return the splats' ids.
+        level: uint8 [N], octree levels, if opacities fade with them (`ProjectionOptions.fade`); else None.
     """
 
     gaussians: Sequence[Tensor]
@@ -155,16 +156,16 @@ class ProjectionInputs(NamedTuple):
 
     @property
     def n_views(self) -> int:
-        """B."""
+        """The number of views B."""
         return len(self.cameras[0])
 
     def run(self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()) -> Projected:
-        """Project.
+        """Project the Gaussians, without gradients.
 
         Args:
-            capacity: how many visible Gaussians and splats to have room for: CUDA then does not wait for
-                their number. None: as many as there are.
-            rank_tiles: the [begin, end) of the tiles that each rank composites, begins ascending.
+            capacity: numbers of visible Gaussians and splats to allocate; CUDA then does not wait for the
+                true numbers. None: wait, and allocate exactly as many as there are.
+            rank_tiles: for each rank the [begin, end) of the tiles that it composites, in ascending order.
         """
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
             list(self.gaussians),
@@ -184,12 +185,12 @@ class Projected(NamedTuple):
     """What `ProjectionInputs.run` returns.
 
     Attributes:
-        splats: with room behind them where a capacity was given; counts are None. Where the capacity was too
-            small they mean nothing.
-        ids: int64 [P], persistent, of the splats' Gaussians; [0] where none were given.
-        totals: int64 [VIEW_TOTALS + B + 2 M], on the device, right in any case: `Sizes` (an upper bound of
-            the entries); the splats of each view; and for each rank its splats and the tiles that these touch
-            there.
+        splats: columns as long as the given capacity, if there was one; `counts` is None. The contents are
+            undefined if the capacity was too small.
+        ids: int64 [P], persistent ids of the splats' Gaussians; [0] if `ProjectionInputs.ids` is None.
+        totals: int64 [VIEW_TOTALS + B + 2 M], on the device, right even if the capacity was too small:
+            `Sizes` (with an upper bound of the entries); the number of splats of each view; and for each rank
+            the number of its splats and of the tiles that these touch there.
     """
 
     splats: ProjectedSplats
@@ -198,13 +199,13 @@ class Projected(NamedTuple):
 
     @property
     def composited(self) -> Splats:
-        """What is composited of the splats."""
+        """Return the columns that compositing reads."""
         s = self.splats
         return Splats(s.means2d, s.conics, s.opacities, s.colors, s.depths, s.camera_ids, self.ids)
 
 
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
-    """`project` of grouped arguments, without gradients."""
+    """Project without gradients and wait for the number of splats; `project` with grouped arguments."""
     with torch._C._AutoDispatchBelowAutograd():
         for attempt in capacity_for(inputs).attempts():
             projected = inputs.run(attempt.sizes)
@@ -215,7 +216,7 @@ def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
 
 
 def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:
-    """Return the estimate that is kept for calls of a size."""
+    """Return the capacity estimate shared by all calls of this size."""
     means = inputs.gaussians[0]
     return _estimate(means.device, len(means), inputs.n_views)
 
