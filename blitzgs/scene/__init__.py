@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras, captures and images: what a model is trained on."""
+"""The input of training: cameras, captures and images."""

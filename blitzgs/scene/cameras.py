@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera of a capture: a pinhole view of the re-centred world, and how its image is made from its file."""
+"""Cameras of a capture: pinhole views of the re-centred world, and how each image is made from its file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One view. All lengths of the image are pixels after undistortion and downscaling."""
+    """One view; image sizes and intrinsics are in pixels after undistortion and downscaling."""
 
     name: str
     width: int
@@ -28,9 +28,9 @@ class Camera:
     image_path: Path
     mask_path: Path | None
     orientation: int
-    """EXIF orientation (1 to 8) to apply to the decoded file; 1 leaves it as it is stored."""
+    """EXIF orientation (1 to 8) to apply to the decoded file; 1: do not turn it."""
     rectification: Rectification
-    """From the file's pixels to a pinhole image, before downscaling."""
+    """Maps the file's pixels to a pinhole image, before downscaling."""
 
     @property
     def center(self) -> Float64:
@@ -44,7 +44,7 @@ def camera_centers(world_to_camera: Float64) -> Float64:
 
 
 def scaled_matrix(K: Float64, old: tuple[int, int], new: tuple[int, int]) -> Float64:
-    """K of an image resized from old to new (width, height), each axis by its own ratio.
+    """Return K of an image resized from old to new (width, height), each axis by its own ratio.
 
     With pixel centres at halves the image covers [0, width], so every entry of a row scales alike.
     """
@@ -52,12 +52,12 @@ def scaled_matrix(K: Float64, old: tuple[int, int], new: tuple[int, int]) -> Flo
 
 
 def downscaled_size(width: int, height: int, factor: float) -> tuple[int, int]:
-    """Size of an image downscaled by `factor`, each side rounded to the nearest pixel, at least 1."""
+    """Return the size of an image downscaled by `factor`, each side rounded to a pixel, at least 1."""
     return max(1, int(width / factor + 0.5)), max(1, int(height / factor + 0.5))
 
 
 def sees_any(camera: Camera, points: Float64) -> bool:
-    """Whether any of the re-centred points [M, 3] lies in front of a camera and within its image."""
+    """Tell whether any of the re-centred points [M, 3] is in front of a camera and within its image."""
     x, y, depth = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
     front = depth > 0
     u = camera.K[0, 0] * x[front] / depth[front] + camera.K[0, 2]

@@ -30,8 +30,8 @@ _LEAST_SIDE = 8
 _HEADER_THREADS = 16
 _SAMPLED_POINTS = 2000
 _MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
-# Cameras closer together than this share of the points' distance are in one place, up to rounding: the
-# parallax between them is far below a pixel.
+# Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
+# between them is far below a pixel.
 _LEAST_SPREAD = 1e-6
 
 
@@ -102,20 +102,21 @@ def load_capture(
             have one) or transforms.json / transforms_train.json.
         images: folder of the images, relative to `path`; not used for transforms.json, which has paths.
         downscale: reduce both sides of the camera model's size by this factor. A folder such as images_4 is
-            used for 4 when every image is in it with the right size; otherwise images are area-averaged when
-            they are decoded.
-        split: see `splits.split_views`: n, "val", a list file, or "auto" (what the files say, or every 8th).
+            used for 4 if it contains every image at the right size; otherwise images are downscaled by
+            averaging areas when they are decoded.
+        split: see `splits.split_views`: n, "val", a list file, or "auto" (the split of the files, or every
+            8th view).
         masks: folder of masks (NAME.png or STEM.png; black = excluded). None uses `masks/` when it exists;
             True requires it; False uses none.
-        undistort: what to do where a distorted image does not fill the pinhole image: "crop" or "mask".
+        undistort: "crop" or "mask" the part of a pinhole image that the distorted image does not cover.
         exif: "auto" turns an image by its EXIF orientation only where its stored size does not fit the camera
             and the turned one does (COLMAP itself ignores the tag); "apply" and "ignore" do as they say.
         allow_missing: drop views whose image is not on disk, with a warning, instead of failing. The world's
             origin, the extent and the split stay those of all views with a pose.
 
     Raises:
-        FileNotFoundError: nothing to load, or images are missing on disk (`MissingImagesError`).
-        ValueError: a file is damaged, or sizes, poses or options make no sense.
+        FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
+        ValueError: a file is damaged, or sizes, poses or options are invalid.
     """
     root = Path(path)
     if downscale < 1:
@@ -128,7 +129,7 @@ def load_capture(
             raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
     views, points = _read_views(root, images, downscale)
     views = sorted(_with_finite_poses(views), key=lambda view: view.name)
-    # Of all views: a photograph that is lost later moves neither the world nor the other views' split.
+    # Use all views, so that a photograph that is lost later changes neither the origin nor the split.
     centers = camera_centers(np.stack([view.world_to_camera for view in views]))
     offset = centers.mean(axis=0)
     train, test = _split(views, root, split)
@@ -171,7 +172,7 @@ def load_capture(
 
 
 def _warn_of_blind_views(cameras: list[Camera], points: Float64) -> None:
-    """Warn when most views see no point: it may be another world's model, or have another axis convention."""
+    """Warn if most views see no point: the poses may be of another world, or have another axis convention."""
     sample = points[:: max(1, len(points) // _SAMPLED_POINTS)]
     blind = [camera.name for camera in cameras if not sees_any(camera, sample)]
     if 2 * len(blind) > len(cameras):
@@ -260,7 +261,7 @@ def _with_finite_poses(views: list[_View]) -> list[_View]:
 
 
 def _existing(views: list[_View], root: Path, images: str, allow_missing: bool) -> list[int]:
-    """Indices of the views whose image is on disk."""
+    """Return the indices of the views whose image is on disk."""
     exists = [view.path.is_file() for view in views]
     missing = [view.name for view, there in zip(views, exists, strict=True) if not there]
     found = [index for index, there in enumerate(exists) if there]
@@ -288,7 +289,7 @@ def _mask_folder(root: Path, masks: str | bool | None) -> Path | None:
 
 
 def _check_masks(cameras: Sequence[Camera], folder: Path | None) -> None:
-    """Check that the masks belong to the images: pixels that should not count must not count silently."""
+    """Check that the masks belong to the images, so that no mask is ignored without a message."""
     used = {camera.mask_path for camera in cameras if camera.mask_path is not None}
     missing = sorted(str(path) for path in used if not path.is_file())
     if missing:
@@ -361,7 +362,7 @@ def _camera(
 
 
 def _orientation(view: _View, header: ImageHeader, exif: str) -> int:
-    """The orientation to apply: COLMAP ignores the tag, so the camera's own shape decides."""
+    """Return the orientation to apply: COLMAP ignores the tag, so the camera's shape decides."""
     if header.orientation == 1 or exif == "ignore":
         return 1
     if exif == "apply":
@@ -397,7 +398,7 @@ def _finite_points(points: _Points) -> _Points:
 
 
 def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_000) -> _Points:
-    """Uniform points of random colours around where the cameras look, for captures that have none."""
+    """Return uniform points of random colours in the region that the cameras look at."""
     warnings.warn(f"the capture has no points: starting from {count} random ones", stacklevel=3)
     poses = np.stack([camera.world_to_camera for camera in cameras])
     centers, axes = camera_centers(poses), poses[:, 2, :3]
@@ -410,7 +411,8 @@ def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_
     half = 0.35 * float(np.linalg.norm(centers - target, axis=1).mean())
     if half <= _LEAST_SPREAD * (1 + float(np.abs(offset).max())):
         raise ValueError(
-            "the capture has no points, and its cameras are all in one place: nothing says where the scene is"
+            "the capture has no points and all its cameras are in one place, so the position of the scene is "
+            "unknown: add points to the capture"
         )
     random = np.random.default_rng(0)
     positions = target + offset + random.uniform(-half, half, (count, 3))

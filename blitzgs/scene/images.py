@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a capture: kept compressed in memory under a budget, decoded ahead by a thread pool.
+"""The images of a capture: kept compressed in memory within a budget, and decoded ahead by threads.
 
-Two bounded caches, both dropping what was used longest ago: compressed images and decoded ones. The
-compressed form is the file itself if the file needs no work. An image that must be undistorted or downscaled
-is made once and kept as QOI, which is lossless: for an image of 1.9 megapixels decoding it takes 16 ms at
-full size and 1 ms at a quarter, where decoding, undistorting and averaging the JPEG again takes 22 and 16 ms,
-and PNG 46 and 3 ms. Nothing is written to disk. The images do not depend on budgets, threads or the order of
-calls.
+There are two bounded caches, for compressed and for decoded images; both drop the entries that were used
+longest ago. The compressed form is the file itself if the file needs no processing. An image that must be
+undistorted or downscaled is processed once and kept as QOI, which is lossless. For an image of 1.9
+megapixels, decoding the QOI takes 16 ms at full size and 1 ms at a quarter; decoding, undistorting and
+averaging the JPEG again takes 22 and 16 ms, and PNG 46 and 3 ms. Nothing is written to disk. The images do
+not depend on budgets, threads or the order of calls.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MAPS_KEPT = 4
 
 
 class BoundedCache(Generic[K, V]):
-    """Least-recently-used entries within a budget of bytes; one that exceeds it alone is not kept."""
+    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored."""
 
     def __init__(self, budget: int) -> None:
         """Hold at most `budget` bytes."""
@@ -50,7 +50,7 @@ class BoundedCache(Generic[K, V]):
         self._lock = threading.Lock()
 
     def get(self, key: K) -> V | None:
-        """The entry, now the most recently used; None when it is not there."""
+        """Return the entry and mark it as the most recently used; None if it is not stored."""
         with self._lock:
             if key not in self._entries:
                 return None
@@ -73,14 +73,14 @@ class BoundedCache(Generic[K, V]):
 
 @dataclass(frozen=True)
 class ImageMemory:
-    """Host memory that images took at most so far, its bounds, and the work done for it.
+    """The largest host memory that images have taken so far, its limits, and the number of decodings.
 
     Attributes:
-        compressed_bytes: of compressed images.
-        compressed_budget: its bound.
-        decoded_bytes: of decoded images and masks; those being handed over come on top.
-        decoded_budget: its bound.
-        decoded: images and masks that were decoded, as often as they were.
+        compressed_bytes: bytes of compressed images.
+        compressed_budget: limit of these bytes.
+        decoded_bytes: bytes of decoded images and masks, without those that a caller holds.
+        decoded_budget: limit of these bytes.
+        decoded: number of decodings of images and masks.
     """
 
     compressed_bytes: int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which views are held out: every n-th, those of a list file, or those in Mega-NeRF's `val/` folder."""
+"""Chooses the held-out views: every n-th, those of a list file, or those in Mega-NeRF's `val/` folder."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From any lens to a pinhole camera: which pixels the new image has, and where each comes from.
+"""Converts images of any lens to pinhole images: chooses the new pixels and maps them to the old image.
 
 The new camera keeps the focal lengths and the principal ray, so the resolution at the centre does not change,
 and its pixel grid continues the old one. "crop" keeps the largest rectangle found in which every pixel was

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How projected splats reach the ranks that composite them, and how their gradients return."""
+"""Sends projected splats to the ranks that composite them, and returns their gradients."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def open_transport(ranks: Ranks, half: bool = False) -> Transport:
 
     Args:
         ranks: the job; the transport is valid until it ends.
-        half: send splats in half precision, see `collective.HalfCodec`. Such travel by collectives.
+        half: send splats in half precision, which only the collective transport can; see
+            `collective.HalfCodec`.
     """
     if ranks.world_size == 1:
         return LocalTransport()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats carried by an all-to-all of NCCL or Gloo, and their gradients by another."""
+"""Sends splats, and returns their gradients, by an all-to-all of NCCL or Gloo."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from blitzgs.ops.splat_gradients import SplatGradients
 
 
 class CollectiveTransport:
-    """For ranks that do not reach each other's memory.
+    """The transport for ranks that do not reach each other's memory.
 
     The ranks show each other how many splats each has for whom; the host waits for these numbers. Splats are
     then packed by rank, carried, and unpacked; their gradients likewise. They are added up at the owner in
@@ -75,7 +75,7 @@ class CollectiveExchange:
         room, needed = attempt.sizes, Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
         if room is not None and not room.holds(needed[:2]):
             projected = ranks.reading(partial(inputs.run, None, tiles))
-        # All ranks find the same, as they have estimated the same number of blocks.
+        # All ranks decide the same, because they have estimated the same number of blocks.
         attempt.end(needed, room is None or needed.blocks <= room.blocks)
         mark("project")
         self._own = splats_of(projected.splats[:12], traffic.counts)
@@ -90,7 +90,7 @@ class CollectiveExchange:
         conics, opacities, colors = rest if codec is None else codec.decode(rest[0], means2d.dtype)
         splats = Splats(means2d, conics, opacities, colors, depths, camera_ids, ids)
         self.gradient_table: Tensor | None = None
-        # Rounding may let splats touch some tiles more.
+        # After rounding, splats may touch a few more tiles.
         self.arrived = Arrived(splats, None, traffic.n_isects if codec is None else -1)
         mark("exchange")
 
@@ -104,7 +104,7 @@ class CollectiveExchange:
         """Nothing of a frame is overwritten by the next one."""
 
     def cleared_table(self) -> None:
-        """Any memory will do."""
+        """Return None: any memory can be used."""
 
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
         """See `WayBack.return_gradients`."""
@@ -151,13 +151,14 @@ class HalfCodec:
     """Splats in half precision, for slow links.
 
     Conics (as Cholesky factors, which stay positive definite), opacities and colours travel in float16, and
-    gradients in bfloat16; positions and depths stay as they are. A splat of three colours then takes 40 bytes
-    instead of 52 one way, and 20 instead of 36 back. The tiles that a splat touches are found before it is
-    rounded: one whose border moves over that of a tile may be missing there, where its alpha is about 1/255.
+    gradients in bfloat16; positions and depths are not rounded. A splat with three colours then takes 40
+    bytes instead of 52, and its gradient 20 instead of 36. The tiles that a splat touches are found before it
+    is rounded. If rounding moves its border into a further tile, it is missing there, where its alpha is
+    about 1/255.
     """
 
     def encode(self, conics: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-        """Return what is sent for them, float16 [P, 4 + D]."""
+        """Return the values to send, float16 [P, 4 + D]."""
         a, b, c = conics.double().unbind(1)
         l11 = a.sqrt()
         l21 = b / l11

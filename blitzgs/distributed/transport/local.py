@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One rank: the splats stay where they are."""
+"""The transport for one rank, which sends nothing."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, splats_of
 
 
 class LocalTransport:
-    """For one rank. With an estimate, compositing is queued before the host knows the number of splats."""
+    """The transport for one rank; with an estimate, the host queues compositing before it waits."""
 
     def __init__(self, capacity: CapacityEstimate | None = None) -> None:
-        """Take an estimate, or begin with one that knows nothing."""
+        """Use a capacity estimate; None: a new one without any sizes."""
         self.capacity = capacity or CapacityEstimate()
 
     def start(
@@ -37,7 +37,7 @@ class LocalExchange:
 
     def __init__(self, inputs: ProjectionInputs, attempt: Attempt, mark: Mark) -> None:
         """Project."""
-        # On the CPU the numbers are there at once.
+        # On the CPU the sizes are known at once, so no estimate is needed.
         self._attempt, self._capacity = attempt, attempt.sizes if inputs.gaussians[0].is_cuda else None
         self._projected = projected = inputs.run(self._capacity)
         self._visible = projected.totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views]
@@ -55,7 +55,7 @@ class LocalExchange:
         """See `Exchange.finish`."""
         totals = self._copy.read()
         counts, needed = totals[:3], Sizes._make(totals[:VIEW_TOTALS].tolist())
-        # Where they did not fit, the splats mean nothing.
+        # If the capacity was too small, the splats are undefined.
         own = splats_of(self._projected.splats[:12], counts)
         composited = self.arrived.splats.first(needed.splats)
         fits = self._capacity is None or self._capacity.holds(needed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a transport does: it brings splats to the ranks that composite them, and their gradients back.
+"""The interface of transports, which send splats to the ranks that composite them, and gradients back.
 
 Every rank projects the Gaussians it owns. Each splat (a Gaussian in a view) then has to reach the ranks that
 composite tiles which it touches, and its gradient has to return (paper §3.1). The calls of one frame, on
@@ -28,12 +28,12 @@ from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.projection import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Splats
 from blitzgs.ops.splat_gradients import SplatGradients
 
-# Is told the end of each stage of a step, for those who measure.
+# Called at the end of each stage of a step with the stage's name, for benchmarks.
 Mark = Callable[[str], None]
 
 
 def unmarked(stage: str) -> None:
-    """Take no note of the end of a stage."""
+    """Do nothing at the end of a stage."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class Traffic:
     Attributes:
         counts: int64 [3] on the CPU: this rank's visible Gaussians, splats and tiles they touch.
         splats: splats[s][d] that rank s sends to rank d.
-        sent: splats for each rank.
-        received: splats from each rank.
-        starts: where this rank's splats begin among those that each rank receives.
-        most: most splats that any rank has, sends or gets.
-        n_isects: tile entries of the splats received, or a few more.
-        most_isects: the most that any rank has of these.
-        most_blocks: the most blocks of which some view may see a part that any rank has.
+        sent: number of splats sent to each rank.
+        received: number of splats received from each rank.
+        starts: index at which this rank's splats begin among those that each rank receives.
+        most: largest number of splats that any rank has, sends or receives.
+        n_isects: upper bound of the tile entries of the splats received.
+        most_isects: largest `n_isects` of any rank.
+        most_blocks: largest number of blocks, of any rank, of which a view may see a part.
     """
 
     counts: Tensor
@@ -83,7 +83,7 @@ class Traffic:
 
     @property
     def needed(self) -> Sizes:
-        """The room that every rank has to have, where they must agree on it."""
+        """The sizes that every rank must allocate, for transports that need equal sizes on all ranks."""
         return Sizes(self.most, self.most, self.most_isects, self.most_blocks)
 
 
@@ -91,9 +91,9 @@ class Arrived(NamedTuple):
     """The splats that this rank composites.
 
     Attributes:
-        splats: with room behind them where their number is not known on the host yet.
-        n_splats: int64 [1], their number, on the device; None: there is no room behind them.
-        n_isects: how many tile entries there are at most, or may be listed; -1: they have to be counted.
+        splats: the splats; the columns are longer than their number if the host does not know it yet.
+        n_splats: int64 [1], number of valid splats, on the device; None: all are valid.
+        n_isects: upper bound of the tile entries, or capacity for them; -1: they must be counted.
     """
 
     splats: Splats
@@ -102,14 +102,14 @@ class Arrived(NamedTuple):
 
 
 class HostCounts(NamedTuple):
-    """What the host knows of an exchange in the end.
+    """The result of an exchange, when the host knows all numbers.
 
     Attributes:
-        projected: this rank's own splats, no more than there are.
-        splats: what this rank composites, no more than there are.
+        projected: this rank's own splats, only valid ones.
+        splats: the splats that this rank composites, only valid ones.
         visible: int64 [B], splats of each view over all ranks; valid until the next exchange.
-        traffic: what went where; None: there is one rank.
-        way_back: of the gradients; None: they are where they belong, because there is one rank.
+        traffic: numbers of splats sent between the ranks; None: there is one rank.
+        way_back: returns the gradients; None: there is one rank, which has them already.
     """
 
     projected: ProjectedSplats
@@ -120,12 +120,12 @@ class HostCounts(NamedTuple):
 
 
 class Exchange(Protocol):
-    """One frame's splats on their way to the ranks that composite them.
+    """The exchange of one frame's splats.
 
     Attributes:
-        arrived: what this rank composites.
-        gradient_table: memory, [R, 12], that compositing has to zero for the gradients of what arrived; None:
-            any memory will do.
+        arrived: the splats that this rank composites.
+        gradient_table: memory, [R, 12], for the gradients of these splats, which compositing must zero; None:
+            any memory can be used.
     """
 
     arrived: Arrived
@@ -135,18 +135,18 @@ class Exchange(Protocol):
         """Wait for the numbers and end the attempt.
 
         Returns:
-            None where there was too little room: the frame has to be started again.
+            The counts; None if the capacity was too small and the frame must be started again.
         """
 
 
 class WayBack(Protocol):
-    """Returns what compositing finds out about the splats of one frame to their owners."""
+    """Returns the gradients, and sums, of one frame's splats to the owners of their Gaussians."""
 
     def expect_gradients(self) -> None:
         """Check that gradients of this frame can still be returned.
 
         Raises:
-            RuntimeError: a later frame has taken the place of this one's splats.
+            RuntimeError: a later frame has overwritten this frame's splats.
         """
 
     def cleared_table(self) -> Tensor | None:
@@ -172,10 +172,10 @@ class WayBack(Protocol):
 
 
 class Transport(Protocol):
-    """Brings the splats of many frames, one after the other.
+    """Sends the splats of many frames, one after the other.
 
     Attributes:
-        capacity: an estimate of what a frame needs; the same on all ranks where they have to agree on it.
+        capacity: estimate of the sizes of a frame; the same on all ranks if the transport needs equal sizes.
     """
 
     capacity: CapacityEstimate
@@ -187,11 +187,11 @@ class Transport(Protocol):
         attempt: Attempt,
         mark: Mark = unmarked,
     ) -> Exchange:
-        """Project this rank's Gaussians and bring the splats to where they are composited. Collective.
+        """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
 
         Args:
-            inputs: what is projected; with the Gaussians' ids.
-            assignment: who composites which tiles; None: this rank alone.
-            attempt: how much to make room for; without sizes the host waits for the numbers first.
+            inputs: inputs of the projection, with the Gaussians' ids.
+            assignment: the tiles of each rank; None: this rank composites all tiles.
+            attempt: the sizes to allocate; without sizes the host first waits for the numbers.
             mark: called at the end of the stages "project" and "exchange".
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Doubles for tests: a transport that tells its calls, and memory that one rank shares with itself."""
+"""Test doubles: a transport that records its calls, and shared memory for a single rank."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from blitzgs.ops.projection import ProjectionInputs
 
 
 class RecordingTransport:
-    """Another transport whose first exchanges find that there was too little room.
+    """Wraps a transport; its first exchanges fail as if the capacity were too small.
 
     Attributes:
         calls: "start", with its capacity, and "finish", in order.
@@ -60,10 +60,10 @@ class RecordingExchange:
 
 
 class LoneMemory:
-    """What `SharedMemory` is to a single rank, on any device: for tests of transports that use one.
+    """A `SharedMemory` of a single rank, on any device, for tests of transports that need one.
 
     Attributes:
-        barriers: how many there were, those with numbers included.
+        barriers: number of barriers so far, including those with numbers.
     """
 
     def __init__(self, words: int) -> None:
