@@ -232,7 +232,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     plan, status = yaml.safe_load(PAPER.read_text())[args.table], 0
     try:
         scenes = dict(map(parse_named, args.runs if args.table in OF_RUNS else args.scenes))
-        if (args.out / quality_report.RUNS).is_dir() and scenes and not (args.resume or args.dry_run):
+        # A call that was refused leaves an empty folder.
+        has_results = any((args.out / quality_report.RUNS).glob("*"))
+        if has_results and scenes and not (args.resume or args.dry_run):
             raise ValueError(f"{args.out} has results: --resume carries on, or choose another --out")
         if not args.dry_run:
             quality_report.collect(args.out, args.collect)

@@ -25,7 +25,7 @@ from blitzgs.training.config_io import save_config
 from blitzgs.training.evaluation import load_lpips
 from blitzgs.training.folder_checks import check_room, check_writable
 from blitzgs.training.gate import lineage_subject, open_gate
-from blitzgs.training.inputs import check_alike, check_capture
+from blitzgs.training.inputs import check_alike, check_capture, train_views_fingerprint
 from blitzgs.training.offload import Course, OffloadingStepper
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
@@ -73,7 +73,7 @@ def set_up(
         )
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = run.restore(folder, ranks, home) if resume else None
-    config = replace(config, schedule=stretched(config.schedule, len(capture.train)))
+    config = _with_length(config, capture, restored)
     config = run.with_pace_of(config, None if restored is None else restored.config)
     schedule = Schedule(config.schedule)
     if restored is None:
@@ -128,6 +128,20 @@ def set_up(
         signals=Signals.of(progress.signals) if config.schedule.adaptive else None,
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )
+
+
+def _with_length(config: Config, capture: Capture, restored: run.Restored | None) -> Config:
+    """Return `config` with the length of the run that `schedule.images_per_view` asks for.
+
+    A run that is resumed with fewer or more photographs (`data.allow_missing`) keeps the length that it began
+    with.
+    """
+    schedule = config.schedule
+    if restored is not None and schedule.images_per_view > 0:
+        known = restored.progress.train_views
+        if known not in ("", train_views_fingerprint(capture)):
+            schedule = replace(schedule, scale=restored.config.schedule.scale, images_per_view=0.0)
+    return replace(config, schedule=stretched(schedule, len(capture.train)))
 
 
 def _stepper(

@@ -250,6 +250,23 @@ def test_a_photograph_that_is_lost_moves_no_mask_to_another_view(tmp_path, monke
     assert summary is not None and len(again.state.progress.gated_views) == 7
 
 
+def test_a_photograph_that_is_lost_does_not_change_how_long_a_run_is(tmp_path, monkeypatch):
+    """Even where the number of training views made it longer, and the same configuration is given again."""
+    longer = ("schedule.images_per_view=20",)
+    stop_at(monkeypatch, 75)
+    before, _ = train(tmp_path, *longer)
+    monkeypatch.undo()
+    capture, images = tiny_scene()
+    del capture.cameras[1], images.images[1]
+    capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
+    config = tiny_config(*FLAGS, *longer, "data.allow_missing=true")
+    with pytest.warns(UserWarning, match="the cull mask is dropped"):
+        fewer = Trainer(config, capture, images, tmp_path, Ranks(), resume=True)
+    fewer.close()
+    assert fewer.state.progress.step == 75
+    assert fewer.state.schedule.iterations == before.state.schedule.iterations > 6 * 20
+
+
 def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypatch):
     stop_at(monkeypatch, 65)
     assert train(tmp_path / "stopped", "view.smooth=true")[1] is None
