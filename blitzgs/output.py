@@ -42,11 +42,11 @@ def new_file(path: Path, sync: bool = True) -> Iterator[Path]:
     try:
         yield partial
         if sync:
-            _sync(partial)
+            sync_to_disk(partial)
         check_replaceable(path)
         os.replace(partial, path)
         if sync:
-            _sync(path.parent)
+            sync_to_disk(path.parent)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -199,7 +199,8 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _sync(path: Path) -> None:
+def sync_to_disk(path: Path) -> None:
+    """Sync a file, or the entries of a folder, so that they survive a power failure."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -13,6 +13,7 @@ from torch import Tensor
 import blitzgs
 from benchmarks.gradients import parameter_gradients as parameter_gradients
 from benchmarks.gradients import sum_of_ranks as sum_of_ranks
+from blitzgs.ops.report import report_
 from blitzgs.reference import ReferenceImage, render
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
@@ -169,3 +170,11 @@ def image_error(actual: Tensor, expected: Tensor, cut: Tensor, most_cut: float =
     if not (actual.isfinite().all() and expected.isfinite().all()):
         return math.inf
     return (actual - expected)[~cut].abs().max().item() if (~cut).any() else 0.0
+
+
+def sum_parts(parts: Tensor) -> tuple[Tensor, Tensor]:
+    """Add up a loss's parts, float64 [B, K, 2], to the sums of |x - y| and of SSIM, float32 [B] each."""
+    target = parts.new_empty(2 * len(parts), dtype=torch.float32)
+    report_(parts, None, (0, 0), 0, 1, [target])
+    l1, ssim = target.view(2, -1)
+    return l1, ssim

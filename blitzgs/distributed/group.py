@@ -42,7 +42,6 @@ class Ranks:
     Attributes:
         rank: index of this process, 0 <= rank < world_size.
         world_size: number of processes M.
-        local_rank: index of this process on its host (selects the GPU).
         local_world_size: number of processes on this host.
         device: where this rank computes.
         timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
@@ -53,7 +52,6 @@ class Ranks:
 
     rank: int = 0
     world_size: int = 1
-    local_rank: int = 0
     local_world_size: int = 1
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
@@ -110,7 +108,6 @@ class Ranks:
         ranks = cls(
             rank=rank,
             world_size=world_size,
-            local_rank=local_rank,
             local_world_size=local_world_size,
             device=place,
             timeout_seconds=timeout_seconds,
@@ -269,12 +266,6 @@ class Ranks:
             lambda: dist.all_to_all_single(result, rows.contiguous(), list(received), list(sent)),
         )
         return result
-
-    def exchange_rows(self, rows: Tensor, sent: Sequence[int]) -> tuple[Tensor, list[int]]:
-        """Exchange sizes, then call `all_to_all`; return the rows and how many came from each rank."""
-        counts = self.exchange_counts(torch.tensor(list(sent), dtype=torch.int64, device=rows.device))
-        received = counts.tolist()
-        return self.all_to_all(rows, sent, received), received
 
     def all_gather(self, tensor: Tensor) -> list[Tensor]:
         """Gather tensors of one shape from all ranks, in rank order; for small tensors."""

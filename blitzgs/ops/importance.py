@@ -25,7 +25,7 @@ def splat_contributions(
     n_cameras: int,
     width: int,
     height: int,
-    tile_size: int = 16,
+    tile_size: int = _TILE_SIZE,
     tile_begin: int = 0,
     tile_end: int = -1,
     n_splats: Tensor | None = None,
@@ -141,8 +141,7 @@ def _of_splats(splats: ProjectedSplats, n_views: int, width: int, height: int) -
     lists = torch.ops.blitzgs.intersect(
         *geometry, splats.depths, splats.camera_ids, None, grid, int(splats.counts[2]), None, True
     )
-    weights, pixels = torch.ops.blitzgs.contributions(*geometry, *lists, grid)
-    return weights, pixels
+    return splat_contributions(*geometry, *lists, n_cameras=n_views, width=width, height=height)
 
 
 @torch.library.register_fake("blitzgs::contributions")

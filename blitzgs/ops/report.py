@@ -35,11 +35,3 @@ def report_(
         RuntimeError: wrong shapes or dtypes.
     """
     torch.ops.blitzgs.report_(parts, tile_work, *tiles, rank, n_ranks, targets)
-
-
-def sum_parts(parts: Tensor) -> tuple[Tensor, Tensor]:
-    """Add up a loss's parts, float64 [B, K, 2], to the sums of |x - y| and of SSIM, float32 [B] each."""
-    target = parts.new_empty(2 * len(parts), dtype=torch.float32)
-    report_(parts, None, (0, 0), 0, 1, [target])
-    l1, ssim = target.view(2, -1)
-    return l1, ssim

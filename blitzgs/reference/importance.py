@@ -102,7 +102,6 @@ class Scores:
 
     score: Tensor  # float64 [N]
     phi: Tensor  # float64 [N]
-    c_rad: Tensor  # int64 [N], views in which a Gaussian is visible
     c_vis: Tensor  # bool [V, N], whether it is within the top 99 % of the view's mass
 
 
@@ -123,4 +122,4 @@ def scores(units: Tensor, pixels: Tensor, visible: Tensor, ids: Tensor, eps: flo
     density = units.double() / 2.0**32 / (pixels.double() + eps)
     c_rad = visible.sum(0)
     score = torch.where(pixels > 0, density, torch.zeros_like(density)).sum(0)
-    return Scores(score, c_vis.sum(0).double() / (c_rad.double() + phi_eps), c_rad, c_vis)
+    return Scores(score, c_vis.sum(0).double() / (c_rad.double() + phi_eps), c_vis)

@@ -32,11 +32,6 @@ class Camera:
     rectification: Rectification
     """Maps the file's pixels to a pinhole image, before downscaling."""
 
-    @property
-    def center(self) -> Float64:
-        """The camera's position in the re-centred world, float64 [3]."""
-        return np.asarray(camera_centers(self.world_to_camera[None])[0])
-
 
 def camera_centers(world_to_camera: Float64) -> Float64:
     """Positions [N, 3] of rigid poses [N, 4, 4]."""

@@ -147,13 +147,6 @@ class ImageStore:
         """
         return torch.from_numpy(self._result("image", index))
 
-    def get_rows(self, index: int, y0: int, y1: int) -> Tensor:
-        """Rows y0 to y1 (exclusive) of `get(index)`."""
-        height = self.capture.cameras[index].height
-        if not 0 <= y0 <= y1 <= height:
-            raise ValueError(f"rows {y0} to {y1} are not inside an image of {height} rows")
-        return self.get(index)[y0:y1]
-
     def mask(self, index: int) -> Tensor | None:
         """Which pixels count, uint8 [height, width] of 0 and 1; None when all do. Shared: do not write to it.
 

@@ -28,7 +28,8 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.sharding import global_positions
-from blitzgs.training.shard_file import file_digest, header_of, sync_folder, write_shard
+from blitzgs.output import sync_to_disk
+from blitzgs.training.shard_file import file_digest, header_of, write_shard
 
 FORMAT = 2
 MANIFEST = "manifest.json"
@@ -328,11 +329,11 @@ def _finish(
         _reached("manifest written")
         file.flush()
         os.fsync(file.fileno())
-    sync_folder(unfinished)
+    sync_to_disk(unfinished)
     _reached("manifest synced")
     unfinished.rename(directory / name)
     _reached("renamed")
-    sync_folder(directory)
+    sync_to_disk(directory)
     _reached("finished")
 
 

@@ -125,7 +125,7 @@ def fake_run(seed, psnr, seconds):
     }  # fmt: skip
 
 
-def test_the_table_has_median_and_worst(tmp_path):
+def test_the_table_has_median_and_worst():
     runs = [fake_run(0, 30.0, 10.0), fake_run(1, 31.0, 12.0), fake_run(2, 29.0, 11.0)]
     (row,) = quality_report.table_rows("b", runs)
     assert row["PSNR"] == "30.00 (29.00)" and row["corrected"] == "31.00 (30.00)"

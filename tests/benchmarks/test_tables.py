@@ -122,7 +122,7 @@ def test_runs_of_other_settings_are_no_seeds_of_an_arm():
     assert [(row["arm"], row["seeds"]) for row in texts] == [("full (0)", 1), ("full (1)", 1)]
 
 
-def test_scaling_has_the_speedup_of_each_number_of_ranks(tmp_path, capsys):
+def test_scaling_has_the_speedup_of_each_number_of_ranks(tmp_path):
     runs = [finished("full", 0, 27.0, ranks=n, seconds=12.0 / n, name=f"a.r{n}") for n in (1, 2, 4)]
     source = tmp_path / "quality.json"
     source.write_text(json.dumps({"runs": runs}))
@@ -131,7 +131,7 @@ def test_scaling_has_the_speedup_of_each_number_of_ranks(tmp_path, capsys):
     assert [(row["GPUs"], float(row["speedup"])) for row in rows] == [("1", 1.0), ("2", 2.0), ("4", 4.0)]
 
 
-def test_cost_and_oracle_are_read_from_finished_results(tmp_path, capsys):
+def test_cost_and_oracle_are_read_from_finished_results(tmp_path):
     stages = ("project", "exchange", "sort", "raster", "loss", "raster back", "exchange back", "optimiser")
     ms = dict.fromkeys(stages, 1.0) | {"other": 0.5, "alone": 8.5, "step": 8.0}
     report = {"ranks": 2, "gaussians": 3_000_000, "ms": ms}
@@ -154,7 +154,7 @@ def test_cost_and_oracle_are_read_from_finished_results(tmp_path, capsys):
     )  # fmt: skip
 
 
-def test_popping_is_measured_once(tmp_path, monkeypatch, capsys):
+def test_popping_is_measured_once(tmp_path, monkeypatch):
     figures = {"mean_change": 1.0, "largest_change": 2.0}
     jumps = figures | {"mean": 0.1, "largest": 0.2, "pixel": 3.0, "kept": 0.5}
     calls = []

@@ -13,13 +13,12 @@ from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileOwners,
 from blitzgs.distributed.pixels import collect_images
 from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
-from blitzgs.ops.report import sum_parts
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.helpers import parameter_gradients
+from tests.helpers import parameter_gradients, sum_parts
 from tests.training.tiny import look_at_origin, random_gaussians
 
 WIDTH, HEIGHT = 150, 90

@@ -9,7 +9,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
-from blitzgs.distributed.transport.testing import LoneMemory, RecordingTransport
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
@@ -17,6 +16,7 @@ from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.distributed.transports import LoneMemory, RecordingTransport
 from tests.helpers import parameter_gradients, sum_of_ranks
 from tests.training.tiny import random_gaussians
 

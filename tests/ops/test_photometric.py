@@ -15,8 +15,7 @@ from blitzgs.ops.photometric import (
     pixel_counts,
     ssim,
 )
-from blitzgs.ops.report import sum_parts
-from tests.helpers import DEVICES
+from tests.helpers import DEVICES, sum_parts
 
 ROOT = Path(__file__).parents[2]
 

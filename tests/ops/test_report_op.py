@@ -2,8 +2,8 @@
 import pytest
 import torch
 
-from blitzgs.ops.report import report_, sum_parts
-from tests.helpers import DEVICES
+from blitzgs.ops.report import report_
+from tests.helpers import DEVICES, sum_parts
 
 
 @pytest.mark.parametrize("device", DEVICES)

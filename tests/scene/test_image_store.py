@@ -24,15 +24,11 @@ def capture(tmp_path):
     return load_capture(write_capture(tmp_path, NAMES))
 
 
-def test_images_are_rgb_and_rows_are_slices(tmp_path):
+def test_images_are_rgb(tmp_path):
     write_capture(tmp_path, ["a.png", "b.png"])
-    store = ImageStore(load_capture(tmp_path))
-    image = store.get(1)
+    image = ImageStore(load_capture(tmp_path)).get(1)
     assert image.dtype == torch.uint8 and not image.is_cuda
     np.testing.assert_array_equal(image.numpy(), smooth_image(48, 64, seed=1))
-    assert torch.equal(store.get_rows(1, 5, 20), image[5:20]) and store.get_rows(1, 7, 7).shape == (0, 64, 3)
-    with pytest.raises(ValueError, match="rows 5 to 49 are not inside an image of 48 rows"):
-        store.get_rows(1, 5, 49)
 
 
 def test_grey_images_become_rgb(tmp_path):

@@ -212,7 +212,7 @@ def test_two_processes_do_not_make_the_same_city(tmp_path):
     generate_city(tmp_path / "city", **tiny, progress=again)
 
 
-def test_a_process_that_the_system_ends_is_an_error(tmp_path):
+def test_a_process_that_the_system_ends_is_an_error():
     def die(index):
         os.kill(os.getpid(), signal.SIGKILL)
 

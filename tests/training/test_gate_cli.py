@@ -130,7 +130,7 @@ def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys):
     assert "is not a sample of spawns" in capsys.readouterr().err.replace("\n", " ")
 
 
-def test_what_is_missing_is_named(lineage_run, tmp_path, capsys):
+def test_what_is_missing_is_named(tmp_path, capsys):
     assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.json")]) == 1
     assert "holds no lineage: train with --population.lineage=true" in capsys.readouterr().err
     assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.txt")]) == 1

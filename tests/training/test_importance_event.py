@@ -168,7 +168,7 @@ def _passes_from(ranks, folder):
 
 
 @pytest.mark.parametrize(("world_size", "device"), on_each_device(2, 4))
-def test_passes_are_the_same_at_every_world_size(whole_run, tmp_path, world_size, device):
+def test_passes_are_the_same_at_every_world_size(tmp_path, world_size, device):
     train(tmp_path, *EARLY, "view.cull=true")
     for later in sorted((tmp_path / "checkpoints").glob("checkpoint_*"))[1:]:
         shutil.rmtree(later)

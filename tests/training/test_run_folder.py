@@ -94,7 +94,7 @@ def test_render_and_export_need_no_photographs(copy, tmp_path):
     assert main(["export", str(folder), "--ply", str(tmp_path / "m.ply")]) == 0
 
 
-def test_a_lost_photograph_costs_its_view_alone(copy, tmp_path, capsys):
+def test_a_lost_photograph_costs_its_view_alone(copy, capsys):
     data, folder = copy
     whole = json.loads((folder / "evaluation" / "000040" / "metrics.json").read_text())
     for name in ("01.png", "05.png"):  # of training views: the split and the world stay as they were
@@ -138,7 +138,7 @@ def test_the_checkpoints_own_configuration_wins(copy, tmp_path, capsys, content)
     assert any("the configuration in the checkpoint is used" in str(w.message) for w in caught)
 
 
-def test_what_a_resume_may_change(trained, tmp_path):
+def test_what_a_resume_may_change(trained):
     saved = run.restore(trained[1], Ranks()).config
     schedule = dataclasses.replace(saved.schedule, evaluate_every=7, checkpoint_every=9)
     run.check_resumable(saved, dataclasses.replace(saved, schedule=schedule))

@@ -130,10 +130,7 @@ class PeerExchange:
     ) -> None:
         """Queue the writing of the splats."""
         self._ranks, self._memory, self._buffers, self._attempt = ranks, memory, buffers, attempt
-        self._n_views, self._n_isects = (
-            inputs.n_views,
-            None if attempt.sizes is None else attempt.sizes.isects,
-        )
+        self._n_views = inputs.n_views
         self._traffic: Traffic | None = None
         room = Sizes(buffers.length, buffers.length, 0)
         projected = inputs.run(room, assignment.all_composited)
