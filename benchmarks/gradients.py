@@ -26,16 +26,19 @@ def sum_of_ranks(gradients: SplatGradients, splats: int) -> Tensor:
 
 
 def parameter_gradients(
-    table: GaussianTable, frame: pipeline.Frame, v_renders: Tensor, scale_reg: Tensor | None = None
+    table: GaussianTable, frame: pipeline.Frame, v_renders: Tensor, *weights: Tensor | None
 ) -> list[Tensor]:
-    """Return the gradients of the U visible Gaussians' parameters, from those of a frame's images."""
+    """Return the gradients of the U visible Gaussians' parameters, from those of a frame's images.
+
+    ``weights``: of regularisers, as those of `WeightedViews`.
+    """
     gradients, projected = pipeline.backward_splats(frame, v_renders), frame.projected
     options = frame.options.projection(frame.views)
     parts = gradients.parts
     if gradients.places is not None:
         parts = [sum_of_ranks(gradients, len(projected.means2d))]
     *parameters, _ = torch.ops.blitzgs.project_bwd(
-        list(table.parameters), [frame.views.viewmats, frame.views.Ks, scale_reg],
+        list(table.parameters), [frame.views.viewmats, frame.views.Ks, *weights],
         [projected.camera_ids, projected.visible_ids, projected.splat_offsets], options.ints, options.floats,
         list(parts), None, False,
     )  # fmt: skip

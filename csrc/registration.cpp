@@ -51,9 +51,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
-  // views: cameras and, of each view, weights of the Gaussians' smallest axes and opacities: (viewmats, Ks[,
-  // scale_reg[, opacity_reg]]). v_splats: (v_means2d, v_conics, v_opacities[, v_colors]) or, on CUDA, one
-  // table of splat gradients.
+  // views: cameras and, of each view, weights of the Gaussians' smallest axes, opacities and mean axes:
+  // (viewmats, Ks[, scale_reg[, opacity_reg[, size_reg]]]). v_splats: (v_means2d, v_conics, v_opacities[,
+  // v_colors]) or, on CUDA, one table of splat gradients.
   m.def(
       "project_bwd(Tensor[] gaussians, Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, "
       "Tensor[] v_splats, Tensor? v_depths, bool need_viewmats, bool dense=False, Tensor? level=None) -> ("

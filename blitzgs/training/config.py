@@ -191,7 +191,7 @@ class OptimiserConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """(1 - ssim) L1 + ssim (1 - SSIM) + scale L_scale + opacity L_opacity per view.
+    """(1 - ssim) L1 + ssim (1 - SSIM) + scale L_scale + opacity L_opacity + size L_size per view.
 
     Attributes:
         ssim: weight of the SSIM term.
@@ -199,12 +199,15 @@ class LossConfig:
             Gaussians; here the term does not act on Gaussians that a step does not see).
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.
+        size: weight of the mean of all three axes of the visible Gaussians, in units of the extent; the other
+            regulariser of 3DGS-MCMC.
     """
 
     ssim: float = 0.2
     opacity: float = 0.0
     scale: float = 10.0
     scale_reference: float = 10.0
+    size: float = 0.0
 
 
 @dataclass(frozen=True)

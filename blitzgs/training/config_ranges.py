@@ -99,6 +99,7 @@ RANGES: Mapping[str, Range] = {
     "loss.opacity": Range(0, 1e6),
     "loss.scale": Range(0, 1e6),
     "loss.scale_reference": Range(1e-6, 1e6),
+    "loss.size": Range(0, 1e6),
     "population.growth": Range(0, 10),
     "population.grad_threshold": Range(0, 1e30),
     "population.absolute_threshold": Range(0, 1e6),

@@ -76,7 +76,7 @@ class OffloadingStepper(Stepper):
         optimiser: LazyAdam,
         owners: TileOwners,
         loss: LossConfig,
-        length_unit: float,
+        extent: float,
         half_exchange: bool = False,
         noise: PositionNoise | None = None,
     ) -> None:
@@ -88,14 +88,14 @@ class OffloadingStepper(Stepper):
             optimiser: as for `Stepper`, like the following arguments.
             owners: learns what the tiles cost.
             loss: weights of the loss.
-            length_unit: L_scale's unit of length.
+            extent: size of the scene.
             half_exchange: send splats in half precision.
             noise: of the means.
         """
         self._residence, self._course = residence, course
         self._reported = residence.traffic
         self._stands_at: int | None = None
-        super().__init__(residence.pool, optimiser, owners, loss, length_unit, half_exchange, noise)
+        super().__init__(residence.pool, optimiser, owners, loss, extent, half_exchange, noise)
         self.scene = residence
 
     def reindex(self) -> None:

@@ -84,6 +84,7 @@ class LazyAdam:
         v: SplatGradients,
         scale_reg: Tensor | None,
         opacity_reg: Tensor | None,
+        size_reg: Tensor | None,
         step: int,
         means2d_sums: Tensor | None = None,
         absolute_sums: bool = False,
@@ -97,6 +98,8 @@ class LazyAdam:
             scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
                 such term.
             opacity_reg: weight per view, [B], of the opacity of each Gaussian visible in it; None: no such
+                term.
+            size_reg: weight per view, [B], of the mean axis of each Gaussian visible in it; None: no such
                 term.
             step: number of the step; the visible rows must be current up to `step` - 1.
             means2d_sums: [P, 2], receives the gradient of the splats' means2d if its parts are at several
@@ -113,7 +116,7 @@ class LazyAdam:
             ),
             AdamSchedule(self.lr_table, *self._betas, self._eps, self._sparse),
             step,
-            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg),
+            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg, size_reg),
             frame.projected,
             frame.options.projection(frame.views),
             v,

@@ -157,7 +157,7 @@ def _stepper(
         optimiser,
         owners,
         config.loss,
-        extent * config.loss.scale_reference,
+        extent,
         config.ranks.half_exchange,
         _position_noise(config, extent),
     )

@@ -42,7 +42,7 @@ class Stepper:
         optimiser: LazyAdam,
         owners: TileOwners,
         loss: LossConfig,
-        length_unit: float,
+        extent: float,
         half_exchange: bool = False,
         noise: PositionNoise | None = None,
     ) -> None:
@@ -53,13 +53,13 @@ class Stepper:
             optimiser: optimiser of the table.
             owners: records what the tiles cost.
             loss: weights of the loss.
-            length_unit: L_scale's unit of length in the unit of the means (extent x `loss.scale_reference`).
+            extent: size of the scene in the unit of the means.
             half_exchange: send splats in half precision, see `open_transport`.
             noise: noise on the means after each step; None: none.
         """
         self.table = self.scene = table
         self._optimiser, self._owners = optimiser, owners
-        self._loss, self._length_unit, self._noise = loss, length_unit, noise
+        self._loss, self._extent, self._noise = loss, extent, noise
         self._transport = open_transport(owners.ranks, half_exchange)
         self.reindex()
 
@@ -121,7 +121,7 @@ class Stepper:
                 assignment, self._transport, attempt, mark, backward_follows=True,
             )  # fmt: skip
         assert frame is not None  # or there would be another attempt
-        terms = loss_terms(frame, batch, self._loss, self._length_unit)
+        terms = loss_terms(frame, batch, self._loss, self._extent)
         mark("loss")
         if batch.ranges is None:
             sums = HostSum(ranks, terms.parts)
@@ -160,7 +160,7 @@ class Stepper:
         if v_means2d is None and keep_means2d:
             v_means2d = sums = torch.empty_like(frame.projected.means2d)
         self._optimiser.step(
-            table, frame, gradients, terms.scale_reg, terms.opacity_reg, step, sums, absolute
+            table, frame, gradients, terms.scale_reg, terms.opacity_reg, terms.size_reg, step, sums, absolute
         )
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))

@@ -12,28 +12,31 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.pipeline import Frame
 from blitzgs.training.batches import Batch
 from blitzgs.training.guard import check_table
-from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term
+from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term, size_term
 from blitzgs.training.state import TrainingState
 
 
 def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
-    """Return figures about a batch, float64 [6], without waiting for the device.
+    """Return figures about a batch, float64 [7], without waiting for the device.
 
-    They are its L_scale, L_opacity and PSNR, and the Gaussians of all ranks: those that the step projected,
-    those of them that are visible in a view, and all.
+    They are its L_scale, L_opacity, L_size and PSNR, and the Gaussians of all ranks: those that the step
+    projected, those of them that are visible in a view, and all.
     """
-    length_unit = state.space.extent * state.config.loss.scale_reference
-    scale = scale_term(frame, state.stepper.table, length_unit).mean()
-    opacity = scale.new_zeros(())
-    if state.config.loss.opacity > 0:
+    loss, extent = state.config.loss, state.space.extent
+    scale = scale_term(frame, state.stepper.table, extent * loss.scale_reference).mean()
+    opacity = size = scale.new_zeros(())
+    if loss.opacity > 0:
         opacity = opacity_term(frame, state.stepper.table).mean()
+    if loss.size > 0:
+        size = size_term(frame, state.stepper.table, extent).mean()
     assert frame.active is not None  # as in every step of a training
     counts = [
         state.ranks.all_reduce(torch.full((), float(count), dtype=torch.float64, device=scale.device))
         for count in (len(frame.projected.visible_ids), len(state.table))
     ]
     counts.insert(0, state.ranks.all_reduce(frame.active.considered().double()))
-    return torch.stack([scale.double(), opacity.double(), batch_psnr(frame, batch).double(), *counts])
+    terms = [term.double() for term in (scale, opacity, size, batch_psnr(frame, batch))]
+    return torch.stack([*terms, *counts])
 
 
 def log_step(
@@ -54,9 +57,9 @@ def log_step(
     check_table(state.stepper.table, state.progress.step)
     loss = state.config.loss
     losses = photometric(sums.read()[: 2 * len(names)], batch.samples.cpu(), loss)
-    scale, opacity, psnr, active, visible, population = measured.tolist()
+    scale, opacity, size, psnr, active, visible, population = measured.tolist()
     values = {
-        "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity,
+        "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity + loss.size * size,
         "l_scale": scale,
         "psnr": psnr,
         "active": active,

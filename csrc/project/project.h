@@ -237,10 +237,11 @@ struct ProjectGradients {
 
 // The terms of the training loss that do not depend on pixels, as weights per view, [B] each, or null (zero).
 // For each Gaussian that has a splat in view b, the loss has scale[b] times the smallest axis of the Gaussian
-// (the paper's L_scale) and opacity[b] times its opacity as summands.
+// (the paper's L_scale), opacity[b] times its opacity and size[b] times the mean of its three axes as
+// summands (the last two are those of 3DGS-MCMC).
 template <class T>
 struct Regularisers {
-  const T *scale, *opacity;
+  const T *scale, *opacity, *size;
 };
 
 // The outputs of the forward pass that the backward pass reads (ProjectIds); n_visible is U.

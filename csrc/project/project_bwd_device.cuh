@@ -339,7 +339,14 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   if constexpr (QUADS) stage.write(lane, v_sh);
   float v_quat[4] = {}, v_opacity = 0.f;
   if (id >= 0) {
-    activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight,
+    // Summed only here, so that this weight occupies no register beside the SH coefficients.
+    float size_weight = 0.f;
+    if (args.regularisers.size) {
+      for (std::int32_t r = begin; r < end; ++r) {
+        size_weight += args.regularisers.size[args.splats.camera_ids[r]];
+      }
+    }
+    activate_gaussian_vjp(gaussian, in.options.raw, gradient, axis_weight, size_weight,
                           ParameterGradients<float>{&v_mean.x, v_quat, &v_scale.x, &v_opacity});
   }
   sink.take(shared, own, warp, triple, v_mean, {v_quat[0], v_quat[1], v_quat[2], v_quat[3]}, v_scale,

@@ -108,15 +108,16 @@ namespace {
 // The group of arguments `views`: the cameras, and the weights of the regularisers for each view.
 struct WeightedViews {
   TensorList cameras;
-  OptionalTensor scale_reg, opacity_reg;
+  OptionalTensor scale_reg, opacity_reg, size_reg;
 
   WeightedViews(const char* op, const OptionalTensorList& views) {
-    constexpr const char* kNames = "(viewmats, Ks[, scale_reg[, opacity_reg]])";
-    check_group(op, kNames, views, 2, 4);
+    constexpr const char* kNames = "(viewmats, Ks[, scale_reg[, opacity_reg[, size_reg]]])";
+    check_group(op, kNames, views, 2, 5);
     STD_TORCH_CHECK(views[0] && views[1], "blitzgs::", op, ": expected ", kNames, ", got no viewmats or Ks");
     cameras = {*views[0], *views[1]};
     if (views.size() > 2) scale_reg = contiguous_or_none(views[2]);
     if (views.size() > 3) opacity_reg = contiguous_or_none(views[3]);
+    if (views.size() > 4) size_reg = contiguous_or_none(views[4]);
   }
 };
 
@@ -125,11 +126,11 @@ struct WeightedViews {
 // reads gradients at places.
 struct BackwardSplats {
   Tensor camera_ids, visible_ids, splat_offsets;
-  OptionalTensor places, scale_reg, opacity_reg;
+  OptionalTensor places, scale_reg, opacity_reg, size_reg;
 
   BackwardSplats(const char* op, const ProjectArguments& p, const WeightedViews& views,
                  const TensorList& splats, bool reads_places)
-      : scale_reg(views.scale_reg), opacity_reg(views.opacity_reg) {
+      : scale_reg(views.scale_reg), opacity_reg(views.opacity_reg), size_reg(views.size_reg) {
     check_group(op,
                 reads_places ? "(camera_ids, visible_ids, splat_offsets[, places])"
                              : "(camera_ids, visible_ids, splat_offsets)",
@@ -144,6 +145,7 @@ struct BackwardSplats {
     check_shape(op, "splat_offsets", splat_offsets, {visible() + 1});
     check_weights(op, p, "scale_reg", scale_reg);
     check_weights(op, p, "opacity_reg", opacity_reg);
+    check_weights(op, p, "size_reg", size_reg);
   }
 
   std::int64_t visible() const { return visible_ids.numel(); }
@@ -154,7 +156,7 @@ struct BackwardSplats {
   }
   template <class T>
   Regularisers<T> regularisers() const {
-    return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg)};
+    return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg), data_or_null<T>(size_reg)};
   }
 
  private:

@@ -16,12 +16,13 @@ from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
-from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
+from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term, size_term
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import parameter_gradients, sum_parts
 from tests.training.tiny import look_at_origin, random_gaussians
 
-WIDTH, HEIGHT = 150, 90
+WIDTH, HEIGHT, EXTENT = 150, 90, 0.3
+LOSS = LossConfig(opacity=0.1, size=0.1)
 OPTIONS = RenderOptions(sh_degree=0, near_plane=0.05, far_plane=100.0, background=(0.1, 0.2, 0.3))
 # Owner of row i: shards of every shape, among them an empty one and 3 : 1.
 LAYOUTS = {1: [0], 2: [0, 0, 0, 1], 3: [0, 2, 2], 4: [0, 3, 1, 0, 0, 3]}
@@ -96,11 +97,13 @@ def _render(ranks):
                 targets[view, :y0], targets[view, y1:] = 77, 77
         on_device = [tensor.to(ranks.device) for tensor in (targets, masks, samples)]
         batch = Batch(list(range(n_views)), views, *on_device, ranges)
-        terms = loss_terms(frame, batch, LossConfig(), 3.0)
+        terms = loss_terms(frame, batch, LOSS, EXTENT)
         sums = torch.cat(sum_parts(terms.parts)).cpu()
         if ranges is not None:
             sums = owners.record(keys, frame.tile_work, ranges, terms.parts).read()[: 2 * n_views]
-        gradients = parameter_gradients(table, frame, terms.v_renders, terms.scale_reg)
+        gradients = parameter_gradients(
+            table, frame, terms.v_renders, terms.scale_reg, terms.opacity_reg, terms.size_reg
+        )
         dense = [torch.zeros_like(column) for column in table.parameters]
         for column, gradient in zip(dense, gradients, strict=True):
             column[frame.projected.visible_ids.long()] = gradient
@@ -109,8 +112,9 @@ def _render(ranks):
         out.append(
             {
                 "image": image.cpu(),
-                "loss": photometric(sums, samples, LossConfig()),
-                "scale": scale_term(frame, table, 3.0).cpu(),
+                "loss": photometric(sums, samples, LOSS),
+                "scale": scale_term(frame, table, EXTENT * LOSS.scale_reference).cpu(),
+                "size": size_term(frame, table, EXTENT).cpu(),
                 "psnr": batch_psnr(frame, batch).cpu(),
                 "gradients": [gradient.cpu() for gradient in dense],
                 "work": int(tile_work.sum()),
@@ -153,6 +157,7 @@ def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device, tr
             assert torch.equal(result["renders"].where(here, 0.0), want["image"].where(here, 0.0))
             assert relative(result["loss"], want["loss"]) <= 1e-6
             assert relative(result["scale"], want["scale"]) <= 1e-6
+            assert relative(result["size"], want["size"]) <= 1e-6
             assert abs(result["psnr"] - want["psnr"]) <= 1e-5
         for column, wanted in enumerate(want["gradients"]):
             got = torch.cat([result["gradients"][column] for result in results])
@@ -172,7 +177,7 @@ def _render_plain(ranks):
     assignment = TileAssignment(ranks, ranges)
     frame = pipeline.forward(table, views, OPTIONS, assignment=assignment)
     with pytest.raises(ValueError, match="the loss reads 10 px beyond"):
-        loss_terms(frame, Batch([0, 1, 2], views, *photographs(3), ranges), LossConfig(), 3.0)
+        loss_terms(frame, Batch([0, 1, 2], views, *photographs(3), ranges), LOSS, EXTENT)
     collect_images(frame.renders, ranges, ranks, 1)
     return assignment.composited == ranges.of(ranks.rank), frame.renders
 

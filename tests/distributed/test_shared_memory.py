@@ -115,7 +115,7 @@ def _gradients(ranks):
             copy = GaussianTable({name: table[name].clone() for name in table})
             if transport is transports[1]:
                 kept = torch.full_like(frame.projected.means2d, torch.nan)
-            optimiser.step(copy, frame, splats[-1], None, None, 1, kept, absolute)
+            optimiser.step(copy, frame, splats[-1], None, None, None, 1, kept, absolute)
             moments.append(copy.exp_avgs)
             # From zeros again; what the first pass left in the tables is read before.
             gradients.append(parameter_gradients(table, frame, v_renders))

@@ -35,7 +35,12 @@ SETTINGS = (
     "log.keep_checkpoints=9",
     "ranks.max_imbalance=1.02",
 )
-RELOCATION = ("population.strategy=relocation", "loss.opacity=0.01", "population.max_gaussians=450")
+RELOCATION = (
+    "population.strategy=relocation",
+    "loss.opacity=0.01",
+    "loss.size=0.01",
+    "population.max_gaussians=450",
+)
 OPTIONS = {
     "relocation": RELOCATION,
     "absolute": ("population.absolute_gradients=true", "population.absolute_threshold=8e-3"),

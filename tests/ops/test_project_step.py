@@ -47,6 +47,7 @@ class Scene:
         self.degree = min(3, math.isqrt(k) - 1)
         self.scale_reg = torch.linspace(0.1, 0.2, views).to(device, dtype)
         self.opacity_reg = torch.linspace(0.3, -0.2, views).to(device, dtype)
+        self.size_reg = torch.linspace(-0.1, 0.4, views).to(device, dtype)
         self.seed = generator
 
     def columns(self):
@@ -72,7 +73,7 @@ class Scene:
         return [self.splats.camera_ids, self.splats.visible_ids, self.splats.splat_offsets]
 
     def views(self):
-        return WeightedViews(self.viewmats, self.Ks, self.scale_reg, self.opacity_reg)
+        return WeightedViews(self.viewmats, self.Ks, self.scale_reg, self.opacity_reg, self.size_reg)
 
     def schedule(self, sparse=False):
         return AdamSchedule(self.lr_table, BETA1, BETA2, EPS, sparse)
@@ -246,6 +247,37 @@ def test_errors_name_the_value():
     scene.render(False)
     scene.exp_avgs[4] = scene.exp_avgs[4][:, :4].contiguous()
     with pytest.raises(RuntimeError, match=r"the moments of sh must have its shape \[20, 16, 3\]"):
+        scene.at_once(False)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_regularisers_have_the_gradients_of_their_definitions(device):
+    """Without gradients of splats, and against autograd in float64."""
+    scene = Scene(800, 16, 3, device, torch.float32)
+    scene.render(True)
+    scene.v = SplatGradients([torch.zeros_like(part) for part in scene.v.parts])
+    _, _, v_scales, v_opacities, *_ = scene.backward()
+    scales, opacities = (scene.params[c].double().requires_grad_() for c in (2, 3))
+    r = scene.splats
+    weights = [w.double()[r.camera_ids.long()] for w in (scene.scale_reg, scene.opacity_reg, scene.size_reg)]
+    axes = scales[r.gaussian_ids.long()].exp()
+    values = axes.amin(1), opacities[r.gaussian_ids.long()].sigmoid(), axes.mean(1)
+    sum((w * value).sum() for w, value in zip(weights, values, strict=True)).backward()
+    ids = r.visible_ids.long()
+    assert len(ids) > 300
+    for got, want in ((v_scales, scales.grad[ids]), (v_opacities, opacities.grad[ids])):
+        torch.testing.assert_close(got.double(), want, rtol=1e-5, atol=1e-6 * float(want.abs().max()))
+
+
+def test_errors_name_what_is_wrong_with_weights():
+    scene = Scene(20, 16, 2, "cpu", torch.float32)
+    scene.render(False)
+    weights = scene.size_reg
+    scene.size_reg = weights.double()
+    with pytest.raises(RuntimeError, match="project_bwd: size_reg must be Float, got Double"):
+        scene.backward()
+    scene.size_reg = weights[:1]
+    with pytest.raises(RuntimeError, match=r"project_bwd_step_: size_reg must have shape \[2\], got \[1\]"):
         scene.at_once(False)
 
 

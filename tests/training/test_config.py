@@ -115,6 +115,8 @@ def test_senseless_numbers_are_refused_by_name(name, default, value):
         ("lod.base_resolution=0", "lod.base_resolution: must be in"),
         ("lod.visible_threshold=1", r"lod.visible_threshold: must be in \[0, 1\), got 1.0"),
         ("population.min_opacity=2", r"population.min_opacity: must be in \[0, 1\), got 2.0"),
+        ("loss.size=-0.01", r"loss.size: must be in \[0, 1,000,000\], got -0.01"),
+        ("loss.size=.inf", r"loss.size: must be in"),
         ("model.near=2e6", "model.near: must be in"),
         ("model.far=0.001", "model.near: must be below model.far"),
         ("data.exif=maybe", "data.exif: must be one of auto, apply, ignore, got maybe"),

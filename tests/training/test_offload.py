@@ -91,6 +91,7 @@ VARIANTS = {
         "population.min_opacity=0.08",
         "population.reset_opacity=0.09",
         "loss.opacity=0.01",
+        "loss.size=0.01",
         "model.scale_floor=0.447",
     ),
     "resets": (

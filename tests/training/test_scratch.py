@@ -54,7 +54,7 @@ def peak_bytes(run, device: str) -> int:
 def scratch_of_a_step(unseen: int, device: str) -> int:
     config, table = tiny_config(), table_of(unseen, device)
     optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), 1.0, device)
-    stepper = Stepper(table, optimiser, TileOwners(Ranks(device=torch.device(device))), config.loss, 10.0)
+    stepper = Stepper(table, optimiser, TileOwners(Ranks(device=torch.device(device))), config.loss, 1.0)
     viewmat = torch.from_numpy(look_at_origin(np.array([3.0, 0.0, 1.5]))).float()[None].to(device)
     K = torch.tensor([[[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]], device=device)
     targets = torch.full((1, HEIGHT, WIDTH, 3), 90, dtype=torch.uint8, device=device)

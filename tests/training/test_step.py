@@ -16,7 +16,7 @@ from tests.training.tiny import look_at_origin, random_gaussians, tiny_config
 def test_a_step_marks_its_stages_and_lowers_the_loss():
     config, table = tiny_config(), random_gaussians(300)
     optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), 1.0, "cpu")
-    stepper = Stepper(table, optimiser, TileOwners(Ranks()), config.loss, 10.0)
+    stepper = Stepper(table, optimiser, TileOwners(Ranks()), config.loss, 1.0)
     viewmat = torch.from_numpy(look_at_origin(np.array([3.0, 0.0, 1.5]))).float()[None]
     K = torch.tensor([[[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]])
     views, options = Views(viewmat, K, 80, 60), RenderOptions(0, 0.05, 100.0)

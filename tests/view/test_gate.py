@@ -167,7 +167,7 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
         table = GaussianTable({name: small[name].to(device) for name in small})
         table["level"] = levels.to(device)
         optimiser = LazyAdam(config.optimiser, schedule, 1.0, device)
-        stepper = Stepper(table, optimiser, TileOwners(Ranks(device=torch.device(device))), config.loss, 10.0)
+        stepper = Stepper(table, optimiser, TileOwners(Ranks(device=torch.device(device))), config.loss, 1.0)
         lod = LodGate(4.0, 2.0, 3, 2, smooth)
         gate = ViewGate(lod.reach(), 0b11)
         for step in range(1, steps + 1):
