@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
         lineage.born(initial_births(table["id"], table["parent"], table["means"]), 0)
         logged = events(table, options.candidates, options.events, lineage)
         begin = now(table.device)
-        lineage.settle(table["id"], options.events)
+        lineage.flush_and_check(table["id"], options.events)
         books = now(table.device) - begin
         lineage.close()
         megabytes = sum(path.stat().st_size for path in Path(folder).iterdir()) / 1e6

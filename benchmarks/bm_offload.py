@@ -34,7 +34,7 @@ from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import OptimiserConfig, ScheduleConfig
-from blitzgs.training.offload import Course, OffloadingStepper
+from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Schedule
@@ -153,8 +153,8 @@ def measure_pool(
     residence = Residence(table, over.ranks.device, budget, over.optimiser.pending_table)
     for name in orders:
         order = over.orders[name]
-        course = Course(order, list(range(LINES * VIEWS_A_LINE)), over.views)
-        stepper = OffloadingStepper(residence, course, over.optimiser, TileOwners(over.ranks), LOSS, 1.0)
+        upcoming = UpcomingCameras(order, list(range(LINES * VIEWS_A_LINE)), over.views)
+        stepper = OffloadingStepper(residence, upcoming, over.optimiser, TileOwners(over.ranks), LOSS, 1.0)
         result: dict[str, Any] = {"arm": f"{ratio:g}x", "order": name, "pool_gb": budget / 1e9}
         results.append(result)
         try:

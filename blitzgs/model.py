@@ -159,7 +159,7 @@ class GaussianTable:
 
     def _store(self, name: str, tensor: Tensor) -> None:
         """Store a tensor as the column `name`; all operations store their new columns through this method."""
-        self._hold(name, as_stored(name, tensor))
+        self._store_raw(name, as_stored(name, tensor))
 
     def _to_change(self) -> list[str]:
         """Return the columns in the order in which they change: `CULL` while others tell its length."""
@@ -171,7 +171,7 @@ class GaussianTable:
         self.columns = {}
         return columns
 
-    def _hold(self, name: str, stored: Tensor) -> None:
+    def _store_raw(self, name: str, stored: Tensor) -> None:
         """Store a column that already has its stored form."""
         self.columns[name] = stored
 

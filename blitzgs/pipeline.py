@@ -300,7 +300,7 @@ def backward_splats(
     )
     grid = [len(views), views.width, views.height, options.tile_size, *tiles]
     if way_back is not None:
-        way_back.expect_gradients()
+        way_back.check_still_valid()
     if v_renders.is_cuda:
         packed = frame.gradients.take(splats.means2d)
         torch.ops.blitzgs.rasterize_bwd_packed_(

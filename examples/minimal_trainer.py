@@ -47,9 +47,9 @@ class Model:
         self.params = {name: torch.nn.Parameter(value) for name, value in start.items()}
         groups = [{"params": [p], "lr": rates[name], "name": name} for name, p in self.params.items()]
         self.optimizer = LazyAdam(groups, eps=1e-15)
-        self.settle()
+        self.sort_by_place()
 
-    def settle(self) -> None:
+    def sort_by_place(self) -> None:
         """Put neighbours in space next to each other, and begin new statistics."""
         self.params = self.optimizer.permute(blitzgs.morton_order(self.params["means"].detach()))
         self.gradients, self.seen = torch.zeros_like(self.params["means"].detach()[:, :2]).unbind(1)
@@ -96,7 +96,7 @@ class Model:
         self.optimizer.append(new)
         self.params = self.optimizer.keep(torch.cat([~split, torch.ones_like(added, dtype=torch.bool)]))
         self.params = self.optimizer.keep(self.params["opacities"].sigmoid() > min_opacity)
-        self.settle()
+        self.sort_by_place()
 
 
 def load_view(capture: Capture, images: ImageStore, index: int, device: torch.device) -> dict[str, Tensor]:

@@ -100,7 +100,7 @@ class LazyAdam(torch.optim.Optimizer):
                 continue
             state, drift = self._state_of(param), self._drift_of(place, group, param)
             if drift.is_full(int(state["step"])):
-                self._settle_one(group, param, state, drift)
+                self._update_one(group, param, state, drift)
                 drift.restart(int(state["step"]))
                 for name in _STEPS:
                     state[name].zero_()
@@ -159,13 +159,13 @@ class LazyAdam(torch.optim.Optimizer):
         )  # fmt: skip
 
     @torch.no_grad()
-    def settle(self) -> None:
+    def bring_up_to_date(self) -> None:
         """Bring all rows and their moments up to date; afterwards the state is that of `torch.optim.Adam`."""
         for place, group, param in self._placed():
             if self.state.get(param):
-                self._settle_one(group, param, self._state_of(param), self._drift_of(place, group, param))
+                self._update_one(group, param, self._state_of(param), self._drift_of(place, group, param))
 
-    def _settle_one(self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift) -> None:
+    def _update_one(self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift) -> None:
         if param.numel() > 0:
             self._catch_up_one(group, param, state, drift, None)
         place = int(state["step"]) - drift.begin
@@ -178,7 +178,7 @@ class LazyAdam(torch.optim.Optimizer):
 
     def state_dict(self) -> dict[str, Any]:
         """Bring all rows up to date and return the state of `torch.optim.Adam`: step, exp_avg, exp_avg_sq."""
-        self.settle()
+        self.bring_up_to_date()
         packed = super().state_dict()
         packed["state"] = {
             index: {name: value for name, value in state.items() if name not in _STEPS}

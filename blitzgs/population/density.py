@@ -193,12 +193,12 @@ def _within_cap(candidates: Tensor, gradient: Tensor, ids: Tensor, cap: int, ran
     """Keep the candidates of largest gradient (ties to the smaller id), each of which adds one Gaussian."""
     sizes = torch.tensor([len(ids), int(candidates.sum())], device=ids.device)
     population, wanted = ranks.all_reduce(sizes).tolist()
-    room = max(0, cap - population)
-    if wanted <= room:
+    places_left = max(0, cap - population)
+    if wanted <= places_left:
         return candidates
     rows = candidates.nonzero().squeeze(1)
     kept = torch.zeros_like(candidates)
-    kept[rows] = smallest(-gradient[rows], ids[rows], room, ranks)
+    kept[rows] = smallest(-gradient[rows], ids[rows], places_left, ranks)
     return kept
 
 

@@ -35,7 +35,7 @@ from blitzgs.ops.view_sums import ViewSums, view_sums_
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.survey import Survey, survey
 from blitzgs.view.gate import SceneGate
-from blitzgs.view.seen import Scene, Seen, seen, table_of
+from blitzgs.view.visible_scene import Scene, VisibleScene, find_visible, table_of
 
 SCORE_EPS = 1e-6
 PHI_EPS = 0.1
@@ -127,7 +127,7 @@ def sweep(
         if stops is not None and number > 0 and stops():
             raise SweepStoppedError
         assignment = _assign(batch, options, owners)
-        visible = seen(scene, *batch.views.as_arguments(), options.limits, lod)
+        visible = find_visible(scene, *batch.views.as_arguments(), options.limits, lod)
         surveyed = survey(visible.table, batch.views, options, assignment, transport, visible.active)
         sums.add(surveyed, batch.columns, visible, ranks)
     return sums.result()
@@ -161,7 +161,7 @@ class _Sums:
             _all_culled(n_views, device).repeat(count, 1),
         )
 
-    def add(self, found: Survey, columns: Sequence[int], surveyed: Seen, ranks: Ranks) -> None:
+    def add(self, found: Survey, columns: Sequence[int], surveyed: VisibleScene, ranks: Ranks) -> None:
         """Add the splats of a batch of views."""
         splats, ids = found.splats, surveyed.table["id"]
         counts = integer_mass_prefix(

@@ -154,7 +154,7 @@ class Lineage:
         columns = ids, torch.full_like(ids, time), causes.long()
         self._log("deaths", columns, torch.empty(len(ids), 0, device=ids.device), step)
 
-    def settle(self, ids: Tensor, step: int) -> Ledger:
+    def flush_and_check(self, ids: Tensor, step: int) -> Ledger:
         """Write all pending rows and check that births - deaths is the population. Collective.
 
         Call this before a checkpoint is written.
@@ -202,7 +202,7 @@ class Lineage:
         self._writing.clear()
 
     def close(self) -> None:
-        """Stop writing; rows since the last `settle` are lost, as is the training since then."""
+        """Stop writing; rows since the last `flush_and_check` are lost, as is the training since then."""
         self._writer.shutdown(wait=True, cancel_futures=True)
 
     def _count(self, ids: Tensor, births: bool) -> None:
@@ -231,7 +231,7 @@ class Lineage:
     def _write(self, name: str, columns: dict[str, Tensor]) -> None:
         arrow, parquet = self._parquet
         try:
-            # The file must be on disk when `settle` returns, because the checkpoint refers to it.
+            # The file must be on disk when `flush_and_check` returns, because the checkpoint refers to it.
             with new_file(self._folder / name) as partial:
                 table = arrow.table({key: column.numpy() for key, column in columns.items()})
                 # Ids and floats hardly repeat, so a dictionary would take time and save nothing.

@@ -71,8 +71,8 @@ def render(
         ready = _queued(groups[0], gaussians, project, image, sizes)
     splats = project_groups(groups, image.sparse_grad, None if ready is None else ready.splats)
     layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
-    laid = _laid(layout, gaussians, project, image)
-    means2d, conics, opacities, depths = layout.take(*laid.values())
+    arranged = _arranged(layout, gaussians, project, image)
+    means2d, conics, opacities, depths = layout.gather(*arranged.values())
     rendered = splats._replace(means2d=means2d, conics=conics, opacities=opacities, depths=depths)
     channels, lead = _channels(rendered, layout, gaussians, image.render_mode), gaussians.lead
     if job is not None:
@@ -83,7 +83,7 @@ def render(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
         composited_lists.splats, composited_lists.offsets, n_cameras=math.prod(lead), width=project.width,
         height=project.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
-        tell_absgrad=_absgrad_teller(layout, laid["means2d"]) if image.absgrad else None,
+        tell_absgrad=_absgrad_teller(layout, arranged["means2d"]) if image.absgrad else None,
         composited=None if ready is None else ready.composited,
     )  # fmt: skip
     if not compiling:
@@ -94,7 +94,8 @@ def render(
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
     if len(lead) > 1:
         renders, alphas = renders.view(*size, renders.shape[-1]), alphas.view(*size, 1)
-    return renders, alphas, make_meta(gaussians, layout, laid, lists, lead, None if job is None else rendered)
+    meta = make_meta(gaussians, layout, arranged, lists, lead, None if job is None else rendered)
+    return renders, alphas, meta
 
 
 def _queued(
@@ -124,16 +125,16 @@ def _queued(
     )
 
 
-def _laid(
+def _arranged(
     layout: Layout, gaussians: Gaussians, project: ProjectionOptions, image: ImageOptions
 ) -> dict[str, Tensor]:
     """Return the rendered columns of splats in the layout of `meta`."""
     splats = layout.splats
-    means2d, conics, opacities, depths = layout.lay(
+    means2d, conics, opacities, depths = layout.arrange(
         splats.means2d, splats.conics, splats.opacities, splats.depths
     )
     if not (image.packed or project.antialiased or image.sparse_grad):
-        opacities = layout.lay_opacities(gaussians.opacities)
+        opacities = layout.arrange_opacities(gaussians.opacities)
     return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
 
 
@@ -197,6 +198,6 @@ def _with_depth(values: Tensor, splats: ProjectedSplats, render_mode: str) -> Te
 
 def _absgrad_teller(layout: Layout, means2d: Tensor) -> Any:
     def tell(gradient: Tensor) -> None:
-        means2d.absgrad = layout.lay(gradient)[0]  # type: ignore[attr-defined]
+        means2d.absgrad = layout.arrange(gradient)[0]  # type: ignore[attr-defined]
 
     return tell

@@ -3,7 +3,7 @@
 
 The ops order splats by Gaussian, then view; packed `meta` orders them by image, then Gaussian. As in gsplat,
 the image is rendered from the tensors in `meta`, so that these get gradients: splats are first arranged for
-`meta`, and the columns to render are taken from there.
+`meta`, and the columns to render are gathered from there.
 """
 
 from __future__ import annotations
@@ -64,99 +64,99 @@ class Layout:
             self._gaussians = self.splats.gaussian_ids.long()
         return self._gaussians
 
-    def lay(self, *values: Tensor) -> tuple[Tensor, ...]:
+    def arrange(self, *values: Tensor) -> tuple[Tensor, ...]:
         """Arrange values of splats, [P, ...], as [*shape, ...]; entries without a splat are zero."""
         if self.places is None:
             return values
         if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
-            return tuple(_laid(self.places, self.shape, v) for v in values)
-        laid: tuple[Tensor, ...] = _Lay.apply(self.places, self.shape, *values)  # type: ignore[no-untyped-call]
-        return laid
+            return tuple(_arranged(self.places, self.shape, v) for v in values)
+        arranged: tuple[Tensor, ...] = _Arrange.apply(self.places, self.shape, *values)  # type: ignore[no-untyped-call]
+        return arranged
 
-    def take(self, *laid: Tensor) -> tuple[Tensor, ...]:
-        """Take the values of splats, [P, ...], from [*shape, ...]; the inverse of `lay`."""
+    def gather(self, *arranged: Tensor) -> tuple[Tensor, ...]:
+        """Gather the values of splats, [P, ...], from [*shape, ...]; the inverse of `arrange`."""
         if self.places is None:
-            return laid
+            return arranged
         if torch.compiler.is_compiling():
-            return tuple(_taken(self.places, self.shape, t) for t in laid)
-        taken: tuple[Tensor, ...] = _Take.apply(self.places, self.shape, *laid)  # type: ignore[no-untyped-call]
-        return taken
+            return tuple(_gathered(self.places, self.shape, t) for t in arranged)
+        gathered: tuple[Tensor, ...] = _Gather.apply(self.places, self.shape, *arranged)  # type: ignore[no-untyped-call]
+        return gathered
 
-    def lay_opacities(self, opacities: Tensor) -> Tensor:
+    def arrange_opacities(self, opacities: Tensor) -> Tensor:
         """Arrange the splats' opacities as [..., C, N].
 
         Entries without a splat have the given opacities, [..., N], as in gsplat.
         """
-        assert self.places is not None  # they are given where all Gaussians are laid out
+        assert self.places is not None  # the constructor computes them when all Gaussians are arranged
         if torch.compiler.is_compiling():
-            return _laid_over(self.places, self.shape, self.splats.opacities, opacities)
-        laid: Tensor = _LayOver.apply(self.places, self.shape, self.splats.opacities, opacities)  # type: ignore[no-untyped-call]
-        return laid
+            return _arranged_over(self.places, self.shape, self.splats.opacities, opacities)
+        arranged: Tensor = _ArrangeOver.apply(self.places, self.shape, self.splats.opacities, opacities)  # type: ignore[no-untyped-call]
+        return arranged
 
 
-def _laid(places: Tensor, shape: tuple[int, ...], values: Tensor) -> Tensor:
-    laid = values.new_zeros(*shape, *values.shape[1:])
-    laid.view(-1, *values.shape[1:]).index_copy_(0, places, values)
-    return laid
+def _arranged(places: Tensor, shape: tuple[int, ...], values: Tensor) -> Tensor:
+    arranged = values.new_zeros(*shape, *values.shape[1:])
+    arranged.view(-1, *values.shape[1:]).index_copy_(0, places, values)
+    return arranged
 
 
-def _laid_over(places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
-    laid = under[..., None, :].expand(shape).clone(memory_format=torch.contiguous_format)
-    laid.view(-1).index_copy_(0, places, values)
-    return laid
+def _arranged_over(places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
+    arranged = under[..., None, :].expand(shape).clone(memory_format=torch.contiguous_format)
+    arranged.view(-1).index_copy_(0, places, values)
+    return arranged
 
 
-def _taken(places: Tensor, shape: tuple[int, ...], laid: Tensor) -> Tensor:
-    return laid.reshape(-1, *laid.shape[len(shape) :]).index_select(0, places)
+def _gathered(places: Tensor, shape: tuple[int, ...], arranged: Tensor) -> Tensor:
+    return arranged.reshape(-1, *arranged.shape[len(shape) :]).index_select(0, places)
 
 
-class _Lay(torch.autograd.Function):
-    """`Layout.lay`; no two splats have the same place, so the gradient is gathered from the places."""
+class _Arrange(torch.autograd.Function):
+    """`Layout.arrange`; no two splats have the same place, so the gradient is gathered from the places."""
 
     @staticmethod
     def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *values: Tensor) -> tuple[Tensor, ...]:
         ctx.save_for_backward(places)
         ctx.shape = shape
         ctx.set_materialize_grads(False)
-        return tuple(_laid(places, shape, v) for v in values)
+        return tuple(_arranged(places, shape, v) for v in values)
 
     @staticmethod
-    def backward(ctx: Any, *v_laid: Tensor | None) -> Any:
+    def backward(ctx: Any, *v_arranged: Tensor | None) -> Any:
         (places,) = ctx.saved_tensors
-        return None, None, *(None if v is None else _taken(places, ctx.shape, v) for v in v_laid)
+        return None, None, *(None if v is None else _gathered(places, ctx.shape, v) for v in v_arranged)
 
 
-class _LayOver(torch.autograd.Function):
-    """`Layout.lay_opacities`."""
+class _ArrangeOver(torch.autograd.Function):
+    """`Layout.arrange_opacities`."""
 
     @staticmethod
     def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
         ctx.save_for_backward(places)
         ctx.shape = shape
-        return _laid_over(places, shape, values, under)
+        return _arranged_over(places, shape, values, under)
 
     @staticmethod
-    def backward(ctx: Any, v_laid: Tensor) -> Any:
+    def backward(ctx: Any, v_arranged: Tensor) -> Any:
         (places,) = ctx.saved_tensors
-        v_values, v_under = _taken(places, ctx.shape, v_laid), None
+        v_values, v_under = _gathered(places, ctx.shape, v_arranged), None
         if ctx.needs_input_grad[3]:
-            covered = v_laid.clone(memory_format=torch.contiguous_format)
+            covered = v_arranged.clone(memory_format=torch.contiguous_format)
             covered.view(-1).index_fill_(0, places, 0)
             v_under = covered.sum(dim=-2)
         return None, None, v_values, v_under
 
 
-class _Take(torch.autograd.Function):
-    """`Layout.take`, the inverse of `_Lay`."""
+class _Gather(torch.autograd.Function):
+    """`Layout.gather`, the inverse of `_Arrange`."""
 
     @staticmethod
-    def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *laid: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *arranged: Tensor) -> tuple[Tensor, ...]:
         ctx.save_for_backward(places)
         ctx.shape = shape
         ctx.set_materialize_grads(False)
-        return tuple(_taken(places, shape, t) for t in laid)
+        return tuple(_gathered(places, shape, t) for t in arranged)
 
     @staticmethod
-    def backward(ctx: Any, *v_taken: Tensor | None) -> Any:
+    def backward(ctx: Any, *v_gathered: Tensor | None) -> Any:
         (places,) = ctx.saved_tensors
-        return None, None, *(None if v is None else _laid(places, ctx.shape, v) for v in v_taken)
+        return None, None, *(None if v is None else _arranged(places, ctx.shape, v) for v in v_gathered)

@@ -55,7 +55,7 @@ class Lists:
 def make_meta(
     gaussians: Gaussians,
     layout: Layout,
-    laid: dict[str, Tensor],
+    arranged: dict[str, Tensor],
     lists: Lists,
     lead: tuple[int, ...],
     arrived: ProjectedSplats | None,
@@ -67,7 +67,7 @@ def make_meta(
     Args:
         gaussians: the checked arguments of the call.
         layout: arrangement of the splats.
-        laid: the rendered columns in this arrangement.
+        arranged: the rendered columns in this arrangement.
         lists: the tile lists.
         lead: batch dimensions, and the number of views that are rendered here.
         arrived: the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`.
@@ -81,14 +81,14 @@ def make_meta(
         return layout.places.index_select(0, lists.listed()).int()
 
     entries: dict[str, Any] = {
-        "batch_ids": Later(lambda: layout.lay(layout.images // views)[0]) if packed else None,
-        "camera_ids": Later(lambda: layout.lay(layout.images % views)[0]) if packed else None,
-        "gaussian_ids": Later(lambda: layout.lay(layout.gaussians)[0]) if packed else None,
-        "radii": Later(lambda: layout.lay(splats.radii)[0]),
-        **laid,
+        "batch_ids": Later(lambda: layout.arrange(layout.images // views)[0]) if packed else None,
+        "camera_ids": Later(lambda: layout.arrange(layout.images % views)[0]) if packed else None,
+        "gaussian_ids": Later(lambda: layout.arrange(layout.gaussians)[0]) if packed else None,
+        "radii": Later(lambda: layout.arrange(splats.radii)[0]),
+        **arranged,
         "tile_width": lists.tiles_x,
         "tile_height": lists.tiles_y,
-        "tiles_per_gauss": Later(lambda: layout.lay(splats.tiles_touched)[0]),
+        "tiles_per_gauss": Later(lambda: layout.arrange(splats.tiles_touched)[0]),
         "isect_ids": Later(lambda: _isect_ids((arrived or splats).depths, lists, math.prod(lead))),
         "flatten_ids": Later(flatten_ids),
         "isect_offsets": Later(lambda: lists.offsets[:-1].reshape(*lead, lists.tiles_y, lists.tiles_x)),

@@ -24,7 +24,7 @@ from blitzgs.scene.pictures import comparison, encode_image
 from blitzgs.training.batches import Images, PhotographError
 from blitzgs.training.views import CameraLike, ViewSet
 from blitzgs.view.gate import SceneGate
-from blitzgs.view.seen import Scene, seen
+from blitzgs.view.visible_scene import Scene, find_visible
 
 Lpips = Callable[[Tensor, Tensor], Tensor]
 Stops = Callable[[], bool]
@@ -120,7 +120,7 @@ def render_view(
         float32 [H, W, 3] on rank `destination`, the same bits at any number of ranks; None elsewhere.
     """
     picked, ranks = views.pick([index]), owners.ranks
-    table, active, _ = seen(scene, *picked.as_arguments(), options.limits, lod)
+    table, active, _ = find_visible(scene, *picked.as_arguments(), options.limits, lod)
     if ranks.world_size == 1:
         return pipeline.forward(table, picked, options, active).renders[0]
     ranges = owners.divide([index], picked.width, picked.height, options.tile_size)

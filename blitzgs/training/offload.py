@@ -21,12 +21,12 @@ from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.training.views import ViewSet
+from blitzgs.view.block_visibility import MOST_VIEWS, Cameras
 from blitzgs.view.gate import ViewGate
 from blitzgs.view.residence import Residence
-from blitzgs.view.sight import MOST_VIEWS, Cameras
 
 
-class Course:
+class UpcomingCameras:
     """The cameras of the present and the next steps.
 
     Attributes:
@@ -72,7 +72,7 @@ class OffloadingStepper(Stepper):
     def __init__(
         self,
         residence: Residence,
-        course: Course,
+        upcoming: UpcomingCameras,
         optimiser: LazyAdam,
         owners: TileOwners,
         loss: LossConfig,
@@ -84,7 +84,7 @@ class OffloadingStepper(Stepper):
 
         Args:
             residence: this rank's Gaussians and their pool.
-            course: the cameras of the next steps.
+            upcoming: the cameras of the next steps.
             optimiser: as for `Stepper`, like the following arguments.
             owners: learns what the tiles cost.
             loss: weights of the loss.
@@ -92,9 +92,9 @@ class OffloadingStepper(Stepper):
             half_exchange: send splats in half precision.
             noise: of the means.
         """
-        self._residence, self._course = residence, course
+        self._residence, self._upcoming = residence, upcoming
         self._reported = residence.traffic
-        self._stands_at: int | None = None
+        self._up_to_date_at: int | None = None
         super().__init__(residence.pool, optimiser, owners, loss, extent, half_exchange, noise)
         self.scene = residence
 
@@ -105,14 +105,14 @@ class OffloadingStepper(Stepper):
 
     def catch_up(self, step: int) -> None:
         """See `Stepper.catch_up`; afterwards the table on the host is up to date."""
-        self.settle()
-        if self._stands_at != step:
+        self.write_back()
+        if self._up_to_date_at != step:
             self._residence.catch_up(lambda pool: self._optimiser.catch_up(pool, None, step))
-            self._stands_at = step
+            self._up_to_date_at = step
 
-    def settle(self) -> None:
-        """See `Stepper.settle`: write changes back to the host, and empty the pool."""
-        self._residence.collect()
+    def write_back(self) -> None:
+        """See `Stepper.write_back`: write changes back to the host, and empty the pool."""
+        self._residence.write_back()
 
     def report(self, whole: bool = False) -> dict[str, float]:
         """See `Stepper.report`: the share of blocks that were on the device, and megabytes moved per step."""
@@ -131,11 +131,11 @@ class OffloadingStepper(Stepper):
         gate: ViewGate | None = None,
     ) -> tuple[Frame, LossTerms, HostSum]:
         """See `Stepper.forward`."""
-        self._stands_at = None
-        cameras = self._course.cameras(step, options.limits)
+        self._up_to_date_at = None
+        cameras = self._upcoming.cameras(step, options.limits)
         if gate is None or not gate.columns:
             cameras = cameras._replace(columns=None)
-        self._blocks = self._residence.bring(step, cameras, self._course.batch_size)
+        self._blocks = self._residence.load_for_step(step, cameras, self._upcoming.batch_size)
         mark("other")
         rendered = super().forward(step, options, batch, mark, gate)
         self._residence.prefetch(step + 1)
@@ -152,5 +152,5 @@ class OffloadingStepper(Stepper):
     ) -> Tensor | None:
         """See `Stepper.backward`."""
         v_means2d = super().backward(step, frame, terms, mark, keep_means2d, absolute)
-        self._residence.note(self._blocks)
+        self._residence.store_bounds(self._blocks)
         return v_means2d

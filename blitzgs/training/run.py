@@ -26,7 +26,7 @@ from blitzgs.training.schedule import Schedule
 from blitzgs.training.views import Space
 from blitzgs.view.host_table import HostTable
 from blitzgs.view.residence import Residence
-from blitzgs.view.seen import Scene
+from blitzgs.view.visible_scene import Scene
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"

@@ -26,7 +26,7 @@ from blitzgs.training.evaluation import load_lpips
 from blitzgs.training.folder_checks import check_room, check_writable
 from blitzgs.training.gate import lineage_subject, open_gate
 from blitzgs.training.inputs import check_alike, check_capture, train_views_fingerprint
-from blitzgs.training.offload import Course, OffloadingStepper
+from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_cameras import CAMERAS, save_cameras
@@ -116,7 +116,7 @@ def set_up(
         sampler=sampler,
         optimiser=optimiser,
         stepper=_stepper(
-            config, table, optimiser, owners, space.extent, Course(sampler, capture.train, views)
+            config, table, optimiser, owners, space.extent, UpcomingCameras(sampler, capture.train, views)
         ),
         owners=owners,
         lpips=lpips,
@@ -150,7 +150,7 @@ def _stepper(
     optimiser: LazyAdam,
     owners: TileOwners,
     extent: float,
-    course: Course,
+    upcoming: UpcomingCameras,
 ) -> Stepper:
     """Return a stepper for a table on the device, or one with a pool for a table on the host."""
     shared = (
@@ -165,7 +165,7 @@ def _stepper(
         return Stepper(table, *shared)
     budget = int(config.memory.resident_gb * 1e9)
     residence = Residence(table, owners.ranks.device, budget, optimiser.pending_table)
-    return OffloadingStepper(residence, course, *shared)
+    return OffloadingStepper(residence, upcoming, *shared)
 
 
 def _position_noise(config: Config, extent: float) -> PositionNoise | None:

@@ -21,7 +21,7 @@ from blitzgs.training.loss import LossTerms, loss_terms
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.gate import ViewGate
-from blitzgs.view.seen import Scene
+from blitzgs.view.visible_scene import Scene
 
 
 class Stepper:
@@ -71,7 +71,7 @@ class Stepper:
         """Apply all pending optimiser steps; `step` is the last step taken."""
         self._optimiser.catch_up(self.table, None, step)
 
-    def settle(self) -> None:
+    def write_back(self) -> None:
         """Write all changes back to this rank's whole table. Nothing to do here; see `OffloadingStepper`."""
         return None
 

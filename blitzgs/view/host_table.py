@@ -15,8 +15,8 @@ from torch import Tensor
 from blitzgs.model import GaussianTable
 
 # Memory is allocated for this many times the present rows, so that a growing table is rarely moved.
-_ROOM = 1.25
-_MEMORY = Path("/proc/meminfo")
+_GROWTH = 1.25
+_MEMORY_INFO = Path("/proc/meminfo")
 
 
 class HostMemoryError(RuntimeError):
@@ -41,41 +41,41 @@ class HostTable(GaussianTable):
         """
         super().__init__(columns)
         self._pinned = pinned
-        self._rooms: dict[str, Tensor] = {}
+        self._memory: dict[str, Tensor] = {}
         for name in list(columns):
             del columns[name]
-            self._hold(name, self.columns[name])
+            self._store_raw(name, self.columns[name])
 
-    def _hold(self, name: str, tensor: Tensor) -> None:
-        for lost in self._rooms.keys() - self.columns.keys():
-            del self._rooms[lost]
-        room = self._rooms.get(name)
+    def _store_raw(self, name: str, tensor: Tensor) -> None:
+        for lost in self._memory.keys() - self.columns.keys():
+            del self._memory[lost]
+        memory = self._memory.get(name)
         if not (
-            room is not None
-            and room.dtype == tensor.dtype
-            and room.shape[1:] == tensor.shape[1:]
-            and len(room) >= len(tensor)
+            memory is not None
+            and memory.dtype == tensor.dtype
+            and memory.shape[1:] == tensor.shape[1:]
+            and len(memory) >= len(tensor)
         ):
             # Free the old memory first, so that the host never holds both.
-            self._rooms.pop(name, None)
+            self._memory.pop(name, None)
             self.columns[name] = tensor
-            del room
-            room = self._rooms[name] = _new_room(tensor, self._pinned)
-        self.columns[name] = room[: len(tensor)].copy_(tensor)
+            del memory
+            memory = self._memory[name] = _allocate(tensor, self._pinned)
+        self.columns[name] = memory[: len(tensor)].copy_(tensor)
 
 
 def available_bytes() -> int | None:
     """Return how many bytes the host can allocate without swapping; None if the system does not tell."""
     with contextlib.suppress(OSError, ValueError, IndexError):
-        for line in _MEMORY.read_text().splitlines():
+        for line in _MEMORY_INFO.read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
     return None
 
 
-def _new_room(like: Tensor, pinned: bool) -> Tensor:
-    """Allocate memory for `_ROOM` times the rows of a tensor, on separate pages."""
-    rows = max(1, int(_ROOM * len(like)))
+def _allocate(like: Tensor, pinned: bool) -> Tensor:
+    """Allocate memory for `_GROWTH` times the rows of a tensor, on separate pages."""
+    rows = max(1, int(_GROWTH * len(like)))
     size = rows * like.element_size() * math.prod(like.shape[1:])
     available = available_bytes()
     if available is not None and size > available:
@@ -88,9 +88,9 @@ def _new_room(like: Tensor, pinned: bool) -> Tensor:
         with contextlib.suppress(AttributeError, OSError):
             pages.madvise(getattr(mmap, advice))
     view = memoryview(pages)
-    room = torch.frombuffer(view, dtype=torch.uint8, count=max(1, size))[:size]
+    memory = torch.frombuffer(view, dtype=torch.uint8, count=max(1, size))[:size]
     if pinned and size:
-        address = room.data_ptr()
+        address = memory.data_ptr()
         error = int(torch.cuda.cudart().cudaHostRegister(address, size, 0))
         if error:
             raise HostMemoryError(
@@ -98,7 +98,7 @@ def _new_room(like: Tensor, pinned: bool) -> Tensor:
                 "with more memory, or cap population.max_gaussians"
             )
         weakref.finalize(view, _unpin, address, pages)
-    return room.view(like.dtype).view(rows, *like.shape[1:])
+    return memory.view(like.dtype).view(rows, *like.shape[1:])
 
 
 def _unpin(address: int, _pages: mmap.mmap) -> None:

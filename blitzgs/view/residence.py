@@ -26,9 +26,9 @@ from torch import Tensor
 from blitzgs.model import CULL, EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.residence import swap_blocks_
+from blitzgs.view.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostTable
-from blitzgs.view.sight import Cameras, Sight, culled_blocks
 
 # Columns that steps change and that are therefore written back to the host.
 _WRITTEN = (
@@ -73,12 +73,12 @@ class Traffic(NamedTuple):
 class Residence:
     """A pool on the device for blocks of a table in host memory.
 
-    Between `bring` and `collect` the table on the host is out of date; `collect` writes back and empties the
-    pool.
+    Between `load_for_step` and `write_back` the table on the host is out of date; `write_back` copies all
+    changes to it and empties the pool.
 
     Attributes:
         table: the table on the host.
-        pool: the table on the device; rows outside the blocks of `bring`'s index are undefined.
+        pool: the table on the device; rows outside the blocks of `load_for_step`'s index are undefined.
         traffic: counts since the beginning.
     """
 
@@ -109,7 +109,7 @@ class Residence:
 
     def reindex(self, schedule: Tensor | None) -> None:
         """Rebuild the index after rows were added, removed or reordered, or the schedule changed."""
-        self.collect()
+        self.write_back()
         self._schedule = schedule
         self._blocks, self._rest = divmod(len(self.table), BLOCK_ROWS)
         self._make_pool()
@@ -139,13 +139,13 @@ class Residence:
                 f"which take {2 * self._bytes_in / 1e9:.4f} GB"
             )
         rows = slots * BLOCK_ROWS + self._rest
-        room = (slots + has_rest) * BLOCK_ROWS
-        if any(not _fits(self._storage.get(name), table.columns[name], room) for name in names):
+        allocated_rows = (slots + has_rest) * BLOCK_ROWS
+        if any(not _fits(self._storage.get(name), table.columns[name], allocated_rows) for name in names):
             # Free the old pool before allocating the new one.
             self.pool.columns.clear()
             self._storage.clear()
             self._storage = {
-                name: torch.zeros((room, *row.shape), dtype=row.dtype, device=self._device)
+                name: torch.zeros((allocated_rows, *row.shape), dtype=row.dtype, device=self._device)
                 for name, row in ((name, table.row_of(name)) for name in names)
             }
         self.pool = self._pool_of({name: self._storage[name] for name in names}, rows)
@@ -173,7 +173,7 @@ class Residence:
                 column[-count:].copy_(self.table.columns[name][-count:])
         self._is_open = True
 
-    def collect(self) -> None:
+    def write_back(self) -> None:
         """Write all changes back to the table on the host, and empty the pool."""
         if not self._is_open:
             return
@@ -191,7 +191,7 @@ class Residence:
         Args:
             function: changes the pool in place, and must tolerate that some rows are passed to it twice.
         """
-        self.collect()
+        self.write_back()
         self._open()
         slots = len(self._block_in)
         for begin in range(0, max(1, self._blocks), max(1, slots)):
@@ -201,11 +201,11 @@ class Residence:
             function(self.pool)
             self._is_changed[:] = True
             self._rest_changed = self._rest > 0
-        self.collect()
+        self.write_back()
 
     # --- Blocks for views ---------------------------------------------------------------------------------
 
-    def bring(self, step: int, cameras: Cameras, batch_size: int) -> BlockIndex:
+    def load_for_step(self, step: int, cameras: Cameras, batch_size: int) -> BlockIndex:
         """Load the blocks that the views of a step see into the pool.
 
         Args:
@@ -214,29 +214,29 @@ class Residence:
             batch_size: views per step.
 
         Returns:
-            The index of the pool's blocks. The step updates its bounds; pass it to `note` afterwards.
+            The index of the pool's blocks. The step updates its bounds; pass it to `store_bounds` afterwards.
 
         Raises:
             ResidenceError: the blocks do not fit into the pool.
         """
         self._open()
         self._begun = self._mark()
-        self._sight = Sight(self._bounds[: self._blocks], cameras, batch_size, self._culled)
+        self._visibility = BlockVisibility(self._bounds[: self._blocks], cameras, batch_size, self._culled)
         if self._ready_for != step:
             # `prefetch` has not loaded all of them.
-            self._load(self._sight.by(0), self._begun, required=True)
+            self._load(self._visibility.blocks_of_batch(0), self._begun, required=True)
         self._ready_for = None
         self._wait()
         return self._index()
 
     def prefetch(self, step: int) -> None:
-        """Load the blocks of the next step, number `step`, while the step of `bring` runs.
+        """Load the blocks of the next step, number `step`, while the step of `load_for_step` runs.
 
         Call this after the host has waited for the running step's number of splats. Its active set is then
         complete. Before that, the device may still read the cull masks of blocks that the step leaves out as
         a whole, and this method may reuse their slots.
         """
-        now = self._sight.by(0)
+        now = self._visibility.blocks_of_batch(0)
         slots = self._slot_of[now.nonzero()[0]]
         if (slots < 0).any():
             raise RuntimeError("blocks of this step have left the pool; this is a bug, please report it")
@@ -247,19 +247,21 @@ class Residence:
         self._count(steps=1, needed=len(slots))
         # If a batch has more than half of the 32 views that are tested together, only the present batch is
         # known.
-        if self._sight.batches > 1 and self._load(self._sight.by(1), self._begun, kept=now):
-            self._ready_for = step
+        if self._visibility.batches > 1:
+            following = self._visibility.blocks_of_batch(1)
+            if self._load(following, self._begun, kept=now):
+                self._ready_for = step
 
-    def note(self, index: BlockIndex) -> None:
-        """Store the bounds of the index that `bring` returned, after a step has moved rows."""
+    def store_bounds(self, index: BlockIndex) -> None:
+        """Store the bounds of the index that `load_for_step` returned, after a step has moved rows."""
         self._bounds[self._places] = index.bounds
 
-    def visit(self, cameras: Cameras) -> BlockIndex:
-        """Load the blocks that views see, for rendering without a training step; otherwise as `bring`."""
+    def load_for_views(self, cameras: Cameras) -> BlockIndex:
+        """Load the blocks that views see, to render without a training step; else as `load_for_step`."""
         self._open()
         self._ready_for = None
-        self._sight = Sight(self._bounds[: self._blocks], cameras, len(cameras.viewmats))
-        wanted = self._sight.by(0)
+        self._visibility = BlockVisibility(self._bounds[: self._blocks], cameras, len(cameras.viewmats))
+        wanted = self._visibility.blocks_of_batch(0)
         self._count(needed=int(wanted.sum()))
         self._load(wanted, self._mark(), required=True)
         self._wait()
@@ -314,7 +316,7 @@ class Residence:
         """Choose the slots whose blocks are needed last; among equals, those that were used longest ago."""
         if len(slots) <= count:
             return slots
-        rank = self._sight.next_use(self._block_in[slots]) * (self._clock + 1) - self._last_use[slots]
+        rank = self._visibility.next_use(self._block_in[slots]) * (self._clock + 1) - self._last_use[slots]
         return slots[np.argpartition(-rank, count)[:count]]
 
     # --- Moves --------------------------------------------------------------------------------------------

@@ -81,7 +81,7 @@ def _round_trip(ranks, half, capacity):
     assert attempt.fits and list(attempt.needed[:3]) == projected.counts.tolist()
     assert splats is got and sum(traffic.received) == len(got.ids)
     for _ in range(2):
-        way_back.expect_gradients()
+        way_back.check_still_valid()
         returned = way_back.return_gradients(SplatGradients(gradients_of(got, ranks.rank)))
     assert returned.places is None
     ids = (inputs.ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
@@ -226,9 +226,9 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
     sums = sum_of_ranks(returned, len(projected.depths))
     assert torch.equal(sums[masks == 1], table) and not sums[masks == 0].any()
     later, _ = finished()
-    later.way_back.expect_gradients()
+    later.way_back.check_still_valid()
     with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
-        counts.way_back.expect_gradients()
+        counts.way_back.check_still_valid()
     # One entry more than there is room for: once more, with room.
     short = CapacityEstimate(Sizes(1, 1, needed[2] - 1))
     again = PeerTransport(alone, short)

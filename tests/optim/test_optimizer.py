@@ -270,7 +270,7 @@ def test_tables_that_are_full_begin_anew_and_nothing_is_lost(backend, monkeypatc
             pair.ours.load_state_dict(copy.deepcopy(pair.ours.state_dict()))
     pair.require_equal()
     assert all(len(kept.table) == 41 and kept.begin > 100 for kept in pair.ours._drifts.values())
-    pair.ours.settle()
+    pair.ours.bring_up_to_date()
     for name in SHAPES:
         ours, dense = pair.ours.state[pair.lazy[name]], pair.torchs.state[pair.dense[name]]
         assert int(ours["step"]) == int(dense["step"]) == 170

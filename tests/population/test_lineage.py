@@ -67,7 +67,7 @@ def test_a_run_of_events_is_logged_row_by_row(tmp_path):
                 lineage=lineage,
             )
         )  # fmt: skip
-    ledger = lineage.settle(table["id"], 3)
+    ledger = lineage.flush_and_check(table["id"], 3)
     lineage.close()
     alive, tables = live(tmp_path)
     assert alive.tolist() == sorted(table["id"].tolist())
@@ -117,14 +117,14 @@ def test_books_balance_whatever_happens(data, tmp_path_factory):
             lineage.died(torch.tensor(gone, dtype=torch.int64), torch.ones(len(gone)), step, step)
             alive -= set(gone)
         else:
-            ledger = lineage.settle(torch.tensor(sorted(alive), dtype=torch.int64), step)
+            ledger = lineage.flush_and_check(torch.tensor(sorted(alive), dtype=torch.int64), step)
             assert ledger.births - ledger.deaths == len(alive)
             if what == "resume":
                 lineage.born(some([next_id + 10_000]), step + 1)  # lost with the process
                 lineage._flush(step + 1)
                 lineage.close()
                 lineage = Lineage(folder, Ranks(), step, ledger)
-    lineage.settle(torch.tensor(sorted(alive), dtype=torch.int64), step + 1)
+    lineage.flush_and_check(torch.tensor(sorted(alive), dtype=torch.int64), step + 1)
     lineage.close()
     if next_id:
         assert live(folder)[0].tolist() == sorted(alive)
@@ -142,7 +142,7 @@ def test_books_that_do_not_balance_stop_the_run(tmp_path, ids, message):
     lineage.born(some([1, 2, 3, 4, 5]), 1)
     lineage.died(torch.tensor([5]), torch.tensor([Cause.SIZE]), 10, 1)
     with pytest.raises(LineageError, match=message):
-        lineage.settle(torch.tensor(ids), 1)
+        lineage.flush_and_check(torch.tensor(ids), 1)
     lineage.close()
 
 
@@ -160,7 +160,7 @@ def _generations(ranks, folder):
             table, RULES, time=100 * event, step=event, seed=3, level_count=4, ranks=ranks, lineage=lineage
         )
         redistribute(table, ranks, max_imbalance=1.0)
-        ledger = lineage.settle(table["id"], event)
+        ledger = lineage.flush_and_check(table["id"], event)
     lineage.close()
     return ledger
 
@@ -183,7 +183,7 @@ def test_what_is_settled_is_on_the_disk(tmp_path, monkeypatch):
     lineage = Lineage(tmp_path, Ranks(), 0, Ledger())
     lineage.born(some([1, 2]), 1)
     lineage.died(torch.tensor([1]), torch.tensor([Cause.SPLIT]), 4, 1)
-    lineage.settle(torch.tensor([2]), 1)
+    lineage.flush_and_check(torch.tensor([2]), 1)
     lineage.close()
     parts = list(tmp_path.glob("*.parquet"))
     assert len(parts) == 2

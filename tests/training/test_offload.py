@@ -174,7 +174,7 @@ def test_a_model_is_rendered_through_a_pool(tmp_path):
     for i, image in zip((0, 5), expected, strict=True):
         assert torch.equal(render_view(scene, trainer.state.views, i, options, owners, lod=lod), image)
         assert image.std() > 0.01
-    scene.collect()
+    scene.write_back()
     for name in whole:
         assert torch.equal(model.table[name], whole[name]), name
 

@@ -12,10 +12,10 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.ops.residence import seen_blocks
 from blitzgs.view import host_table
+from blitzgs.view.block_visibility import BlockVisibility, Cameras, culled_blocks
 from blitzgs.view.blocks import BlockIndex
 from blitzgs.view.host_table import HostMemoryError, HostTable
 from blitzgs.view.residence import Residence, ResidenceError, Traffic
-from blitzgs.view.sight import Cameras, Sight, culled_blocks
 from tests.helpers import DEVICES
 from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 
@@ -41,9 +41,9 @@ def cameras(views, device="cpu", seed=1):
     return Cameras(viewmats, Ks, sizes, LIMITS)
 
 
-def first(course, begin, count=None):
+def first(views, begin, count=None):
     return Cameras(
-        *(column[begin:] if count is None else column[begin : begin + count] for column in course[:3]), LIMITS
+        *(column[begin:] if count is None else column[begin : begin + count] for column in views[:3]), LIMITS
     )
 
 
@@ -63,12 +63,12 @@ def test_steps_change_the_rows_that_they_would_change_in_the_whole_table(device,
     """Steps that move all rows of their views, through a pool and in the table itself."""
     table, residence = make_residence(slots=slots, device=device)
     table = GaussianTable({name: table[name].to(device) for name in table})
-    course, steps = cameras(16, device), 12
+    views, steps = cameras(16, device), 12
     whole = BlockIndex(table)
     for step in range(steps):
-        index = residence.bring(step, first(course, step), 1)
-        rows = active_rows(index, residence.pool, first(course, step))
-        expected = active_rows(whole, table, first(course, step))
+        index = residence.load_for_step(step, first(views, step), 1)
+        rows = active_rows(index, residence.pool, first(views, step))
+        expected = active_rows(whole, table, first(views, step))
         assert torch.equal(residence.rows_of(rows).sort().values, expected)
         assert len(expected) > 0
         residence.prefetch(step + 1)
@@ -76,12 +76,12 @@ def test_steps_change_the_rows_that_they_would_change_in_the_whole_table(device,
             side["means"][at.long(), 0] += 0.5
             side["grad_count"][at.long()] += 1
             view.update(side, at)
-        residence.note(index)
-    residence.collect()
+        residence.store_bounds(index)
+    residence.write_back()
     assert_same(residence.table, table)
     traffic = residence.traffic
     assert traffic.steps == steps and 0 < traffic.loaded <= traffic.needed
-    residence.collect()  # nothing is left to write back
+    residence.write_back()  # nothing is left to write back
     assert residence.traffic == traffic
 
 
@@ -101,11 +101,11 @@ def test_all_rows_pass_through_the_pool(device, n):
 
 def test_the_blocks_that_are_needed_last_go_first():
     _, residence = make_residence(slots=40)
-    course = cameras(8)
-    seen = [set(np.flatnonzero(_blocks(residence, course, view))) for view in range(8)]
-    residence.bring(0, course, 1)
+    views = cameras(8)
+    seen = [set(np.flatnonzero(_blocks(residence, views, view))) for view in range(8)]
+    residence.load_for_step(0, views, 1)
     residence.prefetch(1)
-    residence.bring(1, first(course, 1), 1)
+    residence.load_for_step(1, first(views, 1), 1)
     residence.prefetch(2)
     here = set(residence._block_in[residence._block_in >= 0])
     assert seen[1] | seen[2] <= here
@@ -118,20 +118,20 @@ def test_the_blocks_that_are_needed_last_go_first():
         assert min(next_use[b] for b in gone) >= max(next_use[b] for b in idle)
 
 
-def _blocks(residence, course, view):
-    one = first(course, view, 1)
+def _blocks(residence, views, view):
+    one = first(views, view, 1)
     return seen_blocks(residence._bounds[: residence._blocks], *one[:3], *LIMITS).numpy()
 
 
 def test_a_step_waits_for_what_did_not_come_ahead():
     """The pool has room for each step alone: nothing of the next one replaces what the present one needs."""
     _, residence = make_residence(slots=60)
-    course = cameras(4)
-    counts = [int((_blocks(residence, course, v) != 0).sum()) for v in range(4)]
+    views = cameras(4)
+    counts = [int((_blocks(residence, views, v) != 0).sum()) for v in range(4)]
     _, residence = make_residence(slots=max(counts))
     for step in range(4):
-        index = residence.bring(step, first(course, step), 1)
-        assert len(active_rows(index, residence.pool, first(course, step))) > 0
+        index = residence.load_for_step(step, first(views, step), 1)
+        assert len(active_rows(index, residence.pool, first(views, step))) > 0
         residence.prefetch(step + 1)
     _, residence = make_residence(slots=max(counts) - 1)
     with pytest.raises(
@@ -139,17 +139,17 @@ def test_a_step_waits_for_what_did_not_come_ahead():
         match=rf"see {max(counts)} blocks .* room for {max(counts) - 1},.*raise memory.resident_gb",
     ):
         for step in range(4):
-            residence.bring(step, first(course, step), 1)
+            residence.load_for_step(step, first(views, step), 1)
             residence.prefetch(step + 1)
 
 
 def test_large_batches_do_without_a_look_ahead():
     _, residence = make_residence(60_000, slots=233)
-    course = cameras(40)
-    course.Ks[:, :2, :2] *= 8
+    views = cameras(40)
+    views.Ks[:, :2, :2] *= 8
     for step in range(2):
-        index = residence.bring(step, first(course, 20 * step, 20), 20)
-        found = index.active(residence.pool, *first(course, 20 * step, 20)[:2], WIDTH, HEIGHT, *LIMITS)
+        index = residence.load_for_step(step, first(views, 20 * step, 20), 20)
+        found = index.active(residence.pool, *first(views, 20 * step, 20)[:2], WIDTH, HEIGHT, *LIMITS)
         assert int(found.length) > 0
         residence.prefetch(step + 1)
     assert residence.traffic.needed > residence.traffic.loaded
@@ -162,9 +162,9 @@ def test_a_budget_below_two_blocks_is_refused():
 
 def test_a_table_that_fits_is_loaded_once():
     table, residence = make_residence(5000, slots=100)
-    course = cameras(12)
+    views = cameras(12)
     for step in range(12):
-        residence.bring(step, first(course, step), 1)
+        residence.load_for_step(step, first(views, step), 1)
         residence.prefetch(step + 1)
     assert residence.traffic.loaded <= 5000 // BLOCK_ROWS
     assert residence.traffic.bytes_out == 0
@@ -173,22 +173,22 @@ def test_a_table_that_fits_is_loaded_once():
 
 def test_changes_of_the_table_reach_the_pool():
     table, residence = make_residence(slots=40)
-    course = cameras(2)
-    residence.bring(0, course, 1)
+    views = cameras(2)
+    residence.load_for_step(0, views, 1)
     residence.prefetch(1)
-    residence.collect()
+    residence.write_back()
     kept = torch.arange(len(table)) % 3 > 0
     residence.table.keep(kept)
     residence.table["phi"] = torch.rand(len(residence.table))
     residence.reindex(None)
-    index = residence.visit(first(course, 0, 1))
-    rows = active_rows(index, residence.pool, course).long()
+    index = residence.load_for_views(first(views, 0, 1))
+    rows = active_rows(index, residence.pool, views).long()
     places = residence.rows_of(rows).long()
     assert len(rows) > 0
     for name in residence.pool:
         assert torch.equal(residence.pool[name][rows], residence.table[name][places]), name
     table.keep(kept)
-    residence.collect()
+    residence.write_back()
     for name in table:
         assert torch.equal(residence.table[name], table[name])
 
@@ -226,10 +226,10 @@ def assert_same_bits(table, other):
 
 def test_a_host_without_room_is_named(monkeypatch, tmp_path):
     (tmp_path / "meminfo").write_text("MemTotal: 100 kB\nMemAvailable:       40 kB\n")
-    monkeypatch.setattr(host_table, "_MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(host_table, "_MEMORY_INFO", tmp_path / "meminfo")
     with pytest.raises(HostMemoryError, match=r"10,000 Gaussians needs 0.00 GB .*max_gaussians"):
         host_copy(make_table(10_000))
-    monkeypatch.setattr(host_table, "_MEMORY", tmp_path / "nothing")
+    monkeypatch.setattr(host_table, "_MEMORY_INFO", tmp_path / "nothing")
     assert host_table.available_bytes() is None
     assert len(host_copy(make_table(1000))) == 1000
 
@@ -302,7 +302,7 @@ def test_blocks_that_views_leave_out_are_not_seen():
     viewmats, Ks = torch.eye(4).repeat(32, 1, 1), torch.eye(3).repeat(32, 1, 1)
     viewmats[:, 2, 3] = 5.0
     sizes = torch.full((32, 2), 100, dtype=torch.int32)
-    sight = Sight(bounds, Cameras(viewmats, Ks, sizes, LIMITS, columns), 1, culled)
+    visibility = BlockVisibility(bounds, Cameras(viewmats, Ks, sizes, LIMITS, columns), 1, culled)
     for view, column in enumerate(columns.tolist()):
-        assert np.array_equal(sight.by(view), ~expected[:, column].numpy())
-    assert all(Sight(bounds, Cameras(viewmats, Ks, sizes, LIMITS), 1, culled).by(31))
+        assert np.array_equal(visibility.blocks_of_batch(view), ~expected[:, column].numpy())
+    assert all(BlockVisibility(bounds, Cameras(viewmats, Ks, sizes, LIMITS), 1, culled).blocks_of_batch(31))

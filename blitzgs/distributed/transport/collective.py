@@ -72,11 +72,11 @@ class CollectiveExchange:
         everyone = ranks.share(projected.totals)
         self._visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
         self._traffic = traffic = Traffic.of(ranks.read(everyone), n_views, ranks.rank)
-        room, needed = attempt.sizes, Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
-        if room is not None and not room.holds(needed[:2]):
+        sizes, needed = attempt.sizes, Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
+        if sizes is not None and not sizes.holds(needed[:2]):
             projected = ranks.reading(partial(inputs.run, None, tiles))
         # All ranks decide the same, because they have estimated the same number of blocks.
-        attempt.end(needed, room is None or needed.blocks <= room.blocks)
+        attempt.end(needed, sizes is None or needed.blocks <= sizes.blocks)
         mark("project")
         self._own = splats_of(projected.splats[:12], traffic.counts)
         own = projected.composited.first(len(self._own.camera_ids))
@@ -100,7 +100,7 @@ class CollectiveExchange:
             return None
         return HostCounts(self._own, self.arrived.splats, self._visible, self._traffic, self)
 
-    def expect_gradients(self) -> None:
+    def check_still_valid(self) -> None:
         """Nothing of a frame is overwritten by the next one."""
 
     def cleared_table(self) -> None:

@@ -132,8 +132,8 @@ class PeerExchange:
         self._ranks, self._memory, self._buffers, self._attempt = ranks, memory, buffers, attempt
         self._n_views = inputs.n_views
         self._traffic: Traffic | None = None
-        room = Sizes(buffers.length, buffers.length, 0)
-        projected = inputs.run(room, assignment.all_composited)
+        capacity = Sizes(buffers.length, buffers.length, 0)
+        projected = inputs.run(capacity, assignment.all_composited)
         self._own = projected.splats
         self._shared = memory.share(projected.totals)  # barrier A
         self._counted = torch.cuda.Event()
@@ -153,10 +153,10 @@ class PeerExchange:
 
     def finish(self) -> HostCounts | None:
         """See `Exchange.finish`."""
-        traffic, room = self._read(), self._attempt.sizes
+        traffic, sizes = self._read(), self._attempt.sizes
         fits = traffic.most <= self._buffers.length
-        if room is not None:
-            fits = fits and traffic.most_isects <= room.isects and traffic.most_blocks <= room.blocks
+        if sizes is not None:
+            fits = fits and traffic.most_isects <= sizes.isects and traffic.most_blocks <= sizes.blocks
         self._attempt.end(traffic.needed, fits)
         if not fits:
             return None
@@ -173,8 +173,8 @@ class PeerExchange:
             self._traffic = Traffic.of(self._shared.host.tolist(), self._n_views, self._ranks.rank)
         return self._traffic
 
-    def expect_gradients(self) -> None:
-        """See `WayBack.expect_gradients`."""
+    def check_still_valid(self) -> None:
+        """See `WayBack.check_still_valid`."""
         if self._generation != self._memory.generation:
             raise RuntimeError(
                 "a later exchange has overwritten this one's splats: run the backward pass of a frame before "

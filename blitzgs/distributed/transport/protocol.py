@@ -8,7 +8,7 @@ every rank::
     exchange = transport.start(inputs, assignment, attempt, mark)  # project; send splats to where they go
     exchange.arrived, exchange.gradient_table                      # for compositing
     counts = exchange.finish()                                     # None: there was too little room
-    counts.way_back.expect_gradients()                             # before the backward pass of compositing
+    counts.way_back.check_still_valid()                            # before the backward pass of compositing
     gradients = counts.way_back.return_gradients(gradients)        # those of this rank's own splats
 
 The last two may be repeated. One file has each transport: `local`, `collective`, `peer`.
@@ -142,7 +142,7 @@ class Exchange(Protocol):
 class WayBack(Protocol):
     """Returns the gradients, and sums, of one frame's splats to the owners of their Gaussians."""
 
-    def expect_gradients(self) -> None:
+    def check_still_valid(self) -> None:
         """Check that gradients of this frame can still be returned.
 
         Raises:

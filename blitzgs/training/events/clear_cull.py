@@ -12,7 +12,7 @@ def run(state: TrainingState, event: Event) -> None:
     """Delete the cull mask and free its memory."""
     if CULL not in state.table:
         return
-    state.stepper.settle()
+    state.stepper.write_back()
     del state.table[CULL]
     state.stepper.reindex()
     state.log.event(event.time, "clear_cull", {}, "the cull mask is cleared")

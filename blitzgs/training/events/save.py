@@ -72,10 +72,10 @@ def run_last(state: TrainingState, patience_seconds: float, gives_up: Callable[[
 
 def _write(state: TrainingState) -> None:
     """Write a checkpoint, after the lineage has been written and found to add up."""
-    state.stepper.settle()
+    state.stepper.write_back()
     if state.lineage is not None:
         try:
-            ledger = state.lineage.settle(state.table["id"], state.progress.step)
+            ledger = state.lineage.flush_and_check(state.table["id"], state.progress.step)
         except OSError as error:
             raise CheckpointError(f"no checkpoint was written, because {error}.") from error
         state.progress = replace(state.progress, ledger=ledger_state(ledger))

@@ -35,7 +35,7 @@ class Cameras(NamedTuple):
     columns: Tensor | None = None
 
 
-class Sight:
+class BlockVisibility:
     """Tests which blocks the views of several batches may see; copies the result to the host asynchronously.
 
     Attributes:
@@ -72,7 +72,7 @@ class Sight:
             self._event = None
         return self._seen.numpy().view(np.uint32)
 
-    def by(self, batch: int) -> npt.NDArray[np.bool_]:
+    def blocks_of_batch(self, batch: int) -> npt.NDArray[np.bool_]:
         """Return which blocks a batch (0 is the first) may see, bool [N]; waits for the device."""
         bits = ((1 << self._batch_size) - 1) << batch * self._batch_size
         found: npt.NDArray[np.bool_] = (self._read() & np.uint32(bits & 0xFFFFFFFF)) != 0

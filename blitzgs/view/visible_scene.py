@@ -12,15 +12,15 @@ from torch import Tensor
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.view_gate import gate_views_
+from blitzgs.view.block_visibility import Cameras
 from blitzgs.view.gate import SceneGate
 from blitzgs.view.residence import Residence
-from blitzgs.view.sight import Cameras
 
 # The Gaussians that views are rendered from: a table on the device, or a table on the host with its pool.
 Scene = GaussianTable | Residence
 
 
-class Seen(NamedTuple):
+class VisibleScene(NamedTuple):
     """The Gaussians to render for a batch of views.
 
     Attributes:
@@ -39,7 +39,7 @@ def table_of(scene: Scene) -> GaussianTable:
     return scene.table if isinstance(scene, Residence) else scene
 
 
-def seen(
+def find_visible(
     scene: Scene,
     viewmats: Tensor,
     Ks: Tensor,
@@ -47,7 +47,7 @@ def seen(
     height: int,
     limits: tuple[float, float, float],
     lod: SceneGate | None,
-) -> Seen:
+) -> VisibleScene:
     """Find the Gaussians to render for a batch of views. Collective if `lod` is given.
 
     Args:
@@ -64,12 +64,12 @@ def seen(
     """
     if not isinstance(scene, Residence):
         active = None if lod is None else lod.active(scene, viewmats)
-        return Seen(scene, active, lambda rows: rows)
+        return VisibleScene(scene, active, lambda rows: rows)
     sizes = torch.tensor([[width, height]] * len(viewmats), dtype=torch.int32).to(viewmats.device)
-    index = scene.visit(Cameras(viewmats, Ks, sizes, limits))
+    index = scene.load_for_views(Cameras(viewmats, Ks, sizes, limits))
     pool = scene.pool
     rules = None if lod is None else lod.rules(pool["level"], viewmats)
     active = index.active(pool, viewmats, Ks, width, height, *limits, rules)
     if rules is not None:
         gate_views_(active, pool["means"], viewmats, rules)
-    return Seen(pool, active, scene.rows_of)
+    return VisibleScene(pool, active, scene.rows_of)
