@@ -19,7 +19,6 @@ cmake --build build-exact
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -32,7 +31,7 @@ from pathlib import Path
 import torch
 from exact_windows import EPS2D, FAR, NEAR, ExactWindows
 from gradients import parameter_gradients
-from harness import write_json
+from harness import make_parser, write_json
 from scenes import BenchmarkScene, aerial
 from timing import median_ms
 from torch import Tensor
@@ -271,18 +270,12 @@ def require_bounds(default: Figures) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    cuda = torch.cuda.is_available()
-    parser.add_argument("--device", default="cuda" if cuda else "cpu")
+    parser = make_parser(__doc__, repeats=10)
     parser.add_argument("--gaussians", type=int, help="default: 4 million on CUDA, 100 thousand on the CPU")
     parser.add_argument("--width", type=int, help="default: 1600 px on CUDA, 400 px on the CPU")
-    parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--only", help="the one option to measure")
     parser.add_argument("--exact-library", type=Path, help="kernels built with BLITZGS_EXACT_EXP=ON")
     parser.add_argument("--out", type=Path, help="folder for accuracy.json, accuracy.md and accuracy.png")
-    parser.add_argument("--json", type=Path, help="write the figures, commit and machine to this file")
     args = parser.parse_args()
     on_gpu = args.device.startswith("cuda")
     gaussians = args.gaussians or (4_000_000 if on_gpu else 100_000)

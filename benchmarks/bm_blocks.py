@@ -6,11 +6,8 @@ python benchmarks/bm_blocks.py [--device cuda] [--rows 16000000] [--views 1]
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import torch
-from harness import write_json
+from harness import make_parser, write_json
 from scenes import aerial
 from timing import median_ms
 from torch import Tensor
@@ -23,14 +20,9 @@ from blitzgs.view.blocks import BlockIndex, morton_order
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser = make_parser(__doc__, repeats=20)
     parser.add_argument("--rows", type=int, default=16_000_000)
     parser.add_argument("--views", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     device, n = args.device, args.rows
     scene = aerial(n, device)

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import report
+from harness import make_parser, report
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
 from torch import Tensor
 
@@ -169,13 +169,11 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     """Train with each arm in turn and report."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = make_parser(__doc__)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--downscale", type=float, default=1)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--json", type=Path, help="write the rows and the environment to this file")
     options = parser.parse_args(arguments)
     capture = load_capture(options.capture, downscale=options.downscale)
     images = ImageStore(capture)

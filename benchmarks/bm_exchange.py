@@ -27,12 +27,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from gradients import parameter_gradients
-from harness import write_json
+from harness import make_parser, write_json
 from scenes import aerial
 
 from blitzgs import pipeline
@@ -315,9 +314,7 @@ def show(report: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device="cpu")
     parser.add_argument("--data", help="a capture; its points become the Gaussians")
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--gaussians", type=int, default=1_000_000, help="of the aerial scene (%(default)s)")
@@ -331,8 +328,6 @@ def main() -> None:
         help="of the rows in memory; the trainer's is morton (%(default)s)",
     )
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--json", type=Path, help="write the reports here")
     args = parser.parse_args()
     if "WORLD_SIZE" in os.environ:
         measure(args)

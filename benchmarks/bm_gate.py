@@ -9,7 +9,6 @@ wall time with the device idle before and after. The goal is 50 ms for a million
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 
 import torch
 from bm_importance import median_ms, table_of
-from harness import report
+from harness import make_parser, report
 from scenes import aerial
 
 from blitzgs.distributed.group import Ranks
@@ -58,14 +57,9 @@ def random_model(trees: int) -> dict[str, Any]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, repeats=7)
     parser.add_argument("--candidates", type=int, default=1_000_000)
     parser.add_argument("--trees", type=int, default=200)
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     table = table_of(aerial(options.candidates, options.device))
     ranks, rows = Ranks(device=table.device), torch.arange(options.candidates, device=options.device)

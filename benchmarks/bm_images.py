@@ -7,14 +7,13 @@ Without --data: 24 JPEG photographs of noise, 2000 x 1500, are made for it.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
-from harness import write_json
+from harness import make_parser, write_json
 
 from blitzgs.scene.capture import Capture, load_capture
 from blitzgs.scene.colmap import ColmapCamera, ColmapImages, ColmapModel, write_model
@@ -72,14 +71,11 @@ def report(capture: Capture, threads: int, rounds: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device=None)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--downscale", type=float, default=2)
     parser.add_argument("--threads", type=int, default=4)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if args.data is None:

@@ -12,15 +12,13 @@ should take no longer than the renders.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
-from harness import report
+from harness import make_parser, report
 from scenes import BenchmarkScene, aerial
 
 from blitzgs import pipeline
@@ -127,16 +125,11 @@ def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, repeats=5)
     parser.add_argument("--gaussians", type=int, default=4_000_000)
     parser.add_argument("--views", type=int, default=32)
     parser.add_argument("--batch", type=int, default=4, help="views at a time")
-    parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--size", type=int, nargs=2, default=(1600, 1064), metavar=("WIDTH", "HEIGHT"))
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     width, height = options.size
     scene = aerial(options.gaussians, options.device, views=options.views, width=width, height=height)

@@ -6,13 +6,11 @@ python benchmarks/bm_lazy_adam.py [--device cuda] [--rows 4000000] [--fraction 0
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import torch
-from harness import write_json
+from harness import make_parser, write_json
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
@@ -66,14 +64,9 @@ class State:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser = make_parser(__doc__, repeats=30)
     parser.add_argument("--rows", type=int, default=4_000_000)
     parser.add_argument("--fraction", type=float, default=0.1)
-    parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     device, n = args.device, args.rows
     state = State(n, device)

@@ -10,7 +10,6 @@ less deaths with the population. A run has an event each 100 images and the book
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import tempfile
 import time
@@ -18,7 +17,7 @@ from pathlib import Path
 
 import torch
 from bm_importance import table_of
-from harness import report
+from harness import make_parser, report
 from scenes import aerial
 
 from blitzgs.distributed.group import Ranks
@@ -60,14 +59,10 @@ def now(device: torch.device) -> float:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--gaussians", type=int, default=2_000_000)
     parser.add_argument("--candidates", type=float, default=0.02, help="share that grows at an event")
     parser.add_argument("--events", type=int, default=20)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     scene = aerial(options.gaussians, options.device)
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:

@@ -15,18 +15,16 @@ of the schedule do.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from bm_step import LOSS, OPTIONS, RATE, make_table
-from harness import markdown_table, write_json
+from harness import make_parser, markdown_table, write_json
 from scenes import BenchmarkScene, aerial, look_at
 
 from blitzgs.distributed.group import Ranks
@@ -209,16 +207,12 @@ def run(
 
 def main() -> None:
     """Measure, print a table, and write it as JSON when a file is named."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device="cuda")
     parser.add_argument("--gaussians", type=int, default=16_000_000)
     parser.add_argument("--ratios", type=float, nargs="+", default=[1, 2, 4])
     parser.add_argument("--orders", nargs="+", default=["random", "flight"], choices=["random", "flight"])
     parser.add_argument("--batch-size", type=int, default=1)
     parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--device", default="cuda")
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     with torch.no_grad():
         found = run(

@@ -6,12 +6,9 @@ python benchmarks/bm_photometric.py [--device cuda] [--height 1064 --width 1600]
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import torch
 import torch.nn.functional as F  # noqa: N812
-from harness import write_json
+from harness import make_parser, write_json
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
 
@@ -33,15 +30,10 @@ def plain_loss(x: Tensor, targets: Tensor) -> Tensor:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser = make_parser(__doc__, repeats=30)
     parser.add_argument("--height", type=int, default=1064)
     parser.add_argument("--width", type=int, default=1600)
     parser.add_argument("--views", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     shape = (args.views, args.height, args.width, 3)
     sets = []

@@ -18,7 +18,6 @@ Into the folder go a chart of the popping (popping.svg) and the clip (popping.mp
 
 from __future__ import annotations
 
-import argparse
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from harness import report
+from harness import make_parser, report
 from torch import Tensor
 
 from blitzgs import pipeline
@@ -234,16 +233,12 @@ class _Clip:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("run", type=Path, help="folder of the run")
     parser.add_argument("--out", type=Path, help="folder for the chart and the clip (RUN/popping)")
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--width", type=int, default=640, help="of the frames in pixels")
     parser.add_argument("--camera", help="name of the view whose axis is flown along")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     out = options.out or options.run / "popping"
     found = popping(options.run, out, options.device, options.frames, options.width, options.camera)

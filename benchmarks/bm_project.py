@@ -9,13 +9,11 @@ python benchmarks/bm_project.py [--device cuda] [--gaussians 4000000] [--views 1
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import torch
-from harness import write_json
+from harness import make_parser, write_json
 from scenes import BenchmarkScene, aerial
 from timing import copy_bandwidth, median_ms
 from torch import Tensor
@@ -62,14 +60,9 @@ def backward_arguments(scene: BenchmarkScene, splats: ProjectedSplats) -> tuple[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser = make_parser(__doc__, repeats=10)
     parser.add_argument("--gaussians", type=int, default=1_000_000)
     parser.add_argument("--views", type=int, nargs="+", default=[1, 4])
-    parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     bandwidth = copy_bandwidth(args.device, 2048 if args.device == "cuda" else 256)
     print(f"{args.gaussians} Gaussians, {args.device}, copy {bandwidth:.0f} GB/s")

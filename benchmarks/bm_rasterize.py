@@ -10,11 +10,11 @@ with alpha >= 1/255 that is composited.
 
 from __future__ import annotations
 
-import argparse
+import os
 from collections.abc import Callable
 
 import torch
-from harness import add_arguments, report
+from harness import make_parser, report
 from scenes import BenchmarkScene, aerial, garden_like
 from timing import median_ms
 from torch import Tensor
@@ -150,10 +150,8 @@ def run(scene: BenchmarkScene, repeats: int) -> list[dict[str, object]]:
 
 def main() -> None:
     """Print the comparison for an aerial and a garden-like scene."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add_arguments(parser)
+    parser = make_parser(__doc__, device=None, repeats=7)
+    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="CPU threads")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(0)

@@ -13,15 +13,13 @@ is a median over repeats of CUDA event times; memory is the peak above the input
 
 from __future__ import annotations
 
-import argparse
 import statistics
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
-from harness import write_json
+from harness import make_parser, write_json
 from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
@@ -207,12 +205,8 @@ def run(name: str, repeats: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure the scenes asked for, print a table, optionally write JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device=None, repeats=30)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
-    parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     results = []
     for name in args.scenes:

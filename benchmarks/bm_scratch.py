@@ -13,14 +13,12 @@ turn, in pieces of up to 1 MiB and in larger ones, and how many pieces these are
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
 from bm_step import OurStep, measure
-from harness import report
+from harness import make_parser, report
 from scenes import BenchmarkScene, aerial
 
 from blitzgs.view.blocks import morton_order
@@ -87,13 +85,9 @@ def run(millions: float, views: int, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device=None, repeats=20)
     parser.add_argument("--millions", nargs="+", type=float, default=[4, 16, 64], help="Gaussians, 1e6")
     parser.add_argument("--views", type=int, default=1, help="views in a batch")
-    parser.add_argument("--repeats", type=int, default=20, help="timed steps, of which the median counts")
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     rows = []
     for millions in args.millions:

@@ -12,17 +12,15 @@ scene, by default in Morton order, as the trainer keeps its table. Medians of CU
 
 from __future__ import annotations
 
-import argparse
 import statistics
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
 from bm_render import CallRender
-from harness import write_json
+from harness import make_parser, write_json
 from scenes import BenchmarkScene, aerial, garden_like
 
 from blitzgs.distributed.group import Ranks
@@ -205,16 +203,12 @@ def run(name: str, views: int, order: str, repeats: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure the scenes asked for, print the stages, and write them as JSON when a file is named."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device=None, repeats=20)
     parser.add_argument(
         "--scenes", nargs="+", default=["aerial4", "aerial16"], choices=[*GAUSSIANS, "garden"]
     )
     parser.add_argument("--views", type=int, default=1, help="views in a batch")
     parser.add_argument("--order", default="morton", choices=["morton", "random"], help="of the rows")
-    parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--json", type=Path, help="write the results to this file")
     args = parser.parse_args()
     results = [run(name, args.views, args.order, args.repeats) for name in args.scenes]
     if args.json:

@@ -16,7 +16,6 @@ those of rank 0; the ranks wait for each other in every step.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import tempfile
@@ -28,7 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import torch
-from harness import markdown_table, report
+from harness import make_parser, markdown_table, report
 from torch.profiler import ProfilerActivity, profile
 
 from blitzgs.distributed.group import Ranks, Transport
@@ -190,16 +189,12 @@ def longest_kernels(use: StreamUse, steps: int, count: int = 16) -> list[dict[st
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device="auto")
     parser.add_argument("--data", required=True, metavar="DIR", help="the capture")
     parser.add_argument("--config", type=Path, metavar="YAML", help="of the training (default: the defaults)")
     parser.add_argument("--images", type=int, default=10_000, help="trained before (%(default)s)")
     parser.add_argument("--steps", type=int, default=500, help="timed steps (%(default)s)")
     parser.add_argument("--profiled", type=int, default=40, help="steps under the profiler (%(default)s)")
-    parser.add_argument("--device", default="auto")
-    parser.add_argument("--json", type=Path, help="write the figures here")
     args, overrides = parser.parse_known_args(arguments)
     config = load_config(args.config, [*overrides, f"data.path={json.dumps(str(Path(args.data).resolve()))}"])
     job, schedule = config.ranks, Schedule(config.schedule)

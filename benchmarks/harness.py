@@ -19,6 +19,7 @@ from typing import Any
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+BEST_DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
@@ -104,11 +105,25 @@ def markdown_table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options every benchmark has."""
-    parser.add_argument("--repeats", type=int, default=7, help="timed runs, of which the median counts")
-    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="CPU threads")
-    parser.add_argument("--json", type=Path, help="write the rows and the environment to this file")
+def make_parser(
+    description: str | None, *, device: str | None = BEST_DEVICE, repeats: int | None = None
+) -> argparse.ArgumentParser:
+    """Return a parser of the options that benchmarks share.
+
+    Args:
+        description: the docstring of the benchmark, which --help prints as it is written.
+        device: default of --device; None: the benchmark has no such option.
+        repeats: default of --repeats; None: the benchmark has no such option.
+    """
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    if device is not None:
+        parser.add_argument("--device", default=device)
+    if repeats is not None:
+        parser.add_argument("--repeats", type=int, default=repeats, help="timed runs (%(default)s)")
+    parser.add_argument("--json", type=Path, help="write the results, commit and machine to this file")
+    return parser
 
 
 def report(

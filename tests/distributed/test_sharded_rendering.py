@@ -189,7 +189,6 @@ def test_rendering_alone_composites_no_ring():
 
 
 def _render_half(ranks):
-    torch.set_num_threads(1)
     table, views = shard(ranks), cameras(4, device=ranks.device)
     ranges = TileOwners(ranks).divide(range(4), WIDTH, HEIGHT)
     results = []

@@ -11,9 +11,10 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.training import run
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
-from tests.distributed.test_training import records, sorted_table
+from tests.distributed.test_training import sorted_table
 from tests.helpers import needs_cuda
 from tests.training.tiny import tiny_config, tiny_scene
+from tests.training.tiny_runs import events_of, steps_of
 
 # 30 steps of 2 images, with a checkpoint after 10, and density events after 28, 36, 44 and 52 images.
 SETTINGS = (
@@ -83,7 +84,7 @@ def test_cuda_trains_so_and_resumes_exactly(name, tmp_path):
     resumed, expected = (run.restore(tmp_path / f, Ranks()).table for f in ("run", "whole"))
     for column in expected:
         assert torch.equal(resumed[column], expected[column]), column
-    _, events = records(tmp_path / "whole")
+    events = events_of(tmp_path / "whole", "densify")
     assert sum(event["cloned"] for event in events) > 30
 
 
@@ -91,8 +92,8 @@ def test_two_ranks_agree_with_one(whole, tmp_path):
     options, folder, base = whole
     shutil.copytree(base, tmp_path / "run")
     run_ranks(_train, 2, tmp_path / "run", *options)
-    losses, events = records(tmp_path / "run")
-    expected_losses, expected_events = records(folder)
+    losses, events = steps_of(tmp_path / "run"), events_of(tmp_path / "run", "densify")
+    expected_losses, expected_events = steps_of(folder), events_of(folder, "densify")
     expected_losses = [record for record in expected_losses if record["t"] > 20]
     for got, want in zip(losses, expected_losses, strict=True):
         assert got["gaussians"] == want["gaussians"]
@@ -110,7 +111,7 @@ def test_two_ranks_agree_with_one(whole, tmp_path):
 
 def test_relocation_keeps_the_population_and_grows_to_the_cap(whole):
     options, folder, _ = whole
-    _, events = records(folder)
+    events = events_of(folder, "densify")
     assert (sum(event["relocated"] for event in events) > 5) == (options is not OPTIONS["absolute"])
     if options is RELOCATION:
         counts = [event["gaussians"] for event in events]

@@ -19,6 +19,7 @@ from blitzgs.training import evaluation, run
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.training.tiny_runs import events_of, read_log, steps_of
 
 ROOT = Path(__file__).parents[2]
 # 10 + 20 steps of 2 images; density events (after 28, 36, 44 and 52 images) fall into the 20 steps.
@@ -45,11 +46,6 @@ def _train(ranks, folder, *overrides):
     trainer = Trainer(tiny_config(*SETTINGS, *overrides), capture, images, folder, ranks, resume=True)
     summary = trainer.train()
     return summary, trainer.state.table["id"].cpu()
-
-
-def records(folder):
-    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    return [r for r in lines if "loss" in r], [r for r in lines if r.get("event") == "densify"]
 
 
 def sorted_table(folder):
@@ -80,8 +76,8 @@ def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
     folder = tmp_path / "run"
     shutil.copytree(base, folder)
     answers = run_ranks(_train, world_size, folder, device=device)
-    losses, events = records(folder)
-    expected_losses, expected_events = records(whole)
+    losses, events = steps_of(folder), events_of(folder, "densify")
+    expected_losses, expected_events = steps_of(whole), events_of(whole, "densify")
     expected_losses = [r for r in expected_losses if r["t"] > 20]
     assert len(losses) == 20
     for got, want in zip(losses, expected_losses, strict=True):
@@ -127,7 +123,6 @@ def test_a_mismatch_is_named(tmp_path):
 
 
 def _resume_on_one_rank(ranks, folder):
-    torch.set_num_threads(1)
     capture, images = tiny_scene()
     Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks, resume=ranks.rank == 1)
 
@@ -141,7 +136,6 @@ def test_a_resume_on_one_rank_alone_is_named(tmp_path):
 
 
 def _lose_a_photograph(ranks, folder):
-    torch.set_num_threads(1)
     capture, images = tiny_scene()
     trainer = Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks)
     step = trainer.step
@@ -178,7 +172,6 @@ def test_a_photograph_lost_on_one_rank_is_named_by_all_and_costs_nothing(tmp_pat
 
 
 def _lose_the_last_photographs(ranks, folder):
-    torch.set_num_threads(1)
     capture, images = tiny_scene()
     trainer = Trainer(tiny_config(*SETTINGS, "data.prefetch=0"), capture, images, folder, ranks)
     step, get = trainer.step, images.get
@@ -202,7 +195,6 @@ def test_a_photograph_lost_in_the_last_step_is_named_by_all(tmp_path):
 
 
 def _lose_a_held_out_photograph(ranks, folder, resume):
-    torch.set_num_threads(1)
     capture, images = tiny_scene()
     capture.train, capture.test, get = [0, 2, 4, 6], [1, 3, 5, 7], images.get
 
@@ -227,7 +219,6 @@ def test_a_held_out_photograph_lost_on_several_ranks_is_named_by_all_and_costs_n
 
 def _stop_in_an_evaluation(ranks, folder):
     """Ask rank 1 to stop when it has compared its first view of many; count what each compares."""
-    torch.set_num_threads(1)
     capture, images = tiny_scene()
     capture.test = capture.train * 6
     trainer = Trainer(tiny_config(*SETTINGS, "schedule.evaluate_every=22"), capture, images, folder, ranks)
@@ -249,13 +240,12 @@ def test_a_signal_within_an_evaluation_does_not_wait_for_its_end(tmp_path, world
     for compared, summary in run_ranks(_stop_in_an_evaluation, world_size, tmp_path):
         assert compared == [12] and summary is None  # images 22 and 23
     assert run.restore(tmp_path, Ranks()).progress.step == 12
-    events = [json.loads(line).get("event") for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    events = [record.get("event") for record in read_log(tmp_path)]
     assert "evaluation stopped" in events and "evaluation" not in events
 
 
 def _resume_with_fewer_views(ranks, folder):
     """Train on views of two sizes, and go on from the first checkpoint without the first of them."""
-    torch.set_num_threads(1)
     capture, images = tiny_scene()
     for camera in capture.cameras[::2]:
         camera.width = 24
@@ -282,7 +272,6 @@ def test_borders_of_views_that_are_lost_are_not_those_of_others(tmp_path):
 
 def _train_and_stop(rank, arguments, signalled_at):
     """`blitzgs train`; rank 1 alone is asked to stop after a step."""
-    torch.set_num_threads(1)
     from blitzgs.cli import main
 
     step = Trainer.step
@@ -297,7 +286,6 @@ def _train_and_stop(rank, arguments, signalled_at):
 
 
 def _command(rank, arguments):
-    torch.set_num_threads(1)
     from blitzgs.cli import main
 
     return main(arguments)

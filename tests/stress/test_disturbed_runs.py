@@ -5,7 +5,6 @@ BLITZGS_TRIALS sets how often each disturbance is tried, 20 by default.
 """
 
 import contextlib
-import json
 import os
 import random
 import resource
@@ -20,6 +19,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.training import run
 from tests.distributed.rank_harness import CONTEXT
 from tests.training.tiny import OVERRIDES, write_tiny_capture
+from tests.training.tiny_runs import steps_of
 
 TRIALS = int(os.environ.get("BLITZGS_TRIALS", "20"))
 INTERVAL = 0.5
@@ -158,8 +158,7 @@ def test_a_disturbed_run_ends_like_any_other(scene, tmp_path, disturb):
         found = finish(own, out)
         for name in expected:
             assert torch.equal(found[name], expected[name]), (trial, name)
-        records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-        times = [record["t"] for record in records if "loss" in record]
+        times = [record["t"] for record in steps_of(out)]
         assert times == sorted(set(times)) and times[-1] == 3000
         shutil.rmtree(out)
         shutil.rmtree(own)

@@ -3,9 +3,9 @@ import pytest
 import torch
 
 
-@pytest.fixture
+@pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    """Tests that compare bits, or train tiny models, take one thread."""
+    """Tests of this folder take one thread: they compare bits, and their models are tiny."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

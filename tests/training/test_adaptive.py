@@ -4,9 +4,7 @@
 import itertools
 import json
 import math
-import os
 import random
-import signal
 from dataclasses import replace
 
 import pytest
@@ -21,8 +19,9 @@ from blitzgs.training.pace import Pace
 from blitzgs.training.schedule import Schedule, latest_times
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.training.test_trainer import assert_same_table
+from tests.training import tiny_runs
 from tests.training.tiny import tiny_config, tiny_scene
+from tests.training.tiny_runs import assert_same_table, events_of, read_log, stop_at
 
 CONFIG = ScheduleConfig(
     iterations=3_000, densify_from=100, densify_until=1_500, densify_every=50, t1=800, t2=1_600, adaptive=True
@@ -39,9 +38,6 @@ FLAGS = (
     "view.lod=true",
     "log.pictures=0",
 )
-
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def signals(demand=(), epochs=()):
@@ -147,13 +143,11 @@ def test_what_has_happened_stays_when_a_time_is_placed(batch_size):
 
 
 def train(folder, *overrides, resume=False):
-    trainer = Trainer(tiny_config(*FLAGS, *overrides), *tiny_scene(), folder, Ranks(), resume)
-    return trainer, trainer.train()
+    return tiny_runs.train(folder, *FLAGS, *overrides, resume=resume)
 
 
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("adaptive")
     return folder, *train(folder)
 
@@ -166,12 +160,11 @@ def test_a_run_places_its_times_and_says_why(whole_run):
         assert 0.6 * fixed - 1 <= place <= 1.4 * fixed
     assert placed != (48, 80, 96)
     assert [summary["placed"][name]["time"] for name in ("t1", "densify_until", "t2")] == list(placed)
-    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    logged = [record for record in records if record.get("event") == "place"]
+    logged = events_of(folder, "place")
     assert [record["time"] for record in logged] == list(placed)
     assert all(record["reason"] for record in logged)
     assert [record["reason"] for record in logged] == [x["reason"] for x in summary["placed"].values()]
-    times = {record["event"]: record["t"] for record in records if "event" in record}
+    times = {record["event"]: record["t"] for record in read_log(folder) if "event" in record}
     assert times["pass_1"] == placed[0] and times["pass_2"] == placed[2]
     assert times["densify"] < placed[1]
     assert trainer.state.signals.epochs and trainer.state.signals.demand
@@ -190,17 +183,9 @@ def test_a_fixed_run_with_the_places_is_the_same(whole_run, tmp_path):
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
     """Stopped at a look, within an epoch, and after places."""
     _, whole, _ = whole_run
-    step = Trainer.step
-
-    def interrupted(self, number):
-        step(self, number)
-        if number == last:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(Trainer, "step", interrupted)
+    stop_at(monkeypatch, last)
     assert train(tmp_path)[1] is None
     monkeypatch.undo()
-    torch.set_num_threads(1)
     second, summary = train(tmp_path, resume=True)
     assert second.state.config.schedule.placed == whole.state.config.schedule.placed
     assert second.state.signals.saved() == whole.state.signals.saved()
@@ -209,7 +194,6 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
 
 
 def _train_on(ranks, folder):
-    torch.set_num_threads(1)
     trainer = Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, ranks)
     trainer.train()
     return trainer.state.config.schedule.placed, trainer.state.signals.saved()

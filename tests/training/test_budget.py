@@ -25,12 +25,10 @@ from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.training.tiny_runs import events_of
 
 SECONDS = 2.4
 BUDGET = ("schedule.minutes=0.04", "schedule.densify_until=50")
-
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 class Simulation:
@@ -153,7 +151,6 @@ def stop_after(trainer, count):
 
 @pytest.fixture(scope="module")
 def timed_run(tmp_path_factory):
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("timed")
     trainer = start(folder)
     return folder, trainer, trainer.train()
@@ -165,8 +162,7 @@ def test_training_ends_on_time_and_says_what_it_chose(timed_run):
     assert summary["seconds"] == pytest.approx(SECONDS, rel=0.05)
     assert summary["budget_seconds"] == pytest.approx(SECONDS)
     assert summary["scale"] == summary["images"] / 100
-    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    plans = [record for record in records if record.get("event") == "pace"]
+    plans = events_of(folder, "pace")
     assert len(plans) == len(trainer.state.config.schedule.pace) >= 3
     assert plans[-1]["images"] == summary["images"]
     assert plans[-1]["seconds"] == pytest.approx(SECONDS, rel=0.05)
@@ -226,7 +222,6 @@ def test_a_gate_is_not_replayed_on_a_run_by_the_clock(tmp_path):
 
 
 def _train_on_ranks(ranks, folder):
-    torch.set_num_threads(1)
     trainer = start(folder, ranks=ranks, haste=1.0 + 4.0 * ranks.rank)
     summary = trainer.train()
     return summary, trainer.state.config.schedule.pace, trainer.state.progress.step

@@ -26,7 +26,6 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    torch.set_num_threads(1)
     data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
     write_tiny_capture(data)
     flags = [f"--{text}" for text in OVERRIDES]

@@ -18,6 +18,7 @@ from blitzgs.population.spawn_samples import read_sample
 from blitzgs.training.gate_replay import OracleVeto, event_keys, label_events
 from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import OVERRIDES, write_tiny_capture
+from tests.training.tiny_runs import events_of
 
 parquet = pytest.importorskip("pyarrow.parquet")
 pytest.importorskip("xgboost")
@@ -37,7 +38,6 @@ SETTINGS = (
 
 @pytest.fixture(scope="module")
 def lineage_run(tmp_path_factory):
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("gate")
     write_tiny_capture(folder / "capture")
     flags = [f"--{text}" for text in (*OVERRIDES, *SETTINGS)]
@@ -86,10 +86,7 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     table = (tmp_path / "replay" / "replay.md").read_text()
     assert table.count("\n") == 7 and table in capsys.readouterr().out
     # The first gated event is that of the reference, so the oracle knows each candidate there.
-    records = [
-        json.loads(line) for line in (tmp_path / "replay" / "oracle" / "log.jsonl").read_text().splitlines()
-    ]
-    assert [r["t"] for r in records if r.get("event") == "densify"] == [60, 80]
+    assert [r["t"] for r in events_of(tmp_path / "replay" / "oracle", "densify")] == [60, 80]
     assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
     assert "already holds a replay: choose another --out" in capsys.readouterr().err.replace("\n", " ")
 

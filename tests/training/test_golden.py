@@ -26,6 +26,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.training.config_io import from_dict, to_dict
 from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
+from tests.training.tiny_runs import events_of, read_log, steps_of
 
 GOLDEN = Path(__file__).with_name("golden.json")
 # 100 steps of 2 views: cloning, splitting, pruning by opacity and size, a reset of opacities, all SH degrees.
@@ -79,15 +80,15 @@ def train(config: dict[str, Any], folder: Path, jitter: float = 0.0) -> Curves:
     finally:
         torch.set_num_threads(threads)
     assert summary is not None
-    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    steps = [record for record in records if "loss" in record]
-    densified = [record for record in records if record.get("event") == "densify"]
+    steps, densified = steps_of(folder), events_of(folder, "densify")
     return {
         "images": [record["t"] for record in steps],
         "loss": [record["loss"] for record in steps],
         "psnr": [record["psnr"] for record in steps],
         "gaussians": [record["gaussians"] for record in steps],
-        "events": [[record["t"], record["event"]] for record in records if record.get("event") in CHANGES],
+        "events": [
+            [record["t"], record["event"]] for record in read_log(folder) if record.get("event") in CHANGES
+        ],
         "densified": {
             name: sum(event[name] for event in densified) for name in ("cloned", "split", "pruned")
         },

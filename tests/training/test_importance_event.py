@@ -25,29 +25,24 @@ from blitzgs.training.gate import life_fields, misfits
 from blitzgs.training.guard import ModelLostError
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.training.test_trainer import assert_same_table, stop_at_step_50
+from tests.training import tiny_runs
 from tests.training.tiny import tiny_config, tiny_scene
+from tests.training.tiny_runs import assert_same_table, events_of, read_log, stop_at
 
 # Density events at 20, 40, 60 and 80; the passes after those at 40 and 80.
 PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80", "log.pictures=0")
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
-
 def train(folder, *overrides, ranks=None, resume=False):
-    trainer = Trainer(tiny_config(*PASSES, *overrides), *tiny_scene(), folder, ranks or Ranks(), resume)
-    return trainer, trainer.train()
+    return tiny_runs.train(folder, *PASSES, *overrides, ranks=ranks, resume=resume)
 
 
 def pass_events(folder):
-    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    return {r["event"]: r for r in records if str(r.get("event")).startswith("pass")}
+    return {r["event"]: r for r in read_log(folder) if str(r.get("event")).startswith("pass")}
 
 
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("run")
     return folder, *train(folder)
 
@@ -104,11 +99,10 @@ def test_the_population_is_reported(whole_run):
 def test_resume_is_exact_and_carries_the_columns(whole_run, tmp_path, monkeypatch):
     """Stopped between the passes, when children have inherited phi."""
     _, whole, _ = whole_run
-    stop_at_step_50(monkeypatch)
+    stop_at(monkeypatch, 50)
     first, summary = train(tmp_path)
     assert summary is None and PHI in first.state.table
     monkeypatch.undo()
-    torch.set_num_threads(1)
     second, _ = train(tmp_path, resume=True)
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.milestones == whole.state.progress.milestones
@@ -152,7 +146,6 @@ EARLY = ("schedule.checkpoint_every=30", "log.keep_checkpoints=9")
 
 def _passes_from(ranks, folder):
     """Both passes on a model that is dealt to the ranks; ids and what they have."""
-    torch.set_num_threads(1)
     config = tiny_config(*PASSES, *EARLY, "view.cull=true")
     trainer = Trainer(config, *tiny_scene(), folder, ranks, resume=True)
     state, out = trainer.state, []
@@ -185,10 +178,9 @@ def test_passes_are_the_same_at_every_world_size(tmp_path, world_size, device):
 def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
     """Every Gaussian of the final model was born and did not die; each death has its mechanism."""
     pytest.importorskip("pyarrow")
-    stop_at_step_50(monkeypatch)
+    stop_at(monkeypatch, 50)
     train(tmp_path, "population.lineage=true")
     monkeypatch.undo()
-    torch.set_num_threads(1)
     trainer, _ = train(tmp_path, "population.lineage=true", resume=True)
     tables = read_lineage(tmp_path / run.LINEAGE)
     births, deaths = tables["births"]["id"], tables["deaths"]["id"]
@@ -219,8 +211,7 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
     texts = [str(w.message) for w in warned if "spawn gate" in str(w.message)]
     assert any("fitted on this very capture" in text for text in texts)
     assert any("population.grad_threshold (0.0001, here 0.0002)" in text for text in texts)
-    lines = [json.loads(line) for line in (tmp_path / "gated" / "log.jsonl").read_text().splitlines()]
-    events = {r["t"]: r for r in lines if r.get("event") == "densify"}
+    events = {r["t"]: r for r in events_of(tmp_path / "gated", "densify")}
     assert events[20]["vetoed"] == events[40]["vetoed"] == 0
     for t in (60, 80):
         grown = events[t]["cloned"] + events[t]["split"]
@@ -269,7 +260,6 @@ def test_lineage_says_at_what_pace_its_run_went(tmp_path):
 
 
 def _train_with_lineage(ranks, folder):
-    torch.set_num_threads(1)
     trainer, summary = train(folder, "population.lineage=true", "schedule.batch_size=2", ranks=ranks)
     progress = trainer.state.progress
     return trainer.state.table["id"].cpu(), progress.ledger, progress.milestones, summary["population"]

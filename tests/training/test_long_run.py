@@ -24,8 +24,6 @@ from blitzgs.training.views import Space, ViewSet
 from tests.helpers import needs_cuda
 from tests.training.tiny import Camera, Capture, Images, tiny_config
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 WIDTH, HEIGHT = 32, 24
 ACROSS, SPACING = 16, 2.0  # cameras in a row and a column, and how far apart
 COUNT = 2400

@@ -23,6 +23,7 @@ from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.training.tiny import tiny_config, tiny_scene
+from tests.training.tiny_runs import at_step, read_log, steps_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,12 +42,8 @@ def signals_as_in_a_terminal():
 
 
 @pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def every_warning_is_shown():
     run_log._warned.clear()
-    yield
-    torch.set_num_threads(before)
 
 
 def trainer(folder, *overrides, images=None, resume=False):
@@ -54,24 +51,8 @@ def trainer(folder, *overrides, images=None, resume=False):
     return Trainer(tiny_config(*overrides), capture, images or own, folder, Ranks(), resume)
 
 
-def at_step(monkeypatch, number, action):
-    """Have `action(trainer)` happen after step `number`."""
-    step = Trainer.step
-
-    def changed(self, taken):
-        step(self, taken)
-        if taken == number:
-            action(self)
-
-    monkeypatch.setattr(Trainer, "step", changed)
-
-
 def checkpoints(folder):
     return sorted(path.name for path in (folder / "checkpoints").glob("checkpoint_*"))
-
-
-def records(folder):
-    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
 # Non-finite values never become the newest checkpoint.
@@ -128,7 +109,7 @@ def test_every_signal_saves(tmp_path, monkeypatch, number):
     running = trainer(tmp_path)
     assert running.train() is None
     assert run.restore(tmp_path, Ranks()).progress.step == 17
-    assert signal.Signals(number).name in records(tmp_path)[-1]["reason"]
+    assert signal.Signals(number).name in read_log(tmp_path)[-1]["reason"]
 
 
 def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save():
@@ -203,7 +184,6 @@ def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
     assert 40 <= saved <= 44  # some batches were loaded ahead
     images.get = get
     monkeypatch.undo()
-    torch.set_num_threads(1)
     resumed = trainer(tmp_path / "cut", resume=True)
     resumed.train()
     for name in whole.state.table:
@@ -367,14 +347,13 @@ def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypat
     at_step(monkeypatch, 70, lambda self: (_ for _ in ()).throw(RuntimeError("killed")))
     with pytest.raises(RuntimeError, match="killed"):
         trainer(tmp_path, "schedule.checkpoint_every=50").train()
-    assert [r["t"] for r in records(tmp_path) if "loss" in r] == [20, 40, 60]
+    assert [r["t"] for r in steps_of(tmp_path)] == [20, 40, 60]
     with (tmp_path / "log.jsonl").open("a") as file:
         file.write('{"t": 61, "lo')  # torn
     monkeypatch.undo()
-    torch.set_num_threads(1)
     trainer(tmp_path, "schedule.checkpoint_every=50", resume=True).train()
     trainer(tmp_path, "schedule.checkpoint_every=50", resume=True).train()  # the finished run once more
-    found = records(tmp_path)
+    found = read_log(tmp_path)
     assert [r["t"] for r in found if "loss" in r] == [20, 40, 60, 80, 100]
     assert [r["t"] for r in found if r.get("event") == "evaluation"] == [100]
     assert len({r["run"] for r in found}) == 1

@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-import json
-import os
-import signal
 
 import numpy as np
 import pytest
 import torch
 
-from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
-from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training import run
 from blitzgs.training.evaluation import render_view
 from blitzgs.training.lod import scene_gate
@@ -19,9 +14,8 @@ from blitzgs.training.trainer import Trainer
 from blitzgs.view.residence import Residence, ResidenceError
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import DEVICES
-from tests.training.tiny import HEIGHT, WIDTH, Camera, Capture, Images, random_gaussians, tiny_config
-
-pytestmark = pytest.mark.usefixtures("one_thread")
+from tests.training.tiny import HEIGHT, WIDTH, Camera, photographed, random_gaussians, tiny_config
+from tests.training.tiny_runs import steps_of, stop_at
 
 COUNT, VIEWS = 8000, 12
 RESIDENT = "memory.resident_gb=0.0078"
@@ -34,18 +28,12 @@ def street(count=COUNT):
     truth["means"][:, 0] *= 20
     K = np.array([[40.0, 0.0, 24.5], [0.0, 41.0, 15.0], [0.0, 0.0, 1.0]])
     down = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]])
-    cameras, images = [], []
+    cameras = []
     for i, x in enumerate(np.linspace(-22, 22, VIEWS)):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = down, -down @ np.array([x, 0.1 * (i % 3), 4.0])
         cameras.append(Camera(f"{i:02}.png", WIDTH, HEIGHT, K, pose))
-        views = Views(torch.from_numpy(pose).float()[None], torch.from_numpy(K).float()[None], WIDTH, HEIGHT)
-        render = pipeline.forward(truth, views, RenderOptions(0, 0.01, 1e6)).renders[0]
-        images.append((render.clamp(0, 1) * 255 + 0.5).byte())
-    colors = (0.5 + 0.28209479 * truth["sh"][:, 0]).clamp(0, 1).mul(255).byte().numpy()
-    points = truth["means"].double().numpy()
-    train = [i for i in range(VIEWS) if i != 5]
-    return Capture(cameras, points, colors, train, [5], extent=24.0), Images(images)
+    return photographed(truth, cameras, test=5, extent=24.0)
 
 
 def train(folder, *overrides, device="cpu", resume=False):
@@ -117,34 +105,23 @@ def test_a_run_with_a_quarter_of_its_blocks_on_the_device_is_the_same_run(tmp_pa
         assert summary[name] == expected[name]
     assert 0 <= summary["resident_hits"] < 1 and summary["moved_mb_per_step"] > 0
     assert "resident_hits" not in expected
-    records = [json.loads(line) for line in (tmp_path / "pooled" / "log.jsonl").read_text().splitlines()]
-    shares = [record["resident_hits"] for record in records if "loss" in record]
+    records = steps_of(tmp_path / "pooled")
+    shares = [record["resident_hits"] for record in records]
     assert len(shares) == 3 and all(0 <= share < 1 for share in shares)
-    assert all(record["moved_mb_per_step"] > 0 for record in records if "loss" in record)
+    assert all(record["moved_mb_per_step"] > 0 for record in records)
 
 
 def test_a_run_goes_on_with_and_without_a_pool(tmp_path, monkeypatch):
     whole, _ = train(tmp_path / "whole")
-    stop = Trainer.step
     for at, overrides in ((17, [RESIDENT]), (41, [])):
-        monkeypatch.setattr(Trainer, "step", stopping_at(stop, at))
+        stop_at(monkeypatch, at)
         assert train(tmp_path / "cut", *overrides, resume=at > 17)[1] is None
-    monkeypatch.setattr(Trainer, "step", stop)
+        monkeypatch.undo()
     resumed, _ = train(tmp_path / "cut", RESIDENT, resume=True)
     assert_same_run(resumed, whole)
 
 
-def stopping_at(step, at):
-    def stopping(self, number):
-        step(self, number)
-        if number == at:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    return stopping
-
-
 def _train(ranks, folder, overrides):
-    torch.set_num_threads(1)
     trainer = Trainer(tiny_config(*SETTINGS, *overrides), *street(), folder, ranks)
     trainer.train()
     table = trainer.state.table

@@ -28,7 +28,6 @@ from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_c
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A capture and a short run of it, through the command line."""
-    torch.set_num_threads(1)
     data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
     write_tiny_capture(data)
     flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.4"]

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
-import os
 import shutil
-import signal
 
 import numpy as np
 import pytest
@@ -15,30 +13,7 @@ from blitzgs.training.guard import NonFiniteError
 from blitzgs.training.trainer import Trainer
 from tests.helpers import DEVICES, needs_cuda
 from tests.training.tiny import tiny_config, tiny_scene
-
-pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def train(folder, *overrides, scale=1.0, resume=False):
-    trainer = Trainer(tiny_config(*overrides), *tiny_scene(scale), folder, Ranks(), resume)
-    return trainer, trainer.train()
-
-
-def assert_same_table(a, b):
-    assert len(a) == len(b)
-    for name in a:
-        assert torch.equal(a[name], b[name]), name
-
-
-def stop_at_step_50(monkeypatch):
-    step = Trainer.step
-
-    def interrupted(self, number):
-        step(self, number)
-        if number == 50:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(Trainer, "step", interrupted)
+from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at, train
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +46,8 @@ def test_what_a_run_leaves_behind(whole_run):
     ):
         assert summary[name]
     assert summary["peak_gaussians"] >= summary["gaussians"]
-    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    assert [r["t"] for r in records if "loss" in r] == [20, 40, 60, 80, 100]
-    assert [r["t"] for r in records if r.get("event") == "densify"] == [20, 40, 60, 80]
+    assert [r["t"] for r in steps_of(folder)] == [20, 40, 60, 80, 100]
+    assert [r["t"] for r in events_of(folder, "densify")] == [20, 40, 60, 80]
     assert run.load_config(folder / "config.yaml") == trainer.state.config
     metrics = json.loads((folder / "evaluation" / "000100" / "metrics.json").read_text())
     assert list(metrics["views"]) == ["03.png"]
@@ -85,11 +59,10 @@ def test_what_a_run_leaves_behind(whole_run):
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     """50 steps, SIGTERM, resume, 50 more: bit for bit the run that was never stopped."""
     _, whole, _ = whole_run
-    stop_at_step_50(monkeypatch)
+    stop_at(monkeypatch, 50)
     first, summary = train(tmp_path)
     assert summary is None and first.state.progress.step == 50
     monkeypatch.undo()
-    torch.set_num_threads(1)
     second, summary = train(tmp_path, resume=True)
     assert summary is not None
     assert_same_table(second.state.table, whole.state.table)
@@ -98,7 +71,7 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
 
 def test_a_run_that_views_made_longer_is_resumed_with_either_configuration(tmp_path, monkeypatch):
     asked = ["schedule.iterations=40", "schedule.images_per_view=20"]
-    stop_at_step_50(monkeypatch)
+    stop_at(monkeypatch, 50)
     first, summary = train(tmp_path, *asked)
     views = len(first.state.capture.train)
     assert summary is None and first.state.schedule.iterations == 20 * views > 50
@@ -212,7 +185,7 @@ def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path, monke
     whole = Trainer(config, *tiny_scene(), tmp_path / "whole", ranks)
     summary = whole.train()
     assert summary["psnr"] == pytest.approx(whole_run[2]["psnr"], abs=1.0)
-    stop_at_step_50(monkeypatch)
+    stop_at(monkeypatch, 50)
     assert Trainer(config, *tiny_scene(), tmp_path / "cut", ranks).train() is None
     monkeypatch.undo()
     resumed = Trainer(config, *tiny_scene(), tmp_path / "cut", ranks, resume=True)

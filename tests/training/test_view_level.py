@@ -2,9 +2,6 @@
 """The LOD gate and the cull mask in a training, and in what evaluates and renders its model."""
 
 import dataclasses
-import json
-import os
-import signal
 
 import numpy as np
 import pytest
@@ -28,8 +25,9 @@ from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.training.test_trainer import assert_same_table
+from tests.training import tiny_runs
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
+from tests.training.tiny_runs import assert_same_table, events_of, steps_of, stop_at
 
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
 FLAGS = (
@@ -44,28 +42,13 @@ FLAGS = (
 )
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def train(folder, *overrides, resume=False):
-    trainer = Trainer(tiny_config(*FLAGS, *overrides), *tiny_scene(), folder, Ranks(), resume)
-    return trainer, trainer.train()
-
-
-def logged(folder, event):
-    records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    return [record for record in records if record.get("event") == event]
+    return tiny_runs.train(folder, *FLAGS, *overrides, resume=resume)
 
 
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
     """A run, and of each of its steps what the views had left: (step, gate, views by row, table then)."""
-    torch.set_num_threads(1)
     folder, steps = tmp_path_factory.mktemp("run"), {}
     forward = Stepper.forward
 
@@ -84,8 +67,7 @@ def test_each_phase_leaves_out_what_the_schedule_says(whole_run):
     folder, trainer, _, steps = whole_run
     progress, column_of = trainer.state.progress, trainer.state.columns
     dropped = {"lod": 0, "cull": 0}
-    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    active, compared = {line["t"]: line["active"] for line in lines if "loss" in line}, 0
+    active, compared = {record["t"]: record["active"] for record in steps_of(folder)}, 0
     for step, (gate, rows, (index,), table) in steps.items():
         t = step - 1  # of one image each
         has_lod, has_mask = t >= 60, 40 < t <= 85
@@ -122,28 +104,17 @@ def test_each_phase_leaves_out_what_the_schedule_says(whole_run):
 def test_what_the_run_says_and_saves(whole_run):
     folder, trainer, _, _ = whole_run
     progress = trainer.state.progress
-    opened, again = logged(folder, "lod_gate")  # at the end of the window, and after the second pass
+    opened, again = events_of(folder, "lod_gate")  # at the end of the window, and after the second pass
     assert opened["t"] == 60 and again["t"] == 71
     assert progress.finest_level == progress.level_count - 1 >= 1
     assert progress.reference_distance > 0
     assert len(progress.gated_views) == 7 and "1" in progress.gated_views
     assert again["gated_views"] == progress.gated_views.count("1") and again["kept"] < 0.95
-    assert logged(folder, "clear_cull")[0]["t"] == 85 and CULL not in trainer.state.table
+    assert events_of(folder, "clear_cull")[0]["t"] == 85 and CULL not in trainer.state.table
     saved = run.open_model(folder, Ranks())
     assert saved.progress == progress
     gate = scene_gate(saved.config, saved.progress, saved.table, Ranks())
     assert gate.gate == scene_gate(trainer.state.config, progress, trainer.state.table, Ranks()).gate
-
-
-def stop_at(monkeypatch, last):
-    step = Trainer.step
-
-    def interrupted(self, number):
-        step(self, number)
-        if number == last:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(Trainer, "step", interrupted)
 
 
 def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
@@ -174,14 +145,12 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
     stop_at(monkeypatch, last)
     assert train(tmp_path)[1] is None
     monkeypatch.undo()
-    torch.set_num_threads(1)
     second, _ = train(tmp_path, resume=True)
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.gated_views == whole.state.progress.gated_views
 
 
 def _train_on(ranks, folder):
-    torch.set_num_threads(1)
     trainer = Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, ranks)
     summary = trainer.train()
     return summary["psnr"], trainer.state.progress.gated_views, CULL in trainer.state.table
@@ -245,7 +214,6 @@ def test_a_photograph_that_is_lost_moves_no_mask_to_another_view(tmp_path, monke
     assert fewer.train() is None
     assert len(fewer.state.progress.gated_views) == 6
     monkeypatch.undo()
-    torch.set_num_threads(1)
     again, summary = train(tmp_path, resume=True)
     assert summary is not None and len(again.state.progress.gated_views) == 7
 
@@ -271,7 +239,6 @@ def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypat
     stop_at(monkeypatch, 65)
     assert train(tmp_path / "stopped", "view.smooth=true")[1] is None
     monkeypatch.undo()
-    torch.set_num_threads(1)
     resumed, _ = train(tmp_path / "stopped", "view.smooth=true", resume=True)
     trainer, _ = train(tmp_path / "whole", "view.smooth=true")
     state = trainer.state
@@ -322,7 +289,7 @@ def test_the_gate_follows_levels_that_come_later(tmp_path):
         tmp_path, "schedule.levels_until=90", "view.first_levels=0", "lod.fork=1.3", "schedule.t2=65",
         "view.cull=false",
     )  # fmt: skip
-    levels = [record["finest_level"] for record in logged(tmp_path, "lod_gate")]
+    levels = [record["finest_level"] for record in events_of(tmp_path, "lod_gate")]
     count = trainer.state.progress.level_count
     assert levels == sorted(levels) and levels[-1] == count - 1 and len(set(levels)) >= 2
     assert CULL not in trainer.state.table

@@ -117,31 +117,37 @@ def random_gaussians(count: int = COUNT) -> GaussianTable:
     )
 
 
-def tiny_scene(scale: float = 1.0) -> tuple[Capture, Images]:
-    """Capture and images; `scale` scales the capture's world, not the images."""
-    truth = random_gaussians()
-    cameras = tiny_cameras(1.0)
+def photographed(
+    truth: GaussianTable, cameras: list[Camera], test: int, extent: float
+) -> tuple[Capture, Images]:
+    """A capture of Gaussians: what the cameras see of them, and their centres as points.
+
+    Args:
+        truth: the Gaussians.
+        cameras: of the views.
+        test: the view that is held out.
+        extent: radius of the cameras' positions.
+    """
     images = []
     for camera in cameras:
         views = Views(
             torch.from_numpy(camera.world_to_camera).float()[None],
             torch.from_numpy(camera.K).float()[None],
-            WIDTH,
-            HEIGHT,
+            camera.width,
+            camera.height,
         )
         render = pipeline.forward(truth, views, RenderOptions(0, 0.01, 1e6)).renders[0]
         images.append((render.clamp(0, 1) * 255 + 0.5).byte())
     colors = (0.5 + 0.28209479 * truth["sh"][:, 0]).clamp(0, 1).mul(255).byte().numpy()
-    points = truth["means"].double().numpy() * scale
-    capture = Capture(
-        cameras=tiny_cameras(scale),
-        points=points,
-        colors=colors,
-        train=[i for i in range(8) if i != 3],
-        test=[3],
-        extent=1.1 * 3.0 * scale,
-    )
-    return capture, Images(images)
+    train = [i for i in range(len(cameras)) if i != test]
+    return Capture(cameras, truth["means"].double().numpy(), colors, train, [test], extent), Images(images)
+
+
+def tiny_scene(scale: float = 1.0) -> tuple[Capture, Images]:
+    """Capture and images; `scale` scales the capture's world, not the images."""
+    capture, images = photographed(random_gaussians(), tiny_cameras(1.0), test=3, extent=1.1 * 3.0 * scale)
+    capture.cameras, capture.points = tiny_cameras(scale), scale * capture.points
+    return capture, images
 
 
 def write_tiny_capture(folder: Path) -> None:
