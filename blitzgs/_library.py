@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -40,20 +41,29 @@ def _load(path: Path) -> None:
             "checkout); the CUDA library needs nvcc on the PATH while building."
         )
     torch.ops.load_library(str(path))
-    if REGISTRATION.exists() and schema_digest(path) != hashlib.sha256(REGISTRATION.read_bytes()).hexdigest():
+    if REGISTRATION.exists() and schema_digest(path) != source_digest(REGISTRATION):
         raise ImportError(
             f"{path} was built before the ops changed (it does not match {REGISTRATION}): run `make build`"
         )
 
 
 def schema_digest(path: Path) -> str:
-    """Return the SHA-256 of the registration.cpp that a library was built with; "" if it has none."""
+    """Return the `source_digest` of the ops that a library was built with; "" if the library has none."""
     try:
         digest = ctypes.CDLL(str(path)).blitzgs_schema_digest
     except AttributeError:
         return ""
     digest.restype = ctypes.c_char_p
     return str(digest().decode())
+
+
+def source_digest(registration: Path) -> str:
+    """Return the SHA-256 of the schemas of all ops in a registration.cpp; CMakeLists.txt computes the same.
+
+    Comments, white space and the seams of string literals do not count.
+    """
+    text = re.sub(r"//[^\n]*|[ \n]+", "", registration.read_text()).replace('""', "")
+    return hashlib.sha256(";".join(re.findall(r'm\.def\("[^"]*"', text)).encode()).hexdigest()
 
 
 def without_autograd(op: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Every op of BlitzGS, one readable list. N Gaussians, B views, P projected splats (a Gaussian in a view), U
-// Gaussians visible in at least one view, I splat-tile intersections, D channels, K = (degree + 1)^2 SH
-// coefficients. An argument n_splats, int64 [1]: only the first of the P splats are there. Contracts:
-// csrc/<op>/<op>.h; Python functions, fake kernels and autograd: blitzgs/ops/<op>.py.
+// The signatures of all ops of BlitzGS. Letters: N Gaussians, B views, P projected splats (pairs of a
+// Gaussian and a view), U Gaussians visible in at least one view, I splat-tile intersections, D channels,
+// K = (degree + 1)^2 SH coefficients. An argument n_splats, int64 [1], says how many of the P splats are
+// valid. csrc/<op>/<op>.h defines what an op computes; blitzgs/ops/<op>.py has its Python function, fake
+// kernel and autograd.
 #include <torch/csrc/stable/library.h>
 
 #include <cstdint>
@@ -33,7 +34,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor? level_ranges=None, Tensor? level=None, float[] reach=[], int lod_views=0, Tensor? cull=None, "
       "int[] columns=[], int? room=None) "
       "-> (Tensor active_ids, Tensor active_views, Tensor count, Tensor n_blocks)");
-  // Clears the bits of pairs that a view leaves out, by level and distance or by the columns of a cull mask.
+  // Clears the bits of pairs of a row and a view that the LOD gate or the cull mask drops.
   m.def(
       "gate_views_(Tensor ids, Tensor(a!) views, Tensor? count, Tensor means, Tensor level, Tensor viewmats, "
       "float[] reach, int lod_views, Tensor? cull, int[] columns) -> ()");
@@ -41,10 +42,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Projection: parameters to screen-space splats, ordered by (Gaussian, view). Groups of arguments, as
   // blitzgs/ops/project.py names them: gaussians (means, quats, scales, opacities[, sh]); cameras (viewmats,
   // Ks); active ([ids[, views[, count[, n_blocks]]]]); rank_tiles (begin and end of each rank); capacity
-  // ([visible, splats]; none: wait for their number); splats (camera_ids, visible_ids, splat_offsets); ints
-  // (width, height, tile_size, sh_degree, antialiased, raw); floats (near_plane, far_plane, eps2d,
-  // radius_clip[, fade_slope, reach of each level]). level: of the Gaussians, where opacities fade by it
-  // (csrc/project/project.h).
+  // ([visible, splats]; empty: the op waits for the numbers); splats (camera_ids, visible_ids,
+  // splat_offsets); ints (width, height, tile_size, sh_degree, antialiased, raw); floats (near_plane,
+  // far_plane, eps2d, radius_clip[, fade_slope, reach of each level]). level: the levels of the Gaussians for
+  // smooth levels (csrc/project/project.h).
   m.def(
       "project_fwd(Tensor[] gaussians, Tensor[] cameras, Tensor[] active, int[] ints, float[] floats, "
       "int[] rank_tiles, int[] capacity, Tensor? ids, Tensor? level) -> (Tensor gaussian_ids, "
@@ -68,19 +69,19 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, "
       "Tensor?[] views, Tensor[] splats, int[] ints, float[] floats, Tensor[] v_splats, "
       "Tensor? level=None, Tensor(b!)? means2d_sums=None, bool absolute_sums=False) -> ()");
-  // Where the parts of a splat gradient begin in its floats, and last how many these are: mean2d, conic,
-  // opacity, color, mean2d_abs.
+  // The offsets of mean2d, conic, opacity, color and mean2d_abs in the floats of a splat gradient, then the
+  // number of these floats.
   m.def("splat_gradient_layout() -> int[]");
 
-  // Which splats each tile composites, front to back by (depth, id). grid: n_cameras, width, height,
-  // tile_size, tile_begin, tile_end (-1: all tiles). unchecked: the caller finds out by itself whether
-  // n_isects is too small, and CUDA does not wait for the number.
+  // The splats that each tile composites, front to back by (depth, id). grid: n_cameras, width, height,
+  // tile_size, tile_begin, tile_end (-1: all tiles). unchecked: the caller itself checks whether n_isects is
+  // too small, and CUDA does not wait for the number.
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor depths, Tensor camera_ids, "
       "Tensor? ids, int[] grid, int n_isects, Tensor? n_splats=None, bool unchecked=False) -> ("
       "Tensor isect_splats, Tensor tile_offsets)");
 
-  // Splats on their way between ranks, packed for a collective or written straight into peers' memory (CUDA).
+  // The exchange of splats between ranks: packed for a collective, or written to the memory of peers (CUDA).
   m.def(
       "scatter_splats(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
   m.def("gather_splats(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
@@ -93,7 +94,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "device_barrier_(Tensor(a!)[] control, int rank, int number, Tensor? values, int first, "
       "float timeout_seconds, Tensor(b!)? host=None) -> ()");
-  // Writes a small tensor into pinned memory of the host, behind what is queued (CUDA).
+  // Writes a small tensor to pinned memory of the host, in stream order (CUDA).
   m.def("copy_to_host_(Tensor(a!) host, Tensor values) -> ()");
 
   // Alpha compositing. composited: (transmittances, last_ids, packed_splats, tile_order) of the forward pass.
@@ -103,8 +104,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "bool clear_rest=True, bool backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, "
       "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
       "Tensor splat_gradients)");
-  // The same for a backward pass that adds up gradients in `packed`, which is zeroed; pixels of tiles that
-  // are not owned are left as they are (CUDA).
+  // rasterize_fwd for a backward pass that sums gradients in the table `packed`, which it sets to zero. It
+  // does not write the pixels of tiles that are not owned (CUDA).
   m.def(
       "rasterize_fwd_packed_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
       "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, int[] grid, Tensor(a!) packed, "
@@ -121,23 +122,24 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "rasterize_bwd_packed_(Tensor[] splats, Tensor? backgrounds, Tensor[] lists, Tensor[] composited, "
       "Tensor v_renders, int[] grid, bool deterministic, Tensor(a!) packed, bool absgrad=False) -> ()");
 
-  // What each splat contributes to the pixels, without colours.
+  // The contributions of the splats to the image: their weights alpha T and pixels, without colours.
   m.def(
       "contributions(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, "
       "Tensor tile_offsets, int[] grid, Tensor? n_splats=None) -> (Tensor weights, Tensor pixels)");
 
-  // Of each segment's items, the fewest that hold a share of its weight; `first_step` to `last_step` of the
-  // search, between which sums may be added up over ranks.
+  // For each segment, the fewest items that hold a share of its weight. Runs the steps `first_step` to
+  // `last_step` - 1 of the search; between calls the sums may be added up over ranks.
   m.def(
       "mass_cut_(Tensor weights, Tensor segments, Tensor owners, Tensor ids, Tensor(a!) searches, "
       "Tensor(b!) sums, Tensor(c!) listed, Tensor(d!) chosen, int numerator, int denominator, "
       "int first_step, int last_step) -> ()");
-  // What an importance sweep keeps of a batch of views.
+  // The sums of the importance sweep over a batch of views.
   m.def(
       "view_sums_(Tensor(a!)[] sums, Tensor[] splats, Tensor weights, Tensor pixels, Tensor counts, "
       "int[] columns, int rule, float eps, float unit) -> ()");
 
-  // L1 and SSIM of the owned tiles; fwd_bwd does both at once when the weights of the sums are known.
+  // L1 and SSIM of the owned tiles. fwd_bwd computes the sums and the gradient in one pass; the weights of
+  // the sums must be known before.
   m.def(
       "photometric_fwd(Tensor renders, Tensor targets, Tensor? masks, int tile_size, int tile_begin, "
       "int tile_end) -> (Tensor l1_sums, Tensor ssim_sums)");
@@ -153,15 +155,16 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "report_(Tensor? parts, Tensor? tile_work, int tile_begin, int tile_end, int rank, int n_ranks, "
       "Tensor(a!)[] targets) -> ()");
 
-  // The optimiser: dense Adam over an index list, and its statistics for density control. Groups of arguments
-  // as for project_bwd_step_.
+  // The optimiser: dense Adam over a list of rows, with the groups of arguments of project_bwd_step_; and the
+  // statistics of density control.
   m.def(
       "lazy_adam_step_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, Tensor[] grads, "
       "Tensor ids) -> ()");
   m.def(
       "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int[] steps, float[] decays, Tensor? ids, "
       "Tensor? count=None) -> ()");
-  // What a row owes in the end, by the step that it stands at; `like` is of the parameters' dtype.
+  // The rules of the total drift of a row, by the step of its parameters; `like` has the dtype of the
+  // parameters.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
@@ -176,15 +179,15 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Gradient-boosted trees: the sum of the leaves that each row of features reaches.
   m.def("tree_sums(Tensor features, Tensor roots, Tensor nodes, Tensor leaves, int depth) -> Tensor");
 
-  // A mask of bits by row [N, words], and by block and column [blocks, 32 words, 8].
+  // Conversions of the cull mask between its layouts by row [N, words] and by sector [blocks, 32 words, 8].
   m.def("sectors_of_rows(Tensor rows) -> Tensor");
   m.def("rows_of_sectors(Tensor sectors, int n) -> Tensor");
 
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
 
-  // A table in the memory of the host, of which blocks visit a pool on the device: which blocks views may
-  // see, and blocks that leave and come. The first n_written columns are written back.
+  // For a table in the memory of the host with a pool of blocks on the device: the blocks that views may see,
+  // and the exchange of blocks between table and pool. The first n_written columns are written back.
   m.def(
       "seen_blocks(Tensor bounds, Tensor viewmats, Tensor Ks, Tensor sizes, float near_plane, "
       "float far_plane, float eps2d) -> Tensor seen");

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The libraries that are loaded belong to the sources."""
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -12,8 +11,24 @@ from blitzgs import _library
 
 
 def test_the_library_says_which_ops_it_was_built_with():
-    digest = hashlib.sha256(_library.REGISTRATION.read_bytes()).hexdigest()
+    digest = _library.source_digest(_library.REGISTRATION)
     assert _library.schema_digest(_library.LIBRARY_DIR / "libblitzgs_cpu.so") == digest
+
+
+def test_the_digest_is_that_of_the_schemas(tmp_path):
+    text = _library.REGISTRATION.read_text()
+    signature = "morton_keys(Tensor points) -> Tensor"
+    assert f'm.def("{signature}");' in text
+
+    def changed(new):
+        (tmp_path / "registration.cpp").write_text(text.replace(f'm.def("{signature}");', new))
+        return _library.source_digest(tmp_path / "registration.cpp")
+
+    same = 'm.def(  // of points\n      "morton_keys(Tensor points) "\n      "-> Tensor");'
+    assert changed(same) == _library.source_digest(_library.REGISTRATION)
+    others = [signature.replace("points", "means"), signature.replace("-> Tensor", "-> int")]
+    digests = {changed(f'm.def("{other}");') for other in others} | {changed("")}
+    assert len(digests) == 3 and _library.source_digest(_library.REGISTRATION) not in digests
 
 
 def test_a_library_that_was_not_rebuilt_is_named(tmp_path, monkeypatch):
