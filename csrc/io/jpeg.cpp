@@ -10,8 +10,8 @@ namespace blitzgs::io {
 
 namespace {
 
-constexpr std::uint8_t kSof0 = 0xc0, kSof1 = 0xc1, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8,
-                       kEoi = 0xd9, kSos = 0xda, kDri = 0xdd;
+constexpr std::uint8_t kSof0 = 0xc0, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8, kEoi = 0xd9,
+                       kSos = 0xda, kDri = 0xdd;
 
 // If at least this many consecutive zero bytes decode to coefficients, the file is damaged: an encoder writes
 // flat areas as zeros, but never hundreds of equal coefficients. The 8 bytes of look-ahead are included.
