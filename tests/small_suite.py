@@ -78,7 +78,7 @@ TESTS = [
         "knn_distances.py::test_small_clouds[cuda]",
         "cull_mask.py::test_every_bit_is_at_its_place_and_comes_back[257-3-cuda]",
         "mass_cut.py::test_equals_sorting[share2-ties-3-cuda]",
-        "tree_sums.py::test_equals_a_walk[700-cuda]",
+        "tree_sums.py::test_sums_equal_a_walk_down_each_tree[700-cuda]",
         "view_sums.py::test_equals_dense_sums[density-cuda]",
         "report_op.py::test_each_target_gets_this_ranks_share[3000-cuda]",
         "residence_ops.py::test_blocks_leave_and_come[cuda]",
@@ -89,12 +89,12 @@ TESTS = [
     *(BLOCKS + test for test in (
         "no_visible_row_is_missed_and_most_others_are_dropped[0-cuda]",
         "a_row_that_is_not_finite_is_not_seen_amidst_a_view[cuda]",
-        "whoever_takes_the_set_needs_its_count_on_the_device_alone[True-5000-cuda]",
+        "the_active_set_is_used_with_its_count_on_the_device[True-5000-cuda]",
         "no_rows_stepped_leave_all_bounds_alone[cuda]",
         "odd_sizes[257-cuda]", "morton_order_keeps_neighbours_together[cuda]", "opcheck[cuda]",
     )),
     # A parameter that is stepped alone.
-    "tests/optim/test_optimizer.py::test_rows_may_be_behind_for_long[cuda-float32]",
+    "tests/optim/test_optimizer.py::test_rows_may_have_a_thousand_pending_steps[cuda-float32]",
     "tests/view/test_gate.py::test_the_gated_set_does_not_depend_on_the_order_of_the_rows[columns1-cuda]",
 ]  # fmt: skip
 

@@ -78,7 +78,7 @@ def test_every_page_can_be_reached_from_the_readme():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_files_exist(name):
+def test_files_named_in_the_pages_exist(name):
     for code in inline_code(ROOT / name):
         for word in code.split():
             path = word.strip(',;:()"')

@@ -23,7 +23,7 @@ def batch_of(scenes):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("colors", ["sh", "values", "values per view", "sh per view"])
-def test_a_batch_is_its_scenes(device, packed, colors):
+def test_a_batch_renders_as_its_scenes_alone(device, packed, colors):
     scenes = [random_scene(n=40, cameras=2, seed=seed, device=device) for seed in range(3)]
     generator = torch.Generator().manual_seed(4)
     for scene in scenes:

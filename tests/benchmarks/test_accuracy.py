@@ -55,7 +55,7 @@ def test_windows_of_a_large_image_are_the_image(antialiased):
     assert image_error < 1e-12 and gradient_error < 1e-12
 
 
-def test_table_and_figures(scene, tmp_path):
+def test_the_accuracy_report_is_written_and_bounds_are_required(scene, tmp_path):
     exact = bm_accuracy.Option("float64", dtype=torch.float64)
     figures = bm_accuracy.measure(exact, {1: scene}, repeats=1)
     assert figures.image_error < 1e-12 and figures.milliseconds > 0

@@ -163,7 +163,7 @@ def _fail_and_stay(ranks):
     ranks.all_reduce(torch.zeros(4))
 
 
-def test_nobody_waits_for_a_rank_that_has_failed():
+def test_no_rank_waits_for_a_failed_rank():
     start = time.monotonic()
     with pytest.raises(RankError) as failure:
         run_ranks(_fail_and_stay, 2, timeout_seconds=600.0, limit=45)

@@ -42,7 +42,7 @@ def cases():
 
 
 @pytest.mark.parametrize("name", ["wide", "few", "tiny", "sparse", "equal"])
-def test_against_sorting(name):
+def test_selection_equals_sorting(name):
     ids, columns = cases()
     scores = columns[name]
     signed = torch.where(ids % 2 == 0, scores, -scores)

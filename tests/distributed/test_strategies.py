@@ -76,7 +76,7 @@ def test_a_resumed_run_is_the_same(whole, tmp_path):
 @pytest.mark.cuda
 @needs_cuda
 @pytest.mark.parametrize("name", OPTIONS)
-def test_cuda_trains_so_and_resumes_exactly(name, tmp_path):
+def test_cuda_trains_with_each_option_and_resumes_exactly(name, tmp_path):
     ranks, options = Ranks(device=torch.device("cuda")), (*OPTIONS[name], "model.deterministic=true")
     _train(ranks, tmp_path / "whole", *options)
     shutil.copytree(tmp_path / "whole" / FIRST, tmp_path / "run" / FIRST)

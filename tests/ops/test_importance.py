@@ -99,7 +99,7 @@ def test_is_the_definition(backend, mode):
     assert 0.1 < visible.double().mean() < 1
 
 
-def test_what_is_not_there_contributes_nothing():
+def test_hidden_and_missing_gaussians_contribute_nothing():
     scene = random_scene(4, 1)
     scene.means[:, 2] -= 100.0
     scene.scales[3] = float("nan")

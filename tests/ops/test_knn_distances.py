@@ -64,7 +64,7 @@ def test_small_clouds(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_one_place_many_times(device):
+def test_a_hundred_thousand_equal_points(device):
     """Linear time even when every point is the same."""
     got = knn_distances(torch.full((100_000, 3), 0.7, device=device), 3)
     assert (got == 0).all()

@@ -271,7 +271,7 @@ def test_a_step_after_catching_up_equals_a_step_alone():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("gap", [-1, 0, 1, 5000])
-def test_what_rows_owe_in_the_end_is_tabulated_once(gap, dtype):
+def test_final_rules_replace_many_pending_steps(gap, dtype):
     """Around the gap from which the table holds, and far behind it."""
     lr_table = learning_rates(9000)
     reach = explicit_steps(BETA1, BETA2, dtype)

@@ -101,7 +101,7 @@ def test_sums_of_parts_add_up(device, kind):
     assert chosen.tolist() == expected and ROUNDS == TIES_STEP // 2
 
 
-def test_errors():
+def test_errors_name_the_value():
     def cut(**changes):
         items = {
             "weights": torch.ones(3, dtype=torch.int64),

@@ -78,7 +78,7 @@ def test_blocks_leave_and_come(device):
     swap_blocks_(pool, table, 4, *moves[:, :0].to(device))
 
 
-def test_errors():
+def test_errors_name_the_value():
     pool, table = columns(512, "cpu"), columns(1024, "cpu")
     lists = [torch.zeros(2, dtype=torch.int32)] * 3
     with pytest.raises(RuntimeError, match="the same columns, at most 48; got 6 and 5"):

@@ -76,7 +76,7 @@ def test_doubles_and_strided_columns():
     assert sum_splats(values, places, [2, 2], 4, [1])[0].squeeze(1).tolist() == [0, 0, 3, 3]
 
 
-def test_errors():
+def test_errors_name_the_value():
     masks = torch.ones(4, dtype=torch.int64)
     with pytest.raises(RuntimeError, match=r"a column must have shape \[4, \*\], got \[3, 1\]"):
         scatter_splats([torch.zeros(4), torch.zeros(3)], masks, [4])

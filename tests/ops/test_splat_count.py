@@ -167,7 +167,7 @@ def test_lists_with_too_little_room_are_an_error(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_errors(device):
+def test_errors_name_the_value(device):
     columns = Columns(100, 150, device)
     view = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     with pytest.raises(RuntimeError, match="n_splats must be Long, got Int"):

@@ -36,7 +36,7 @@ def test_bits_and_unaligned_columns(device):
     assert torch.equal(take_rows(column[:, 1], rows).isnan(), column[:, 1][rows].isnan())
 
 
-def test_errors():
+def test_errors_name_the_value():
     rows = torch.tensor([0])
     with pytest.raises(RuntimeError, match="column must have rows"):
         take_rows(torch.tensor(1.0), rows)

@@ -43,7 +43,7 @@ def tensors(nodes, roots):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [0, 1, 700])
-def test_equals_a_walk(device, count):
+def test_sums_equal_a_walk_down_each_tree(device, count):
     nodes, roots = forest()
     features = torch.rand(count, FEATURES, generator=torch.Generator().manual_seed(1))
     features[::3, 1] = math.nan
@@ -65,7 +65,7 @@ def test_equals_a_walk(device, count):
     assert tree_sums(features.to(device), *moved).tolist() == expected
 
 
-def test_errors():
+def test_errors_name_the_value():
     roots, nodes, leaves, depth = tensors(*forest())
     with pytest.raises(RuntimeError, match=r"nodes must have shape \[\*, 4\], got"):
         tree_sums(torch.rand(2, 3), roots, nodes[:, :3], leaves, depth)

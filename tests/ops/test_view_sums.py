@@ -62,7 +62,7 @@ def test_equals_dense_sums(device, rule):
     assert torch.equal(bits.view(N, -1).bool(), cull)
 
 
-def test_errors():
+def test_errors_name_the_value():
     with pytest.raises(RuntimeError, match="cull has 64 columns, got 64"):
         add(empty("cpu"), "cpu", columns=[*COLUMNS[1:], 64])
     with pytest.raises(RuntimeError, match="1 to 32 views at once, got 33"):

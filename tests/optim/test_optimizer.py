@@ -72,7 +72,7 @@ def test_it_is_dense_adam(backend, options):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_rows_may_be_behind_for_long(backend):
+def test_rows_may_have_a_thousand_pending_steps(backend):
     pair = Pair(backend, rows=30)
     pair.step(1.0)
     for _ in range(1100):  # more than there are tables for at first

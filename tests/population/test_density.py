@@ -170,7 +170,7 @@ def test_empty_table():
     assert len(table) == 0 and report.cloned == report.split == report.pruned == report.held_back == 0
 
 
-def test_capping_opacities_touches_what_lies_above_and_every_moment():
+def test_capping_opacities_lowers_those_above_and_clears_their_moments():
     table = random_table(200)
     before, others = table["opacities"].clone(), table["exp_avg.means"].clone()
     cap_opacities(table, 0.01)

@@ -63,7 +63,7 @@ def test_scales_of_the_named_rows_rise_to_it():
 
 
 @pytest.mark.parametrize("batch_size", [1, 2])
-def test_a_run_keeps_to_it(tmp_path, batch_size):
+def test_no_scale_falls_below_the_floor_in_a_run(tmp_path, batch_size):
     """Of the Gaussians that the last step saw; others may owe steps that shrink them a little."""
     options = ("model.scale_floor=0.447", f"schedule.batch_size={batch_size}", "optimiser.sparse=true")
     trainer = Trainer(tiny_config(*options), *tiny_scene(), tmp_path, Ranks())

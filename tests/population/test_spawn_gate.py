@@ -79,7 +79,7 @@ def test_trees_are_those_of_xgboost(gate, tmp_path, device, suffix):
     assert SpawnGate(copy).scores(some.features[:0]).shape == (0,)
 
 
-def test_the_gate_that_comes_along():
+def test_the_default_gate_loads_and_ranks_candidates():
     gate = SpawnGate(gate_file("default"))
     assert gate.info.schedule["schedule.iterations"] == 30_000 and len(gate.info.scenes) >= 2
     held_out = gate.info.auc["held_out"]

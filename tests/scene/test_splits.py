@@ -11,7 +11,7 @@ PATHS = [ROOT / "images" / name for name in NAMES]
 
 
 @pytest.mark.parametrize(("spec", "test"), [(2, [0, 2]), ("3", [0, 3]), (0, []), ("auto", [0])])
-def test_every_nth(spec, test):
+def test_every_nth_view_is_held_out(spec, test):
     train, found = split_views(NAMES, PATHS, ROOT, spec)
     assert found == test and sorted(train + found) == [0, 1, 2, 3]
 
@@ -39,7 +39,7 @@ def test_val_folder_is_used_when_it_is_there():
         split_views(NAMES, PATHS, ROOT, "val")
 
 
-def test_specs_that_make_no_sense(tmp_path):
+def test_invalid_splits_are_refused(tmp_path):
     with pytest.raises(ValueError, match="must be 0 .none. or at least 2"):
         split_views(NAMES, PATHS, ROOT, 1)
     with pytest.raises(ValueError, match="neither a number, 'auto', 'val' nor a file"):

@@ -92,7 +92,7 @@ def _flip_bit(path, offset):
         (lambda p: (p / "manifest.json").write_text("[" * 5000), "recursion"),
     ],
 )
-def test_a_damaged_one_is_refused_by_name(tmp_path, damage, reason):
+def test_a_damaged_checkpoint_is_refused_by_name(tmp_path, damage, reason):
     checkpoint.save(tmp_path, table(50, 1), {"iteration": 1}, ALONE)
     newest = checkpoint.save(tmp_path, table(50, 2), {"iteration": 2}, ALONE)
     damage(newest)
@@ -108,7 +108,7 @@ def test_a_damaged_one_is_refused_by_name(tmp_path, damage, reason):
     assert checkpoint.save(tmp_path, table(5), {}, ALONE).name == "checkpoint_000002"
 
 
-def test_each_damaged_one_is_named_once(tmp_path):
+def test_each_damaged_checkpoint_is_named_once(tmp_path):
     paths = [checkpoint.save(tmp_path, table(5), {}, ALONE) for _ in range(3)]
     for path in paths[1:]:
         (path / "manifest.json").unlink()

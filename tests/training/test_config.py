@@ -123,7 +123,7 @@ def test_senseless_numbers_are_refused_by_name(name, default, value):
         ("ranks.timeout_seconds=-1", r"ranks.timeout_seconds: must be in \[1, 1,000,000\], got -1.0"),
     ],
 )
-def test_hostile_values(override, message):
+def test_values_out_of_range_are_refused(override, message):
     with pytest.raises(ConfigError, match=message):
         load_config(None, [f"--{override}"])
 

@@ -87,7 +87,7 @@ def of_one_view(trainer: Trainer, index: int, sh_degree: int) -> tuple[torch.Ten
 
 
 @pytest.mark.parametrize("batch_size", [1, 3])
-def test_they_are_those_of_autograd(tmp_path, batch_size):
+def test_statistics_are_those_of_autograd(tmp_path, batch_size):
     """Over several steps that change the Gaussians, through loss, compositing and projection."""
     trainer = make_trainer(tmp_path, f"schedule.batch_size={batch_size}")
     table, steps = trainer.state.table, 4
@@ -188,7 +188,7 @@ def test_cuda_sums_the_same_absolute_gradients(tmp_path):
 
 
 @pytest.mark.parametrize("batch_size", [2, 4, 8])
-def test_they_do_not_depend_on_the_batch_size(tmp_path, batch_size):
+def test_statistics_do_not_depend_on_the_batch_size(tmp_path, batch_size):
     """The gradients of a view's own loss, added up: METHOD, section 3. With the Gaussians standing still."""
     tables = {}
     for size in (1, batch_size):

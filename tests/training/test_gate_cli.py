@@ -149,7 +149,7 @@ def test_events_are_labelled_by_their_children(lineage_run):
     assert torch.isin(key, dead).all()
 
 
-def test_an_oracle_vetoes_the_dead_it_knows():
+def test_an_oracle_vetoes_candidates_that_are_known_to_die():
     some = candidates(200)
     keys = event_keys(some.parents, some.time, some.is_split)
     known, dead = keys[:150], keys[:120]

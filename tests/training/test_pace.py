@@ -104,7 +104,7 @@ def test_rates_follow_the_configurations_own_times():
 
 
 @pytest.mark.parametrize("factor", [0.1, 5.0])
-def test_rows_that_are_behind_owe_the_same_after_a_change_of_pace(factor):
+def test_pending_steps_are_the_same_after_a_change_of_pace(factor):
     """Steps without a gradient on both sides of a change: dense Adam in float64, step by step."""
     before = ScheduleConfig(iterations=200, position_decay=100)
     config, changed_at, end = OptimiserConfig(final_share=0.01), 60, 70

@@ -179,7 +179,7 @@ def caught_up_and_projected(table, ids, views, count, viewmats, Ks):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [0, 1, 5000, 150_000])
 @pytest.mark.parametrize("ahead", [True, False])
-def test_whoever_takes_the_set_needs_its_count_on_the_device_alone(device, n, ahead):
+def test_the_active_set_is_used_with_its_count_on_the_device(device, n, ahead):
     table = make_table(max(n, 300), device)
     table.keep(torch.arange(len(table), device=device) < n)
     for name in (*EXP_AVGS, *EXP_AVG_SQS):

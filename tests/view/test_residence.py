@@ -123,7 +123,7 @@ def _blocks(residence, views, view):
     return seen_blocks(residence._bounds[: residence._blocks], *one[:3], *LIMITS).numpy()
 
 
-def test_a_step_waits_for_what_did_not_come_ahead():
+def test_a_step_waits_for_blocks_that_were_not_prefetched():
     """The pool has room for each step alone: nothing of the next one replaces what the present one needs."""
     _, residence = make_residence(slots=60)
     views = cameras(4)
