@@ -13,7 +13,7 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.transport import Mark, unmarked
 from blitzgs.pipeline import Frame, RenderOptions
-from blitzgs.population.exploration import PositionNoise
+from blitzgs.population.position_noise import PositionNoise
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
 from blitzgs.training.loss import LossTerms

@@ -12,9 +12,9 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import GaussianTable
-from blitzgs.population.exploration import PositionNoise
 from blitzgs.population.initialisation import octree_gaussians
 from blitzgs.population.lineage import Lineage, initial_births, ledger_of
+from blitzgs.population.position_noise import PositionNoise
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run
 from blitzgs.training.adaptive import Signals

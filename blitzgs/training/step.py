@@ -13,7 +13,7 @@ from blitzgs.distributed.transport import Mark, open_transport, unmarked
 from blitzgs.model import GaussianTable
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import Frame, RenderOptions
-from blitzgs.population.exploration import PositionNoise
+from blitzgs.population.position_noise import PositionNoise
 from blitzgs.population.scale_floor import FLOOR, raise_scales
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig

@@ -149,7 +149,7 @@ def test_parameters_out_of_range_are_named(tmp_path, name, value):
     assert not (tmp_path / "x").exists()
 
 
-def test_command(city, capsys):
+def test_the_command_generates_a_city(city, capsys):
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     flags = [f"--{key.replace('_', '-')}={value}" for key, value in SMALL.items()]
