@@ -32,7 +32,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "cull_blocks(Tensor bounds, Tensor[] rows, Tensor[] cameras, int[] size, float[] limits, "
       "Tensor? level_ranges=None, Tensor? level=None, float[] reach=[], int lod_views=0, Tensor? cull=None, "
-      "int[] columns=[], int? room=None) "
+      "int[] columns=[], int? capacity_blocks=None) "
       "-> (Tensor active_ids, Tensor active_views, Tensor count, Tensor n_blocks)");
   // Clears the bits of pairs of a row and a view that the LOD gate or the cull mask drops.
   m.def(

@@ -43,11 +43,11 @@ TESTS = [
         "entries_of_no_tile_name_any_splat[True]",
     )),
     *(IMPORTANCE + test for test in (
-        "close_to_float64", "room_behind_the_splats_is_not_read",
+        "close_to_float64", "entries_after_the_last_splat_are_not_read",
     )),
     *(TRANSPORT + test for test in (
         "splats_arrive_and_their_gradients_are_found",
-        "a_barrier_with_ranks_that_have_come", "numbers_for_the_host_go_to_pinned_memory",
+        "a_barrier_exchanges_values_when_all_ranks_have_arrived", "copies_to_the_host_need_pinned_memory",
     )),
     # Rows, coefficients, degree, views, sparse.
     *(f"{OPS}project_step.py::test_equals_backward_and_step[{case}-cuda]" for case in (
@@ -55,7 +55,7 @@ TESTS = [
         "333-25-3-1-False",
     )),
     # Rows, coefficients, degree, views.
-    *(f"{OPS}project_step.py::test_gradients_in_tables_of_ranks[{case}]" for case in (
+    *(f"{OPS}project_step.py::test_gradients_are_read_from_the_tables_of_several_ranks[{case}]" for case in (
         "3001-16-3-4", "700-16-2-1", "700-4-1-2", "700-16-0-1", "70-16-3-12",
     )),
     *(OPS + test for test in (
@@ -65,9 +65,9 @@ TESTS = [
         "photometric.py::test_float32_matches_the_definition[shape4-False-cuda]",
         "photometric.py::test_a_partition_of_the_tiles_adds_up_to_the_whole[16-cuda]",
         "photometric.py::test_loss_and_ssim_are_means[cuda]",
-        "splat_count.py::test_lists_are_those_of_the_splats_alone[8192-True-cuda]",
+        "splat_count.py::test_lists_ignore_entries_after_the_last_splat[8192-True-cuda]",
         "splat_count.py::test_a_number_out_of_range_is_no_splat[501-cuda]",
-        "splat_count.py::test_images_and_gradients_are_those_of_the_splats_alone[700-3-composited1-owned1-cuda]",
+        "splat_count.py::test_images_and_gradients_ignore_entries_after_the_last_splat[700-3-composited1-owned1-cuda]",
         "splat_count.py::test_a_table_of_gradients_is_zeroed_for_the_splats[700-1500-tiles0]",
         "splat_count.py::test_lists_with_too_little_room_are_the_nearest_splats[tiles1-0.5]",
         "scatter.py::test_splats_reach_their_groups[6000-cuda]",
@@ -81,7 +81,7 @@ TESTS = [
         "tree_sums.py::test_sums_equal_a_walk_down_each_tree[700-cuda]",
         "view_sums.py::test_equals_dense_sums[density-cuda]",
         "report_op.py::test_each_target_gets_this_ranks_share[3000-cuda]",
-        "residence_ops.py::test_blocks_leave_and_come[cuda]",
+        "residence_ops.py::test_swapped_blocks_have_the_right_contents[cuda]",
         "residence_ops.py::test_views_have_sizes_of_their_own[cuda]",
         "take_rows.py::test_bits_and_unaligned_columns[cuda]",
         "voxel_keys.py::test_matches_the_formula[cuda-dtype2]",

@@ -44,7 +44,7 @@ def test_permute_keep_and_append_move_whole_rows():
 
 
 @pytest.mark.parametrize("count, added", [(50, 9), (0, 9), (50, 0)])
-def test_renew_is_append_keep_and_permute_in_one_go(count, added):
+def test_renew_equals_append_keep_and_permute(count, added):
     renewed, expected = filled_table(count), filled_table(count)
     more = filled_table(added, seed=2)
     new = {name: more[name] for name in more if not name.startswith("exp_avg")}

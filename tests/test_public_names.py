@@ -20,5 +20,5 @@ def test_public_names_are_loaded_when_they_are_asked_for():
     subprocess.run([sys.executable, "-c", CODE], check=True)
 
 
-def test_another_name_is_an_error():
+def test_an_unknown_public_name_is_an_error():
     assert not hasattr(blitzgs, "rasterise")

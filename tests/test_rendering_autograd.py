@@ -220,7 +220,7 @@ def test_a_second_derivative_of_a_compiled_call_is_refused():
 
 
 @pytest.mark.parametrize("options", [{"absgrad": True}, {"sparse_grad": True}], ids=str)
-def test_what_cannot_be_compiled_says_so(options):
+def test_options_without_compile_support_are_named(options):
     torch._dynamo.reset()
     leaves = random_scene(n=20).leaves()
     with pytest.raises(Exception, match="not supported under torch.compile"):

@@ -138,7 +138,7 @@ def test_packed_rows_stand_image_after_image(device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("cameras", [1, 3])
-def test_what_is_rendered_gets_gradients(device, packed, cameras):
+def test_rendered_columns_of_meta_have_gradients(device, packed, cameras):
     scene = random_scene(n=40, cameras=cameras, device=device).leaves()
     renders, _, meta = rasterize_scene(scene, packed=packed, render_mode="RGB+D", absgrad=True)
     gradients = torch.autograd.grad(

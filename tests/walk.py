@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What somebody reads to follow one training step: `python -m tests.walk` counts files, and stops on the way.
+"""Counts the files that a reader opens to follow one training step, and the stops: `python -m tests.walk`.
 
 Python is traced while a trainer takes a step: every function of `blitzgs/` counts at its first call, in the
 order of these calls. Functions of one file that follow each other are one stop. C++ and CUDA are counted from

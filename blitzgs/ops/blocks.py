@@ -137,7 +137,7 @@ def cull_blocks(
     pending: PendingSteps | None = None,
     level_ranges: Tensor | None = None,
     rules: GateRules | None = None,
-    room: int | None = None,
+    capacity_blocks: int | None = None,
 ) -> ActiveRows:
     """Return the rows that at least one of B views may see; rows of blocks outside all views are not read.
 
@@ -160,8 +160,8 @@ def cull_blocks(
         level_ranges: uint8 [ceil(N / 256), 2], coarsest and finest level of each block; needed for `rules`.
         rules: also drop the rows that these rules leave out wherever their pending steps may move them;
             `blitzgs.ops.view_gate.gate_views_` decides about the remaining rows. None: no rules.
-        room: capacity of the lists, in blocks of 256 rows, at least 1. None: exactly as many blocks as the
-            views may see; the host then waits for this number.
+        capacity_blocks: capacity of the lists, in blocks of 256 rows, at least 1. None: exactly as many
+            blocks as the views may see; the host then waits for this number.
 
     Raises:
         RuntimeError: wrong shapes or dtypes, more than 32 views, or as `gate_views_` says.
@@ -173,7 +173,7 @@ def cull_blocks(
         [width, height],
         [near_plane, far_plane, eps2d],
         *(() if rules is None else (level_ranges, *rules)),
-        room=room,
+        capacity_blocks=capacity_blocks,
     )
     return ActiveRows(ids, views, length, blocks)
 
@@ -194,8 +194,12 @@ def _(*_args: object) -> None:
 
 
 @torch.library.register_fake("blitzgs::cull_blocks")
-def _(bounds: Tensor, *_args: object, room: int | None = None) -> tuple[Tensor, ...]:
-    blocks = torch.library.get_ctx().new_dynamic_size() if room is None else min(room, len(bounds))
+def _(bounds: Tensor, *_args: object, capacity_blocks: int | None = None) -> tuple[Tensor, ...]:
+    blocks = (
+        torch.library.get_ctx().new_dynamic_size()
+        if capacity_blocks is None
+        else min(capacity_blocks, len(bounds))
+    )
     return tuple(
         bounds.new_empty(n, dtype=torch.int32) for n in (blocks * BLOCK_ROWS, blocks * BLOCK_ROWS, 1, 1)
     )

@@ -106,10 +106,12 @@ class Stepper:
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
         for attempt in self._transport.capacity.attempts():
             # On the CPU the number of blocks is known at once, so no estimate is needed.
-            room = attempt.sizes.blocks if attempt.sizes is not None and views.viewmats.is_cuda else None
+            capacity_blocks = (
+                attempt.sizes.blocks if attempt.sizes is not None and views.viewmats.is_cuda else None
+            )
             active = self._blocks.active(
                 table, views.viewmats, views.Ks, views.width, views.height, options.near_plane,
-                options.far_plane, options.eps2d, rules, room,
+                options.far_plane, options.eps2d, rules, capacity_blocks,
             )  # fmt: skip
             mark("other")
             self._optimiser.catch_up(table, active.ids, step - 1, active.length)

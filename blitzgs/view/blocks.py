@@ -79,7 +79,7 @@ class BlockIndex:
         far_plane: float,
         eps2d: float = 0.3,
         rules: GateRules | None = None,
-        room: int | None = None,
+        capacity_blocks: int | None = None,
     ) -> ActiveRows:
         """Return the rows that the views may see, and for each row the views that may see it.
 
@@ -89,7 +89,7 @@ class BlockIndex:
         pending = self._pending(table)
         return cull_blocks(
             self._bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
-            eps2d, pending, self._level_ranges, rules, room,
+            eps2d, pending, self._level_ranges, rules, capacity_blocks,
         )  # fmt: skip
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:

@@ -140,18 +140,19 @@ struct CullCamera {
   float near_plane, far_plane, eps2d;
 };
 
-BLITZGS_HD Frustum make_frustum(const CullCamera& of, int view) {
-  const Camera<float> camera = make_camera(of.viewmats + 16 * view, of.Ks + 9 * view, of.width, of.height);
-  return make_frustum(camera, of.width, of.height, of.near_plane, of.far_plane, of.eps2d);
+BLITZGS_HD Frustum make_frustum(const CullCamera& args, int view) {
+  const Camera<float> camera =
+      make_camera(args.viewmats + 16 * view, args.Ks + 9 * view, args.width, args.height);
+  return make_frustum(camera, args.width, args.height, args.near_plane, args.far_plane, args.eps2d);
 }
 
-// some: a view may see a part of a box. all: the view certainly sees all means in the box.
-struct Sight {
-  bool some, all;
+// any: a view may see a part of a box. all: the view certainly sees all means in the box.
+struct Visibility {
+  bool any, all;
 };
 
 // Tests a box against the planes of a view. slack: the largest relative rounding error of each term.
-BLITZGS_HD Sight sight_of(const Frustum& view, const SweptBox& box, float slack) {
+BLITZGS_HD Visibility visibility_of(const Frustum& view, const SweptBox& box, float slack) {
   float centre[3], half[3];
   for (int axis = 0; axis < 3; ++axis) {
     centre[axis] = 0.5f * box.low[axis] + 0.5f * box.high[axis];
@@ -159,7 +160,7 @@ BLITZGS_HD Sight sight_of(const Frustum& view, const SweptBox& box, float slack)
     if (half[axis] < 0.0f) return {false, false};  // empty
     half[axis] += slack * (std::fabs(centre[axis]) + half[axis]);
   }
-  Sight sight{true, true};
+  Visibility visibility{true, true};
   for (int i = 0; i < kFrustumPlanes; ++i) {
     const FrustumPlane& plane = view.planes[i];
     float value = plane.d, reach = slack * std::fabs(plane.d);
@@ -167,10 +168,10 @@ BLITZGS_HD Sight sight_of(const Frustum& view, const SweptBox& box, float slack)
       value += plane.n[axis] * centre[axis];
       reach += std::fabs(plane.n[axis]) * half[axis];
     }
-    if (value + reach + plane.k * box.sigma < 0.0f) sight.some = false;
-    if (!(value - reach >= 0.0f)) sight.all = false;
+    if (value + reach + plane.k * box.sigma < 0.0f) visibility.any = false;
+    if (!(value - reach >= 0.0f)) visibility.all = false;
   }
-  return sight;
+  return visibility;
 }
 
 constexpr float kRowSlack = kPointSlack, kBlockSlack = 2 * kPointSlack;
@@ -204,31 +205,31 @@ BLITZGS_HD DistanceRange distances_of(const SweptBox& box, const float* centre, 
 // One bit for each view. some: the view may see a row of the block. inside: the view's frustum contains all
 // rows. all: the view certainly sees all rows.
 struct BlockViews {
-  std::uint32_t some, inside, all;
+  std::uint32_t any, inside, all;
 };
 
-// Removes from `seen` the views in which the gate drops all rows (some) or may drop a row (all).
+// Removes from `seen` the views in which the gate drops all rows (any) or may drop a row (all).
 BLITZGS_HD void gate_block(const BlockGate& gate, const GateTable& table, std::int64_t block,
                            const SweptBox& box, BlockViews& seen) {
   const GateRules& rules = gate.rules;
   const int last = rules.n_levels - 1;
   const int coarsest = gate.level_ranges[2 * block], finest = gate.level_ranges[2 * block + 1];
   for (int view = 0; view < rules.n_views; ++view) {
-    if (!has_bit(seen.some & rules.lod_views, view)) continue;
+    if (!has_bit(seen.any & rules.lod_views, view)) continue;
     const DistanceRange range = distances_of(box, table.centres[view], kBlockSlack);
     const std::uint32_t others = ~(1u << view);
-    if (range.near2 > table.reach2[coarsest < last ? coarsest : last]) seen.some &= others;
+    if (range.near2 > table.reach2[coarsest < last ? coarsest : last]) seen.any &= others;
     if (!(range.far2 <= table.reach2[finest < last ? finest : last])) seen.all &= others;
   }
   for (int view = 0; view < rules.n_views; ++view) {
-    if (!has_bit(seen.some & rules.cull_views, view)) continue;
+    if (!has_bit(seen.any & rules.cull_views, view)) continue;
     const std::int64_t sector = sector_at(block, rules.cull_columns, table.columns[view]);
     const SectorBits culled = sector_bits(rules.cull + sector, rows_in_block(rules.n_rows, block));
-    if (culled.all) seen.some &= ~(1u << view);
+    if (culled.all) seen.any &= ~(1u << view);
     if (culled.any) seen.all &= ~(1u << view);
   }
-  seen.inside &= seen.some;
-  seen.all &= seen.some;
+  seen.inside &= seen.any;
+  seen.all &= seen.any;
 }
 
 // The test of a block from its bounds [kBlockBounds].
@@ -238,9 +239,9 @@ BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const floa
   const SweptBox box = load_box(bounds + block * kBlockBounds);
   BlockViews result{0, 0, 0};
   for (int view = 0; view < count; ++view) {
-    const Sight sight = sight_of(views[view], box, kBlockSlack);
-    if (sight.some) result.some |= 1u << view;
-    if (sight.some && sight.all) result.inside |= 1u << view;
+    const Visibility visibility = visibility_of(views[view], box, kBlockSlack);
+    if (visibility.any) result.any |= 1u << view;
+    if (visibility.any && visibility.all) result.inside |= 1u << view;
   }
   if (bounds[block * kBlockBounds + 7] == 0.0f) result.inside = 0;
   result.all = result.inside;
@@ -249,7 +250,7 @@ BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const floa
 }
 
 // Whether the block's rows have to be tested one by one.
-BLITZGS_HD bool is_mixed(const BlockViews& block) { return block.some != block.all; }
+BLITZGS_HD bool is_mixed(const BlockViews& block) { return block.any != block.all; }
 
 // The views that may see a row of a mixed block, as bits. The row's columns are read only if the bounds of
 // its block do not decide.
@@ -257,7 +258,7 @@ template <bool kGated>
 BLITZGS_HD std::uint32_t views_of_row(const BlockRows& rows, const Frustum* views, int count,
                                       const float* bounds, const BlockViews& seen, std::int64_t row,
                                       const BlockGate& gate, const GateTable& table) {
-  std::uint32_t mask = seen.some, by_level = 0;
+  std::uint32_t mask = seen.any, by_level = 0;
   float reach2 = 0.0f;
   if (kGated) {
     mask &= ~views_that_cull(gate.rules, table, row, mask);
@@ -279,7 +280,7 @@ BLITZGS_HD std::uint32_t views_of_row(const BlockRows& rows, const Frustum* view
   if (!(by_frustum | by_level)) return mask;
   const SweptBox box = sweep_row(rows, row);
   for (int view = 0; view < count; ++view) {
-    bool dropped = has_bit(by_frustum, view) && !sight_of(views[view], box, kRowSlack).some;
+    bool dropped = has_bit(by_frustum, view) && !visibility_of(views[view], box, kRowSlack).any;
     if (kGated && !dropped && has_bit(by_level, view)) {
       dropped = distances_of(box, table.centres[view], kRowSlack).near2 > reach2;
     }
@@ -294,26 +295,27 @@ struct alignas(16) ActiveBlock {
   BlockViews seen;
 };
 
-// The result of the tests, from which the rows are listed. `room` is the capacity in blocks.
+// The result of the tests, from which the rows are listed. The lists have a capacity of capacity_blocks
+// blocks.
 struct CullPlan {
-  ActiveBlock* blocks;   // [room], the blocks that some view may see, in order
-  std::uint32_t* masks;  // [room, kBlockRows], the views that may see each row of a mixed block, as bits
-  std::int32_t* active;  // [room], the number of active rows of each block
-  std::int64_t room;
+  ActiveBlock* blocks;   // the blocks that some view may see, in order
+  std::uint32_t* masks;  // [blocks, kBlockRows], the views that may see each row of a mixed block, as bits
+  std::int32_t* active;  // the number of active rows of each block
+  std::int64_t capacity_blocks;
 
   CullPlan(std::int64_t n_blocks, Workspace& workspace)
       : blocks(workspace.allocate<ActiveBlock>(n_blocks)),
         masks(workspace.allocate<std::uint32_t>(n_blocks * kBlockRows)),
         active(workspace.allocate<std::int32_t>(n_blocks)),
-        room(n_blocks) {}
+        capacity_blocks(n_blocks) {}
 };
 
-// The output: the active rows and the views that may see each (as bits), in lists with the capacity of `room`
-// blocks, of which the first *count entries are valid. *n_blocks is the number of blocks that some view may
-// see; if it exceeds `room`, *count is 0.
+// The output: the active rows and the views that may see each (as bits), in lists for capacity_blocks blocks,
+// of which the first *count entries are valid. *n_blocks is the number of blocks that some view may see; if
+// it exceeds `capacity_blocks`, *count is 0.
 struct ActiveList {
-  std::int32_t *ids, *views, *count, *n_blocks;  // [room * kBlockRows] twice, [1] twice
-  std::int64_t room;
+  std::int32_t *ids, *views, *count, *n_blocks;  // [capacity_blocks * kBlockRows] twice, [1] twice
+  std::int64_t capacity_blocks;
 };
 
 // The inputs of the test: the rows, the bounds of their blocks, the views and the gate.

@@ -46,7 +46,7 @@ std::vector<ActiveBlock> list_blocks(const CullInputs& in, const CullViews& view
       for (std::int64_t block = part * kPart; block < std::min(blocks, (part + 1) * kPart); ++block) {
         const BlockViews seen =
             views_of_block<kGated>(views.planes, in.views, in.bounds, block, in.gate, views.table);
-        if (seen.some) parts[part].push_back({static_cast<std::int32_t>(block), seen});
+        if (seen.any) parts[part].push_back({static_cast<std::int32_t>(block), seen});
       }
     }
   });
@@ -62,7 +62,7 @@ std::vector<ActiveBlock> active_blocks(const CullInputs& in, const CullViews& vi
 // Finds the views of the rows of mixed blocks, and the number of active rows of each block.
 template <bool kGated>
 void fill_plan(const CullInputs& in, const CullViews& views, const CullPlan& plan) {
-  parallel_for(0, plan.room, 16, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(0, plan.capacity_blocks, 16, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t place = begin; place < end; ++place) {
       const auto& [block, seen] = plan.blocks[place];
       const int count = rows_in_block(in.rows.n, block);
@@ -115,7 +115,7 @@ void cull_blocks(const CullInputs& in, const ActiveList& list, Workspace& worksp
   const auto n_blocks = static_cast<std::int64_t>(blocks.size());
   *list.n_blocks = static_cast<std::int32_t>(n_blocks);
   *list.count = 0;
-  if (n_blocks > list.room) return;
+  if (n_blocks > list.capacity_blocks) return;
   const CullPlan plan(n_blocks, workspace);
   std::copy(blocks.begin(), blocks.end(), plan.blocks);
   (leaves_out_any(in.gate.rules) ? fill_plan<true> : fill_plan<false>)(in, views, plan);

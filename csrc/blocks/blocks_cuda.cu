@@ -105,7 +105,7 @@ __global__ void __launch_bounds__(kGroup)
                 std::int32_t* mixed, std::int32_t* n_blocks, Frustum* planes_out) {
   __shared__ Frustum planes[kMaxViews];
   __shared__ GateTable table;
-  __shared__ int of_warps[kWarps];
+  __shared__ int warp_counts[kWarps];
   wait_for_earlier_kernels();
   const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
   if (kGated) fill_gate_table(in.gate.rules, in.camera.viewmats, threadIdx.x, table);
@@ -117,20 +117,21 @@ __global__ void __launch_bounds__(kGroup)
   const std::int64_t blocks = blocks_of(in.rows.n), block = group * std::int64_t{kGroup} + thread;
   BlockViews seen{0, 0, 0};
   if (block < blocks) seen = views_of_block<kGated>(planes, in.views, in.bounds, block, in.gate, table);
-  const unsigned ballot = __ballot_sync(kFullWarp, seen.some != 0);
-  if (lane == 0) of_warps[warp] = __popc(ballot);
+  const unsigned ballot = __ballot_sync(kFullWarp, seen.any != 0);
+  if (lane == 0) warp_counts[warp] = __popc(ballot);
   __syncthreads();
-  int at = __popc(ballot & ((1u << lane) - 1)), count = 0;
+  int listed_before = __popc(ballot & ((1u << lane) - 1)), count = 0;
 #pragma unroll
   for (int other = 0; other < kWarps; ++other) {
-    if (other < warp) at += of_warps[other];
-    count += of_warps[other];
+    if (other < warp) listed_before += warp_counts[other];
+    count += warp_counts[other];
   }
-  const std::int64_t before = counters.earlier.sum_before<kGroup>(group, count), place = before + at;
+  const std::int64_t before = counters.earlier.sum_before<kGroup>(group, count),
+                     place = before + listed_before;
   if (thread == 0 && (group + 1) * std::int64_t{kGroup} >= blocks) {
     *n_blocks = static_cast<std::int32_t>(before + count);
   }
-  const bool listed = seen.some && place < plan.room;
+  const bool listed = seen.any && place < plan.capacity_blocks;
   if (listed) {
     plan.blocks[place] = {static_cast<std::int32_t>(block), seen};
     if (!is_mixed(seen)) {
@@ -148,12 +149,12 @@ template <bool kGated>
 __global__ void __launch_bounds__(kBlockRows, kResident)
     test_rows(const __grid_constant__ CullInputs in, const CullPlan plan, const CullCounters counters,
               const std::int32_t* mixed, const std::int32_t* n_blocks, const Frustum* planes) {
-  __shared__ Frustum shared[kMaxViews];
+  __shared__ Frustum shared_planes[kMaxViews];
   __shared__ GateTable table;
   wait_for_earlier_kernels();
-  const std::int32_t count = *n_blocks > plan.room ? 0 : *counters.n_mixed;
+  const std::int32_t count = *n_blocks > plan.capacity_blocks ? 0 : *counters.n_mixed;
   if (static_cast<std::int32_t>(blockIdx.x) >= count) return;
-  if (threadIdx.x < in.views) shared[threadIdx.x] = planes[threadIdx.x];
+  if (threadIdx.x < in.views) shared_planes[threadIdx.x] = planes[threadIdx.x];
   if (kGated) fill_gate_table(in.gate.rules, in.camera.viewmats, threadIdx.x, table);
   __syncthreads();
   for (std::int32_t i = blockIdx.x; i < count; i += gridDim.x) {
@@ -162,7 +163,7 @@ __global__ void __launch_bounds__(kBlockRows, kResident)
     const std::int64_t row = std::int64_t{block} * kBlockRows + threadIdx.x;
     std::uint32_t mask = 0;
     if (row < in.rows.n) {
-      mask = views_of_row<kGated>(in.rows, shared, in.views, in.bounds, seen, row, in.gate, table);
+      mask = views_of_row<kGated>(in.rows, shared_planes, in.views, in.bounds, seen, row, in.gate, table);
       plan.masks[std::int64_t{place} * kBlockRows + threadIdx.x] = mask;
     }
     const int total = __syncthreads_count(mask != 0);
@@ -192,18 +193,18 @@ __device__ std::int32_t rows_before(const CullPlan& plan, const std::int32_t* gr
 __global__ void __launch_bounds__(kBlockRows)
     emit_rows(std::int64_t n, const CullPlan plan, const std::int32_t* groups, const ActiveList out) {
   wait_for_earlier_kernels();
-  const std::int32_t n_blocks = *out.n_blocks > plan.room ? 0 : *out.n_blocks;
+  const std::int32_t n_blocks = *out.n_blocks > plan.capacity_blocks ? 0 : *out.n_blocks;
   const std::int32_t first = static_cast<std::int32_t>(blockIdx.x) * kWarps;
   if (blockIdx.x == 0 && threadIdx.x == 0 && n_blocks == 0) *out.count = 0;
   if (first >= n_blocks) return;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const std::int32_t place = first + warp, before = rows_before(plan, groups, first);
-  const std::int32_t here = lane < kWarps && first + lane < n_blocks ? plan.active[first + lane] : 0;
+  const std::int32_t block_rows = lane < kWarps && first + lane < n_blocks ? plan.active[first + lane] : 0;
   if (first + kWarps >= n_blocks && warp == 0) {
-    const std::int32_t all = before + __reduce_add_sync(kFullWarp, here);
+    const std::int32_t all = before + __reduce_add_sync(kFullWarp, block_rows);
     if (lane == 0) *out.count = all;
   }
-  std::int32_t at = before + __reduce_add_sync(kFullWarp, lane < warp ? here : 0);
+  std::int32_t first_place = before + __reduce_add_sync(kFullWarp, lane < warp ? block_rows : 0);
   if (place >= n_blocks) return;
   const auto [block, seen] = plan.blocks[place];
   const bool mixed = is_mixed(seen);
@@ -214,12 +215,12 @@ __global__ void __launch_bounds__(kBlockRows)
                                : mixed        ? plan.masks[std::int64_t{place} * kBlockRows + local]
                                               : seen.all;
     const std::uint32_t ballot = __ballot_sync(kFullWarp, mask != 0);
-    const std::int32_t to = at + __popc(ballot & ((1u << lane) - 1));
+    const std::int32_t target = first_place + __popc(ballot & ((1u << lane) - 1));
     if (mask) {
-      out.ids[to] = block * kBlockRows + local;
-      out.views[to] = static_cast<std::int32_t>(mask);
+      out.ids[target] = block * kBlockRows + local;
+      out.views[target] = static_cast<std::int32_t>(mask);
     }
-    at += __popc(ballot);
+    first_place += __popc(ballot);
   }
 }
 
@@ -258,10 +259,11 @@ namespace {
 
 // Finds the blocks that some view may see. If the capacity is not 0, also lists their active rows.
 void cull(const CullInputs& in, const ActiveList& out, Workspace& workspace, CudaStream stream) {
-  const CullPlan plan(out.room, workspace);
-  std::int32_t* mixed = workspace.allocate<std::int32_t>(out.room);
+  const CullPlan plan(out.capacity_blocks, workspace);
+  std::int32_t* mixed = workspace.allocate<std::int32_t>(out.capacity_blocks);
   Frustum* planes = workspace.allocate<Frustum>(in.views);
-  const unsigned turns = blocks_for(blocks_of(in.rows.n), kGroup), n_groups = blocks_for(out.room, kGroup);
+  const unsigned turns = blocks_for(blocks_of(in.rows.n), kGroup),
+                 n_groups = blocks_for(out.capacity_blocks, kGroup);
   auto* sums = workspace.allocate<std::uint64_t>(turns + 1 + (n_groups + 2) / 2);
   auto* groups = reinterpret_cast<std::int32_t*>(sums + turns + 1);
   const CullCounters counters{RunningSum(sums), groups, groups + n_groups};
@@ -269,12 +271,12 @@ void cull(const CullInputs& in, const ActiveList& out, Workspace& workspace, Cud
   const bool gated = leaves_out_any(in.gate.rules);
   launch_early("cull_blocks", gated ? test_blocks<true> : test_blocks<false>, {turns, kGroup, stream}, in,
                plan, counters, mixed, out.n_blocks, planes);
-  if (out.room == 0) return;
+  if (out.capacity_blocks == 0) return;
   launch_early("cull_blocks", gated ? test_rows<true> : test_rows<false>,
-               {persistent_blocks(out.room), kBlockRows, stream}, in, plan, counters, mixed, out.n_blocks,
-               planes);
-  launch_early("cull_blocks", emit_rows, {blocks_for(out.room, kWarps), kBlockRows, stream}, in.rows.n, plan,
-               groups, out);
+               {persistent_blocks(out.capacity_blocks), kBlockRows, stream}, in, plan, counters, mixed,
+               out.n_blocks, planes);
+  launch_early("cull_blocks", emit_rows, {blocks_for(out.capacity_blocks, kWarps), kBlockRows, stream},
+               in.rows.n, plan, groups, out);
 }
 
 }  // namespace
@@ -290,7 +292,7 @@ std::int64_t count_active_blocks(const CullInputs& in, Workspace& workspace, Cud
 }
 
 void cull_blocks(const CullInputs& in, const ActiveList& out, Workspace& workspace, CudaStream stream) {
-  if (in.rows.n == 0 || out.room == 0) {
+  if (in.rows.n == 0 || out.capacity_blocks == 0) {
     check(cudaMemsetAsync(out.count, 0, sizeof(*out.count), stream), "cull_blocks");
     check(cudaMemsetAsync(out.n_blocks, 0, sizeof(*out.n_blocks), stream), "cull_blocks");
   }

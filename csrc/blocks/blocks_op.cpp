@@ -99,7 +99,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
     const std::vector<std::int64_t>& size, const std::vector<double>& limits,
     const std::optional<Tensor>& level_ranges_in, const std::optional<Tensor>& level,
     const std::vector<double>& reach, std::int64_t lod_views, const std::optional<Tensor>& cull,
-    const std::vector<std::int64_t>& columns, std::optional<std::int64_t> room_in) {
+    const std::vector<std::int64_t>& columns, std::optional<std::int64_t> capacity_in) {
   const char* op = "cull_blocks";
   STD_TORCH_CHECK(cameras.size() == 2 && size.size() == 2 && limits.size() == 3, "blitzgs::", op,
                   ": cameras are viewmats and Ks, size is width and height, limits are near_plane, "
@@ -134,16 +134,16 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
   }
   DeviceScope scope(bounds);
   const CullInputs in{held.rows, data<float>(bounds), camera, static_cast<int>(views), gate};
-  STD_TORCH_CHECK(!room_in || *room_in > 0, "blitzgs::", op, ": room must be for 1 block or more, got ",
-                  *room_in);
-  const std::int64_t room = room_in ? std::min(*room_in, blocks_of(held.rows.n))
-                                    : backend::count_active_blocks(in, scope.workspace, scope.stream);
-  Tensor active_ids = make_empty(bounds, {room * kBlockRows}, ScalarType::Int);
-  Tensor active_views = make_empty(bounds, {room * kBlockRows}, ScalarType::Int);
+  STD_TORCH_CHECK(!capacity_in || *capacity_in > 0, "blitzgs::", op,
+                  ": capacity_blocks must be for 1 block or more, got ", *capacity_in);
+  const std::int64_t capacity = capacity_in ? std::min(*capacity_in, blocks_of(held.rows.n))
+                                            : backend::count_active_blocks(in, scope.workspace, scope.stream);
+  Tensor active_ids = make_empty(bounds, {capacity * kBlockRows}, ScalarType::Int);
+  Tensor active_views = make_empty(bounds, {capacity * kBlockRows}, ScalarType::Int);
   Tensor count = make_empty(bounds, {1}, ScalarType::Int),
          n_blocks = make_empty(bounds, {1}, ScalarType::Int);
   const ActiveList list{mutable_data<std::int32_t>(active_ids), mutable_data<std::int32_t>(active_views),
-                        mutable_data<std::int32_t>(count), mutable_data<std::int32_t>(n_blocks), room};
+                        mutable_data<std::int32_t>(count), mutable_data<std::int32_t>(n_blocks), capacity};
   backend::cull_blocks(in, list, scope.workspace, scope.stream);
   return {active_ids, active_views, count, n_blocks};
 }

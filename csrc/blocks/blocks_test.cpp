@@ -21,11 +21,11 @@ struct Scene {
 
 blitzgs::SweptBox point(float x, float y, float z, float sigma) { return {{x, y, z}, {x, y, z}, sigma}; }
 
-blitzgs::Sight sight(const blitzgs::SweptBox& box) {
-  return blitzgs::sight_of(Scene().view(), box, blitzgs::kRowSlack);
+blitzgs::Visibility visibility(const blitzgs::SweptBox& box) {
+  return blitzgs::visibility_of(Scene().view(), box, blitzgs::kRowSlack);
 }
 
-bool seen(const blitzgs::SweptBox& box) { return sight(box).some; }
+bool seen(const blitzgs::SweptBox& box) { return visibility(box).any; }
 
 }  // namespace
 
@@ -42,9 +42,9 @@ TEST_CASE("a box is dropped where no view can see it") {
 }
 
 TEST_CASE("a view sees all of a box whose every point it sees whatever its size") {
-  REQUIRE(sight({{-0.5f, -0.4f, 3}, {0.5f, 0.4f, 5}, 2}).all);
-  REQUIRE_FALSE(sight({{-0.5f, -0.4f, 0.4f}, {0.5f, 0.4f, 5}, 2}).all);
-  REQUIRE_FALSE(sight({{-0.5f, -0.4f, 3}, {20, 0.4f, 5}, 100}).all);
+  REQUIRE(visibility({{-0.5f, -0.4f, 3}, {0.5f, 0.4f, 5}, 2}).all);
+  REQUIRE_FALSE(visibility({{-0.5f, -0.4f, 0.4f}, {0.5f, 0.4f, 5}, 2}).all);
+  REQUIRE_FALSE(visibility({{-0.5f, -0.4f, 3}, {20, 0.4f, 5}, 100}).all);
 }
 
 TEST_CASE("pending steps widen a row's box along its drift, and rows that are not finite have none") {

@@ -91,7 +91,7 @@ __device__ __forceinline__ void wait_for_earlier_kernels() {
 // runs and not on the device: code that was compiled for an older architecture and translated at load time
 // does not wait. All kernels are compiled for the same architectures, so it is enough to ask about one of
 // them.
-inline bool kernels_wait(const void* kernel) {
+inline bool can_launch_early(const void* kernel) {
   if constexpr (BLITZGS_SM80_BRANCHES) return false;
   enum : signed char { kUnknown, kNo, kYes };
   static std::array<std::atomic<signed char>, 64> known{};  // by device
@@ -128,7 +128,7 @@ void launch_early(const char* what, void (*kernel)(Parameters...), const LaunchS
   config.dynamicSmemBytes = shape.shared_bytes;
   config.stream = shape.stream;
   config.attrs = &early;
-  config.numAttrs = kernels_wait(reinterpret_cast<const void*>(kernel)) ? 1 : 0;
+  config.numAttrs = can_launch_early(reinterpret_cast<const void*>(kernel)) ? 1 : 0;
   cudaLaunchKernelEx(&config, kernel, arguments...);
   check_launch(what);
 }

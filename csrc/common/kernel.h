@@ -66,15 +66,15 @@ std::tuple<T*...> allocate_arrays(std::int64_t length, Workspace& workspace) {
 // first *known splats are valid, and the memory after them is undefined and not read. A number outside
 // [0, n_splats] counts as 0: the splats exceeded the capacity, and the caller discards the result. known:
 // null if all n_splats splats are valid. Kernels read it after wait_for_earlier_kernels().
-BLITZGS_HD std::int64_t splats_there(std::int64_t n_splats, const std::int64_t* known) {
+BLITZGS_HD std::int64_t valid_splat_count(std::int64_t n_splats, const std::int64_t* known) {
   if (!known) return n_splats;
-  const std::int64_t there = *known;
-  return 0 <= there && there <= n_splats ? there : 0;
+  const std::int64_t count = *known;
+  return 0 <= count && count <= n_splats ? count : 0;
 }
 
 template <class Input>
-BLITZGS_HD std::int64_t splats_there(const Input& in) {
-  return splats_there(in.n_splats, in.known_splats);
+BLITZGS_HD std::int64_t valid_splat_count(const Input& in) {
+  return valid_splat_count(in.n_splats, in.known_splats);
 }
 
 // The gradient of one splat: on CUDA the rasteriser's backward pass sums it, and the projection's backward

@@ -138,19 +138,19 @@ const T* data_or_null(const std::optional<Tensor>& tensor) {
   return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
 }
 
-// An upper bound on the number of valid entries of a list with the capacity `room`. The first count [1]
-// entries are valid; without a count all are. On CUDA the bound is the capacity, because the host does not
-// wait for the count; the kernels read it.
-inline std::int64_t most_listed(const char* op, const std::optional<Tensor>& count, std::int64_t room) {
-  if (!count) return room;
+// An upper bound on the number of valid entries of a list that can have `capacity` of them. The first count
+// [1] entries are valid; without a count all are. On CUDA the bound is the capacity, because the host does
+// not wait for the count; the kernels read it.
+inline std::int64_t max_listed(const char* op, const std::optional<Tensor>& count, std::int64_t capacity) {
+  if (!count) return capacity;
   check_dtype(op, "the count of a list", *count, ScalarType::Int);
   check_shape(op, "the count of a list", *count, {1});
 #ifdef BLITZGS_BACKEND_CUDA
-  return room;
+  return capacity;
 #else
   const std::int64_t listed = *data<std::int32_t>(*count);
-  STD_TORCH_CHECK(listed >= 0 && listed <= room, "blitzgs::", op, ": a list of ", room, " cannot have ",
-                  listed, " entries");
+  STD_TORCH_CHECK(listed >= 0 && listed <= capacity, "blitzgs::", op, ": a list of ", capacity,
+                  " cannot have ", listed, " entries");
   return listed;
 #endif
 }
@@ -213,17 +213,17 @@ struct SplatCount {
 
 inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor>& n_splats,
                                       const Tensor& splats) {
-  const std::int64_t room = splats.size(0);
-  if (!n_splats) return {room, nullptr};
+  const std::int64_t capacity = splats.size(0);
+  if (!n_splats) return {capacity, nullptr};
   check_dtype(op, "n_splats", *n_splats, ScalarType::Long);
   check_shape(op, "n_splats", *n_splats, {1});
   STD_TORCH_CHECK(
       n_splats->is_cpu() == splats.is_cpu() && n_splats->get_device_index() == splats.get_device_index(),
       "blitzgs::", op, ": n_splats must be on the device of the splats");
 #ifdef BLITZGS_BACKEND_CUDA
-  return {room, data<std::int64_t>(*n_splats)};
+  return {capacity, data<std::int64_t>(*n_splats)};
 #else
-  return {splats_there(room, data<std::int64_t>(*n_splats)), nullptr};
+  return {valid_splat_count(capacity, data<std::int64_t>(*n_splats)), nullptr};
 #endif
 }
 

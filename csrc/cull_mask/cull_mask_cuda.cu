@@ -11,8 +11,8 @@ __device__ std::uint32_t transpose_bits(std::uint32_t word, int lane) {
   std::uint32_t own = 0;
 #pragma unroll
   for (int bit = 0; bit < 32; ++bit) {
-    const std::uint32_t of_bit = __ballot_sync(kFullWarp, word >> bit & 1u);
-    if (lane == bit) own = of_bit;
+    const std::uint32_t lanes_with_bit = __ballot_sync(kFullWarp, word >> bit & 1u);
+    if (lane == bit) own = lanes_with_bit;
   }
   return own;
 }
@@ -25,14 +25,14 @@ __global__ void __launch_bounds__(kSectorRows) transpose_kernel(const CullMask m
   const std::int64_t block = blockIdx.x, row = block * kSectorRows + threadIdx.x;
   const bool present = row < mask.n;
   for (std::int64_t word = 0; word < mask.words; ++word) {
-    std::int32_t& of_row = mask.rows[(present ? row : 0) * mask.words + word];
-    std::int32_t& of_sector = mask.sectors[sector_at(block, 32 * mask.words, 32 * word + lane) + group];
+    std::int32_t& row_word = mask.rows[(present ? row : 0) * mask.words + word];
+    std::int32_t& sector_word = mask.sectors[sector_at(block, 32 * mask.words, 32 * word + lane) + group];
     if (kToSectors) {
-      of_sector =
-          static_cast<std::int32_t>(transpose_bits(present ? static_cast<std::uint32_t>(of_row) : 0u, lane));
+      sector_word = static_cast<std::int32_t>(
+          transpose_bits(present ? static_cast<std::uint32_t>(row_word) : 0u, lane));
     } else {
-      const std::uint32_t own = transpose_bits(static_cast<std::uint32_t>(of_sector), lane);
-      if (present) of_row = static_cast<std::int32_t>(own);
+      const std::uint32_t own = transpose_bits(static_cast<std::uint32_t>(sector_word), lane);
+      if (present) row_word = static_cast<std::int32_t>(own);
     }
   }
 }

@@ -95,7 +95,7 @@ struct alignas(16) Touched {
   }
 
   // Returns the value of another lane. All lanes of the warp must call this.
-  __device__ Touched of_lane(int lane) const {
+  __device__ Touched from_lane(int lane) const {
     Touched other{__shfl_sync(kFullWarp, first, lane), {}};
     for (int k = 0; k < kWords; ++k) other.rows[k] = __shfl_sync(kFullWarp, rows[k], lane);
     return other;
@@ -146,7 +146,7 @@ struct DepthRange {
 
   // Returns the union of the ranges of all threads of a block to each thread. All threads call this.
   template <int kThreads>
-  __device__ DepthRange of_block() const {
+  __device__ DepthRange over_block() const {
     __shared__ DepthRange warps[kThreads / 32];
     const int lane = threadIdx.x % 32;
     DepthRange range{__reduce_min_sync(kFullWarp, low), __reduce_max_sync(kFullWarp, high)};
@@ -186,7 +186,7 @@ struct DepthDigits {
 __global__ void __launch_bounds__(kRangeThreads)
     range_kernel(const IntersectInput<float> in, DepthRange* ranges, uint4* zeros, std::int64_t n_zeros) {
   wait_for_earlier_kernels();
-  const std::int64_t n = splats_there(in);
+  const std::int64_t n = valid_splat_count(in);
   constexpr std::int64_t kStep = kRangeBlocks * kRangeThreads;
   const std::int64_t thread = blockIdx.x * static_cast<std::int64_t>(kRangeThreads) + threadIdx.x;
   DepthRange range{0xffffffffu, 0u};
@@ -196,7 +196,7 @@ __global__ void __launch_bounds__(kRangeThreads)
     range = {min(range.low, bits), max(range.high, bits)};
   }
   for (std::int64_t i = thread; i < n_zeros; i += kStep) zeros[i] = uint4{};
-  range = range.of_block<kRangeThreads>();
+  range = range.over_block<kRangeThreads>();
   if (threadIdx.x == 0) ranges[blockIdx.x] = range;
 }
 
@@ -211,9 +211,9 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
   for (int bin = threadIdx.x; bin < kDepthPasses * kDepthBins; bin += kDepthThreads) counts[0][bin] = 0;
   wait_for_earlier_kernels();
   // The number is below 2^31, and a 64-bit loop counter would need more registers than there are.
-  const auto n = static_cast<std::uint32_t>(splats_there(in));
+  const auto n = static_cast<std::uint32_t>(valid_splat_count(in));
   const DepthRange range =
-      ranges[threadIdx.x].of_block<kDepthThreads>();  // also a barrier for the zeroed counters
+      ranges[threadIdx.x].over_block<kDepthThreads>();  // also a barrier for the zeroed counters
   const DepthDigits digits(range, in.grid.n_cameras);
   if (blockIdx.x == 0 && threadIdx.x == 0) {
     *dropped_bits = digits.dropped;

@@ -52,7 +52,7 @@ struct TileDigits {
 __global__ void count_kernel(const Input in, std::int32_t* counts) {
   const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
   if (i >= in.n_splats) return;
-  counts[i] = i < splats_there(in) ? find_touched(in.grid, load_splat(in, i)).count() : 0;
+  counts[i] = i < valid_splat_count(in) ? find_touched(in.grid, load_splat(in, i)).count() : 0;
 }
 
 // Writes the entries of a warp's splats, one splat for each lane. The warp's entries begin at `turn`, the
@@ -77,26 +77,26 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t spla
     }
     const std::int32_t k = entry - __shfl_sync(kFullWarp, begin, source);
     const std::int64_t at = turn + __shfl_sync(kFullWarp, start, source) + k;
-    const std::int32_t of_splat = __shfl_sync(kFullWarp, splat, source);
-    const Touched its = touched.of_lane(source);
+    const std::int32_t source_splat = __shfl_sync(kFullWarp, splat, source);
+    const Touched source_touched = touched.from_lane(source);
     if (entry < total && at < capacity) {
-      const std::uint32_t tile = its.tile(k, in.grid.tiles_x);
+      const std::uint32_t tile = source_touched.tile(k, in.grid.tiles_x);
       keys[at] = static_cast<Key>(tile);
-      entries[at] = of_splat;
+      entries[at] = source_splat;
       digits.count(tile, counts);
     }
   }
   // For each splat that is not compact, all lanes go through its tile rows together.
   for (unsigned left = __ballot_sync(kFullWarp, !touched.compact()); left; left &= left - 1) {
     const int source = __ffs(left) - 1;
-    const std::int32_t of_splat = __shfl_sync(kFullWarp, splat, source);
+    const std::int32_t source_splat = __shfl_sync(kFullWarp, splat, source);
     std::int64_t at = turn + __shfl_sync(kFullWarp, start, source);
-    const SplatShape shape = load_splat(in, of_splat);
+    const SplatShape shape = load_splat(in, source_splat);
     for_each_owned(in.grid, shape, [&](const Owned& owned) {
       const int n = owned.last - owned.first;
       for (int k = lane; k < n && at + k < capacity; k += 32) {
         keys[at + k] = static_cast<Key>(owned.first + k);
-        entries[at + k] = of_splat;
+        entries[at + k] = source_splat;
         digits.count(owned.first + k, counts);
       }
       at += n;

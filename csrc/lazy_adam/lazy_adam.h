@@ -231,34 +231,35 @@ BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const PendingSteps<T>& steps, i
   return adam_ruled_drift(steps.rules[group], m, root, static_cast<T>(args.eps));
 }
 
-// Whether the drift of a row on its way to the target is above rounding. `stand` is the step of its moments;
-// the drift from explicit_steps after that step on is below rounding.
+// Whether the drift of a row on its way to the target is above rounding. `moment_step` is the step of its
+// moments; the drift from explicit_steps after that step on is below rounding.
 template <class T>
-BLITZGS_HD bool adam_moves(const AdamArgs<T>& args, std::int32_t from, std::int32_t stand) {
-  return from < args.target() && from - stand < args.explicit_steps;
+BLITZGS_HD bool adam_moves(const AdamArgs<T>& args, std::int32_t from, std::int32_t moment_step) {
+  return from < args.target() && from - moment_step < args.explicit_steps;
 }
 
 // The factors by which the moments of a row decay.
 template <class T>
 struct AdamRow {
-  std::int32_t from;  // the step of the parameters
-  T here1, here2;     // beta1^k, beta2^k from the moments' step to `from`
-  T then1, then2;     // beta1^k, beta2^k from the moments' step to the target
-  bool moves;         // see adam_moves
+  std::int32_t from;                     // the step of the parameters
+  T decay1_to_params, decay2_to_params;  // beta1^k, beta2^k from the moments' step to `from`
+  T decay1_to_target, decay2_to_target;  // beta1^k, beta2^k from the moments' step to the target
+  bool moves;                            // see adam_moves
 };
 
 template <class T>
 BLITZGS_HD AdamRow<T> adam_row(const AdamArgs<T>& args, std::int64_t row) {
   const std::int32_t target = args.target();
   if (args.sparse) return {target, T(1), T(1), T(1), T(1), false};
-  const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
-  const double *here = args.table_row(from - stand), *then = args.table_row(target - stand);
+  const std::int32_t from = args.last_step[row], moment_step = args.moment_step[row];
+  const double *to_params = args.table_row(from - moment_step),
+               *to_target = args.table_row(target - moment_step);
   return {from,
-          static_cast<T>(here[kBeta1Power]),
-          static_cast<T>(here[kBeta2Power]),
-          static_cast<T>(then[kBeta1Power]),
-          static_cast<T>(then[kBeta2Power]),
-          adam_moves(args, from, stand)};
+          static_cast<T>(to_params[kBeta1Power]),
+          static_cast<T>(to_params[kBeta2Power]),
+          static_cast<T>(to_target[kBeta1Power]),
+          static_cast<T>(to_target[kBeta2Power]),
+          adam_moves(args, from, moment_step)};
 }
 
 // The scalars of one step with a gradient.

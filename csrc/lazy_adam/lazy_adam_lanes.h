@@ -82,12 +82,12 @@ void update_elements(const AdamRowJob<T>& job, const int* groups, T* p, T* m, T*
   Lanes param = Lanes::load(p), first = Lanes::load(m), second = Lanes::load(v);
   const AdamRow<T>& state = job.state;
   if (job.steps) {
-    param = param - drift_of<Lanes>(job, groups, first * Lanes::broadcast(state.here1),
-                                    second * Lanes::broadcast(state.here2));
+    param = param - drift_of<Lanes>(job, groups, first * Lanes::broadcast(state.decay1_to_params),
+                                    second * Lanes::broadcast(state.decay2_to_params));
   }
   if (g) {
-    first = first * Lanes::broadcast(state.then1);
-    second = second * Lanes::broadcast(state.then2);
+    first = first * Lanes::broadcast(state.decay1_to_target);
+    second = second * Lanes::broadcast(state.decay2_to_target);
     take_step(job.step, groups, Lanes::load(g), param, first, second);
     first.store(m);
     second.store(v);

@@ -44,7 +44,7 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
     check_shape(kOp, "ids", *ids, {-1});
     list = as_contiguous(*ids);
   }
-  const std::int64_t n = most_listed(kOp, count, list ? list->size(0) : state.rows());
+  const std::int64_t n = max_listed(kOp, count, list ? list->size(0) : state.rows());
   DeviceScope scope(state.like());
   dispatch_floating(state.like(), [&](auto zero) {
     auto args = state.arguments<decltype(zero)>(data_or_null<std::int32_t>(list), n);

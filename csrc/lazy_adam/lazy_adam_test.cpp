@@ -104,10 +104,10 @@ TEST_CASE("a row's moments decay to where its parameters stand and on to the tar
   args.step = 50;
   args.explicit_steps = 187;
   const auto fresh = blitzgs::adam_row(args, 0), stale = blitzgs::adam_row(args, 1);
-  REQUIRE(fresh.here1 == 1);
-  REQUIRE(fresh.then2 == Approx(std::pow(kBeta2, 20)).epsilon(1e-12));
-  REQUIRE(stale.here1 == Approx(std::pow(kBeta1, 4)).epsilon(1e-12));
-  REQUIRE(stale.then1 == Approx(std::pow(kBeta1, 10)).epsilon(1e-12));
+  REQUIRE(fresh.decay1_to_params == 1);
+  REQUIRE(fresh.decay2_to_target == Approx(std::pow(kBeta2, 20)).epsilon(1e-12));
+  REQUIRE(stale.decay1_to_params == Approx(std::pow(kBeta1, 4)).epsilon(1e-12));
+  REQUIRE(stale.decay1_to_target == Approx(std::pow(kBeta1, 10)).epsilon(1e-12));
   REQUIRE((fresh.moves && stale.moves));
   args.step = 400;
   REQUIRE_FALSE(blitzgs::adam_row(args, 2).moves);  // what is left of its drift is below rounding

@@ -181,14 +181,14 @@ BackwardTensors project_bwd(const TensorList& gaussians, const OptionalTensorLis
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
-  const auto of_visible = [&](const std::vector<std::int64_t>& shape) {
+  const auto make_gradient = [&](const std::vector<std::int64_t>& shape) {
     Tensor gradient = make_empty(p.means, shape);
     if (dense) TORCH_ERROR_CODE_CHECK(aoti_torch_zero_(gradient.get()));
     return gradient;
   };
-  Tensor v_means = of_visible({length, 3}), v_quats = of_visible({length, 4}),
-         v_scales = of_visible({length, 3}), v_opacities = of_visible({length}),
-         v_sh = of_visible({length, p.sh_stride, 3}),
+  Tensor v_means = make_gradient({length, 3}), v_quats = make_gradient({length, 4}),
+         v_scales = make_gradient({length, 3}), v_opacities = make_gradient({length}),
+         v_sh = make_gradient({length, p.sh_stride, 3}),
          v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {

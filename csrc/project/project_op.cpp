@@ -31,7 +31,7 @@ struct Candidates {
       check_shape(op, "n_blocks", *blocks, {1});
       check_dtype(op, "n_blocks", *blocks, ScalarType::Int);
     }
-    count = most_listed(op, listed, ids->numel());
+    count = max_listed(op, listed, ids->numel());
   }
 };
 

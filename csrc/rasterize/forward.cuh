@@ -38,7 +38,7 @@ inline __global__ void __launch_bounds__(kPackThreads, 8)
     order.add(in.tile_offsets, static_cast<int>((blockIdx.x - pack_blocks) * kPackThreads + threadIdx.x));
     return;
   }
-  const std::int64_t n = splats_there(in);
+  const std::int64_t n = valid_splat_count(in);
   __shared__ PackedSplat stages[kPackThreads];
   const PackedSplat* stage = stages + threadIdx.x / 32 * 32;
   const int lane = threadIdx.x % 32;

@@ -86,7 +86,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
   __shared__ int tile_work;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   wait_for_earlier_kernels();
-  const std::int64_t zero_splats = splats_there(args.zero_splats, args.known_splats);
+  const std::int64_t zero_splats = valid_splat_count(args.zero_splats, args.known_splats);
   const int block = static_cast<int>(blockIdx.x), owned = args.order.n_tiles;
   const std::int64_t index = block < owned                          ? args.order.tile(block)
                              : block - owned < args.grid.tile_begin ? block - owned

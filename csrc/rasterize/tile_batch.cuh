@@ -84,15 +84,15 @@ struct TileOrder {
   // The tile that block number `block` < n_tiles takes.
   __device__ __forceinline__ std::int64_t tile(int block) const {
     if (!counts) return first + block;
-    const std::int32_t* of_class = tiles;
+    const std::int32_t* class_tiles = tiles;
     const auto* quads = reinterpret_cast<const int4*>(counts);
 #pragma unroll
     for (int i = 0; i < kLengthClasses / 4; ++i) {
       const int4 four = quads[i];
       for (const int count : {four.x, four.y, four.z, four.w}) {
-        if (block < count) return of_class[block];
+        if (block < count) return class_tiles[block];
         block -= count;
-        of_class += n_tiles;
+        class_tiles += n_tiles;
       }
     }
     return 0;  // not reached: the counts add up to n_tiles

@@ -52,19 +52,19 @@ struct SwapBlocks {
   int n_columns;
 };
 
-BLITZGS_HD std::int32_t views_that_see(const SeenBlocks& of, const Frustum* planes, std::int64_t block) {
-  const SweptBox box = load_box(of.bounds + block * kBlockBounds);
+BLITZGS_HD std::int32_t views_that_see(const SeenBlocks& args, const Frustum* planes, std::int64_t block) {
+  const SweptBox box = load_box(args.bounds + block * kBlockBounds);
   std::uint32_t seen = 0;
-  for (int view = 0; view < of.views; ++view) {
-    if (sight_of(planes[view], box, kSeenSlack).some) seen |= 1u << view;
+  for (int view = 0; view < args.views; ++view) {
+    if (visibility_of(planes[view], box, kSeenSlack).any) seen |= 1u << view;
   }
   return static_cast<std::int32_t>(seen);
 }
 
-BLITZGS_HD Frustum frustum_of(const SeenBlocks& of, int view) {
-  return make_frustum(
-      {of.viewmats, of.Ks, of.sizes[2 * view], of.sizes[2 * view + 1], of.near_plane, of.far_plane, of.eps2d},
-      view);
+BLITZGS_HD Frustum frustum_of(const SeenBlocks& args, int view) {
+  return make_frustum({args.viewmats, args.Ks, args.sizes[2 * view], args.sizes[2 * view + 1],
+                       args.near_plane, args.far_plane, args.eps2d},
+                      view);
 }
 
 namespace cpu {

@@ -7,12 +7,12 @@
 
 namespace blitzgs::cpu {
 
-void seen_blocks(const SeenBlocks& of, Workspace&, CudaStream) {
+void seen_blocks(const SeenBlocks& args, Workspace&, CudaStream) {
   Frustum planes[kMaxViews];
-  for (int view = 0; view < of.views; ++view) planes[view] = frustum_of(of, view);
-  parallel_for(0, of.n, 1024, [&](std::int64_t begin, std::int64_t end) {
+  for (int view = 0; view < args.views; ++view) planes[view] = frustum_of(args, view);
+  parallel_for(0, args.n, 1024, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t block = begin; block < end; ++block) {
-      of.seen[block] = views_that_see(of, planes, block);
+      args.seen[block] = views_that_see(args, planes, block);
     }
   });
 }

@@ -16,12 +16,12 @@ constexpr int kThreads = 256, kWarps = kThreads / 32;
 constexpr int kWords = 4, kUnit = 32 * kWords, kBlocks = 96;
 
 // seen [n] (residence.h), one thread per block of the table.
-__global__ void __launch_bounds__(kThreads) see_blocks(const SeenBlocks of) {
+__global__ void __launch_bounds__(kThreads) see_blocks(const SeenBlocks args) {
   __shared__ Frustum planes[kMaxViews];
-  if (threadIdx.x < of.views) planes[threadIdx.x] = frustum_of(of, threadIdx.x);
+  if (threadIdx.x < args.views) planes[threadIdx.x] = frustum_of(args, threadIdx.x);
   __syncthreads();
   const std::int64_t block = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
-  if (block < of.n) of.seen[block] = views_that_see(of, planes, block);
+  if (block < args.n) args.seen[block] = views_that_see(args, planes, block);
 }
 
 // A warp moves up to kUnit words, of which `count` exist: from the slot to the leaving block, and from the
@@ -72,9 +72,9 @@ __global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, i
 
 }  // namespace
 
-void seen_blocks(const SeenBlocks& of, Workspace&, CudaStream stream) {
-  if (of.n == 0) return;
-  see_blocks<<<blocks_for(of.n, kThreads), kThreads, 0, stream>>>(of);
+void seen_blocks(const SeenBlocks& args, Workspace&, CudaStream stream) {
+  if (args.n == 0) return;
+  see_blocks<<<blocks_for(args.n, kThreads), kThreads, 0, stream>>>(args);
   check_launch("seen_blocks");
 }
 

@@ -143,10 +143,10 @@ __device__ void scatter_block(ScatterShared<RANKS>& shared, const ScatterSplats&
     const int m = threadIdx.x;
     const int count = scan_warps(shared.before[m]);
     const std::int64_t base = state.take(m, count);
-    const std::int64_t room = groups.sizes[m] - base;
+    const std::int64_t places_left = groups.sizes[m] - base;
     shared.base[m] = static_cast<int>(base);
     shared.target[m] = base;
-    shared.count[m] = room >= count ? count : room > 0 ? static_cast<int>(room) : 0;
+    shared.count[m] = places_left >= count ? count : places_left > 0 ? static_cast<int>(places_left) : 0;
   }
   __syncthreads();
 #pragma unroll

@@ -21,10 +21,10 @@ __global__ void __launch_bounds__(kThreads) tree_sums_kernel(const TreeSumsArgs 
   wait_for_earlier_kernels();
   const std::int64_t row = static_cast<std::int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (row >= args.n_rows) return;
-  float* const mine = shared + threadIdx.x;
+  float* const row_features = shared + threadIdx.x;
   const float* const features = args.features + row * args.n_features;
-  for (int i = 0; i < args.n_features; ++i) mine[i * kThreads] = features[i];
-  args.sums[row] = tree_sum_of(args, StridedRow{mine});
+  for (int i = 0; i < args.n_features; ++i) row_features[i * kThreads] = features[i];
+  args.sums[row] = tree_sum_of(args, StridedRow{row_features});
 }
 
 }  // namespace

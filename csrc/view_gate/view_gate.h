@@ -14,8 +14,8 @@
 // alone, in float32 and from caught-up means, so the sets depend neither on the order of the rows nor on how
 // they are divided among ranks. One thread handles a row: deterministic. The cost is O(listed rows).
 //
-// ids int32 [room] and views int32 [room], of which the first count [1] are valid; means [N, 3]; level uint8
-// [N]; viewmats [B, 4, 4], rigid; cull int32 [ceil(N / 256), columns, 8].
+// ids int32 [capacity] and views int32 [capacity], of which the first count [1] are valid; means [N, 3];
+// level uint8 [N]; viewmats [B, 4, 4], rigid; cull int32 [ceil(N / 256), columns, 8].
 #pragma once
 #include <cstdint>
 
@@ -47,7 +47,7 @@ BLITZGS_HD bool leaves_out_any(const GateRules& rules) { return (rules.lod_views
 struct ViewGateArgs {
   const std::int32_t* ids;
   std::int32_t* views;
-  std::int64_t room;
+  std::int64_t capacity;
   const std::int32_t* count;  // CUDA: the number of valid ids, in device memory; null: all
   const float* means;
   const float* viewmats;

@@ -15,7 +15,7 @@ constexpr int kResident = 6;  // CUDA blocks that fit a multiprocessor of every 
 __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const ViewGateArgs args) {
   __shared__ GateTable table;
   wait_for_earlier_kernels();
-  const std::int64_t count = args.count ? *args.count : args.room;
+  const std::int64_t count = args.count ? *args.count : args.capacity;
   const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
   if (first >= count) return;
   fill_gate_table(args.rules, args.viewmats, threadIdx.x, table);
@@ -28,10 +28,11 @@ __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const V
 }  // namespace
 
 void gate_views(const ViewGateArgs& args, Workspace&, CudaStream stream) {
-  if (args.room == 0) return;
+  if (args.capacity == 0) return;
   // The grid is limited because the list's capacity is the whole table and its valid entries are few.
   const std::int64_t most = kResident * multiprocessors();
-  const auto blocks = static_cast<unsigned>(std::min<std::int64_t>(blocks_for(args.room, kThreads), most));
+  const auto blocks =
+      static_cast<unsigned>(std::min<std::int64_t>(blocks_for(args.capacity, kThreads), most));
   launch_early("gate_views", gate_views_kernel, {blocks, kThreads, stream}, args);
 }
 

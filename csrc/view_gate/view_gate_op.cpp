@@ -15,8 +15,8 @@ void gate_views_(const Tensor& ids_in, Tensor views, const std::optional<Tensor>
                  const std::optional<Tensor>& cull_in, const std::vector<std::int64_t>& columns) {
   check_dtype(kOp, "ids", ids_in, ScalarType::Int);
   check_shape(kOp, "ids", ids_in, {-1});
-  const std::int64_t room = ids_in.size(0);
-  check_in_place(kOp, "views", views, ScalarType::Int, {room});
+  const std::int64_t capacity = ids_in.size(0);
+  check_in_place(kOp, "views", views, ScalarType::Int, {capacity});
   check_dtype(kOp, "means", means_in, ScalarType::Float);
   check_shape(kOp, "means", means_in, {-1, 3});
   const std::int64_t rows = means_in.size(0);
@@ -31,7 +31,7 @@ void gate_views_(const Tensor& ids_in, Tensor views, const std::optional<Tensor>
   if (!leaves_out_any(held.rules)) return;
   const ViewGateArgs args{data<std::int32_t>(ids),
                           mutable_data<std::int32_t>(views),
-                          most_listed(kOp, count, room),
+                          max_listed(kOp, count, capacity),
                           data_or_null<std::int32_t>(count),
                           data<float>(means),
                           data<float>(viewmats),

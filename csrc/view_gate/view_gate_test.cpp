@@ -19,7 +19,7 @@ struct Rows {
 
   blitzgs::ViewGateArgs args() {
     blitzgs::ViewGateArgs args{};
-    args.ids = ids.data(), args.views = views.data(), args.room = 3;
+    args.ids = ids.data(), args.views = views.data(), args.capacity = 3;
     args.means = means.data(), args.viewmats = viewmats.data();
     args.rules.level = level.data(), args.rules.cull = cull.data(), args.rules.cull_columns = 32;
     args.rules.n_views = 2, args.rules.n_levels = 2;

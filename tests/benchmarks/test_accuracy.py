@@ -70,7 +70,7 @@ def test_the_accuracy_report_is_written_and_bounds_are_required(scene, tmp_path)
     assert (tmp_path / "accuracy.png").stat().st_size > 1000
 
 
-def test_what_was_measured_stays_when_a_run_is_cut_off(scene, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_run_keeps_its_measurements(scene, tmp_path, monkeypatch, capsys):
     def measure(option, *_):
         if option.name == "batch of 4 views":
             raise KeyboardInterrupt

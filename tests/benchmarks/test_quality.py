@@ -78,7 +78,7 @@ def test_runs_are_done_once_and_a_failure_stops_no_other(tmp_path, capture, caps
 
 
 @pytest.mark.parametrize("name", ["ablation", "adaptive"])
-def test_the_plans_that_come_along_can_be_run(name, capture, monkeypatch):
+def test_shipped_plans_can_be_run(name, capture, monkeypatch):
     root = Path(bm_quality.__file__).parents[1]
     monkeypatch.chdir(root)
     plan = read_plan(root / "benchmarks" / f"{name}.yaml")

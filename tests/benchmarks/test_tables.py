@@ -42,7 +42,7 @@ def finished(recipe, seed, psnr, capture="town", **more):
 
 @pytest.mark.parametrize("config", ["configs/compact.yaml", "configs/paper.yaml"])
 @pytest.mark.parametrize("table", tables.TRAINED)
-def test_every_arm_is_a_configuration_of_its_own(capture, monkeypatch, table, config):
+def test_every_arm_has_a_distinct_configuration(capture, monkeypatch, table, config):
     monkeypatch.chdir(ROOT)
     plan = PLANS[table]
     recipes = tables.recipes_of(plan, config, Path("gates/some.json"))
@@ -55,7 +55,7 @@ def test_every_arm_is_a_configuration_of_its_own(capture, monkeypatch, table, co
     assert chosen.population.gate == str(ROOT / "gates/some.json")
 
 
-def test_without_a_gate_its_arms_are_left_out_and_onsets_follow_the_schedule(monkeypatch):
+def test_arms_without_a_gate_file_and_onsets(monkeypatch):
     monkeypatch.chdir(ROOT)
     recipes = tables.recipes_of(PLANS["ablation"], "configs/paper.yaml", None)
     assert "no_gate" not in recipes and {"full", "all_off", "no_phi", "partition_4x5"} <= set(recipes)

@@ -33,7 +33,7 @@ def test_a_training_is_measured(tmp_path, capsys, device):
         bm_training.main([*flags, "--images", "90", "--steps", "20", *settings])
 
 
-def test_what_a_trace_says():
+def test_figures_read_from_a_profiler_trace():
     def work(begin, end, name, stream=7):
         return {"cat": "kernel", "ts": begin, "dur": end - begin, "name": name, "args": {"stream": stream}}
 

@@ -24,7 +24,7 @@ def test_the_device_runs_the_branches_that_the_build_asked_for(library):
 
 
 @pytest.mark.parametrize("n", [100, 3000])
-def test_sorts_take_wide_states_from_the_limit_on(n, library):
+def test_sorts_use_wide_states_above_the_limit(n, library):
     """The profiler names the kernels that ran, with the types of their states."""
     scene = Scene(n, views=1)
     rows = [r.cuda() if torch.is_tensor(r) else r for r in scene.project("cpu")]

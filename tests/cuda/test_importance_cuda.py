@@ -57,12 +57,12 @@ def test_repeats_and_adds_up():
     assert torch.equal(sum(part[1] for part in parts), pixels)
 
 
-def test_room_behind_the_splats_is_not_read():
+def test_entries_after_the_last_splat_are_not_read():
     splats, lists, grid, (weights, pixels) = survey(Scene(500))
     count = len(splats[0])
-    roomy = [torch.cat((t, torch.full_like(t, float("nan")))) for t in splats]
+    padded = [torch.cat((t, torch.full_like(t, float("nan")))) for t in splats]
     known = torch.tensor([count], device="cuda")
-    got = ops.contributions(*roomy, *lists, grid, known)
+    got = ops.contributions(*padded, *lists, grid, known)
     assert torch.equal(got[0][:count], weights) and torch.equal(got[1][:count], pixels)
     assert not got[0][count:].any() and not got[1][count:].any()
 

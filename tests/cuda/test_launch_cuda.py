@@ -45,7 +45,7 @@ class Calls:
         return [*lists, renders, rest, last, v_renders, *gradients[:4]]
 
 
-def test_kernels_find_what_those_in_front_wrote():
+def test_early_kernels_read_what_earlier_kernels_wrote():
     """Queued behind a busy device, all launches overlap, and calls reuse one another's scratch memory."""
     calls = [Calls(n) for n in SIZES]
     expected = []

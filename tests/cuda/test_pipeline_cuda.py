@@ -19,7 +19,7 @@ from tests.training.tiny import random_gaussians
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gradients_are_those_from_columns(degree):
+def test_packed_gradients_equal_those_from_columns(degree):
     small = random_gaussians(3000)
     columns = {name: small[name] for name in small if "exp_avg" not in name}
     columns["sh"] = torch.cat((columns["sh"], 0.1 * torch.randn(3000, 15, 3)), 1)
@@ -101,11 +101,11 @@ def test_an_active_set_that_did_not_fit_is_found_again():
     views, index, asked = cameras(3, device="cuda"), BlockIndex(table), []
     expected = pipeline.forward(table, views, OPTIONS)
 
-    def find(room):
-        asked.append(room)
+    def find(capacity_blocks):
+        asked.append(capacity_blocks)
         return index.active(
             table, views.viewmats, views.Ks, views.width, views.height, OPTIONS.near_plane,
-            OPTIONS.far_plane, room=room,
+            OPTIONS.far_plane, capacity_blocks=capacity_blocks,
         )  # fmt: skip
 
     def rendered(transport):
@@ -127,7 +127,7 @@ def test_an_active_set_that_did_not_fit_is_found_again():
         assert len(asked) == 1 and asked[0] >= blocks
 
 
-def test_a_frame_without_splats_takes_no_room_and_any():
+def test_a_frame_without_splats_works_with_any_capacity():
     small = random_gaussians(500)
     table = GaussianTable({name: small[name].cuda() for name in small})
     table["means"].add_(1e6)

@@ -38,7 +38,7 @@ def test_active_rows_and_views(scene):
         assert torch.equal(splats[i].cpu(), expected[i]), NAMES[i]
 
 
-def test_a_splat_does_not_depend_on_the_others(scene):
+def test_a_splat_does_not_depend_on_other_gaussians(scene):
     whole = scene.project("cuda")
     ids = torch.arange(1, 3000, 7, dtype=torch.int32, device="cuda")
     part = scene.project("cuda", active_ids=ids)

@@ -88,22 +88,22 @@ def test_gradients_match_float64(scene, channels, deterministic, absgrad):
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_packed_gradients_are_the_same(scene, channels, absgrad):
     job = Job(scene, channels)
-    renders, rest, *_, room = saved = job.forward("cuda", backward_follows=True)
-    assert room.shape == (len(job.splats[0]), 12) and not room.any()
+    renders, rest, *_, table = saved = job.forward("cuda", backward_follows=True)
+    assert table.shape == (len(job.splats[0]), 12) and not table.any()
     v_renders = torch.randn(renders.shape, generator=torch.Generator().manual_seed(7)).cuda()
     none = torch.zeros_like(rest)
     *columns, absolute = job.backward("cuda", torch.float32, saved, v_renders, none, absgrad, True)
     arguments = *job.saved("cuda", torch.float32, saved), v_renders, job.grid
-    ops.rasterize_bwd_packed_(*arguments, True, room, absgrad)
-    assert torch.equal(room[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
+    ops.rasterize_bwd_packed_(*arguments, True, table, absgrad)
+    assert torch.equal(table[:, : 6 + channels], torch.cat([c.view(len(c), -1) for c in columns], 1))
     if absgrad:
-        assert absolute.any() and torch.equal(absolute_column(room), absolute)
+        assert absolute.any() and torch.equal(absolute_column(table), absolute)
 
 
 @pytest.mark.parametrize("n_splats", [0, 1, 1000, 300_000])
 @pytest.mark.parametrize("begin,end", [(0, -1), (3, 9), (5, 5)])
-def test_backward_finds_zeros(n_splats, begin, end):
-    """For few splats and many, some tiles and none: whoever writes them."""
+def test_forward_zeroes_the_gradient_table(n_splats, begin, end):
+    """The table is zeroed for few and many splats, and for some tiles and none."""
     job = Job(Scene(4, views=1, width=90, height=50), 3, 16, begin, end)
     job.splats = [
         torch.zeros(n_splats, 2),
@@ -112,22 +112,22 @@ def test_backward_finds_zeros(n_splats, begin, end):
         torch.ones(n_splats, 3),
     ]
     job.lists = [torch.zeros(0, dtype=torch.int32), torch.zeros(25, dtype=torch.int64)]
-    torch.full((n_splats, 12), float("nan"), device="cuda")  # what the room would hold otherwise
+    torch.full((n_splats, 12), float("nan"), device="cuda")  # what the table would hold otherwise
     assert len(job.forward("cuda")[6]) == 0
-    room = job.forward("cuda", backward_follows=True)[6]
-    assert room.shape == (n_splats, 12) and not room.any()
+    table = job.forward("cuda", backward_follows=True)[6]
+    assert table.shape == (n_splats, 12) and not table.any()
 
 
-def test_splats_of_many_channels_get_no_room(scene):
+def test_splats_of_many_channels_get_no_gradient_table(scene):
     assert len(Job(scene, 9).forward("cuda", backward_follows=True)[6]) == 0
 
 
 def test_packed_gradients_have_four_channels_at_most(scene):
     job = Job(scene, 9)
-    renders, *_, room = saved = job.forward("cuda")
+    renders, *_, table = saved = job.forward("cuda")
     arguments = *job.saved("cuda", torch.float32, saved), renders, job.grid
     with pytest.raises(RuntimeError, match="1 to 4 channels, got 9"):
-        ops.rasterize_bwd_packed_(*arguments, True, room)
+        ops.rasterize_bwd_packed_(*arguments, True, table)
 
 
 def test_deterministic_gradients_repeat(scene):

@@ -106,7 +106,7 @@ def test_nothing_is_written_where_room_is_too_small(counts):
         assert (buffer == -1).all()
 
 
-def test_splats_need_the_room_that_others_count_on():
+def test_send_refuses_columns_below_the_capacity():
     rank = Rank(0, 100)
     projected = rank.inputs.run(Sizes(64, 63, 0), RANGES)
     with pytest.raises(RuntimeError, match="columns must have room for 64 splats, got 63"):
@@ -117,7 +117,7 @@ def test_splats_need_the_room_that_others_count_on():
 
 
 @pytest.mark.parametrize("n_values", [0, 5, 100])
-def test_a_barrier_with_ranks_that_have_come(n_values):
+def test_a_barrier_exchanges_values_when_all_ranks_have_arrived(n_values):
     control = [torch.zeros(3 + 3 + 4 * 100, dtype=torch.int64, device="cuda") for _ in range(3)]
     host = torch.zeros(3, n_values, dtype=torch.int64, pin_memory=True)
     for number, first in ((4, 3), (5, 6)):
@@ -151,7 +151,7 @@ def test_ranks_on_two_streams_wait_for_each_other():
     assert [words.tolist() for words in control] == [[1, 1, 10, 11, 21]] * 2
 
 
-def test_numbers_for_the_host_go_to_pinned_memory():
+def test_copies_to_the_host_need_pinned_memory():
     for n in (0, 1, 300):
         values = torch.arange(n, device="cuda") + 7
         copy = HostCopy(values)

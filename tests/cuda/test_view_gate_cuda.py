@@ -14,10 +14,10 @@ from tests.view.test_gate import GATE, bits, kept_by_definition, make_scene
 
 def gated(table, viewmats, gate, count):
     """The views of the first `count` rows, of lists that have room for all."""
-    device, room = table.device, len(table)
+    device, capacity = table.device, len(table)
     active = ActiveRows(
-        torch.arange(room, dtype=torch.int32, device=device),
-        torch.full((room,), -1, dtype=torch.int32, device=device),
+        torch.arange(capacity, dtype=torch.int32, device=device),
+        torch.full((capacity,), -1, dtype=torch.int32, device=device),
         torch.tensor([count], dtype=torch.int32, device=device),
     )
     gate_views_(active, table["means"], viewmats, gate.rules(table))

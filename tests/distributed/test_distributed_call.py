@@ -120,7 +120,7 @@ def test_one_process_without_a_group_is_one_rank():
     [{"absgrad": True}, {"sh_degree": None, "colors": torch.rand(2, 20, 3)}],
     ids=["absgrad", "colors"],
 )
-def test_what_ranks_cannot_do_is_refused(options):
+def test_unsupported_distributed_options_are_refused(options):
     scene = random_scene(n=20)
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height")
     arguments = {**dict(zip(names, scene.arguments(), strict=True)), "sh_degree": 3, **options}

@@ -42,7 +42,7 @@ def test_sums_reach_the_host_of_every_rank(world_size, device):
             assert torch.equal(total, torch.cat((sums, work.float())))
 
 
-def test_sums_of_one_process_are_there_at_once():
+def test_sums_of_one_process_need_no_wait():
     parts = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]], dtype=torch.float64)
     assert HostSum(Ranks(), parts).read().tolist() == [4.0, 6.0]
     assert HostSum(Ranks(), None, torch.tensor([5, 6], dtype=torch.int32), (0, 2)).read().tolist() == [5, 6]

@@ -72,7 +72,7 @@ def visit(owners, costs):
     return owners.record(list(costs), work, ranges, torch.ones(len(costs), 1, 2, dtype=torch.float64))
 
 
-def test_costs_are_those_of_the_last_visit_but_two():
+def test_costs_are_used_two_batches_later():
     owners = TileOwners(TwoRanks())
     assert owners.divide(["a", "b"], *SIZE).bounds == (0, 12, 24)
     work = torch.zeros(24, dtype=torch.int32)
@@ -91,7 +91,7 @@ def test_costs_are_those_of_the_last_visit_but_two():
     assert owners.divide(["a"], 32, 32).bounds == (0, 2, 4)
 
 
-def test_no_batch_is_divided_by_what_the_host_would_wait_for(monkeypatch):
+def test_batches_are_divided_without_waiting_for_the_device(monkeypatch):
     """Seen or not, a view's borders follow from sums that the guard of the losses has read."""
     owners, queued, reads = TileOwners(TwoRanks()), [], []
     read = HostSum.read
@@ -108,7 +108,7 @@ def test_no_batch_is_divided_by_what_the_host_would_wait_for(monkeypatch):
     assert len(reads) == 10
 
 
-def test_what_is_kept_of_many_large_views_is_small():
+def test_cost_memory_of_many_4k_views_is_small():
     """Sums of whole batches are let go, and 4K views keep 16 KB each; borders stay as good."""
     owners, alive, generator = TileOwners(TwoRanks()), [], torch.Generator().manual_seed(0)
     size, tiles = (3840, 2160), 240 * 135
@@ -148,7 +148,7 @@ def test_pixel_rows_and_composited_tiles():
 
 @pytest.mark.parametrize("tile_size", [4, 8, 16])
 @pytest.mark.parametrize("bounds", [(0, 0, 1), (0.1, 0.35, 0.35, 0.7), (0.24, 0.25, 0.26, 0.5, 0.98, 1)])
-def test_all_that_the_loss_reads_is_composited(tile_size, bounds):
+def test_composited_tiles_cover_the_halo_of_the_loss(tile_size, bounds):
     """Every pixel within 10 of an owned one, of the same view; hardly more than that; none for no tiles."""
     n_views, width, height = 3, 71, 50
     per_view = -(-width // tile_size) * -(-height // tile_size)
@@ -175,8 +175,8 @@ def test_all_that_the_loss_reads_is_composited(tile_size, bounds):
         assert not there.flatten(1).any(1)[~views_owned].any()
 
 
-def test_what_is_saved_draws_the_same_borders():
-    """From any moment on: what was measured of late counts from the same batch on."""
+def test_restored_costs_give_the_same_borders():
+    """The saved state is taken at every step; recent measurements count from the same batch on."""
     batches = [[5, 2], [2, 1], [5, 1], [7, 2], [1, 7], [2, 5]]
     for saved_at in range(len(batches)):
         owners, again = TileOwners(TwoRanks()), TileOwners(TwoRanks())

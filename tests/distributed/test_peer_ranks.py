@@ -184,7 +184,7 @@ def _keys(ids, camera_ids):
         (Sizes(1, 1, 1), 2),
     ],
 )
-def test_ranks_begin_a_frame_again_together(sizes, frames, backward_follows):
+def test_all_ranks_repeat_a_frame_that_did_not_fit(sizes, frames, backward_follows):
     table, views, ranges, owner = _scene()
     alone = pipeline.forward(table, views, OPTIONS)
     weights = torch.linspace(-1, 1, alone.renders.numel()).view_as(alone.renders)

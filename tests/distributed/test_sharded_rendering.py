@@ -182,7 +182,7 @@ def _render_plain(ranks):
     return assignment.composited == ranges.of(ranks.rank), frame.renders
 
 
-def test_rendering_alone_composites_no_ring():
+def test_rendering_without_a_loss_composites_no_halo():
     answers = run_ranks(_render_plain, 3)
     assert all(alone for alone, _ in answers)
     assert torch.equal(answers[1][1], pipeline.forward(shard(Ranks()), cameras(3), OPTIONS).renders)

@@ -71,8 +71,8 @@ def _both_ways(ranks):
         table = _table(count, ranks)
         transport = PeerTransport(ranks)
         written, needed = _exchange(table, ranks, transport)
-        for room in (needed.isects, needed.isects // 2):  # for lists: enough, too little
-            given = needed._replace(splats=min(needed.splats, 1000), isects=max(room, 1))
+        for isects in (needed.isects, needed.isects // 2):  # for lists: enough, too little
+            given = needed._replace(splats=min(needed.splats, 1000), isects=max(isects, 1))
             transport, before = PeerTransport(ranks, CapacityEstimate(given)), memory.generation
             again, _ = _exchange(table, ranks, transport)
             assert all(torch.equal(x, y) for x, y in zip(written, again, strict=True))
@@ -88,7 +88,7 @@ def _both_ways(ranks):
 
 
 @pytest.mark.parametrize(("world_size", "device"), on_cuda(2, 4))
-def test_peers_bring_what_collectives_bring(world_size, device):
+def test_peer_and_collective_transports_deliver_the_same(world_size, device):
     sizes = run_ranks(_both_ways, world_size, device=device, transport="peer")
     assert len(set(sizes)) == 1
 
@@ -135,7 +135,7 @@ def _gradients(ranks):
 
 
 @pytest.mark.parametrize(("world_size", "device"), on_cuda(2, 4))
-def test_gradients_in_tables_are_those_that_return(world_size, device):
+def test_returned_gradients_equal_the_tables(world_size, device):
     assert len(run_ranks(_gradients, world_size, device=device, transport="peer")) == world_size
 
 
@@ -178,7 +178,7 @@ def _overtaken(ranks):
 
 
 @pytest.mark.parametrize(("world_size", "device"), on_cuda(2))
-def test_an_overtaken_exchange_is_refused(world_size, device):
+def test_gradients_of_an_overwritten_exchange_are_refused(world_size, device):
     assert run_ranks(_overtaken, world_size, device=device, transport="peer") == [True] * world_size
 
 
@@ -216,7 +216,7 @@ def alone(monkeypatch):
     return control, SharedMemory(0, 1, torch.device("cpu"), control, 1.0), queued
 
 
-def test_numbers_are_not_overwritten_before_all_have_read_them(alone):
+def test_two_shares_in_turn_use_different_words(alone):
     """Two calls of `share` in turn use different places."""
     control, memory, queued = alone
     numbers, second = torch.arange(3), 2 * MAX_VALUES
@@ -237,7 +237,7 @@ def test_numbers_are_not_overwritten_before_all_have_read_them(alone):
     assert 1 + 2 * second + 1 == len(control)
 
 
-def test_sums_are_where_no_rank_writes_numbers(alone):
+def test_sums_and_numbers_use_different_words(alone):
     _, memory, _ = alone
     calls = [memory.share(torch.zeros(n, dtype=torch.int64)) for n in (1, 7, MAX_VALUES, 3, 20, MAX_VALUES)]
     numbers = [{*call.everyone.flatten().tolist()} for call in calls]
@@ -250,7 +250,7 @@ def test_sums_are_where_no_rank_writes_numbers(alone):
         memory.share(torch.zeros(MAX_VALUES + 1, dtype=torch.int64))
 
 
-def test_boards_have_two_places_and_grow(alone, monkeypatch):
+def test_boards_alternate_between_two_halves_and_grow(alone, monkeypatch):
     _, memory, queued = alone
     monkeypatch.setattr(torch.cuda, "current_stream", lambda _: SimpleNamespace(synchronize=lambda: None))
     monkeypatch.setattr(

@@ -261,7 +261,7 @@ def test_a_transport_that_does_not_serve_the_job_says_so():
         PeerTransport(Ranks())
 
 
-def test_one_rank_has_its_gradients_where_they_belong():
+def test_one_rank_needs_no_way_back():
     counts = LocalTransport().start(scene(), None, Attempt(None)).finish()
     assert counts.way_back is None and counts.traffic is None
 

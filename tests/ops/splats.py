@@ -115,9 +115,9 @@ def near_a_cut(splats, width, height, margin=1e-5):
     return close[None]
 
 
-def with_room(column, room):
-    """A column of `room` splats that begins with these; what lies behind them would not go unnoticed."""
+def with_capacity(column, capacity):
+    """A column of `capacity` splats that begins with these; what lies behind them would not go unnoticed."""
     garbage = float("nan") if column.is_floating_point() else torch.iinfo(column.dtype).max - 3
-    padded = column.new_full((room, *column.shape[1:]), garbage)
+    padded = column.new_full((capacity, *column.shape[1:]), garbage)
     padded[: len(column)] = column
     return padded

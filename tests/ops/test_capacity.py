@@ -6,7 +6,7 @@ import pytest
 from blitzgs.ops.capacity import MOST_ATTEMPTS, CapacityEstimate, Sizes
 
 
-def test_an_estimate_follows_the_largest_of_late():
+def test_an_estimate_follows_the_largest_recent_sizes():
     estimate = CapacityEstimate()
     assert estimate.sizes is None
     estimate.learn((800, 1600, 0))
@@ -19,7 +19,7 @@ def test_an_estimate_follows_the_largest_of_late():
     assert estimate.sizes.splats < 400
 
 
-def test_attempts_are_given_what_the_last_one_needed():
+def test_the_next_attempt_gets_the_sizes_the_last_one_needed():
     given, needed = [], Sizes(10, 100, 1000)
     for attempt in CapacityEstimate(Sizes(10, 99, 2000)).attempts():
         given.append(attempt.sizes)
@@ -28,7 +28,7 @@ def test_attempts_are_given_what_the_last_one_needed():
     assert given[1].holds((10, 100, 1000))
 
 
-def test_a_need_that_grows_for_ever_is_an_error():
+def test_attempts_are_bounded_when_the_needed_size_grows():
     count = 0
     with pytest.raises(RuntimeError, match=f"{MOST_ATTEMPTS} attempts .* needs \\(1, 10000, 1, 0\\)"):
         for attempt in CapacityEstimate().attempts():

@@ -72,7 +72,7 @@ def test_parts_add_up_and_repeat(backend):
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_is_the_definition(backend, mode):
+def test_contributions_equal_the_definition(backend, mode):
     scene = random_scene(70, 10, seed=5, scale=0.15).to(backend[1], backend[0])  # more views than go at once
     scene.means[:25] *= 4  # beyond the borders and in front of the near plane, in some views
     arguments = (

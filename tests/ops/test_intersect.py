@@ -132,9 +132,9 @@ def test_capacity(device):
     splats = Splats(*(t.to(device) for t in vars(random_splats(100, WIDTH, HEIGHT)).values()))
     options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     entries, offsets = intersect(*splats.geometry(), **options)
-    roomy, same_offsets = intersect(*splats.geometry(), n_isects=len(entries) + 5, **options)
-    assert len(roomy) == len(entries) + 5
-    assert torch.equal(roomy[: len(entries)], entries)
+    padded, same_offsets = intersect(*splats.geometry(), n_isects=len(entries) + 5, **options)
+    assert len(padded) == len(entries) + 5
+    assert torch.equal(padded[: len(entries)], entries)
     assert torch.equal(offsets, same_offsets)
     with pytest.raises(RuntimeError, match=f"n_isects is {len(entries) - 1} but there are {len(entries)}"):
         intersect(*splats.geometry(), n_isects=len(entries) - 1, **options)

@@ -177,7 +177,7 @@ def test_gradients_are_repeatable_and_sum_over_views():
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("degree, coefficients", [(3, 16), (1, 16), (2, 9), (0, 1), (None, 0)])
-def test_dense_gradients_are_the_compact_ones_where_they_belong(backend, degree, coefficients):
+def test_dense_gradients_equal_scattered_compact_ones(backend, degree, coefficients):
     device, dtype = backend
     scene = random_scene(n=700, cameras=2, width=20, height=16, dtype=dtype, device=device)
     scene.means[::2] *= 20.0  # seen by no view
@@ -230,7 +230,7 @@ def test_regularisers_add_the_slopes_of_smallest_axis_and_opacity():
     assert relative_error(v_opacities, logits.grad[visible]) < 1e-14
 
 
-def test_nothing_finite_is_lost_and_nothing_else_spreads():
+def test_non_finite_gaussians_are_dropped_and_others_are_unchanged():
     scene = random_scene(n=40, cameras=2)
     clean = project_scene(scene)
     poisoned = {3: "means", 7: "quats", 11: "scales", 13: "opacities", 17: "colors"}

@@ -189,7 +189,7 @@ def test_gradients_are_read_where_they_are(device, width, n, k, degree, views):
         (70, 16, 3, 12), (500, 25, 3, 32),
     ],
 )  # fmt: skip
-def test_gradients_in_tables_of_ranks(n, k, degree, views):
+def test_gradients_are_read_from_the_tables_of_several_ranks(n, k, degree, views):
     """Read where the ranks left them, some at several: as from columns of their sums."""
     plain, other = (Scene(n, k, views, "cuda", torch.float32) for _ in range(2))
     for scene in (plain, other):

@@ -349,11 +349,11 @@ def test_errors_name_the_value():
         rasterize(*splats.values(), tile_lists[0], tile_lists[1][:-1], **options)
 
 
-def test_zeros_for_gradients_serve_once():
+def test_a_gradient_buffer_gives_its_zeros_once():
     means2d, zeros = torch.ones(5, 2), torch.zeros(5, 12)
-    room = GradientBuffer(zeros)
-    assert room.take(means2d) is zeros
-    for others in (room, GradientBuffer(torch.zeros(0, 12))):  # taken, or never written
+    gradients = GradientBuffer(zeros)
+    assert gradients.take(means2d) is zeros
+    for others in (gradients, GradientBuffer(torch.zeros(0, 12))):  # taken, or never written
         taken = others.take(means2d)
         assert taken is not zeros and taken.shape == (5, 12) and not taken.any()
     assert GradientBuffer(torch.zeros(0, 12)).take(means2d[:0]).shape == (0, 12)

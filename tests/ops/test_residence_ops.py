@@ -54,7 +54,7 @@ def columns(rows, device, pinned=False, seed=0):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_blocks_leave_and_come(device):
+def test_swapped_blocks_have_the_right_contents(device):
     blocks, slots, rest = 40, 12, 100
     pool = columns(slots * BLOCK_ROWS + 7, device, seed=1)
     table = columns(blocks * BLOCK_ROWS + rest, "cpu", device == "cuda", seed=2)

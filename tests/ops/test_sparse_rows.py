@@ -43,7 +43,7 @@ def test_sums_of_gradients_are_summed(device):
     assert values[:, 0].tolist() == [1, 2, 1, 1]
 
 
-def test_indices_of_others_are_not_trusted():
+def test_foreign_sparse_tensors_are_coalesced():
     kept = sparse_rows(torch.tensor([0, 1]), torch.ones(2, 1), torch.Size([3, 1]))
     doubled = torch.sparse_coo_tensor(torch.tensor([[2, 2]]), torch.ones(2, 1), (3, 1))
     rows, values = distinct_rows(doubled)

@@ -7,7 +7,7 @@ import torch
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
 from tests.helpers import DEVICES, needs_cuda
-from tests.ops.splats import Splats, random_splats, with_room
+from tests.ops.splats import Splats, random_splats, with_capacity
 
 WIDTH, HEIGHT = 91, 70
 VIEW = (1, WIDTH, HEIGHT, 16)
@@ -23,34 +23,34 @@ def kept_by(outputs):
 class Columns:
     """Splats, and the same at the start of columns with room for more."""
 
-    def __init__(self, n, room, device, channels=3, cameras=1):
+    def __init__(self, n, capacity, device, channels=3, cameras=1):
         splats = random_splats(n, WIDTH, HEIGHT, channels=channels, cameras=cameras)
         splats.depths = (splats.depths * 64).round() / 64  # many ties
         self.alone = Splats(*(t.to(device) for t in vars(splats).values()))
-        self.roomy = Splats(*(with_room(t, room) for t in vars(self.alone).values()))
+        self.padded = Splats(*(with_capacity(t, capacity) for t in vars(self.alone).values()))
         self.ids = torch.randperm(n, generator=torch.Generator().manual_seed(3)).to(device)
-        self.roomy_ids = with_room(self.ids, room)
+        self.padded_ids = with_capacity(self.ids, capacity)
         self.count = torch.tensor([n], device=device)
 
 
 def empty_room(device, number):
     """Columns of 500 splats, none of which is there, and the number that says so."""
-    return Columns(0, 500, device).roomy, torch.tensor([number], device=device)
+    return Columns(0, 500, device).padded, torch.tensor([number], device=device)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("with_ids", [False, True])
 @pytest.mark.parametrize("n", [0, 1, 1024, 8192, 20_000])
-def test_lists_are_those_of_the_splats_alone(n, with_ids, device):
+def test_lists_ignore_entries_after_the_last_splat(n, with_ids, device):
     columns = Columns(n, 40_000, device, cameras=2)
-    ids, roomy_ids = (columns.ids, columns.roomy_ids) if with_ids else (None, None)
+    ids, padded_ids = (columns.ids, columns.padded_ids) if with_ids else (None, None)
     view = {"n_cameras": 2, "width": WIDTH, "height": HEIGHT}
     expected, offsets = intersect(*columns.alone.geometry(), ids, **view)
-    for room in (-1, len(expected), len(expected) + 30_000):
+    for capacity in (-1, len(expected), len(expected) + 30_000):
         found, found_offsets = intersect(
-            *columns.roomy.geometry(), roomy_ids, **view, n_isects=room, n_splats=columns.count
+            *columns.padded.geometry(), padded_ids, **view, n_isects=capacity, n_splats=columns.count
         )
-        assert len(found) == (len(expected) if room < 0 else room)
+        assert len(found) == (len(expected) if capacity < 0 else capacity)
         assert torch.equal(found_offsets, offsets)
         assert torch.equal(found[: len(expected)], expected)
 
@@ -59,9 +59,9 @@ def test_lists_are_those_of_the_splats_alone(n, with_ids, device):
 @pytest.mark.parametrize("number", [0, -1, 501, 2**62, -(2**63)])
 def test_a_number_out_of_range_is_no_splat(number, device):
     splats, count = empty_room(device, number)
-    for room in (-1, 100):
-        entries, offsets = ops.intersect(*splats.geometry(), None, [*VIEW, 0, -1], room, count)
-        assert len(entries) == max(room, 0) and not offsets.any()
+    for capacity in (-1, 100):
+        entries, offsets = ops.intersect(*splats.geometry(), None, [*VIEW, 0, -1], capacity, count)
+        assert len(entries) == max(capacity, 0) and not offsets.any()
     background = torch.rand(1, 3, device=device)
     image = ops.rasterize_fwd(
         *splats.values(), background, entries, offsets, [*VIEW, 0, -1], None, True, True, count
@@ -71,12 +71,12 @@ def test_a_number_out_of_range_is_no_splat(number, device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_no_room_at_all(device):
+def test_columns_with_zero_capacity(device):
     columns = Columns(0, 0, device)
-    lists = ops.intersect(*columns.roomy.geometry(), None, [*VIEW, 0, -1], 10, columns.count)
+    lists = ops.intersect(*columns.padded.geometry(), None, [*VIEW, 0, -1], 10, columns.count)
     assert not lists[1].any()
     renders = ops.rasterize_fwd(
-        *columns.roomy.values(), None, *lists, [*VIEW, 0, -1], None, True, True, columns.count
+        *columns.padded.values(), None, *lists, [*VIEW, 0, -1], None, True, True, columns.count
     )[0]
     assert not renders.any()
 
@@ -88,15 +88,15 @@ def test_no_room_at_all(device):
      (9, (3, 30), (3, 30))],
 )  # fmt: skip
 @pytest.mark.parametrize("n", [1, 700])
-def test_images_and_gradients_are_those_of_the_splats_alone(n, channels, composited, owned, device):
+def test_images_and_gradients_ignore_entries_after_the_last_splat(n, channels, composited, owned, device):
     """Backward has columns of the splats alone in either case."""
     columns = Columns(n, 1500, device, channels)
     lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, *composited], -1)
     plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *composited], None)
-    roomy = ops.rasterize_fwd(
-        *columns.roomy.values(), None, *lists, [*VIEW, *composited], None, True, True, columns.count
+    padded = ops.rasterize_fwd(
+        *columns.padded.values(), None, *lists, [*VIEW, *composited], None, True, True, columns.count
     )
-    for found, expected in zip(roomy[:4], plain[:4], strict=True):
+    for found, expected in zip(padded[:4], plain[:4], strict=True):
         assert torch.equal(found, expected)
     v_renders = torch.randn(plain[0].shape, generator=torch.Generator().manual_seed(1)).to(device)
     gradients = [
@@ -104,7 +104,7 @@ def test_images_and_gradients_are_those_of_the_splats_alone(n, channels, composi
             columns, None, lists, kept_by(image), v_renders, None, [*VIEW, *owned], True, True
         )
         for columns, image in (
-            (columns.alone.values(), plain), ([c[:n] for c in columns.roomy.values()], roomy),
+            (columns.alone.values(), plain), ([c[:n] for c in columns.padded.values()], padded),
         )
     ]  # fmt: skip
     assert n == 1 or gradients[0][0].any()
@@ -115,27 +115,27 @@ def test_images_and_gradients_are_those_of_the_splats_alone(n, channels, composi
 @needs_cuda
 @pytest.mark.cuda
 @pytest.mark.parametrize("tiles", [(0, -1), (3, 9)])
-@pytest.mark.parametrize(("n", "room"), [(700, 1500), (0, 900), (50_000, 60_000)])
-def test_a_table_of_gradients_is_zeroed_for_the_splats(n, room, tiles):
+@pytest.mark.parametrize(("n", "capacity"), [(700, 1500), (0, 900), (50_000, 60_000)])
+def test_a_table_of_gradients_is_zeroed_for_the_splats(n, capacity, tiles):
     """Also where tiles are too few to write the zeros."""
-    columns = Columns(n, room, "cuda")
-    memory = torch.full((room + 100, SPLAT_GRADIENT), float("nan"), device="cuda")
-    table = memory[40 : room + 60]
+    columns = Columns(n, capacity, "cuda")
+    memory = torch.full((capacity + 100, SPLAT_GRADIENT), float("nan"), device="cuda")
+    table = memory[40 : capacity + 60]
     lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, *tiles], -1)
     plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *tiles], None, False)
     image = ops.rasterize_fwd_packed_(
-        *columns.roomy.values(), None, *lists, [*VIEW, *tiles], table, columns.count
+        *columns.padded.values(), None, *lists, [*VIEW, *tiles], table, columns.count
     )
     assert (table[:n] == 0).all()
-    assert memory[:40].isnan().all() and memory[40 + room :].isnan().all()
+    assert memory[:40].isnan().all() and memory[40 + capacity :].isnan().all()
     v_renders = torch.randn(plain[0].shape, generator=torch.Generator().manual_seed(1)).cuda()
-    arguments = ([c[:n] for c in columns.roomy.values()], None, lists, kept_by(image), v_renders)
+    arguments = ([c[:n] for c in columns.padded.values()], None, lists, kept_by(image), v_renders)
     ops.rasterize_bwd_packed_(*arguments, [*VIEW, *tiles], True, table)
     expected = ops.rasterize_bwd(
         columns.alone.values(), None, lists, kept_by(plain), v_renders, None, [*VIEW, *tiles], False, True
     )
     assert torch.equal(table[:n, :9], torch.cat([c if c.dim() == 2 else c[:, None] for c in expected[:4]], 1))
-    assert memory[:40].isnan().all() and memory[40 + room :].isnan().all()
+    assert memory[:40].isnan().all() and memory[40 + capacity :].isnan().all()
 
 
 @needs_cuda
@@ -146,11 +146,11 @@ def test_lists_with_too_little_room_are_the_nearest_splats(share, tiles):
     columns = Columns(20_000, 30_000, "cuda", cameras=2)
     view = [2, *VIEW[1:], *tiles]
     whole, offsets = (t.cpu() for t in ops.intersect(*columns.alone.geometry(), None, view, -1))
-    room = int(share * len(whole))
+    capacity = int(share * len(whole))
     cut, cut_offsets = (
-        t.cpu() for t in ops.intersect(*columns.roomy.geometry(), None, view, room, columns.count, True)
+        t.cpu() for t in ops.intersect(*columns.padded.geometry(), None, view, capacity, columns.count, True)
     )
-    assert len(cut) == room == cut_offsets[-1]
+    assert len(cut) == capacity == cut_offsets[-1]
     assert (cut_offsets.diff() >= 0).all() and cut_offsets[0] == 0
     for tile in range(len(offsets) - 1):
         found = cut[cut_offsets[tile] : cut_offsets[tile + 1]]
@@ -163,7 +163,7 @@ def test_lists_with_too_little_room_are_an_error(device):
     columns = Columns(100, 150, device)
     count = len(ops.intersect(*columns.alone.geometry(), None, [*VIEW, 0, -1], -1)[0])
     with pytest.raises(RuntimeError, match=f"n_isects is {count - 1} but there are {count}"):
-        ops.intersect(*columns.roomy.geometry(), None, [*VIEW, 0, -1], count - 1, columns.count)
+        ops.intersect(*columns.padded.geometry(), None, [*VIEW, 0, -1], count - 1, columns.count)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -171,20 +171,20 @@ def test_errors_name_the_value(device):
     columns = Columns(100, 150, device)
     view = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     with pytest.raises(RuntimeError, match="n_splats must be Long, got Int"):
-        intersect(*columns.roomy.geometry(), **view, n_splats=columns.count.int())
+        intersect(*columns.padded.geometry(), **view, n_splats=columns.count.int())
     with pytest.raises(RuntimeError, match=r"n_splats must have shape \[1\], got \[2\]"):
-        intersect(*columns.roomy.geometry(), **view, n_splats=columns.count.repeat(2))
+        intersect(*columns.padded.geometry(), **view, n_splats=columns.count.repeat(2))
     lists = intersect(*columns.alone.geometry(), **view)
     image = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, 0, -1])
-    arguments = (columns.roomy.values(), None, lists, kept_by(image), image[0], None, [*VIEW, 0, -1])
+    arguments = (columns.padded.values(), None, lists, kept_by(image), image[0], None, [*VIEW, 0, -1])
     with pytest.raises(RuntimeError, match="for 150 splats and 30 tiles or more, got 100 and 30"):
         ops.rasterize_bwd(*arguments, False, True)
     if device == "cuda":
         with pytest.raises(RuntimeError, match="n_splats must be on the device of the splats"):
-            intersect(*columns.roomy.geometry(), **view, n_splats=columns.count.cpu())
+            intersect(*columns.padded.geometry(), **view, n_splats=columns.count.cpu())
         with pytest.raises(RuntimeError, match="packed must have 150 splats or more, got 149"):
             ops.rasterize_fwd_packed_(
-                *columns.roomy.values(),
+                *columns.padded.values(),
                 None,
                 *lists,
                 [*VIEW, 0, -1],
@@ -195,11 +195,11 @@ def test_errors_name_the_value(device):
 @pytest.mark.parametrize("device", DEVICES)
 def test_opcheck(device):
     columns = Columns(20, 30, device)
-    arguments = (*columns.roomy.geometry(), None, [*VIEW, 0, -1])
+    arguments = (*columns.padded.geometry(), None, [*VIEW, 0, -1])
     torch.library.opcheck(ops.intersect, (*arguments, -1, columns.count))
     lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, 0, -1], -1)
     torch.library.opcheck(ops.intersect, (*arguments, len(lists[0]), columns.count))
-    values = [t.requires_grad_() for t in columns.roomy.values()]
+    values = [t.requires_grad_() for t in columns.padded.values()]
     torch.library.opcheck(
         ops.rasterize_fwd,
         (*values, None, *lists, [*VIEW, 0, -1], None, True, False, columns.count),

@@ -61,7 +61,7 @@ class Pair:
 @pytest.mark.parametrize(
     "options", [{}, {"eps": 1e-15}, {"betas": (0.5, 0.9)}, {"betas": (0.0, 0.99)}], ids=str
 )
-def test_it_is_dense_adam(backend, options):
+def test_steps_equal_dense_adam(backend, options):
     pair = Pair(backend, **options)
     for _ in range(12):
         pair.step(0.2)
@@ -261,7 +261,7 @@ def test_rows_that_do_not_fit_change_nothing():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_tables_that_are_full_begin_anew_and_nothing_is_lost(backend, monkeypatch):
+def test_full_tables_restart_and_still_equal_dense_adam(backend, monkeypatch):
     monkeypatch.setattr(drift, "CAPACITY", 40)
     pair = Pair(backend, eps=1e-8)
     for number in range(170):

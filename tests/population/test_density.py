@@ -81,8 +81,8 @@ def brute_force(table: GaussianTable, rules: DensityRules) -> dict[int, dict[str
 
     candidates = [row for row in rows if gradient(row) >= np.float32(rules.grad_threshold)]
     if rules.max_gaussians is not None:
-        room = max(0, rules.max_gaussians - len(rows))
-        candidates = sorted(candidates, key=lambda row: (-gradient(row), row["id"]))[:room]
+        places_left = max(0, rules.max_gaussians - len(rows))
+        candidates = sorted(candidates, key=lambda row: (-gradient(row), row["id"]))[:places_left]
     result, replaced = [], set()
     for row in candidates:
         if math.exp(row["scales"].max()) <= rules.clone_scale:

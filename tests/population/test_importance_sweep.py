@@ -99,7 +99,7 @@ def test_sweep_is_the_definition(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_survey_is_what_contributions_says(device):
+def test_survey_equals_contributions(device):
     """Up to the rounding of the activations; equal depths go by id here and by row there."""
     table = population(Ranks(device=torch.device(device)))
     table.permute(table["id"].argsort())

@@ -101,7 +101,7 @@ def test_a_run_of_events_is_logged_row_by_row(tmp_path):
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_books_balance_whatever_happens(data, tmp_path_factory):
+def test_ledger_matches_the_log_after_random_events(data, tmp_path_factory):
     """Births, deaths and checkpoints in any order: the log says who lives, and so does the ledger."""
     folder = tmp_path_factory.mktemp("lineage")
     lineage, alive, next_id, step = Lineage(folder, Ranks(), 0, Ledger()), set(), 0, 0
@@ -137,7 +137,7 @@ def test_books_balance_whatever_happens(data, tmp_path_factory):
         ([1, 2, 3, 9], r"the live population of 4 Gaussians \(their numbers agree, their ids do not\)"),
     ],
 )
-def test_books_that_do_not_balance_stop_the_run(tmp_path, ids, message):
+def test_a_ledger_that_misses_the_population_stops_the_run(tmp_path, ids, message):
     lineage = Lineage(tmp_path, Ranks(), 0, Ledger())
     lineage.born(some([1, 2, 3, 4, 5]), 1)
     lineage.died(torch.tensor([5]), torch.tensor([Cause.SIZE]), 10, 1)
@@ -165,7 +165,7 @@ def _generations(ranks, folder):
     return ledger
 
 
-def test_ranks_log_the_same_lives(tmp_path):
+def test_two_ranks_log_the_same_births_and_deaths(tmp_path):
     alone = _generations(Ranks(), tmp_path / "1")
     both = run_ranks(_generations, 2, tmp_path / "2")
     assert both[0] == both[1] == alone
@@ -177,7 +177,7 @@ def test_ranks_log_the_same_lives(tmp_path):
             np.testing.assert_array_equal(one[column][order], two[column][other], column)
 
 
-def test_what_is_settled_is_on_the_disk(tmp_path, monkeypatch):
+def test_flushed_lineage_is_synced_to_disk(tmp_path, monkeypatch):
     synced, fsync = set(), os.fsync
     monkeypatch.setattr(os, "fsync", lambda file: (synced.add(os.fstat(file).st_ino), fsync(file)))
     lineage = Lineage(tmp_path, Ranks(), 0, Ledger())

@@ -45,7 +45,7 @@ def test_the_closed_form_is_the_paper_s_double_sum(copies):
 
 
 @pytest.mark.parametrize("copies", [2, 5, 30])
-def test_copies_together_show_what_the_one_did(copies):
+def test_copies_together_look_like_the_original(copies):
     """At the centre, and integrated along a line through it."""
     opacity, x = torch.tensor([0.8], dtype=torch.float64), torch.linspace(-12, 12, 20001, dtype=torch.float64)
     logits, logarithms = shared(opacity.logit(), torch.zeros(1, 3).double(), torch.tensor([copies]))
@@ -163,7 +163,7 @@ class _Log:
         assert (causes == Cause.RELOCATED).all() and (time, step) == (TIME, STEP)
 
 
-def test_any_number_of_ranks_and_any_order_give_the_same():
+def test_the_result_does_not_depend_on_ranks_and_order():
     alone, report, log = _relocate_a_share(Ranks(), 0.2)
     shares = run_ranks(_relocate_a_share, 2, 0.2)
     order = alone["id"].argsort()

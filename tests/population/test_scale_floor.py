@@ -52,7 +52,7 @@ def test_the_finest_view_that_samples_a_gaussian_sets_its_floor():
     torch.testing.assert_close(found.double(), expected.double(), rtol=1e-6, atol=1e-6)
 
 
-def test_scales_of_the_named_rows_rise_to_it():
+def test_scales_of_the_given_rows_rise_to_the_floor():
     table = random_gaussians()
     table[FLOOR] = torch.linspace(-3.5, -2.0, len(table))
     before, ids = table["scales"].clone(), torch.arange(0, len(table), 3, dtype=torch.int32)

@@ -114,7 +114,7 @@ def _veto(ranks, path):
     return [own.parents[veto(own, ranks)].tolist() for veto in vetoes]
 
 
-def test_the_same_vetoes_at_every_world_size(gate):
+def test_vetoes_do_not_depend_on_the_world_size(gate):
     alone = _veto(Ranks(), gate[0])
     answers = run_ranks(_veto, 3, gate[0])
     for k, want in enumerate(alone):
@@ -134,7 +134,7 @@ def test_auc_is_the_chance_to_rank_right():
     assert judge(run, run.survived.astype(float))["auc"] == 1
 
 
-def test_a_lone_scene_holds_parents_out(tmp_path):
+def test_fitting_one_scene_holds_out_parents(tmp_path):
     figures = fit([spawns("a")], tmp_path / "g.json")
     (entry,) = figures["held_out"]
     assert 800 < entry["spawns"] < 1200 and entry["auc"] > 0.85

@@ -217,7 +217,7 @@ def test_views_and_points_that_are_not_finite_are_dropped_with_a_warning(tmp_pat
         load_capture(tmp_path)
 
 
-def test_points_that_no_view_sees_are_a_warning(tmp_path, recwarn):
+def test_unseen_points_cause_a_warning(tmp_path, recwarn):
     write_capture(tmp_path, [f"{i}.png" for i in range(4)])
     warnings.simplefilter("always")
     load_capture(tmp_path)

@@ -137,7 +137,7 @@ def test_an_image_wanted_by_many_threads_is_decoded_once(capture, monkeypatch):
     assert calls == [3]
 
 
-def test_a_thread_held_up_after_its_look_does_not_decode_again(capture, monkeypatch):
+def test_a_delayed_thread_does_not_decode_an_image_twice(capture, monkeypatch):
     store, calls, looked, others_done = ImageStore(capture), [], threading.Event(), threading.Event()
     make, look = ImageStore._make_image, store._decoded.get
 

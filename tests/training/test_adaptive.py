@@ -96,7 +96,7 @@ def test_t2_comes_when_the_loss_has_settled_after_densification():
     assert place(signals(), replace(config, placed=(700, 1_200, 1_360)), 2_999) is None
 
 
-def test_demand_counts_what_was_held_back_too():
+def test_demand_includes_clones_that_were_held_back_or_vetoed():
     found, nothing = Signals(), {"cloned": 0, "split": 0, "pruned": 0, "held_back": 0, "vetoed": 0}
     for counts, share in (
         ({"cloned": 10, "split": 5, "pruned": 20, "gaussians": 195}, 0.075),
@@ -117,7 +117,7 @@ def test_the_loss_is_that_of_whole_epochs():
 
 
 @pytest.mark.parametrize("batch_size", [1, 4])
-def test_what_has_happened_stays_when_a_time_is_placed(batch_size):
+def test_placing_a_time_does_not_change_past_events(batch_size):
     chance = random.Random(5)
     for scale in (0.3, 1.0, 2.0):
         config = replace(CONFIG, batch_size=batch_size, scale=scale, reset_every=300)
@@ -200,7 +200,7 @@ def _train_on(ranks, folder):
 
 
 @pytest.mark.parametrize(("world_size", "device"), on_each_device(2))
-def test_ranks_decide_alike(whole_run, tmp_path, world_size, device):
+def test_all_ranks_make_the_same_decision(whole_run, tmp_path, world_size, device):
     answers = run_ranks(_train_on, world_size, tmp_path, device=device)
     assert all(answer == answers[0] for answer in answers)
     if device == "cpu":

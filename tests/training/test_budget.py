@@ -101,7 +101,7 @@ def test_noise_and_single_slow_steps_do_no_harm():
     assert seconds == pytest.approx(60.0, rel=0.05)
 
 
-def test_a_budget_of_a_few_steps_is_used_up_and_not_more_than_it_must():
+def test_a_short_budget_is_used_and_an_impossible_one_ends_soon():
     simulation = Simulation(1.0, lambda time, step: 3.0)
     seconds, _ = simulation.train()
     assert seconds == pytest.approx(60.0, abs=6.0)

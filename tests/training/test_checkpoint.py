@@ -251,7 +251,7 @@ def test_dealing_keeps_the_order_and_opens_only_what_it_needs(tmp_path, monkeypa
     assert equal(checkpoint._read_share(tmp_path, shards, ALONE, torch.device("cpu")), whole)
 
 
-def test_what_all_ranks_have_alike_is_kept_and_checked(tmp_path):
+def test_shared_columns_are_saved_and_checked(tmp_path):
     shared = {"costs": torch.rand(7), "views": torch.arange(3), "none": torch.empty(0, 4)}
     path = checkpoint.save(tmp_path, table(5), {}, ALONE, shared=shared)
     assert equal(checkpoint.load_latest(tmp_path, ALONE, "cpu").shared, shared)

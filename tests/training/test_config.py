@@ -128,7 +128,7 @@ def test_values_out_of_range_are_refused(override, message):
         load_config(None, [f"--{override}"])
 
 
-def test_a_rate_of_nothing_keeps_the_means_in_place():
+def test_a_position_rate_of_zero_keeps_the_means_in_place():
     config = load_config(None, ["--optimiser.position=0"])
     rates = Schedule(config.schedule).learning_rates(config.optimiser, 3.0)
     assert rates.isfinite().all() and not rates[:, 0].any() and rates[1:, 1:].all()

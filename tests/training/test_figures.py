@@ -12,7 +12,7 @@ from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
 
 
-def test_a_view_that_is_masked_all_over_counts_for_nothing(tmp_path):
+def test_a_fully_masked_view_counts_for_nothing(tmp_path):
     capture, images = tiny_scene()
     capture.train, capture.test = [1, 2, 4, 5, 6, 7], [0, 3]
     images.masks = [None] * 8

@@ -42,7 +42,7 @@ def _check(ranks, folders):
     check_writable(Path(folders[ranks.rank]), ranks)
 
 
-def test_every_rank_is_asked(tmp_path):
+def test_folders_are_checked_on_every_rank(tmp_path):
     with pytest.raises(RankError) as failure:
         run_ranks(_check, 2, [str(tmp_path / "a"), "/proc/nothing"])
     for message in failure.value.messages.values():

@@ -130,7 +130,7 @@ def golden() -> dict[str, Any]:
     return json.loads(GOLDEN.read_text())
 
 
-def test_the_training_goes_as_it_did(golden, tmp_path):
+def test_training_repeats_the_golden_curves(golden, tmp_path):
     wrong = differences(train(golden["config"], tmp_path), golden["curves"])
     assert not wrong, "\n".join([*wrong, "Meant so? python -m tests.training.test_golden writes it anew."])
 

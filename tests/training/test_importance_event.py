@@ -47,7 +47,7 @@ def whole_run(tmp_path_factory):
     return folder, *train(folder)
 
 
-def test_what_the_passes_keep(whole_run):
+def test_how_many_gaussians_the_importance_passes_keep(whole_run):
     folder, trainer, summary = whole_run
     events = pass_events(folder)
     first, second = events["pass_1"], events["pass_2"]
@@ -266,7 +266,7 @@ def _train_with_lineage(ranks, folder):
 
 
 @pytest.mark.parametrize(("world_size", "device"), on_each_device(2))
-def test_two_ranks_pass_and_keep_the_books(tmp_path, world_size, device):
+def test_importance_passes_on_two_ranks_keep_the_lineage_consistent(tmp_path, world_size, device):
     pytest.importorskip("pyarrow")
     answers = run_ranks(_train_with_lineage, world_size, tmp_path, device=device)
     _, ledger, milestones, population = answers[0]

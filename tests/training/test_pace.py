@@ -45,7 +45,7 @@ def phases_of(schedule, begin):
     )
 
 
-def test_what_has_happened_stays_when_the_pace_changes():
+def test_a_change_of_pace_does_not_change_past_events():
     """A run that changes its pace at random has the events and the rates of the schedule it ends with."""
     chance = random.Random(3)
     for batch_size in (1, 4):
@@ -178,7 +178,7 @@ def test_impossible_paces_and_budgets_are_refused(overrides, message):
         load_config(None, overrides)
 
 
-def test_every_piece_has_its_own_step_numbers():
+def test_every_piece_of_the_final_drift_has_its_own_step_numbers():
     """A change within a batch's images would leave a step in two pieces: it falls between two steps."""
     schedule = Schedule(ScheduleConfig(iterations=100, batch_size=4, pace=((8, 0.5),)))
     assert schedule.iterations == 56  # 8 + 92 / 2 = 54, in steps of 4

@@ -123,7 +123,7 @@ def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("content", ["", "model: {sh_degree: 0}\n", "loss: [", None])
-def test_the_checkpoints_own_configuration_wins(copy, tmp_path, capsys, content):
+def test_eval_uses_the_configuration_of_the_checkpoint(copy, tmp_path, capsys, content):
     data, folder = copy
     expected = json.loads((folder / "summary.json").read_text())["psnr"]
     if content is None:

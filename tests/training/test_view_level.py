@@ -63,7 +63,7 @@ def whole_run(tmp_path_factory):
         return folder, *train(folder), steps
 
 
-def test_each_phase_leaves_out_what_the_schedule_says(whole_run):
+def test_gate_and_mask_apply_in_the_scheduled_phases(whole_run):
     folder, trainer, _, steps = whole_run
     progress, column_of = trainer.state.progress, trainer.state.columns
     dropped = {"lod": 0, "cull": 0}
@@ -196,7 +196,7 @@ def test_the_export_carries_the_levels(whole_run, tmp_path):
                   opacities=found.opacities, sh=found.sh, levels=found.levels[1:])  # fmt: skip
 
 
-def test_a_photograph_that_is_lost_moves_no_mask_to_another_view(tmp_path, monkeypatch):
+def test_masks_stay_with_their_views_when_a_photograph_is_lost(tmp_path, monkeypatch):
     """The columns of the cull matrix and the gated views are those of the checkpoint's training views."""
     stop_at(monkeypatch, 75)
     before, _ = train(tmp_path)

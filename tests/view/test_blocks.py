@@ -99,7 +99,7 @@ def test_the_set_does_not_depend_on_the_order_of_the_rows(device, n):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_rows_of_culled_blocks_are_not_read(device):
-    """Rows of blocks behind the camera may become anything: without an update of the bounds nobody looks."""
+    """Rows of blocks behind the camera are not read; their values do not matter until bounds are updated."""
     table = make_table(12_000, device)
     _, Ks = make_views(count=1, device=device)
     viewmats = torch.eye(4, device=device)[None]
@@ -193,7 +193,7 @@ def test_the_active_set_is_used_with_its_count_on_the_device(device, n, ahead):
     listed = active.listed()
     assert len(active.ids) == 256 * int(active.blocks) < n + 256
     assert (len(listed[0]) > 0) == ahead or n < 300
-    active.ids[len(listed[0]) :] = 2**31 - 1  # nobody may look there
+    active.ids[len(listed[0]) :] = 2**31 - 1  # entries after the count must not be read
     got = caught_up_and_projected(table, *active[:3], viewmats, Ks)
     expected = caught_up_and_projected(table, *listed, None, viewmats, Ks)
     for a, b in zip(got, expected, strict=True):
@@ -202,7 +202,7 @@ def test_the_active_set_is_used_with_its_count_on_the_device(device, n, ahead):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [1, 5000, 150_000])
-def test_too_little_room_leaves_the_lists_empty_and_tells_how_much_is_needed(device, n):
+def test_too_small_a_capacity_gives_empty_lists_and_the_needed_number_of_blocks(device, n):
     table = make_table(max(n, 300), device)
     table.keep(torch.arange(len(table), device=device) < n)
     viewmats, Ks = make_views(device=device)
@@ -210,12 +210,12 @@ def test_too_little_room_leaves_the_lists_empty_and_tells_how_much_is_needed(dev
     exact = index.active(table, *views)
     needed = int(exact.blocks)
     assert len((exact.listed()[0] // 256).unique()) <= needed <= -(-n // 256)
-    for room in {1, max(1, needed - 1), max(1, needed), needed + 1, 10**6}:
-        active = index.active(table, *views, room=room)
+    for capacity_blocks in {1, max(1, needed - 1), max(1, needed), needed + 1, 10**6}:
+        active = index.active(table, *views, capacity_blocks=capacity_blocks)
         assert int(active.blocks) == needed
-        assert len(active.ids) == len(active.views) == 256 * min(room, -(-n // 256))
-        active.views[int(active.length) :] = 1  # what is there does not count
-        if room < needed:
+        assert len(active.ids) == len(active.views) == 256 * min(capacity_blocks, -(-n // 256))
+        active.views[int(active.length) :] = 1  # entries after the count are ignored
+        if capacity_blocks < needed:
             assert int(active.length) == 0
         else:
             assert all(torch.equal(a, b) for a, b in zip(active.listed(), exact.listed(), strict=True))
@@ -224,7 +224,7 @@ def test_too_little_room_leaves_the_lists_empty_and_tells_how_much_is_needed(dev
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_nothing_is_missed_while_thousands_of_steps_are_pending(device):
+def test_the_active_set_covers_thousands_of_pending_steps(device):
     """Only what the set names is caught up and stepped; dense Adam decides what is really visible."""
     steps, beta1, beta2, eps = 2000, 0.9, 0.999, 1e-15
     table = make_table(500, device)
@@ -314,8 +314,8 @@ def test_errors_name_the_value():
     viewmats, Ks = make_views(33)
     with pytest.raises(RuntimeError, match="at most 32 views at once, got 33"):
         active_of(index, table, viewmats, Ks)
-    with pytest.raises(RuntimeError, match="room must be for 1 block or more, got 0"):
-        index.active(table, *make_views(1), WIDTH, HEIGHT, NEAR, FAR, room=0)
+    with pytest.raises(RuntimeError, match="capacity_blocks must be for 1 block or more, got 0"):
+        index.active(table, *make_views(1), WIDTH, HEIGHT, NEAR, FAR, capacity_blocks=0)
     table.keep(torch.arange(len(table)) < 100)
     with pytest.raises(RuntimeError, match=r"bounds must have shape \[1, 8\], got \[12, 8\]"):
         active_of(index, table, *make_views(1))

@@ -69,8 +69,8 @@ def some_rows(table, views, seed=0):
     generator = torch.Generator().manual_seed(seed)
     ids = torch.randperm(len(table), generator=generator)[: len(table) // 2].sort().values
     allowed = torch.randint(0, 1 << views, (len(ids),), generator=generator)
-    room = torch.full((len(table) - len(ids),), 2**31 - 1)
-    columns = (torch.cat((ids, room)), torch.cat((allowed, room)), torch.tensor([len(ids)]))
+    unused = torch.full((len(table) - len(ids),), 2**31 - 1)
+    columns = (torch.cat((ids, unused)), torch.cat((allowed, unused)), torch.tensor([len(ids)]))
     return ActiveRows(*(column.int().to(table.device) for column in columns))
 
 
@@ -204,7 +204,7 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_the_set_before_catching_up_misses_nothing(device):
+def test_the_gated_active_set_covers_pending_steps(device):
     """Blocks and rows are dropped by where pending steps may take them; dense Adam decides what is kept."""
     steps, beta1, beta2, eps = 400, 0.9, 0.999, 1e-15
     table = make_scene(1500, device)
@@ -290,7 +290,7 @@ def test_the_gated_set_does_not_depend_on_the_order_of_the_rows(device, columns)
     assert len(sets[0]) < 1.01 * len(exact[0])
 
 
-def test_what_a_view_keeps_is_predicted_from_a_sample():
+def test_the_share_a_view_keeps_is_predicted_from_a_sample():
     viewmats, _ = make_views()
     for n, tolerance in ((3000, 1e-12), (4 * SAMPLE, 0.015)):
         table = make_scene(n)

@@ -193,12 +193,12 @@ def test_changes_of_the_table_reach_the_pool():
         assert torch.equal(residence.table[name], table[name])
 
 
-def test_traffic_of_a_time():
+def test_traffic_between_two_counts():
     later, earlier = Traffic(10, 100, 25, 3_000_000, 2_000_000), Traffic(5, 50, 20, 1_000_000, 0)
     assert later.since(earlier).values() == {"resident_hits": 0.9, "moved_mb_per_step": 0.8}
 
 
-def test_columns_stay_in_their_room_while_rows_come_and_go():
+def test_columns_keep_their_memory_when_rows_change():
     plain = make_table(1000)
     table = host_copy(plain)
     places = {name: table[name].data_ptr() for name in table}
