@@ -46,10 +46,11 @@ def project(
 ) -> ProjectedSplats:
     """Project Gaussians into B views (EWA splatting; the image's definition).
 
-    A splat exists where a Gaussian can reach alpha = 1/255 in the image at a depth in (near, far]. Anything
-    NaN or infinite hides its Gaussian: there is no splat, or, where only the colour is not finite, one whose
-    opacity, colour, radii and tiles are 0. Differentiable in means, quats, scales, opacities, sh and viewmats
-    (dense gradients; the pose's as 12 free entries); the culling itself has no gradient.
+    A Gaussian has a splat in a view if it can reach alpha = 1/255 in the image at a depth in (near, far]. A
+    Gaussian with NaN or infinite values has no splat; if only its colour is not finite, it has a splat whose
+    opacity, colour, radii and tiles are 0. The function is differentiable in means, quats, scales, opacities,
+    sh and viewmats. Gradients are dense; the gradient of a pose treats its 12 entries as free. Culling has no
+    gradient.
 
     Args:
         means: [N, 3] in world units, float32 or (CPU) float64; the other tensors share its dtype and device.
@@ -61,25 +62,27 @@ def project(
         Ks: [B, 3, 3] pinhole intrinsics in px (no skew).
         width: image width in px.
         height: image height in px.
-        active_ids: int32 [A] ascending rows to consider; None for all.
-        active_views: int32 [A] bit masks of the views to consider for each; None for all.
+        active_ids: int32 [A], the rows to consider, ascending; None: all rows.
+        active_views: int32 [A], the views to consider for each of these rows, as bits; None: all views.
         tile_size: edge of a tile in px (only for `tiles_touched`).
         sh_degree: degree to evaluate, 0 to 3.
         near_plane: splats have z > near_plane, world units.
         far_plane: splats have z <= far_plane, world units.
         eps2d: variance added to both screen axes, px^2.
-        radius_clip: drop splats that reach no further than this, px.
-        antialiased: scale opacities by sqrt(det before / det after) of that addition.
+        radius_clip: drop splats whose radius is at most this, px.
+        antialiased: multiply opacities by sqrt(det / det'), the determinants before and after adding eps2d.
         raw: whether scales and opacities are before their activation.
-        sparse_grad: whether gradients of Gaussians are sparse tensors of the visible ones, without a pass
-            over all N: those of means, quats and scales, and with `sh` also of opacities and sh where these
-            are leaves (what made others of them might not take a sparse gradient).
+        sparse_grad: return gradients as sparse tensors of the visible Gaussians, so that no pass over all N
+            Gaussians is needed. This holds for means, quats and scales. With `sh`, it also holds for
+            opacities and sh if these are leaves; operations that computed them might not accept a sparse
+            gradient.
 
     Returns:
-        ProjectedSplats, bit-identical for a Gaussian and a view whatever else is projected with them.
+        ProjectedSplats. The bits of a Gaussian's splat in a view do not depend on the other Gaussians and
+        views of the call.
 
     Raises:
-        RuntimeError: a wrong shape, dtype or value, by name.
+        RuntimeError: an argument has a wrong shape, dtype or value; the message names it.
         ValueError: `sparse_grad` under `torch.compile`.
     """
     if active_views is not None and active_ids is None:
@@ -105,12 +108,12 @@ def gaussians_of(
 def differentiable_splats(
     inputs: ProjectionInputs, sparse_grad: bool, splats: ProjectedSplats | None = None
 ) -> ProjectedSplats:
-    """`project` of grouped arguments.
+    """Project as `project` does, with grouped arguments.
 
     Args:
-        inputs: what is projected.
+        inputs: the inputs of the projection.
         sparse_grad: see `project`.
-        splats: what `project_splats` returned or would return, if they are there already.
+        splats: the result of `project_splats` for these inputs, if it is already known.
     """
     gaussians, (viewmats, Ks) = list(inputs.gaussians), inputs.cameras  # noqa: N806
     if not torch.compiler.is_compiling():
@@ -209,7 +212,7 @@ def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats) -> None:
 
 
 class _Saved(NamedTuple):
-    """What `_save` saved, in its groups."""
+    """The tensors that `_save` saved, in its groups."""
 
     gaussians: Sequence[Tensor]
     cameras: Sequence[Tensor]
@@ -218,7 +221,7 @@ class _Saved(NamedTuple):
 
     @classmethod
     def of(cls, ctx: Any) -> _Saved:
-        """Read it, once: checkpointing recomputes saved tensors for each reading."""
+        """Read them. Call this once: checkpointing recomputes saved tensors at each reading."""
         *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level = ctx.saved_tensors  # noqa: N806
         return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets), level)
 
@@ -226,12 +229,12 @@ class _Saved(NamedTuple):
 def _gradients(
     ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: ProjectedSplats
 ) -> tuple[Tensor | None, ...]:
-    """Return the gradients of all gaussians (None where there are no sh) and viewmats, where needed.
+    """Return the gradients of all gaussians (None without sh) and viewmats, if they are needed.
 
     Args:
         ctx: from `_save`.
-        needed: which of means, quats, scales, opacities and, unless there are none, sh need a gradient.
-        need_viewmats: whether viewmats do.
+        needed: which of means, quats, scales, opacities and, if given, sh need a gradient.
+        need_viewmats: whether viewmats need a gradient.
         sparse: which of these gradients are to be sparse.
         v: gradients of the splats; None: zero.
     """
@@ -249,7 +252,7 @@ def _first_gradients(
     sparse: Sequence[bool],
     v: ProjectedSplats,
 ) -> tuple[Tensor | None, ...]:
-    # Where all are to be dense, the kernel writes them so; one that is not needed would cost memory.
+    # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
     dense = not any(sparse) and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         list(saved.gaussians), list(saved.cameras), list(saved.splats), options.ints, options.floats,
@@ -264,7 +267,7 @@ def _first_gradients(
 
 
 def _of_all(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> Tensor:
-    """Return the gradient of a whole parameter, from that of its rows `ids`."""
+    """Return the gradient of a whole parameter from the gradient of its rows `ids`."""
     if sparse:
         return sparse_rows(ids, gradient, parameter.shape)
     return torch.zeros_like(parameter).index_copy_(0, ids, gradient)
@@ -283,10 +286,10 @@ def _splat_gradients(saved: _Saved, v: ProjectedSplats) -> list[Tensor]:
 
 
 class _Project(torch.autograd.Function):
-    """`project_splats` with the formula registered below, outside of `torch.compile`.
+    """`project_splats` for calls outside of `torch.compile`, with the gradient formula registered below.
 
-    The way through torch to a registered formula takes 0.2 ms of the host's time, and each argument some:
-    those without a gradient are one. Counts are no output of the op.
+    Calling an op with a registered formula through torch takes 0.2 ms of the host's time. Each argument adds
+    to it, so all arguments without a gradient are passed as one. Counts are no output of the op.
     """
 
     @staticmethod

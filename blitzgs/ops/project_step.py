@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the gradients of projected splats straight to an optimiser step of the Gaussians they are of."""
+"""Takes an optimiser step of Gaussians directly from the gradients of their projected splats."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ def project_bwd_step_(
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
-    What the backward pass of `blitzgs.ops.project.project` and `blitzgs.ops.lazy_adam.lazy_adam_step_` do one
-    after the other, to rounding; on CUDA the gradients of the parameters are never stored. The parameters of
-    the visible Gaussians must stand at ``step`` - 1 (`lazy_adam_catch_up_`), as when they were projected.
+    The result is that of the backward pass of `blitzgs.ops.project.project` followed by
+    `blitzgs.ops.lazy_adam.lazy_adam_step_`, to rounding. On CUDA the gradients of the parameters are never
+    stored. The parameters of the visible Gaussians must be at ``step`` - 1 (`lazy_adam_catch_up_`), as when
+    they were projected.
 
     Args:
         state: parameters before their activation, float32 or (CPU) float64, and their moments; `last_step`
             and `moment_step` become `step` for the visible Gaussians.
         schedule: of S steps.
         step: 1 <= step <= S.
-        views: what the splats were projected into, and the weights of regularisers.
-        splats: what `project` made of these parameters and views: P splats.
-        options: with which the splats were projected; scales and opacities are taken before their activation.
+        views: the views that the splats were projected into, and the weights of regularisers.
+        splats: the P splats that `project` returned for these parameters and views.
+        options: the options of the projection; scales and opacities are taken before their activation.
         gradients: of the splats.
-        level: uint8 [N], octree levels, where opacities fade by them (`options.fade`).
-        means2d_sums: [P, 2], becomes the gradient of `splats.means2d` where `gradients` has it at ranks.
-        absolute_sums: `means2d_sums` becomes the sum over pixels of its absolute values instead.
+        level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
+        means2d_sums: [P, 2], receives the gradient of `splats.means2d` if `gradients` has a part per rank.
+        absolute_sums: `means2d_sums` receives the sum over pixels of its absolute values instead.
 
     Raises:
         ValueError: decay rates outside their range.

@@ -18,7 +18,7 @@ rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
 
 
 class RasterizeForward(NamedTuple):
-    """What the ops of the backward pass take of the forward pass, in their groups.
+    """The tensors of the forward pass that the ops of the backward pass take, in their groups.
 
     Attributes:
         splats: means2d, conics, splat_opacities, colors.
@@ -59,9 +59,9 @@ def rasterize(
         the pixel ends before T (1 - alpha) would fall below 1e-4
         color += alpha T splat_color;  T *= 1 - alpha
 
-    and the background is added with the remaining T. Differentiable in means2d, conics, splat_opacities,
-    colors and backgrounds; no gradient flows where alpha is clipped, nor through the order and the two cuts.
-    Gradients are bitwise repeatable on the CPU, and on CUDA under
+    and the background is added with the remaining T. The function is differentiable in means2d, conics,
+    splat_opacities, colors and backgrounds. No gradient flows through clipped alphas, the order of the splats
+    and the two cuts. Gradients repeat bit for bit on the CPU, and on CUDA under
     ``torch.use_deterministic_algorithms(True)``.
 
     Args:
@@ -70,7 +70,7 @@ def rasterize(
         splat_opacities: [P].
         colors: [P, D], any D.
         isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
-        tile_offsets: int64 [B * T + 1], likewise.
+        tile_offsets: int64 [B * T + 1], from the same call.
         n_cameras: number of views B.
         width: of every view, pixels.
         height: of every view, pixels.
@@ -78,9 +78,10 @@ def rasterize(
         backgrounds: [B, D], or None for black.
         tile_begin: first owned tile; pixels of tiles outside [tile_begin, tile_end) are zero.
         tile_end: end of the owned tiles, -1 for all.
-        tell_absgrad: is called in the backward pass, whatever that is asked for, with the sum over pixels of
-            the absolute gradient of means2d, per axis: [P, 2].
-        composited: what the op `rasterize_fwd` has returned of these arguments already; None: it is called.
+        tell_absgrad: the backward pass calls it with the sum over pixels of the absolute gradient of means2d,
+            per axis, [P, 2], whichever gradients it computes.
+        composited: the result of the op `rasterize_fwd` for these arguments, if it is already known; None:
+            call the op.
 
     Returns:
         Renders [B, H, W, D] and alphas [B, H, W].
@@ -97,7 +98,7 @@ def rasterize(
         renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, grid, None, True, False, None)
         alphas = 1 - transmittances
     else:
-        # Whose gradients stay packed, see `_gradients`.
+        # The inputs whose gradients stay packed, see `_gradients`.
         packed = tell_absgrad is None and torch.is_grad_enabled() and any(x.requires_grad for x in splats[:4])
         renders, alphas = _Rasterize.apply(*splats, grid, tell_absgrad, packed, composited)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
@@ -132,7 +133,7 @@ def _(
 ) -> tuple[Tensor, ...]:
     n_cameras, width, height, *_ = grid
     pixels, context = (n_cameras, height, width), torch.library.get_ctx()
-    # The layout of what is packed is the backend's own.
+    # The layout of packed splats differs between backends.
     splat_bytes, n_ordered = context.new_dynamic_size(), context.new_dynamic_size()
     n_ready = context.new_dynamic_size() if backward_follows else 0
     return (
@@ -178,7 +179,7 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
 
 
 def _save(ctx: Any, splats: Any, grid: Any, output: tuple[Tensor, ...]) -> None:
-    # Not the renders, which callers may change in place: the backward pass does not need them.
+    # The renders are not saved: callers may change them in place, and the backward pass does not need them.
     _, transmittances, last_ids, _, packed_splats, tile_order, splat_gradients = output
     ctx.set_materialize_grads(False)
     ctx.gradients = GradientBuffer(splat_gradients)
@@ -187,7 +188,7 @@ def _save(ctx: Any, splats: Any, grid: Any, output: tuple[Tensor, ...]) -> None:
 
 
 def _saved(ctx: Any) -> RasterizeForward:
-    """Return what `_save` saved; read it once: checkpointing recomputes saved tensors for each reading."""
+    """Return the tensors that `_save` saved. Call this once: checkpointing recomputes them each time."""
     means2d, conics, opacities, colors, backgrounds, isect_splats, tile_offsets, *composited = (
         ctx.saved_tensors
     )
@@ -209,7 +210,7 @@ def _gradients(
 ) -> tuple[Tensor | None, ...]:
     """Return the gradients of means2d, conics, splat_opacities, colors, backgrounds and means2d_abs.
 
-    With `may_pack`, on CUDA, they may be columns of one table, which `project_bwd` reads as it is.
+    With `may_pack` they may, on CUDA, be columns of one table, which `project_bwd` reads without copying.
     """
     if v_renders is None and v_alphas is None:
         return (None,) * 6
@@ -247,9 +248,9 @@ def _first_gradients(
 
 
 class _Rasterize(torch.autograd.Function):
-    """Renders and alphas outside of `torch.compile`.
+    """Renders and alphas for calls outside of `torch.compile`, with the gradient formula registered below.
 
-    The formula is the one registered below, whose way through torch takes 0.2 ms of the host's time.
+    Calling an op with a registered formula through torch takes 0.2 ms of the host's time.
     """
 
     @staticmethod

@@ -55,7 +55,7 @@ def take_photographs(
             image = city.render(view)
             corners = find_corners(city, view, image, options.points_per_view, options.seed)
             encoded = _encode_jpeg(path, image)
-            # Checksums find what a power failure tore, so nobody waits for the disk.
+            # Checksums find files that a power failure tore, so the files are not synced to disk.
             write_file(path, encoded, sync=False)
             write_file(record, _pack(corners, encoded), sync=False)
         return corners
