@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of a capture: pinhole views of the re-centred world, and how each image is made from its file."""
+"""Cameras of a capture: pinhole views of the re-centred world, and the steps from a file to its image."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Camera:
 
 
 def camera_centers(world_to_camera: Float64) -> Float64:
-    """Positions [N, 3] of rigid poses [N, 4, 4]."""
+    """Return the positions [N, 3] of rigid poses [N, 4, 4]."""
     return np.asarray(-np.einsum("nji,nj->ni", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]))
 
 

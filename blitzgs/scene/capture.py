@@ -66,7 +66,7 @@ class MissingImagesError(FileNotFoundError):
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A view as its file describes it."""
+    """A view as the capture's file describes it."""
 
     name: str
     path: Path
@@ -98,8 +98,8 @@ def load_capture(
     """Load a capture without decoding its images.
 
     Args:
-        path: folder with a COLMAP sparse model (sparse/0, sparse, ...; or train/ and val/ folders that each
-            have one) or transforms.json / transforms_train.json.
+        path: folder with a COLMAP sparse model (sparse/0, sparse, ...; or train/ and val/ folders that have
+            one each) or transforms.json / transforms_train.json.
         images: folder of the images, relative to `path`; not used for transforms.json, which has paths.
         downscale: reduce both sides of the camera model's size by this factor. A folder such as images_4 is
             used for 4 if it contains every image at the right size; otherwise images are downscaled by
@@ -109,10 +109,10 @@ def load_capture(
         masks: folder of masks (NAME.png or STEM.png; black = excluded). None uses `masks/` when it exists;
             True requires it; False uses none.
         undistort: "crop" or "mask" the part of a pinhole image that the distorted image does not cover.
-        exif: "auto" turns an image by its EXIF orientation only where its stored size does not fit the camera
-            and the turned one does (COLMAP itself ignores the tag); "apply" and "ignore" do as they say.
+        exif: "auto" turns an image by its EXIF orientation only if its stored size does not fit the camera
+            and its turned size does (COLMAP itself ignores the tag); "apply" always turns it, "ignore" never.
         allow_missing: drop views whose image is not on disk, with a warning, instead of failing. The world's
-            origin, the extent and the split stay those of all views with a pose.
+            origin, the extent and the split are still computed from all views with a pose.
 
     Raises:
         FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
@@ -140,7 +140,7 @@ def load_capture(
     train, test = ([place[index] for index in part if index in place] for part in (train, test))
     if not train:
         raise MissingImagesError(f"{root}: no image of a training view is on disk")
-    with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # headers may lie on a slow network disk
+    with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
         headers = list(pool.map(lambda view: read_header(view.path), views))
     mask_folder = _mask_folder(root, masks)
     if masks is False:
@@ -172,7 +172,7 @@ def load_capture(
 
 
 def _warn_of_blind_views(cameras: list[Camera], points: Float64) -> None:
-    """Warn if most views see no point: the poses may be of another world, or have another axis convention."""
+    """Warn if most views see no point: poses and points may have different worlds or axis conventions."""
     sample = points[:: max(1, len(points) // _SAMPLED_POINTS)]
     blind = [camera.name for camera in cameras if not sees_any(camera, sample)]
     if 2 * len(blind) > len(cameras):
@@ -197,7 +197,9 @@ def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View],
         return [view for views, _ in found for view in views], found[0][1]
     incomplete = colmap.find_incomplete_model(root)
     if incomplete is not None:
-        return _read_colmap(root, incomplete, images, downscale)  # says which file is missing
+        return _read_colmap(
+            root, incomplete, images, downscale
+        )  # raises an error that names the missing file
     raise FileNotFoundError(
         f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
         ".bin or .txt), or transforms.json"

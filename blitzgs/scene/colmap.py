@@ -2,7 +2,7 @@
 """COLMAP sparse models (cameras, images, points3D; binary and text) as columns of numpy arrays.
 
 Poses map world to camera: x_camera = R(q) x_world + t with q = (w, x, y, z); pixel (i, j) has its centre at
-(i + 0.5, j + 0.5). Parsing is done by the compiled readers, which check every count against the bytes left.
+(i + 0.5, j + 0.5). Compiled readers parse the files; they check every count against the bytes left.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class ColmapPoints:
 
     @property
     def track_lengths(self) -> npt.NDArray[np.int64]:
-        """Number of images that see each point, int64 [M]."""
+        """The number of images that see each point, int64 [M]."""
         ends = self.track_offsets.astype(np.int64)
         return np.asarray(ends[1:] - ends[:-1])
 
@@ -91,17 +91,17 @@ class ColmapModel:
 
 @cache
 def camera_models() -> dict[str, list[str]]:
-    """Every camera model of COLMAP: name to the names of its parameters, in order."""
+    """Return the names of the parameters, in order, of every camera model of COLMAP."""
     return {name: params.split(",") for _, name, params in native_io().camera_models()}
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of a sparse model below `path` (sparse/0, sparse, `path` itself, colmap/...), or None."""
+    """Return the folder of a sparse model below `path` (sparse/0, sparse, `path`, colmap/...), or None."""
     return _find(path, all)
 
 
 def find_incomplete_model(path: Path) -> Path | None:
-    """The folder that `find_model` would find if all of its files were there, or None."""
+    """Return the folder that `find_model` would return if none of its files were missing, or None."""
     return _find(path, any)
 
 
@@ -119,7 +119,7 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     Args:
         folder: holds cameras, images and points3D as .bin or .txt (rigs and frames files are not needed).
         points2d: read the observations of the images too (most of the file's size).
-        tracks: read the tracks of the points too (their lengths are always there).
+        tracks: read the tracks of the points too (their lengths are always read).
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -160,7 +160,7 @@ def _columns(table: ColmapImages | ColmapPoints) -> dict[str, Any]:
 
 
 def quats_to_rotations(quats: Float64) -> Float64:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z; any length, but zero gives NaN)."""
+    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any length; zero: NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
         w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
     rows = [
@@ -172,7 +172,7 @@ def quats_to_rotations(quats: Float64) -> Float64:
 
 
 def world_to_camera(images: ColmapImages) -> Float64:
-    """The poses as matrices [N, 4, 4]."""
+    """Return the poses as matrices [N, 4, 4]."""
     poses = np.tile(np.eye(4), (len(images.ids), 1, 1))
     poses[:, :3, :3] = quats_to_rotations(images.quats)
     poses[:, :3, 3] = images.translations

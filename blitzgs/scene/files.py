@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the images and masks of a COLMAP capture lie on disk."""
+"""Finds the images and masks of a COLMAP capture on disk."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class ImageFinder:
         self._mapping = _mega_nerf_mapping(root)
 
     def find_all(self, names: Sequence[str], lenses: Sequence[Lens], downscale: float) -> list[Path]:
-        """Return the file of each name, from images_N when all images are in it at the right size.
+        """Return the file of each name, from images_N if it has all images at the right size.
 
         For an image that is found nowhere the returned path does not exist.
         """
@@ -73,7 +73,7 @@ def _with_any_suffix(path: Path) -> Path | None:
 
 
 def _mega_nerf_mapping(root: Path) -> dict[str, str]:
-    """Mega-NeRF's mappings.txt: "original image name,000123.pt" a line."""
+    """Read Mega-NeRF's mappings.txt, whose lines are "original image name,000123.pt"."""
     path = root / "mappings.txt"
     if not path.is_file():
         return {}
@@ -89,10 +89,10 @@ def _mega_nerf_mapping(root: Path) -> dict[str, str]:
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of an image: NAME.png as COLMAP has it, STEM.png, or the image's own name; else None.
+    """Return the mask of an image, or None: NAME.png (as in COLMAP), STEM.png or the image's own name.
 
-    A name that is absolute or climbs out of its folder counts by its last part: joined as it is, it could
-    lead to the photograph itself.
+    Of a name that is absolute or leads out of its folder, only the last part is used: the whole name, joined
+    to the folder of masks, could be the path of the photograph itself.
     """
     pure = PurePath(name)
     leads_out = pure.is_absolute() or ".." in pure.parts

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image files: size and orientation from the header alone, and decoding that refuses damaged files."""
+"""Reads size and orientation of image files from their headers, and decodes images; refuses damaged files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TURNS[8] = (cv2.ROTATE_90_COUNTERCLOCKWISE,)
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Size as stored (pixels), EXIF orientation (1 to 8) and whether there is an alpha channel."""
+    """The stored size (pixels), the EXIF orientation (1 to 8) and whether there is an alpha channel."""
 
     width: int
     height: int
@@ -34,7 +34,7 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Size and orientation of an image file; JPEG and PNG are not decoded for it.
+    """Return size and orientation of an image file; JPEG and PNG files are not decoded.
 
     Raises:
         ValueError: the file is damaged or not an image; names it.
@@ -44,7 +44,7 @@ def read_header(path: Path) -> ImageHeader:
         if data[:2] == b"\xff\xd8":
             try:
                 header = _jpeg_header(data)
-            except (EOFError, struct.error):  # a large preview or colour profile comes before the size
+            except (EOFError, struct.error):  # the size follows a large preview or colour profile
                 try:
                     header = _jpeg_header(data + file.read())
                 except (EOFError, struct.error):
@@ -60,7 +60,7 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Marker and payload of every segment before the image data; EOFError when the bytes end before it."""
+    """Yield marker and payload of each segment before the image data; EOFError if the bytes end earlier."""
     at = 2
     while True:
         if at + 4 > len(data):
@@ -92,7 +92,7 @@ def _jpeg_header(data: bytes) -> ImageHeader | None:
 
 
 def _exif_orientation(tiff: bytes) -> int:
-    """The orientation tag of the first directory; 1 when there is none or it makes no sense."""
+    """Return the orientation tag of the first directory; 1 if it is missing or invalid."""
     order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
     try:
         if order is None:
@@ -119,7 +119,7 @@ def _imdecode(data: bytes, flags: int, name: str) -> UInt8:
 
 
 def read_whole(path: Path) -> bytes:
-    """Return the bytes of an image file; refuse one whose damage a decoder would conceal.
+    """Return the bytes of an image file; refuse a file if a decoder would conceal its damage.
 
     Decoders show the lost part of a JPEG as grey, without an error, so this function walks the codes of the
     file. Damage that leaves a valid sequence of codes (most changes of a single bit) cannot be detected.
@@ -139,7 +139,7 @@ def decode_rgb(data: bytes, name: str, background: tuple[float, float, float] | 
     Args:
         data: the file, from `read_whole`.
         name: names the file in errors.
-        background: composite an alpha channel over this colour (0 to 1); None drops it.
+        background: colour (0 to 1) over which an alpha channel is composited; None: drop the channel.
 
     Raises:
         ValueError: the file cannot be decoded.

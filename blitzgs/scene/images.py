@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a capture: kept compressed in memory within a budget, and decoded ahead by threads.
+"""Keeps the images of a capture compressed in memory within a budget; threads decode them ahead.
 
 There are two bounded caches, for compressed and for decoded images; both drop the entries that were used
 longest ago. The compressed form is the file itself if the file needs no processing. An image that must be
@@ -45,7 +45,7 @@ class BoundedCache(Generic[K, V]):
         """Hold at most `budget` bytes."""
         self.budget = budget
         self.bytes = 0
-        self.most_bytes = 0  # ever held
+        self.most_bytes = 0  # the largest size so far
         self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -90,7 +90,7 @@ class ImageMemory:
     decoded: int
 
     def __str__(self) -> str:
-        """Say it in gigabytes."""
+        """Return the figures as text, in gigabytes."""
         return (
             f"host memory of images: at most {self.compressed_bytes / 1e9:.2f} GB compressed (budget "
             f"{self.compressed_budget / 1e9:.2f}) and {self.decoded_bytes / 1e9:.2f} GB decoded (budget "
@@ -119,10 +119,10 @@ class ImageStore:
         """Read nothing yet.
 
         Args:
-            capture: whose images.
-            budget_bytes: of compressed images kept in memory.
-            threads: that decode ahead.
-            decoded_bytes: of decoded images kept; a quarter of `budget_bytes` when left out.
+            capture: the capture that has the images.
+            budget_bytes: limit of the compressed images in memory.
+            threads: number of threads that decode ahead.
+            decoded_bytes: limit of the decoded images in memory; None: a quarter of `budget_bytes`.
             background: RGB in [0, 1] that images with an alpha channel are composited over.
         """
         self.capture = capture
@@ -139,7 +139,7 @@ class ImageStore:
         self._pool = ThreadPoolExecutor(max(1, threads), thread_name_prefix="blitzgs-images")
 
     def get(self, index: int) -> Tensor:
-        """The image of a camera, uint8 RGB [height, width, 3] on the CPU. It is shared: do not write to it.
+        """Return a camera's image, uint8 RGB [height, width, 3] on the CPU. It is shared: do not write to it.
 
         Raises:
             ValueError: the file is damaged or its size changed; names it.
@@ -148,7 +148,7 @@ class ImageStore:
         return torch.from_numpy(self._result("image", index))
 
     def mask(self, index: int) -> Tensor | None:
-        """Which pixels count, uint8 [height, width] of 0 and 1; None when all do. Shared: do not write to it.
+        """Return which pixels count, uint8 0 or 1 [height, width]; None: all. Shared: do not write to it.
 
         A pixel that mixes counted and excluded pixels of the file is excluded.
         """
@@ -158,7 +158,7 @@ class ImageStore:
         return torch.from_numpy(self._result("mask", index))
 
     def prefetch(self, indices: Iterable[int]) -> None:
-        """Start decoding images that will be asked for, in order, as many as the decoded budget holds."""
+        """Start to decode the images that are needed next, in order, as many as the decoded budget holds."""
         planned = 0
         for index in indices:
             camera = self.capture.cameras[index]
@@ -169,23 +169,23 @@ class ImageStore:
 
     @property
     def compressed_bytes(self) -> int:
-        """Memory now held by compressed images."""
+        """The memory that compressed images take now, in bytes."""
         return self._packed.bytes
 
     @property
     def decoded_bytes(self) -> int:
-        """Memory now held by decoded images and masks."""
+        """The memory that decoded images and masks take now, in bytes."""
         return self._decoded.bytes
 
     def memory(self) -> ImageMemory:
-        """Return what images have taken so far."""
+        """Return the memory that images have taken so far."""
         packed, decoded = self._packed, self._decoded
         return ImageMemory(
             packed.most_bytes, packed.budget, decoded.most_bytes, decoded.budget, self._times_decoded
         )
 
     def close(self) -> None:
-        """Stop the threads; decoding that has not begun is dropped."""
+        """Stop the threads; images whose decoding has not begun are not decoded."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _result(self, kind: str, index: int) -> UInt8:
@@ -193,7 +193,7 @@ class ImageStore:
         return found.result() if isinstance(found, Future) else found
 
     def _submit(self, kind: str, index: int) -> UInt8 | Future[UInt8]:
-        """The images that are decoded or will be."""
+        """Return the images that are decoded or waiting to be decoded."""
         key = (kind, index)
         # An image that is no longer pending is decoded. Both lists are looked up under one lock; otherwise a
         # thread that is delayed between the two look-ups would decode the image again.
@@ -262,7 +262,7 @@ class ImageStore:
         stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
         if (mask.shape[1], mask.shape[0]) == stored:
             mask = apply_orientation(mask, camera.orientation)
-        if mask.shape != (lens.height, lens.width):  # masks of another resolution
+        if mask.shape != (lens.height, lens.width):  # the mask has another resolution
             mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
         return mask
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera models: from directions to pixels, for every model COLMAP knows.
+"""Camera models: map directions to pixels, for every camera model of COLMAP.
 
 A lens maps normalised coordinates (u, v) = (x/z, y/z) of a point in front of the camera to pixels:
 (fx u' + cx, fy v' + cy) with (u', v') = distort(u, v). The formulas are those that COLMAP documents for its
@@ -51,7 +51,7 @@ class Lens:
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy in pixels."""
+        """Return fx, fy, cx, cy in pixels."""
         if self._shared_focal:
             f, cx, cy = self.params[:3]
             return f, f, cx, cy
@@ -60,24 +60,24 @@ class Lens:
 
     @property
     def distortion(self) -> tuple[float, ...]:
-        """The parameters after the intrinsics."""
+        """Return the parameters after the intrinsics."""
         return self.params[3 if self._shared_focal else 4 :]
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether straight lines stay straight: a pinhole model, or a distortion that is zero throughout."""
+        """Whether straight lines stay straight: the model is a pinhole, or its distortion is zero."""
         if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
             return True
         return self.model in _ZERO_IS_PINHOLE and not any(self.distortion)
 
     @property
     def matrix(self) -> Array:
-        """K [3, 3] of the intrinsics."""
+        """Return the matrix K [3, 3] of the intrinsics."""
         fx, fy, cx, cy = self.intrinsics
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def scaled(self, width: int, height: int) -> Lens:
-        """The same lens for an image resized to width x height (each axis by its own ratio)."""
+        """Return this lens for an image resized to width x height (each axis by its own ratio)."""
         if (width, height) == (self.width, self.height):
             return self
         sx, sy = width / self.width, height / self.height
@@ -86,19 +86,19 @@ class Lens:
         return Lens(_WITH_TWO_FOCALS.get(self.model, self.model), width, height, (*intrinsics, *self._full()))
 
     def _full(self) -> tuple[float, ...]:
-        """The distortion in the parameters of the model with two focal lengths."""
+        """Return the distortion parameters of the model with two focal lengths."""
         padding = {"SIMPLE_RADIAL": 3, "RADIAL": 2, "SIMPLE_RADIAL_FISHEYE": 3, "RADIAL_FISHEYE": 2}
         return self.distortion + (0.0,) * padding.get(self.model, 0)
 
     def distort(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Normalised coordinates to distorted ones; NaN where the model does not see the direction."""
+        """Map normalised coordinates to distorted ones; NaN if the model does not see the direction."""
         if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
             return u, v
         with np.errstate(all="ignore"):
             return _DISTORT[self.model](u, v, self.distortion)
 
     def project(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Normalised coordinates to pixels."""
+        """Map normalised coordinates to pixels."""
         fx, fy, cx, cy = self.intrinsics
         u, v = self.distort(u, v)
         return fx * u + cx, fy * v + cy
@@ -147,7 +147,7 @@ def _fov(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
 
 
 def _equidistant(u: Array, v: Array) -> tuple[Array, Array]:
-    """Directions on the plane where the distance from the centre is the angle from the axis."""
+    """Map directions to the plane in which the distance from the centre is the angle to the axis."""
     r = np.hypot(u, v)
     scale = np.where(r > 1e-8, np.arctan(r) / np.maximum(r, 1e-8), 1.0)
     return u * scale, v * scale

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures to look at: saving images, and a render beside its photograph and its error."""
+"""Saves images, and pictures that show a render beside its photograph and its error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from blitzgs.output import write_file
 
 UInt8 = npt.NDArray[np.uint8]
 
-# Shown in the last colour of an error map.
+# The error that the last colour of an error map shows.
 _FULL_ERROR = 0.25
 _LABELS = ("render", "photograph", f"error (red: {_FULL_ERROR} or more)")
 _BAR = 24
@@ -24,7 +24,7 @@ _GAP = 4
 
 
 def to_uint8(image: Tensor) -> UInt8:
-    """Quantise an image to uint8 [H, W, 3]: floats are clamped to [0, 1] and rounded, uint8 stays."""
+    """Quantise an image to uint8 [H, W, 3]: clamp floats to [0, 1] and round them; keep uint8 as it is."""
     image = image.detach().cpu()
     if image.dtype != torch.uint8:
         image = (image.float().nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).to(torch.uint8)
@@ -61,13 +61,13 @@ def encode_image(image: Tensor, suffix: str) -> bytes:
 def error_map(
     render: Tensor, target: Tensor, mask: Tensor | None = None, full: float = _FULL_ERROR
 ) -> Tensor:
-    """Mean absolute error over the channels as colours from dark blue (0) to red (`full` and more).
+    """Return the mean absolute error over channels as colours from dark blue (0) to red (`full` or more).
 
     Args:
         render: float [H, W, 3].
         target: float or uint8 [H, W, 3].
         mask: uint8 [H, W]; pixels with 0 become grey; or None.
-        full: the error, in [0, 1], shown in the last colour.
+        full: the error, in [0, 1], that the last colour shows.
 
     Returns:
         uint8 RGB [H, W, 3] on the CPU.
@@ -82,7 +82,7 @@ def error_map(
 
 
 def strip(images: Sequence[Tensor], labels: Sequence[str]) -> Tensor:
-    """Images of one height side by side, each under its label; uint8 RGB [H + bar, W, 3]."""
+    """Return images of one height side by side, each under its label; uint8 RGB [H + bar, W, 3]."""
     if len({image.shape[0] for image in images}) != 1 or len(images) != len(labels):
         shapes = [list(image.shape) for image in images]
         raise ValueError(f"a strip needs images of one height and a label for each, got {shapes}, {labels}")

@@ -10,14 +10,14 @@ DEFAULT_EVERY = 8
 
 
 def every_nth(count: int, n: int) -> list[int]:
-    """Test views 0, n, 2n, ... of `count` (views sorted by name); none when n is 0."""
+    """Return the test views 0, n, 2n, ... of `count` (views sorted by name); none if n is 0."""
     if n < 0 or n == 1:
         raise ValueError(f"every {n}-th view cannot be held out: n must be 0 (none) or at least 2")
     return list(range(0, count, n)) if n else []
 
 
 def from_list(names: Sequence[str], path: Path) -> list[int]:
-    """Test views named in a text file, one a line (# comments); the folder and suffix may be left out.
+    """Return the test views that a text file names, one per line, with or without folder and suffix.
 
     Raises:
         ValueError: a line names no view, or several.
@@ -45,7 +45,7 @@ def from_list(names: Sequence[str], path: Path) -> list[int]:
 
 
 def is_val(name: str, image_path: Path, root: Path) -> bool:
-    """Whether an image belongs to Mega-NeRF's `val/` folder of the capture."""
+    """Tell whether an image is in Mega-NeRF's `val/` folder of the capture."""
     inside = image_path.relative_to(root) if image_path.is_relative_to(root) else PurePath(name)
     return inside.parts[0] == "val" or PurePath(name).parts[0] == "val"
 
@@ -53,14 +53,14 @@ def is_val(name: str, image_path: Path, root: Path) -> bool:
 def split_views(
     names: Sequence[str], paths: Sequence[Path], root: Path, spec: int | str | Path = "auto"
 ) -> tuple[list[int], list[int]]:
-    """Train and test views, both ascending.
+    """Return train and test views, both ascending.
 
     Args:
         names: of all views, in their order.
         paths: of their image files.
         root: folder of the capture.
         spec: n (every n-th), "val" (Mega-NeRF's layout), a list file (relative to `root` or as it is), or
-            "auto": "val" where such a folder holds views, else every 8th.
+            "auto": "val" if such a folder has views, else every 8th.
 
     Raises:
         ValueError: the list names unknown views, or no training view is left.

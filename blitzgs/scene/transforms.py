@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras from transforms.json: nerfstudio's single file, or Blender's transforms_train/test.json.
+"""Reads cameras from transforms.json: nerfstudio's single file, or Blender's transforms_train/test.json.
 
-Poses there are camera-to-world with x right, y up, z backwards; ours are world-to-camera with y down, z
-forwards.
+Poses in these files are camera-to-world with x right, y up, z backwards. Poses of this package are
+world-to-camera with y down, z forwards.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: its lens is that of the size the file states, its pose world-to-camera float64 [4, 4]."""
+    """One frame: its lens at the size that the file states, and its world-to-camera pose, float64 [4, 4]."""
 
     name: str
     path: Path
@@ -43,14 +43,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class Transforms:
-    """What the files of a capture say together."""
+    """The combined content of a capture's files."""
 
     frames: list[Frame]
     points_path: Path | None
 
 
 def find_transforms(root: Path) -> list[Path]:
-    """The files to read: transforms.json, else those of Blender's train and test split; may be empty."""
+    """Return the files to read: transforms.json, else the files of Blender's train and test split, if any."""
     if (root / "transforms.json").is_file():
         return [root / "transforms.json"]
     files = [root / f"transforms_{part}.json" for part in ("train", "test")]

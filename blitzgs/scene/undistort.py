@@ -25,7 +25,7 @@ _MIN_SIDE = 16
 
 @dataclass(frozen=True)
 class Rectification:
-    """How a lens' image becomes a pinhole image of width x height with the matrix `K` (pixels)."""
+    """How to turn a lens' image into a pinhole image of width x height with the matrix `K` (pixels)."""
 
     lens: Lens
     width: int
@@ -43,14 +43,14 @@ class Rectification:
 
     @property
     def K(self) -> Array:  # noqa: N802
-        """Matrix [3, 3] of the new image."""
+        """Return the matrix [3, 3] of the new image."""
         matrix = self.lens.matrix
         matrix[0, 2] -= self.x0
         matrix[1, 2] -= self.y0
         return matrix
 
     def maps(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-        """Columns and rows in the old image for cv2.remap [height, width], and which of them were seen.
+        """Return columns and rows in the old image for cv2.remap [height, width], and which of them it shows.
 
         cv2 puts the centre of pixel (i, j) at (i, j), hence the half pixel less.
         """
@@ -68,7 +68,7 @@ class Rectification:
         return columns, rows, _seen(self.lens, columns + 0.5, rows + 0.5, axis)
 
     def source(self, columns: npt.ArrayLike, rows: npt.ArrayLike) -> tuple[Array, Array]:
-        """Where in the old image (x, y) the centres of pixels of the new one come from."""
+        """Return where the centres of the new image's pixels lie in the old image, (x, y)."""
         fx, fy, cx, cy = self.lens.intrinsics
         u = (np.asarray(columns) + 0.5 + self.x0 - cx) / fx
         v = (np.asarray(rows) + 0.5 + self.y0 - cy) / fy
@@ -97,7 +97,7 @@ def rectify(lens: Lens, policy: str = "crop") -> Rectification:
 
 
 def _seen_grid(lens: Lens) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    """A grid of normalised coordinates that covers what the lens sees: columns u, rows v, seen [v, u]."""
+    """Return a grid of normalised coordinates that covers the lens' view: columns u, rows v, seen [v, u]."""
     fx, fy, cx, cy = lens.intrinsics
     box = np.array([-cx / fx, (lens.width - cx) / fx, -cy / fy, (lens.height - cy) / fy])
     while True:
@@ -147,7 +147,7 @@ def _bounds(seen: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
 
 
 def _inner_rectangle(seen: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    """Shrink the bounds, always giving up the side with the largest part unseen, until all is seen."""
+    """Shrink the bounds until every pixel is seen, each time at the side with the largest unseen share."""
     top, bottom, left, right = _bounds(seen)
     while True:
         part = seen[top : bottom + 1, left : right + 1]
@@ -155,7 +155,7 @@ def _inner_rectangle(seen: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
             return top, bottom, left, right
         unseen = [1 - side.mean() for side in (part[0], part[-1], part[:, 0], part[:, -1])]
         worst = int(np.argmax(unseen))
-        if unseen[worst] == 0:  # a hole inside: no side is to blame, so give up from all of them
+        if unseen[worst] == 0:  # there is a hole inside, so shrink all sides
             top, bottom, left, right = top + 1, bottom - 1, left + 1, right - 1
             continue
         top, bottom = top + (worst == 0), bottom - (worst == 1)
@@ -163,7 +163,7 @@ def _inner_rectangle(seen: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
 
 
 def _trim(plan: Rectification) -> Rectification:
-    """Drop border pixels that were not seen, which the coarse grid did not show."""
+    """Drop border pixels that were not seen, which the coarse grid did not find."""
     x0, y0, width, height = plan.x0, plan.y0, plan.width, plan.height
     while min(width, height) >= _MIN_SIDE:
         plan = Rectification(plan.lens, width, height, x0, y0, has_invalid=False)

@@ -3,8 +3,8 @@
 
 Streets, houses, trees and cars are laid out by rules from a seed (`plan`, `city`, `buildings`, `greenery`),
 painted by procedural materials (`materials`, `ground`), photographed with Embree rays along flight lines
-(`render`, `flight`), and written with the sparse model a structure-from-motion tool would give (`tracks`,
-`dataset`, `generate`).
+(`render`, `flight`), and written with the sparse model that a structure-from-motion tool would give
+(`tracks`, `dataset`, `generate`).
 """
 
 from blitzgs.scene.synth.command import add_arguments, run

@@ -24,7 +24,7 @@ from blitzgs.scene.synth.plan import Rectangle
 Rng = np.random.Generator
 
 FLOOR: Final = 3.1  # metres from one floor to the next
-# Facade styles, the first free number of a FACADE look: what materials.py paints.
+# Facade styles that materials.py paints: the first free number of a FACADE look.
 PLASTER, BRICK, BANDED = 0.0, 1.0, 2.0
 
 _WALLS: Final[list[Color]] = [

@@ -14,7 +14,7 @@ from blitzgs.scene.synth.tracks import Cloud
 def colmap_model(views: list[View], cloud: Cloud) -> ColmapModel:
     """Return one PINHOLE camera, the poses with their observations, and the points with their tracks.
 
-    An image lists its matched observations first, by point, and then the corners nothing was matched to.
+    An image lists its matched observations first, by point, and then the corners without a match.
     """
     first = views[0]
     params = np.array([first.focal, first.focal, first.width / 2, first.height / 2])

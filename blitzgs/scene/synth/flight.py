@@ -52,7 +52,7 @@ class View:
 
 
 def flight_height(options: CityOptions) -> float:
-    """Return the metres above ground at which the nadir images overlap as they should."""
+    """Return the height above ground, in metres, at which nadir images have the wanted overlap."""
     nadir = max(options.views - _oblique_count(options), 1)
     spacing = options.extent / math.sqrt(nadir)
     footprint = spacing / (1 - OVERLAP)
@@ -73,7 +73,7 @@ def plan_flight(options: CityOptions) -> list[View]:
     views: list[View] = []
     for label, heading, tilt, count in passes:
         forward = np.array([math.sin(heading), math.cos(heading)])
-        # Oblique cameras fly behind what they look at.
+        # Oblique cameras fly behind the point that they look at.
         back = height * math.tan(tilt)
         for position in _lawn_mower(count, flown):
             ground = position + rng.normal(0, 0.01 * height, 2)

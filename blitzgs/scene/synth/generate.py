@@ -45,9 +45,9 @@ def generate_city(
 
     Writes `images/*.jpg`, `sparse/0/*.bin` (a COLMAP model: PINHOLE camera, poses, points with tracks; in
     metres, z up) and `city.json` (the parameters). The folder appears only when complete. Until then the
-    files are in `.NAME.partial` beside it, where the same call continues after an interruption, however it
-    came. The files depend on the parameters alone, not on processes or interruptions; on another
-    processor or with other library versions single pixels may differ in rounding.
+    files are in `.NAME.partial` beside it, and after an interruption the same call continues there. The
+    files depend on the parameters alone, not on processes or interruptions. On another processor or with
+    other library versions, single pixels may differ by rounding.
 
     Args:
         out: folder to create.
@@ -57,8 +57,8 @@ def generate_city(
         height: of the images, pixels.
         points_per_view: feature points looked for per image.
         oblique: fraction of oblique views, 0 to 1.
-        seed: of everything random.
-        processes: to render with; one for each core that this process may use if None.
+        seed: seed of all random numbers.
+        processes: number of processes that render; None: one for each core that this process may use.
         overwrite: replace a city with other parameters instead of raising.
         progress: called after each image.
 
@@ -68,7 +68,7 @@ def generate_city(
     Raises:
         ValueError: a parameter is out of range.
         FileExistsError: `out` holds something else, or another process is making it.
-        BrokenProcessPool: the system ended one of the processes, as for want of memory.
+        BrokenProcessPool: the system ended one of the processes, for example because memory ran out.
         ModuleNotFoundError: `embreex` is not installed.
     """
     options = CityOptions(extent, views, width, height, points_per_view, oblique, seed)
@@ -89,7 +89,7 @@ def generate_city(
 
 @contextlib.contextmanager
 def _begun(partial: Path, options: CityOptions) -> Iterator[None]:
-    """Hold the folder in which a city is made, emptied where it holds the beginning of another one."""
+    """Lock the folder in which a city is made; empty it if it holds the beginning of another city."""
     partial.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(partial / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
@@ -112,7 +112,7 @@ def _begun(partial: Path, options: CityOptions) -> Iterator[None]:
 
 
 def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
-    """Return whether `out` holds this very city; raise if it holds anything that must not be replaced."""
+    """Return whether `out` holds this city; raise if it holds files that must not be replaced."""
     if not out.exists():
         return False
     if not out.is_dir():
@@ -149,7 +149,7 @@ def _write(folder: Path, options: CityOptions, processes: int, progress: Progres
 
 
 def _replace(out: Path, made: Path) -> None:
-    """Put a new city in place of the one in `out`, leaving alone whatever else is there."""
+    """Replace the city in `out` by a new one; other files in it stay."""
     (out / MANIFEST).unlink()
     for name in ("images", "sparse"):
         shutil.rmtree(out / name, ignore_errors=True)

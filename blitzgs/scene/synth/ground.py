@@ -221,7 +221,7 @@ def _car_park(
     j: Ints,
     footprint: Floats,
 ) -> Floats:
-    """Asphalt with rows of stalls, lined up with the cars `city.py` parks there."""
+    """Asphalt with rows of stalls, aligned with the cars that `city.py` parks there."""
     a, b = plan.along_y, plan.along_x
     u = x - (a.centres[i] + a.halves[i] + SIDEWALK)
     v = y - (b.centres[j] + b.halves[j] + SIDEWALK)

@@ -40,7 +40,7 @@ def mix(a: Floats, b: Floats | tuple[float, float, float], amount: Floats) -> Fl
 
 
 def facade(p: Points, noise: Noise) -> Floats:
-    """Plaster, brick or banded concrete with a grid of windows; a shop front below where the look says so."""
+    """Plaster, brick or banded concrete with a grid of windows; with a shop front if the look has one."""
     seed, style, pitch, shop = p.numbers.T
     stains = noise.layers(p.u + 7 * seed, p.v, p.footprint, (9.0, 0.05), (2.0, 0.04), (0.5, 0.035))
     streaks = noise((p.u + seed) / 0.7, p.v / 6) * resolved(0.7, p.footprint)
@@ -80,7 +80,7 @@ def facade(p: Points, noise: Noise) -> Floats:
 
 
 def _panes(p: Points, column: Floats, row: Floats, du: Floats, dv: Floats, shop: Bools) -> Floats:
-    """Return what is seen in the windows: dark rooms, curtains, displays, glazing bars."""
+    """Return the colours of the windows: dark rooms, curtains, displays, glazing bars."""
     seed = p.numbers[:, 0]
     chance = cell_random(column, row, seed)
     room = (
@@ -184,5 +184,5 @@ def leaves(p: Points, noise: Noise) -> Floats:
 
 
 def paint(p: Points, noise: Noise) -> Floats:
-    """Car paint: the colour, with the bright sky on what faces up."""
+    """Car paint: the colour, with the bright sky on surfaces that face up."""
     return mix(p.color, (0.6, 0.65, 0.7), (0.12 * np.clip(p.normal[:, 2], 0, 1)).astype(np.float32))

@@ -50,7 +50,7 @@ class Noise:
         """Return a sum of bands (wavelength in metres, amplitude), each faded out where it is unresolved."""
         total = np.zeros_like(x)
         for index, (wavelength, amplitude) in enumerate(bands):
-            # Turned by another angle each, so that the bands' lattices do not line up.
+            # Each band is turned by another angle, so that their lattices do not line up.
             c, s = np.cos(0.6 + 1.9 * index) / wavelength, np.sin(0.6 + 1.9 * index) / wavelength
             band = self(np.float32(c) * x - np.float32(s) * y, np.float32(s) * x + np.float32(c) * y)
             total += np.float32(amplitude) * resolved(wavelength, footprint) * band
@@ -58,7 +58,7 @@ class Noise:
 
 
 def resolved(size: float, footprint: Floats) -> Floats:
-    """Return how much of a pattern of that size (metres) survives sampling: 0 (none) to 1 (all), [R]."""
+    """Return the share of a pattern of that size (metres) that survives sampling: 0 to 1, [R]."""
     return np.clip(np.float32(1.6) - np.float32(1.6 / size) * footprint, 0, 1)
 
 

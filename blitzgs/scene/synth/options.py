@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to generate: the parameters of a city and the presets the command line offers."""
+"""The parameters of a city, and the presets of the command line."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class CityOptions:
                 raise ValueError(f"synthetic city: {name} must be between {low} and {high}, got {value}")
 
     def manifest(self) -> dict[str, float | int]:
-        """Return what decides the content of the files, for the manifest that makes a city reusable."""
+        """Return the parameters that decide the files' content, for a city's manifest."""
         return {"format_version": FORMAT_VERSION, **asdict(self)}
 
 
 PRESETS = {
-    # Made in well under a minute on two cores: the default scene of `make demo`.
+    # Takes well under a minute on two cores; the default scene of `make demo`.
     "demo": CityOptions(),
-    # A quarter of a square kilometre in as many views as a survey of it has.
+    # A quarter of a square kilometre in as many views as an aerial survey would take.
     "town": CityOptions(extent=500.0, views=400, width=1368, height=912, points_per_view=1000),
     # More than two square kilometres, with the views and the image size of the usual large captures.
     "city": CityOptions(extent=1600.0, views=2048, width=1368, height=912, points_per_view=1200),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Takes the photographs of a city, those that an interrupted generation has left excepted."""
+"""Takes the photographs of a city, except those that an interrupted generation has finished."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def take_photographs(
 ) -> list[Corners]:
     """Write the photographs of all views and return the corners found in each.
 
-    A photograph that is there already, whole and with its corners beside it, is not taken again: it is read
-    once and compared with the checksum kept with the corners.
+    A photograph that exists, is whole and has its corners beside it is not taken again. It is read once and
+    compared with the checksum that is kept with the corners.
 
     Args:
-        folder: gets `images/` with the photographs and `corners/` with what continues an interrupted call.
-        city: to photograph.
-        views: from where.
-        processes: to share the views among.
+        folder: folder for `images/` and for `corners/`, from which an interrupted call continues.
+        city: the city to photograph.
+        views: the cameras.
+        processes: number of processes that share the views.
         progress: called after each view.
     """
     for name in (IMAGES, CORNERS):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of the city: gently bent streets and what each block between them is used for.
+"""The plan of the city: gently bent streets, and the use of each block between them.
 
 Everything is laid out in straight *plan* coordinates (metres, x east, y north) and bent into the world last,
 so that blocks stay rectangles for the builders while the streets the cameras see are curved.
@@ -28,7 +28,7 @@ class Streets:
 
     centres: Floats  # [S]
     halves: Floats  # [S]
-    main: Bools  # [S] wide ones, which go on beyond the city
+    main: Bools  # [S] whether a street is wide; wide streets go on beyond the city
 
     def nearest(self, coordinate: Floats) -> tuple[Floats, Ints]:
         """Return signed distances [R] to the nearest centre line and its index [R]."""

@@ -14,7 +14,7 @@ import cv2
 
 T = TypeVar("T")
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
-_task: Callable[[int], Any]  # what the forked processes do; they find it in the memory they share
+_task: Callable[[int], Any]  # the task of the forked processes, which share this memory
 
 
 def each(task: Callable[[int], T], count: int, processes: int) -> Iterator[T]:
@@ -24,15 +24,15 @@ def each(task: Callable[[int], T], count: int, processes: int) -> Iterator[T]:
     are sent. They end with this process, however it ends.
 
     Args:
-        task: called in another process, unless there is one alone.
-        count: of the calls.
-        processes: to share the calls among.
+        task: called in other processes, or in this one if there is only one.
+        count: number of calls.
+        processes: number of processes that share the calls.
 
     Raises:
-        BrokenProcessPool: a process was killed, as for want of memory.
+        BrokenProcessPool: a process was killed, for example because memory ran out.
     """
     cv_threads = cv2.getNumThreads()
-    # Every core has a call of its own; and a forked process could not end OpenCV's threads, nor use them.
+    # Every core runs a call of its own, and a forked process can neither use nor end OpenCV's threads.
     cv2.setNumThreads(1)
     try:
         if processes == 1:
@@ -51,7 +51,7 @@ def _forked(task: Callable[[int], T], count: int, processes: int) -> Iterator[T]
         try:
             yield from pool.map(_call, range(count))
         except BaseException:
-            pool.shutdown(cancel_futures=True)  # or leaving the pool would first make every call
+            pool.shutdown(cancel_futures=True)  # otherwise leaving the pool would first make every call
             raise
 
 

@@ -20,7 +20,7 @@ class Hits:
 
 
 class RayCaster:
-    """A triangle mesh one can shoot rays at, from several threads at once."""
+    """A triangle mesh that several threads may cast rays at."""
 
     def __init__(self, triangles: Floats) -> None:
         """Build the acceleration structure of `triangles` [T, 3, 3] (metres).

@@ -21,7 +21,7 @@ from blitzgs.scene.synth.raycast import Hits, RayCaster
 # Four samples per pixel on a rotated grid: every row and column of the 4 x 4 subpixels is met once.
 _SAMPLES: Final = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]], np.float32)
 _RAYS_AT_ONCE: Final = 400_000
-_OFFSET: Final = 0.02  # metres a shadow ray starts off its surface
+_OFFSET: Final = 0.02  # distance from the surface, in metres, at which a shadow ray starts
 
 _SUN: Final = np.array([-0.52, -0.42, 0.74], np.float32) / np.float32(np.linalg.norm([-0.52, -0.42, 0.74]))
 _SUNLIGHT: Final = np.array([2.35, 2.16, 1.82], np.float32)
@@ -43,7 +43,7 @@ _PAINTERS: Final = {
 
 
 class City:
-    """The city ready to be photographed; its methods may be called from several processes at once."""
+    """A city prepared for photographs; several processes may call its methods at once."""
 
     def __init__(self, plan: Plan) -> None:
         """Build the geometry and the skylight of `plan`: seconds for a square kilometre."""
@@ -75,8 +75,9 @@ class City:
     def _shade(self, view: View, pixels: Floats) -> Floats:
         """Return display values [P, 3] of P pixels from the positions of their samples [4 P, 2].
 
-        Samples of a pixel that meet the same surface are shaded once, at their mean and for the area they
-        stand for: materials filter themselves. Shadows have edges within a surface: every sample casts a ray.
+        Samples of a pixel that meet the same surface are shaded once, at their mean and for the area
+        that they cover, because materials filter their own patterns. Shadows have edges within a surface, so
+        every sample casts a shadow ray.
         """
         directions = view.directions(pixels)
         origins = np.ascontiguousarray(np.broadcast_to(view.centre.astype(np.float32), directions.shape))
@@ -96,7 +97,7 @@ class City:
         return mean
 
     def _share(self, surface: Ints, seen: Ints) -> tuple[Ints, Ints]:
-        """Return the samples [G] that stand for groups, and the group of each seen sample [S].
+        """Return a sample for each group, [G], and the group of each sample that meets a surface, [S].
 
         A group has the samples of a pixel that see the same surface; surfaces [4 P], -1 for none. The ground
         is one surface with hard edges between its parts, so its upper and lower two samples stay apart.
@@ -116,7 +117,7 @@ class City:
         return first, number[leaders]
 
     def _color(self, view: View, surface: Ints, samples: Floats, group: Ints) -> Floats:
-        """Return scene-linear RGB [G, 3] of what a view sees.
+        """Return the scene-linear RGB [G, 3] of groups of samples.
 
         Args:
             view: the camera.
@@ -130,7 +131,9 @@ class City:
         direction = position - view.centre.astype(np.float32)
         distance = np.sqrt(dot(direction, direction))
         direction /= distance[:, None]
-        pixel = distance * np.float32(0.5 / view.focal) * np.sqrt(count)  # a sample stands for half a pixel
+        pixel = (
+            distance * np.float32(0.5 / view.focal) * np.sqrt(count)
+        )  # a sample covers half a pixel's width
         material = self.mesh.material[surface]
         normal = self.mesh.normal[surface]
         round_ = np.flatnonzero(material == mesh.LEAVES)
@@ -153,7 +156,7 @@ class City:
         return color
 
     def _ruffle(self, position: Floats, footprint: Floats) -> Floats:
-        """Return what to add to the smooth normals of foliage [R, 3], so that crowns look like leaves."""
+        """Return offsets for the smooth normals of foliage [R, 3], which make crowns look like leaves."""
         x, y, z = position.T
         bands = ((1.1, 0.30), (0.45, 0.30))
         turns = [
@@ -200,7 +203,7 @@ class City:
         facing = np.where(material == mesh.LEAVES, 0.75 * facing + 0.25, facing)
         towards = np.flatnonzero((facing > 0)[group])
         lit = group[towards]
-        # Foliage is coarser than its mesh: its rays start further out, or each crown would shade itself.
+        # Rays of foliage start further out; otherwise each crown would shade itself.
         lift = np.where(material == mesh.LEAVES, np.float32(0.35), np.float32(_OFFSET))[:, None] * normal
         origins = samples[towards] + lift[lit]
         rays = np.ascontiguousarray(np.broadcast_to(_SUN, origins.shape))
@@ -209,7 +212,7 @@ class City:
         return sunny
 
     def _light(self, position: Floats, normal: Floats, sunny: Floats) -> Floats:
-        """Return the irradiance [G, 3]: sun where no shadow falls, sky by openness, light from the ground."""
+        """Return the irradiance [G, 3]: sun outside shadows, sky by openness, light from the ground."""
         openness = self._openness(position + np.float32(1.5) * normal)
         sky = openness * (0.55 + 0.45 * normal[:, 2])
         bounce = (0.5 - 0.5 * normal[:, 2]) * (0.4 + 0.6 * openness)
@@ -227,7 +230,7 @@ class City:
         cosine = np.clip(-dot(d, n), 0, 1)
         fresnel = 0.08 + 0.92 * (1 - cosine) ** 5
         mirrored = d + 2 * cosine[:, None] * n
-        # A mirrored ray that goes down meets other buildings, not sky.
+        # A mirrored ray that points down meets other buildings.
         seen = np.where(mirrored[:, 2:] > 0, self._sky(mirrored), np.float32(0.22))
         glass = albedo[index].max(1) < 0.45
         lit[index] += (fresnel * glass)[:, None] * (seen - lit[index])

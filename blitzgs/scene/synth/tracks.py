@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What structure from motion would find: corners matched over views, triangulated with plausible errors.
+"""Imitates structure from motion: matches corners over views and triangulates them with plausible errors.
 
 Corners are detected in the photographs, placed on the surface by a ray, and tracked into every view that
-really sees them: projected inside, not hidden (a ray), and not from too different an angle. Observations are
-off by a fraction of a pixel, and a point's error is what triangulating such observations gives: it grows with
-distance squared over baseline along the line of sight. A few points are plain wrong.
+sees them: the corner projects into the image, a ray finds nothing in front of it, and the angle differs
+little. Observations are off by a fraction of a pixel. A point has the error that triangulating such
+observations gives; along the line of sight it grows with distance squared over baseline. A few points
+are off by metres.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from blitzgs.scene.synth.render import City
 PIXEL_NOISE: Final = 0.35  # standard deviation of an observation, pixels
 _MIN_TRACK: Final = 3
 _OUTLIERS: Final = 0.004  # fraction of points off by metres
-_MISSED: Final = 0.25  # fraction of the possible observations a matcher does not find
+_MISSED: Final = 0.25  # fraction of the possible observations that a matcher does not find
 _SAME_PLACE: Final = 0.0015  # relative depth difference below which a ray reached the point
 _BORDER: Final = 2.0  # pixels: corners nearer to the edge of the image are not found
 
@@ -65,7 +66,7 @@ def find_corners(city: City, view: View, image: Bytes, count: int, seed: int) ->
     directions = view.directions(pixels)
     hits = city.hit(view, pixels)
     on_city = hits.triangle >= 0
-    # Leaves move in the wind and look different from everywhere: few of their corners survive matching.
+    # Leaves move in the wind and look different from each view, so few of their corners are matched.
     leaves = city.mesh.material[city.mesh.surface[hits.triangle]] == LEAVES
     on_city &= ~leaves | (rng.random(len(pixels)) < 0.3)
     pixels, directions = pixels[on_city], directions[on_city]
@@ -86,11 +87,11 @@ def track(city: City, views: list[View], corners: list[Corners], seed: int, run:
     """Return the cloud of all corners seen in three views or more.
 
     Args:
-        city: for the rays that tell what is hidden.
+        city: casts the rays that find hidden corners.
         views: V cameras.
-        corners: those found in each of them.
+        corners: the corners found in each view.
         seed: of the noise.
-        run: applies a function of a view index to all of them; may do so concurrently, in order.
+        run: applies a function to all view indices and yields the results in order; may run concurrently.
     """
     positions = np.concatenate([c.positions for c in corners])
     directions = np.concatenate([c.directions for c in corners])
@@ -130,7 +131,7 @@ def track(city: City, views: list[View], corners: list[Corners], seed: int, run:
 
 
 def _ball(points: Doubles) -> Doubles:
-    """Return centre and radius [4] of a ball around points [N, 3]; the radius of none is -inf."""
+    """Return centre and radius [4] of a ball around points [N, 3]; without points the radius is -inf."""
     if len(points) == 0:
         return np.array([0, 0, 0, -np.inf])
     centre = (points.min(0) + points.max(0)) / 2
