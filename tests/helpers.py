@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small scenes, and error measures that cannot pass by accident (tests/test_helpers.py tests them)."""
+"""Small scenes, and error measures that fail for NaN and wrong shapes (tests/test_helpers.py tests them)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Scene:
 
 
 def rasterize_scene(scene: Scene, **options):
-    """Call `blitzgs.rasterization` for a scene; options override what it says."""
+    """Call `blitzgs.rasterization` for a scene; options override the scene's."""
     return blitzgs.rasterization(*scene.arguments(), **{"sh_degree": scene.sh_degree, **options})
 
 

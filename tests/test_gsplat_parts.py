@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's own parts that need no GPU, around our renderer: its strategies, and its projection in torch."""
+"""Parts of gsplat that need no GPU work with our renderer: its strategies, and its projection in torch."""
 
 import math
 

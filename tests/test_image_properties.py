@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold for every image, whatever its values: symmetries, limits and special cases."""
+"""Properties of every image: symmetries, limits and special cases."""
 
 import math
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the CUDA kernels' bits and order rest on: compiler flags, and a wait at the start of kernels."""
+"""Sources of the CUDA kernels have the required compiler flags, and kernels wait at their start."""
 
 import json
 import re
@@ -154,7 +154,7 @@ def test_kernels_that_are_launched_early_wait_for_the_one_in_front():
 
 @pytest.mark.slow
 def test_compiled_kernels_wait_before_they_touch_memory():
-    """Of what the compiler made: the wait comes before the first access to global memory."""
+    """In the compiled code, the wait comes before the first access to global memory."""
     if shutil.which("cuobjdump") is None or not LIBRARY.exists():
         pytest.skip("needs the CUDA library and cuobjdump")
     listing = subprocess.run(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A `LazyDict` is a dict to everyone who reads it, and computes what is read, once."""
+"""A `LazyDict` reads like a dict and computes each value once, when it is read."""
 
 import copy
 import json

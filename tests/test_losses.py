@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs.l1_ssim` is the mean of `photometric_loss`, which its own tests hold against the textbook."""
+"""`blitzgs.l1_ssim` is the mean of `photometric_loss`, which has tests of its own."""
 
 import pytest
 import torch

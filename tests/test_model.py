@@ -76,7 +76,7 @@ def test_empty_table():
 
 
 class LoopbackRanks:
-    """Two ranks on one process: what is sent to rank 1 is dropped, what comes from rank 1 is fixed."""
+    """Two ranks in one process: data sent to rank 1 are dropped, and data from rank 1 are fixed."""
 
     world_size = 2
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No name of an image makes a file land outside its folder, on an input or on another image's file."""
+"""No image name makes a file land outside its folder, or replace an input or another image's file."""
 
 import os
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `blitzgs` offers is there after `import blitzgs` alone, which itself loads no kernels."""
+"""The public names of `blitzgs` exist after `import blitzgs`, which loads no kernels."""
 
 import subprocess
 import sys

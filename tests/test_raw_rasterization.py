@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs.raw_rasterization` is `blitzgs.rasterization` of activated parameters, for what is visible."""
+"""`blitzgs.raw_rasterization` equals `blitzgs.rasterization` of activated parameters."""
 
 import pytest
 import torch
@@ -108,7 +108,7 @@ def test_nothing_visible_is_an_empty_image(device):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("in_one", [True, False])
 def test_lazy_steps_are_those_of_dense_adam(backend, in_one):
-    """Views in turn, so that most rows are behind when they are next seen."""
+    """Views take turns, so most rows have pending steps when they are next seen."""
     device, dtype = backend
     scene = spread(random_scene(n=60, cameras=6, width=20, height=16, dtype=dtype, device=device))
     dense, lazy = raw_parameters(scene), raw_parameters(scene)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs.rasterization` against the float64 reference: images, gradients, modes."""
+"""`blitzgs.rasterization` agrees with the float64 reference: images, gradients, modes."""
 
 import pytest
 import torch
@@ -94,7 +94,7 @@ def test_random_scenes_against_the_reference(seed, n, scale, degree, width, heig
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_call_does_not_depend_on_those_before(device):
-    """What calls before needed decides how much room the next one's rows get first."""
+    """The sizes of earlier calls decide the next call's first capacity, but not its results."""
     few, many = (random_scene(n=n, width=33, height=17, device=device).leaves() for n in (5, 3000))
 
     def render(scene):

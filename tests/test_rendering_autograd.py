@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What autograd, checkpointing and torch.compile may ask of `blitzgs.rasterization`."""
+"""`blitzgs.rasterization` under autograd, checkpointing and torch.compile."""
 
 from dataclasses import replace
 from functools import partial

@@ -82,7 +82,7 @@ def test_meta_read_late_is_differentiable_as_the_call_was():
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("packed", [False, True])
 def test_meta_lists_only_what_touches_a_tile(device, packed):
-    """Not Gaussians whose colour is not finite, for which there is room in the lists."""
+    """The lists of meta leave out Gaussians whose colour is not finite."""
     scene = random_scene(n=90, cameras=2, width=50, height=37, device=device)
     scene.colors[::3, 0] = float("nan")
     _, _, meta = rasterize_scene(scene, packed=packed)

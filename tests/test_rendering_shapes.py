@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batches, any number of views, colours per view, covariances; what is refused."""
+"""Batches, any number of views, colours per view and covariances work; wrong shapes are refused."""
 
 import enum
 from dataclasses import replace

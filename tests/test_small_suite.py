@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of the small suite is kept up by hand: its tests exist, and kernels are told apart."""
+"""The list of the small suite names existing tests, and kernels of one name are distinguished."""
 
 import subprocess
 import sys

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measure of popping: levels that are cut off jump, levels that fade do less, one level does not."""
+"""The measure of popping: levels that are cut off pop, levels that fade pop less, a single level does not."""
 
 import sys
 from pathlib import Path

@@ -147,7 +147,7 @@ def test_the_plot_is_drawn(tmp_path):
 
 
 def test_relocation_is_equation_9():
-    """Against the double sum of arXiv 2404.09591 in Python's integers and floats."""
+    """The weights equal the double sum of arXiv 2404.09591, computed with Python's integers and floats."""
     g = torch.Generator().manual_seed(0)
     opacities = torch.rand(60, generator=g) * 0.98 + 0.01
     scales = torch.rand(60, 3, generator=g) + 0.1

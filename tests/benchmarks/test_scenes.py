@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark inputs are what they claim to be."""
+"""The benchmark inputs have the properties that their docstrings state."""
 
 import importlib.util
 import sys

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training benchmark runs a training, and reads a profile right."""
+"""The training benchmark runs a training and reads a profile correctly."""
 
 import json
 import sys

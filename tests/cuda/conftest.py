@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything here needs a GPU."""
+"""All tests of this folder need a GPU."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which code the library runs: a test build takes that of older GPUs and larger scenes (docs/testing.md)."""
+"""The library runs the branches that it was built with (docs/testing.md)."""
 
 import ctypes
 

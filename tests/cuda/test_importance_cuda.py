@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contributions on CUDA: against the renderer's bits, the CPU in float64, and themselves."""
+"""Contributions on CUDA equal the renderer's bits, agree with the CPU in float64, and repeat."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def survey(scene, device="cuda", dtype=torch.float32, tile_size=16, begin=0, end
 
 
 def test_a_crowded_scene_has_the_bits_of_its_image():
-    """A splat's own channel: four splats an image."""
+    """Each chosen splat has its own channel, four splats per image."""
     scene = Scene(5000, width=170, height=110)
     splats, lists, grid, (weights, pixels) = survey(scene)
     count = len(splats[0])
@@ -68,7 +68,7 @@ def test_entries_after_the_last_splat_are_not_read():
 
 
 def test_a_splat_over_every_pixel_fits():
-    """The largest sums a tile can have: nothing carries over from one field to the next."""
+    """Even the largest sums that a tile can have do not overflow from one field into the next."""
     means2d = torch.tensor([[64.0, 64.0]] * 3, device="cuda")
     conics = torch.tensor([[1e-9, 0.0, 1e-9]] * 3, device="cuda")
     opacities = torch.tensor([1.0, 0.9, 0.95], device="cuda")

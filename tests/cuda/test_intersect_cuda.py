@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intersection on CUDA: the CPU's lists, in the exact order."""
+"""Intersection on CUDA gives the CPU's lists in the same order."""
 
 import pytest
 import torch
@@ -42,7 +42,7 @@ def test_lists_match_the_cpu(scene, tile_size, with_ids):
 
 @pytest.mark.parametrize("tiles", [(0, -1), (700, 2600)])
 def test_splats_of_every_shape(tiles):
-    """From a point to the whole image, needles and discs, upright and slanted."""
+    """Splats from a point to the whole image: needles and discs, upright and slanted."""
     g = torch.Generator().manual_seed(4)
     n, views, width, height = 3000, 2, 900, 700
     long = 10 ** (torch.rand(n, generator=g) * 3)  # pixels
@@ -99,7 +99,7 @@ def test_depths_of_every_kind(depths, with_ids, n, views):
 
 @pytest.mark.parametrize("tile_size", [8, 16, 64])
 def test_many_splats_and_entries(tile_size):
-    """Hundreds of blocks in every pass of the sorts."""
+    """Every pass of the sorts has hundreds of blocks."""
     g = torch.Generator().manual_seed(2)
     splats, ids = small_splats(1_000_000, torch.rand(1_000_000, generator=g), 2)
     require_same_lists(splats, (2, 200, 150, tile_size, 0, -1), ids)

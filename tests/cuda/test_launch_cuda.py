@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that are placed while the ones in front of them still end (csrc/common/cuda.cuh)."""
+"""Kernels that are launched while the kernel before them still ends (csrc/common/cuda.cuh)."""
 
 import torch
 from cuda_scenes import Scene, ops
@@ -10,7 +10,7 @@ SIZES = (3000, 40, 30_000, 700)
 
 
 class Calls:
-    """Lists, image, loss and gradients of some splats, without a word to the host in between."""
+    """Lists, image, loss and gradients of some splats, computed without a copy to the host in between."""
 
     def __init__(self, n: int) -> None:
         g = torch.Generator().manual_seed(n)
@@ -46,7 +46,7 @@ class Calls:
 
 
 def test_early_kernels_read_what_earlier_kernels_wrote():
-    """Queued behind a busy device, all launches overlap, and calls reuse one another's scratch memory."""
+    """The device is busy while calls are queued, so all launches overlap and calls reuse scratch memory."""
     calls = [Calls(n) for n in SIZES]
     expected = []
     for call in calls:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search for thresholds among very many items: CUDA against the CPU."""
+"""The search for thresholds among very many items gives the same result on CUDA and the CPU."""
 
 import pytest
 import torch

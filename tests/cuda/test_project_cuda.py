@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projection on CUDA against the CPU kernel."""
+"""Projection on CUDA agrees with the CPU kernel."""
 
 import pytest
 import torch

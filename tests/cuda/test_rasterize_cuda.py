@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rasterisation on CUDA against the CPU kernel in float64, on the same splats and lists."""
+"""Rasterisation on CUDA agrees with the CPU kernel in float64, for the same splats and lists."""
 
 import pytest
 import torch
@@ -157,7 +157,7 @@ def test_tile_ranges_are_the_image_bit_for_bit(scene):
 
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_gradients_of_some_of_the_composited_tiles(scene, deterministic):
-    """As in training on several ranks: the ring around the tiles is composited, but not differentiated."""
+    """As in training on several ranks, the halo around the tiles is composited but not differentiated."""
     job = Job(scene, 3, 16, 8, 100)
     exact, ours, decided = close_images(job)
     g = torch.Generator().manual_seed(8)
@@ -172,7 +172,7 @@ def test_gradients_of_some_of_the_composited_tiles(scene, deterministic):
 
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_entries_of_no_tile_name_any_splat(scene, deterministic):
-    """Lists may be longer than what the tiles have."""
+    """Lists may be longer than the number of entries that the tiles have."""
     job = Job(scene, 3)
     saved = job.forward("cuda")
     v = torch.randn_like(saved[0]), torch.randn_like(saved[1])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs.rasterization` on CUDA: every mode of the CPU, with the same results."""
+"""`blitzgs.rasterization` on CUDA has every mode of the CPU and gives the same results."""
 
 import pytest
 import torch

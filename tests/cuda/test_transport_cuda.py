@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats written to other ranks' memory, and their gradients read there: ranks take turns on one GPU."""
+"""Splats are written to other ranks' memory and gradients are read there; ranks take turns on one GPU."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ RANGES = [(0, 70), (60, 110), (100, 100), (100, TILES)]
 
 
 class Rank:
-    """One rank's Gaussians, and how many splats they make."""
+    """One rank's Gaussians and the number of their splats."""
 
     def __init__(self, number, n):
         scene = Scene(n, VIEWS, WIDTH, HEIGHT, seed=number)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The view level on a large table: what the GPU leaves out is what the CPU leaves out."""
+"""On a large table, GPU and CPU leave out the same rows of views."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ from tests.view.test_gate import GATE, bits, kept_by_definition, make_scene
 
 
 def gated(table, viewmats, gate, count):
-    """The views of the first `count` rows, of lists that have room for all."""
+    """Gate the first `count` rows of lists with a capacity for all rows; return their views."""
     device, capacity = table.device, len(table)
     active = ActiveRows(
         torch.arange(capacity, dtype=torch.int32, device=device),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rasterization(distributed=True)`: what ranks render together is what one renders alone."""
+"""`rasterization(distributed=True)`: several ranks render what one rank renders alone."""
 
 from dataclasses import replace
 
@@ -71,7 +71,7 @@ def test_ranks_render_what_one_renders(world_size, device):
 
 
 def require_whole(parts, options, world_size, device):
-    """What the ranks made together, with these options, is what one makes."""
+    """Check that several ranks and one rank give the same images and gradients with these options."""
     whole = whole_scene(world_size, options).leaves()
     backgrounds = torch.full((VIEWS * world_size, whole.colors.shape[-1]), 0.3)
     renders, alphas, meta = rasterize_scene(whole, backgrounds=backgrounds, **options)

@@ -147,7 +147,7 @@ def _work(ranks, hang):
 
 
 def test_a_rank_that_is_at_work_is_waited_for():
-    """Longer than the timeout, as long as it says what it does and shows signs of life."""
+    """A rank may work longer than the timeout if it reports what it does and sends signs of life."""
     first, second = run_ranks(_work, 2, False, timeout_seconds=3.0, limit=60)
     assert first == (2.0, ["rank 1 (writing to a slow disk)"]) and second == (2.0, [])
     with pytest.raises(RankError) as failure:

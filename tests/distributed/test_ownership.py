@@ -40,7 +40,7 @@ def test_extreme_costs():
 @pytest.mark.parametrize("n", [1, 127, 128, 129, 257, 1000])
 @pytest.mark.parametrize("share_of_zeros", [0.0, 0.5, 0.99])
 def test_each_bound_is_the_nearest_to_its_share(n, share_of_zeros):
-    """However the stretches that are summed first lie."""
+    """The result does not depend on which stretches are summed first."""
     rng = np.random.default_rng(n)
     for parts in range(1, 17):
         cost = (rng.integers(1, 9, n) * (rng.random(n) >= share_of_zeros)).astype(np.float32)
@@ -52,7 +52,7 @@ def test_each_bound_is_the_nearest_to_its_share(n, share_of_zeros):
 
 
 class TwoRanks(Ranks):
-    """Rank 0 of two, of which the other has nothing to add."""
+    """Rank 0 of two ranks; the other rank adds zeros."""
 
     def __init__(self):
         super().__init__(world_size=2)
@@ -66,7 +66,7 @@ SIZE, TILES = (64, 48), 12
 
 
 def visit(owners, costs):
-    """Record a batch: views and what each of their tiles costs."""
+    """Record a batch of views with the costs of their tiles."""
     work = torch.tensor(list(costs.values()), dtype=torch.int32).repeat_interleave(TILES)
     ranges = TileRanges((0, len(work), len(work)), len(costs), *SIZE)
     return owners.record(list(costs), work, ranges, torch.ones(len(costs), 1, 2, dtype=torch.float64))
@@ -92,7 +92,7 @@ def test_costs_are_used_two_batches_later():
 
 
 def test_batches_are_divided_without_waiting_for_the_device(monkeypatch):
-    """Seen or not, a view's borders follow from sums that the guard of the losses has read."""
+    """The borders of every view follow from sums that the guard of the losses has already read."""
     owners, queued, reads = TileOwners(TwoRanks()), [], []
     read = HostSum.read
 
@@ -109,7 +109,7 @@ def test_batches_are_divided_without_waiting_for_the_device(monkeypatch):
 
 
 def test_cost_memory_of_many_4k_views_is_small():
-    """Sums of whole batches are let go, and 4K views keep 16 KB each; borders stay as good."""
+    """Sums of whole batches are freed, and each 4K view keeps 16 KB; the borders stay equally good."""
     owners, alive, generator = TileOwners(TwoRanks()), [], torch.Generator().manual_seed(0)
     size, tiles = (3840, 2160), 240 * 135
     work = torch.randint(0, 3000, (40, tiles), generator=generator, dtype=torch.int32)
@@ -149,7 +149,7 @@ def test_pixel_rows_and_composited_tiles():
 @pytest.mark.parametrize("tile_size", [4, 8, 16])
 @pytest.mark.parametrize("bounds", [(0, 0, 1), (0.1, 0.35, 0.35, 0.7), (0.24, 0.25, 0.26, 0.5, 0.98, 1)])
 def test_composited_tiles_cover_the_halo_of_the_loss(tile_size, bounds):
-    """Every pixel within 10 of an owned one, of the same view; hardly more than that; none for no tiles."""
+    """Every pixel within 10 pixels of an owned one is composited, and few others; none without tiles."""
     n_views, width, height = 3, 71, 50
     per_view = -(-width // tile_size) * -(-height // tile_size)
     cuts = (0, *(round(n_views * per_view * at) for at in bounds), n_views * per_view)

@@ -32,14 +32,14 @@ INTERSECT = torch.ops.blitzgs.intersect
 
 
 class Host:
-    """What the ranks have in common."""
+    """The state that the ranks share."""
 
     def __init__(self, world_size):
         self.meeting = threading.Barrier(world_size, timeout=PATIENCE)
         self.slots = [None] * world_size
 
     def gather(self, rank, value):
-        """Every rank's value; collective."""
+        """Return every rank's value. Collective."""
         self.slots[rank] = value
         self.meeting.wait()
         values = list(self.slots)
@@ -48,7 +48,7 @@ class Host:
 
 
 class Memory:
-    """What `SharedMemory` is to a rank."""
+    """A stand-in for `SharedMemory` of one rank."""
 
     def __init__(self, host, rank):
         self.host, self.rank, self.generation, self.log = host, rank, 0, []
@@ -69,7 +69,7 @@ class Memory:
 
 
 class ThreadRanks(Ranks):
-    """The ranks as one of these threads has them."""
+    """A stand-in for `Ranks` of one thread."""
 
     def all_to_all(self, rows, sent, received):
         self.memory.log.append("all_to_all")
@@ -79,7 +79,7 @@ class ThreadRanks(Ranks):
 
 
 def _send(columns, masks, everyone, rank, buffers, capacity):
-    """Plays `send_splats_`."""
+    """Replaces `send_splats_`."""
     world_size = len(buffers)
     n_views = everyone.shape[1] - VIEW_TOTALS - 2 * world_size
     splats = everyone[:, VIEW_TOTALS + n_views :: 2].tolist()
@@ -101,20 +101,20 @@ def _send(columns, masks, everyone, rank, buffers, capacity):
 
 
 def _rasterize_into(*arguments):
-    """Plays `rasterize_fwd_packed_`."""
+    """Replaces `rasterize_fwd_packed_`."""
     *rest, table, n_splats = arguments
     table[: int(n_splats)] = 0
     return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_splats)[:6]
 
 
 def _intersect(*arguments):
-    """Plays `intersect` with too little room for entries, which a CPU refuses at once."""
+    """Replaces `intersect` for a capacity below the number of entries, which the CPU op refuses."""
     *splats, grid, _, n_splats, _ = arguments
     return INTERSECT(*splats, grid, -1, n_splats, True)
 
 
 class Event:
-    """Plays `torch.cuda.Event`."""
+    """Replaces `torch.cuda.Event`."""
 
     def record(self):
         pass
@@ -141,7 +141,7 @@ def without_gpu(monkeypatch):
 
 
 def _on_all(world_size, function):
-    """[function(ranks) of each rank], and what each did in the shared memory."""
+    """Return [function(ranks) of each rank] and the calls of each rank to the shared memory."""
     host = Host(world_size)
 
     def rank(number):
@@ -157,7 +157,7 @@ def _on_all(world_size, function):
 
 
 def _scene():
-    """A table, its views, and who owns which of its Gaussians at three ranks: the last has none."""
+    """Return a table, its views, and the owner of each Gaussian among three ranks; the last owns none."""
     table, views = random_gaussians(600), cameras(VIEWS)
     tiles = TileRanges((0, 1), VIEWS, views.width, views.height).tiles_per_view * VIEWS
     ranges = TileRanges((0, tiles // 5, tiles // 2, tiles), VIEWS, views.width, views.height, halo=LOSS_HALO)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The image does not depend on the number of ranks, bit for bit; losses and gradients only by rounding."""
+"""The image has the same bits for any number of ranks; losses and gradients differ by rounding only."""
 
 import functools
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats written to other GPUs' memory: what collectives carry too, and clear errors where it cannot be."""
+"""Peer memory delivers what collectives deliver; where it cannot be used, errors are clear."""
 
 import dataclasses
 import os
@@ -140,7 +140,7 @@ def test_returned_gradients_equal_the_tables(world_size, device):
 
 
 def _hidden(ranks):
-    """A rank composites what one rank would, where the colours of some splats are not finite."""
+    """Ranks composite what one rank would when the colours of some splats are not finite."""
     whole = random_gaussians(2000)
     whole["scales"].add_(1)
     whole["sh"][::5] = torch.nan

@@ -56,7 +56,7 @@ def sorted_table(folder):
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory):
-    """A run on one rank, and a folder with its checkpoint after 10 steps, where all others begin."""
+    """A run on one rank, and a folder with its checkpoint after 10 steps, from which all other runs begin."""
 
     @functools.cache
     def make(device):

@@ -62,7 +62,7 @@ def weight_of(splats):
 
 
 def gradients_of(splats, rank):
-    """Gradients that depend on a splat and the rank that had it."""
+    """Gradients that depend on the splat and on the rank that composited it."""
     w = weight_of(splats)[:, None] * (1 + rank)
     return [
         2 * w * splats.means2d, w.expand(-1, 3), 3 * w[:, 0] * splats.opacities**2, 2 * w * splats.colors
@@ -89,7 +89,7 @@ def _round_trip(ranks, half, capacity):
 
 
 def masks_by_lists(projected, world_size):
-    """Which ranks a splat has to reach, by what intersection lists for each."""
+    """Return the ranks that each splat must reach, from the lists of each rank's intersection."""
     masks, ranges = torch.zeros(len(projected.depths), dtype=torch.int64), ranges_for(world_size)
     for rank in range(world_size):
         begin, end = ranges.composited(rank)

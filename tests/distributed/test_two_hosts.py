@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two torchrun agents on one machine, as hosts that meet over the loopback: one is lost, and both resume."""
+"""Two torchrun agents on one machine act as two hosts; one is killed, and both resume."""
 
 import os
 import socket

@@ -22,11 +22,11 @@ class Splats:
         return Splats(*(t.to(dtype) for t in floats), self.camera_ids)
 
     def geometry(self):
-        """What `intersect` takes."""
+        """Return the arguments of `intersect`."""
         return self.means2d, self.conics, self.opacities, self.depths, self.camera_ids
 
     def values(self):
-        """What `rasterize` takes and differentiates."""
+        """Return the arguments that `rasterize` differentiates."""
         return self.means2d, self.conics, self.opacities, self.colors
 
 
@@ -96,7 +96,7 @@ def dense_composite(splats, width, height, n_cameras=1, backgrounds=None):
 
 
 def _drawn(alphas):
-    """Which splats, front to back, each pixel composites: bool [P, H, W]."""
+    """Return which splats, front to back, each pixel composites: bool [P, H, W]."""
     drawn = torch.zeros_like(alphas, dtype=torch.bool)
     rest, running = torch.ones_like(alphas[0]), torch.ones_like(alphas[0], dtype=torch.bool)
     for i, alpha in enumerate(alphas):
@@ -109,14 +109,14 @@ def _drawn(alphas):
 
 
 def near_a_cut(splats, width, height, margin=1e-5):
-    """Pixels [B, H, W] where some alpha is within a relative margin of 1/255: rounding may decide them."""
+    """Return the pixels [B, H, W] with an alpha so near to 1/255 that rounding may decide."""
     alphas = pixel_alphas(*(t.double() for t in splats.values()[:3]), width, height)
     close = ((alphas * 255 - 1).abs() < margin).any(0)
     return close[None]
 
 
 def with_capacity(column, capacity):
-    """A column of `capacity` splats that begins with these; what lies behind them would not go unnoticed."""
+    """Return a column of `capacity` splats that begins with these; the rest would spoil any result."""
     garbage = float("nan") if column.is_floating_point() else torch.iinfo(column.dtype).max - 3
     padded = column.new_full((capacity, *column.shape[1:]), garbage)
     padded[: len(column)] = column

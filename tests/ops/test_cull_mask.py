@@ -33,7 +33,7 @@ def test_every_bit_is_at_its_place_and_comes_back(n, words, device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [300, 1024])
 def test_a_table_s_mask_moves_with_its_rows(n, device):
-    """Beside a column of the same numbers that is no mask."""
+    """The table also has an ordinary column with the same numbers."""
     small = random_gaussians(n)
     table = type(small)({name: small[name].to(device) for name in small})
     mask = random_rows(n, 3, device)

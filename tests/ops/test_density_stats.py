@@ -78,7 +78,7 @@ def test_radii_keep_their_maximum_and_empty_steps_change_nothing(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_gradients_are_read_where_they_are(device):
-    """Those in the first columns of a table."""
+    """The gradients may be the first columns of a table."""
     visible, offsets, gradients, conics, _, _ = rows(device=device)
 
     def sums(v_means2d):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instrumented rasterisation: against the renderer bit for bit, and against the definition in float64."""
+"""The instrumented rasterisation has the renderer's bits and agrees with the definition in float64."""
 
 import pytest
 import torch

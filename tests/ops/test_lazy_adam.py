@@ -50,7 +50,7 @@ class State:
         )  # fmt: skip
 
     def moments_at(self, step):
-        """Both moments with the decay that they still owe at `step`, float64."""
+        """Return both moments with their pending decay up to `step`, float64."""
         gaps = (step - self.moment_step).double()
         return [
             [(m.double().flatten(1).T * beta**gaps).T.reshape(m.shape) if m.dim() > 1 else m * beta**gaps
@@ -185,7 +185,7 @@ def test_eps_is_exact_where_it_matters():
 
 
 def scattered_state(n, dtype, step, device="cpu"):
-    """Rows that stand at `step` with second moments of 1e-40 to 1 and any first moment, some of it zero."""
+    """Rows at `step` with second moments of 1e-40 to 1 and arbitrary first moments, some of them zero."""
     state = State(n, dtype, device)
     generator = torch.Generator().manual_seed(11)
     for m, v in zip(*state.moments(), strict=True):
@@ -200,7 +200,7 @@ def scattered_state(n, dtype, step, device="cpu"):
 
 
 def drift_one_by_one(state, lr_table, begin, end):
-    """What dense Adam subtracts from the parameters over zero gradients, float64."""
+    """Return what dense Adam subtracts from the parameters over steps without a gradient, float64."""
     rates = lr_table.double().cpu()
     drifts = []
     for c, (m, v) in enumerate(zip(*([y.double().cpu() for y in x] for x in state.moments()), strict=True)):
@@ -220,7 +220,7 @@ def drift_one_by_one(state, lr_table, begin, end):
 @pytest.mark.parametrize("begin", [1, 30, 150, 400, 2000])
 @pytest.mark.parametrize("gap", [1, 2, 40, 700])
 def test_float32_drift_of_any_second_moment(begin, gap, device):
-    """The rules (late) and the steps one by one (early) are exact to rounding wherever eps weighs."""
+    """Final rules (late) and explicit steps (early) are exact to rounding for every ratio to eps."""
     lr_table = learning_rates(4000).to(device)
     state = scattered_state(200, torch.float32, begin, device)
     for p in state.params:
@@ -235,7 +235,7 @@ def test_float32_drift_of_any_second_moment(begin, gap, device):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_catching_up_in_parts_is_catching_up_at_once(dtype):
-    """Moments stand still meanwhile; past the steps that matter nothing is left to do."""
+    """Moments do not change during a catch-up; long after their last step, rows no longer move."""
     lr_table = learning_rates(4000)
     begin, tolerance = 900, 3e-6 if dtype == torch.float32 else 1e-12
     once, parts = (scattered_state(50, dtype, begin) for _ in range(2))
@@ -272,7 +272,7 @@ def test_a_step_after_catching_up_equals_a_step_alone():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("gap", [-1, 0, 1, 5000])
 def test_final_rules_replace_many_pending_steps(gap, dtype):
-    """Around the gap from which the table holds, and far behind it."""
+    """Gaps around the first one for which the table is used, and much larger ones."""
     lr_table = learning_rates(9000)
     reach = explicit_steps(BETA1, BETA2, dtype)
     for begin in (1, 40, 900, 2000):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search for thresholds against sorting in Python's integers."""
+"""The search for thresholds equals sorting with Python's integers."""
 
 from fractions import Fraction
 
@@ -13,7 +13,7 @@ SHARE = 99, 100
 
 
 def by_sorting(weights, segments, ids, share):
-    """Return what is chosen, by descending weight and ascending id, as the definition says."""
+    """Return the chosen items by the definition: sorted by descending weight and ascending id."""
     chosen = [False] * len(weights)
     for segment in set(segments):
         mine = [i for i, s in enumerate(segments) if s == segment]
@@ -77,7 +77,7 @@ def test_largest_weights():
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("kind", ["many sizes", "ties", "zeros"])
 def test_sums_of_parts_add_up(device, kind):
-    """Three ranks, the last of them without items, add their sums up after every scan."""
+    """Three ranks, the last without items, add up their sums after every scan."""
     weights, segments, owners, ids = (t.to(device) for t in items(kind, 3))
     expected = by_sorting(weights.tolist(), segments.tolist(), ids[owners.long()].tolist(), SHARE)
     part = owners % 2

@@ -99,7 +99,7 @@ class Scene:
         )  # fmt: skip
 
     def pack(self, width):
-        """Put the gradients into one table, with something that is none of them behind."""
+        """Put the gradients into the first columns of one table; its other columns have other values."""
         parts = self.v.parts
         table = torch.full((len(parts[0]), width), 1e9).to(parts[0])
         table[:, :9] = torch.cat([v[:, None] if v.dim() == 1 else v for v in parts], 1)
@@ -109,7 +109,7 @@ class Scene:
             self.v = SplatGradients([table[:, :2], table[:, 2:5], table[:, 5], table[:, 6:9]])
 
     def spread(self):
-        """Replace the gradients by others, in tables of ranks amid what is of no use; return their sums."""
+        """Replace the gradients by random ones in the tables of several ranks; return their sums."""
         splats, starts, ranks = len(self.splats.camera_ids), [5, 0, 900, 1], 4
         masks = torch.randint(0, 2**ranks, (splats,), generator=self.seed) & ~2  # rank 1 had nothing
         alone = torch.rand(splats, generator=self.seed) < 0.6  # as most splats are
@@ -171,7 +171,7 @@ def test_equals_backward_and_step(device, sparse, n, k, degree, views):
     "n,k,degree,views", [(1, 16, 3, 1), (3000, 16, 3, 3), (700, 16, 2, 1), (700, 4, 1, 2), (700, 16, 0, 1)]
 )
 def test_gradients_are_read_where_they_are(device, width, n, k, degree, views):
-    """In the columns of a table: as from columns of their own."""
+    """Gradients in the columns of one table give the same result as separate tensors."""
     plain, other = (Scene(n, k, views, device, torch.float32) for _ in range(2))
     for scene in (plain, other):
         scene.degree = degree
@@ -190,7 +190,7 @@ def test_gradients_are_read_where_they_are(device, width, n, k, degree, views):
     ],
 )  # fmt: skip
 def test_gradients_are_read_from_the_tables_of_several_ranks(n, k, degree, views):
-    """Read where the ranks left them, some at several: as from columns of their sums."""
+    """Gradients in the tables of several ranks give the same result as tensors of their sums."""
     plain, other = (Scene(n, k, views, "cuda", torch.float32) for _ in range(2))
     for scene in (plain, other):
         scene.degree = degree
@@ -252,7 +252,7 @@ def test_errors_name_the_value():
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_regularisers_have_the_gradients_of_their_definitions(device):
-    """Without gradients of splats, and against autograd in float64."""
+    """Regularisers alone, without gradients of splats, agree with autograd in float64."""
     scene = Scene(800, 16, 3, device, torch.float32)
     scene.render(True)
     scene.v = SplatGradients([torch.zeros_like(part) for part in scene.v.parts])

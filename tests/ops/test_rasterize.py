@@ -152,7 +152,7 @@ def test_gradient_is_zero_where_alpha_is_clipped():
 
 
 def test_thousands_of_layers_stay_accurate():
-    """2300 faint layers over every pixel: as deep as a pixel can be before its transmittance runs out."""
+    """2300 faint layers cover every pixel, about as many as it takes to use up the transmittance."""
     splats = random_splats(2300, WIDTH, HEIGHT, smallest=300, largest=900, opacity=(0.0041, 0.0044))
     splats.means2d = (splats.means2d / 10 + 20).float()
     v_renders = torch.rand(1, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of a sparse gradient are taken as they are where each is there once, and summed where not."""
+"""Rows of a sparse gradient are used as they are if they are distinct, and summed otherwise."""
 
 import pytest
 import torch

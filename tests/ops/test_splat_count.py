@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns with room for more splats than there are, whose number is read on the device."""
+"""Ops take columns with more capacity than splats and read the number of splats on the device."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ def kept_by(outputs):
 
 
 class Columns:
-    """Splats, and the same at the start of columns with room for more."""
+    """Splats, and the same splats at the start of longer columns."""
 
     def __init__(self, n, capacity, device, channels=3, cameras=1):
         splats = random_splats(n, WIDTH, HEIGHT, channels=channels, cameras=cameras)
@@ -34,7 +34,7 @@ class Columns:
 
 
 def empty_room(device, number):
-    """Columns of 500 splats, none of which is there, and the number that says so."""
+    """Return columns with a capacity of 500 splats, none of them valid, and a given number of splats."""
     return Columns(0, 500, device).padded, torch.tensor([number], device=device)
 
 
@@ -89,7 +89,7 @@ def test_columns_with_zero_capacity(device):
 )  # fmt: skip
 @pytest.mark.parametrize("n", [1, 700])
 def test_images_and_gradients_ignore_entries_after_the_last_splat(n, channels, composited, owned, device):
-    """Backward has columns of the splats alone in either case."""
+    """The backward pass gets columns without spare capacity in both cases."""
     columns = Columns(n, 1500, device, channels)
     lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, *composited], -1)
     plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *composited], None)
@@ -117,7 +117,7 @@ def test_images_and_gradients_ignore_entries_after_the_last_splat(n, channels, c
 @pytest.mark.parametrize("tiles", [(0, -1), (3, 9)])
 @pytest.mark.parametrize(("n", "capacity"), [(700, 1500), (0, 900), (50_000, 60_000)])
 def test_a_table_of_gradients_is_zeroed_for_the_splats(n, capacity, tiles):
-    """Also where tiles are too few to write the zeros."""
+    """The table is zeroed even if there are too few tiles to write the zeros."""
     columns = Columns(n, capacity, "cuda")
     memory = torch.full((capacity + 100, SPLAT_GRADIENT), float("nan"), device="cuda")
     table = memory[40 : capacity + 60]

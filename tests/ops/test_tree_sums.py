@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trees against a walk in Python."""
+"""Sums over trees equal a walk in Python."""
 
 import math
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sums of an importance sweep against dense ones."""
+"""The sums of an importance sweep equal dense sums."""
 
 import pytest
 import torch

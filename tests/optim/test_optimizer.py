@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blitzgs.optim.LazyAdam` against `torch.optim.Adam`, which gets zeros where there is no gradient."""
+"""`blitzgs.optim.LazyAdam` equals `torch.optim.Adam`, which gets zeros for missing gradients."""
 
 import copy
 import io
@@ -157,7 +157,7 @@ def test_rows_are_added_kept_and_reordered(backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_state_is_that_of_adam(backend):
-    """It goes from one to the other and back; training continues as if nothing had happened."""
+    """The state is loaded into torch's Adam and back; training continues unchanged."""
     pair = Pair(backend)
     for _ in range(10):
         pair.step(0.2)
@@ -248,7 +248,7 @@ def test_wrong_use_is_refused():
 
 
 def test_rows_that_do_not_fit_change_nothing():
-    """Neither is a row lost by a mask that is too short, nor one parameter longer than the others."""
+    """A mask that is too short loses no row, and no parameter becomes longer than the others."""
     means, sh = torch.ones(4, 3, requires_grad=True), torch.ones(4, 16, 3, requires_grad=True)
     optimizer = LazyAdam([{"params": [means], "name": "means"}, {"params": [sh], "name": "sh"}])
     for length in (3, 5):

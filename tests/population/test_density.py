@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Density control against a row-by-row reimplementation."""
+"""Density control equals a row-by-row reimplementation."""
 
 import math
 

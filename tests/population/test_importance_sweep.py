@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sweep against brute force, and its bits over world sizes; the passes' draws against theory."""
+"""The sweep equals brute force, with the same bits at every world size; draws match the theory."""
 
 from fractions import Fraction
 
@@ -100,7 +100,7 @@ def test_sweep_is_the_definition(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_survey_equals_contributions(device):
-    """Up to the rounding of the activations; equal depths go by id here and by row there."""
+    """They agree up to rounding of the activations; one orders equal depths by id, the other by row."""
     table = population(Ranks(device=torch.device(device)))
     table.permute(table["id"].argsort())
     units, pixels, visible = dense_survey(table)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lineage: what is logged, that it always adds up, and that it says so when it does not."""
+"""Lineage: its log, its sums after any events, and its error when they do not match the population."""
 
 import os
 
@@ -102,7 +102,7 @@ def test_a_run_of_events_is_logged_row_by_row(tmp_path):
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_ledger_matches_the_log_after_random_events(data, tmp_path_factory):
-    """Births, deaths and checkpoints in any order: the log says who lives, and so does the ledger."""
+    """Births, deaths and checkpoints in any order: log and ledger match the live population."""
     folder = tmp_path_factory.mktemp("lineage")
     lineage, alive, next_id, step = Lineage(folder, Ranks(), 0, Ledger()), set(), 0, 0
     for what in data.draw(st.lists(st.sampled_from(["birth", "death", "save", "resume"]), max_size=12)):

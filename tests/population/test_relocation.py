@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relocation: the closed form against its double sum and by quadrature, and the event row by row."""
+"""Relocation: the closed form equals its double sum and a quadrature; the event is checked row by row."""
 
 import math
 from fractions import Fraction
@@ -46,7 +46,7 @@ def test_the_closed_form_is_the_paper_s_double_sum(copies):
 
 @pytest.mark.parametrize("copies", [2, 5, 30])
 def test_copies_together_look_like_the_original(copies):
-    """At the centre, and integrated along a line through it."""
+    """The opacity agrees at the centre, and integrated along a line through the centre."""
     opacity, x = torch.tensor([0.8], dtype=torch.float64), torch.linspace(-12, 12, 20001, dtype=torch.float64)
     logits, logarithms = shared(opacity.logit(), torch.zeros(1, 3).double(), torch.tensor([copies]))
     new, scale = logits.sigmoid(), logarithms.exp()[0, 0]
@@ -149,7 +149,7 @@ def _relocate_a_share(ranks, growth):
 
 
 class _Log:
-    """Takes what a lineage is told."""
+    """Records the calls to a lineage."""
 
     def __init__(self):
         self.births, self.deaths = [], []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Floors of scales: against one Gaussian and view at a time, and kept in whole runs."""
+"""Floors of scales equal those of one Gaussian and view at a time, and whole runs keep to them."""
 
 import math
 
@@ -64,7 +64,7 @@ def test_scales_of_the_given_rows_rise_to_the_floor():
 
 @pytest.mark.parametrize("batch_size", [1, 2])
 def test_no_scale_falls_below_the_floor_in_a_run(tmp_path, batch_size):
-    """Of the Gaussians that the last step saw; others may owe steps that shrink them a little."""
+    """This holds for Gaussians that the last step saw; others may have pending steps that shrink them."""
     options = ("model.scale_floor=0.447", f"schedule.batch_size={batch_size}", "optimiser.sparse=true")
     trainer = Trainer(tiny_config(*options), *tiny_scene(), tmp_path, Ranks())
     seen = {}

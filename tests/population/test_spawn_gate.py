@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spawn gate: its trees against XGBoost, its veto against sorting, its fit on lives that can be told."""
+"""The spawn gate: trees equal XGBoost's, the veto equals sorting, and a fit predicts predictable lives."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ SCHEDULE = {"schedule.iterations": 100}
 
 
 def spawns(scene, count=4000, seed=0, schedule=SCHEDULE):
-    """Lives decided by two features together, neither of which tells by itself, and by chance."""
+    """Lives that depend on two features together and on chance; neither feature alone predicts them."""
     g = np.random.default_rng(seed)
     features = g.random((count, len(FEATURES)), dtype=np.float32)
     features[:, 7] = features[:, 7] > 0.5

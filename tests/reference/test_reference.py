@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference against a scalar loop over pixels and splats, and against closed forms."""
+"""The reference equals a scalar loop over pixels and splats, and closed forms."""
 
 import math
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small captures on disk, and the real ones where they are."""
+"""Small captures on disk, and the folder of the real captures."""
 
 import os
 from pathlib import Path

@@ -426,7 +426,7 @@ def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path):
 
 
 def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
-    """Joined to the folder of masks as they are, absolute names and `..` lead to the photographs."""
+    """Absolute names and `..`, joined to the folder of masks, would lead to the photographs."""
     (tmp_path / "photos").mkdir()
     (tmp_path / "capture" / "masks").mkdir(parents=True)
     write_image(tmp_path / "photos" / "a.png", smooth_image(64, 48))

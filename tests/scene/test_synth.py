@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The synthetic city: the same by seed, geometrically right, with something to see in every image."""
+"""The synthetic city: a seed gives the same files, geometry is right, and no image is empty."""
 
 import argparse
 import hashlib
@@ -160,7 +160,7 @@ def test_the_command_generates_a_city(city, capsys):
 
 
 def test_a_killed_generation_continues_and_redoes_torn_photographs(city, tmp_path):
-    """A generation is killed by the system, one of its pictures is torn, one of its records is lost."""
+    """The system kills a generation; a picture of it is torn, and a record is lost."""
     out = tmp_path / "city"
     script = (
         "import os, sys, signal\nfrom blitzgs.scene.synth import generate_city\n"

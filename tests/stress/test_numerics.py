@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs at the ends of every range: finite images and gradients, and the reference's image."""
+"""Inputs at the ends of every range give finite images and gradients, and the reference's image."""
 
 import math
 
@@ -131,7 +131,7 @@ def far_from_the_origin() -> Scene:
 
 
 def one_tile(n: int) -> Scene:
-    """Every Gaussian covers the whole image; the depths are apart by more than rounding, in any order."""
+    """Every Gaussian covers the whole image; depths differ by more than rounding, in random order."""
     scene = facing_scene(n, 4, 4, focal=40.0)
     order = torch.randperm(n, generator=torch.Generator().manual_seed(9))
     z = 2.0 * 100.0 ** (order.double() / n)
@@ -142,7 +142,7 @@ def one_tile(n: int) -> Scene:
 
 
 def deep(n: int) -> Scene:
-    """Each layer takes little: two thousand are composited before a pixel ends."""
+    """Each layer is faint, so two thousand are composited before a pixel ends."""
     scene = facing_scene(n, 3, 2)
     z = torch.linspace(2.0, 1e3, n, dtype=torch.float64)
     scene.means = torch.stack([torch.zeros_like(z), torch.zeros_like(z), z], dim=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The adaptive schedule: what it measures, where it places its times, and that a run can be repeated."""
+"""The adaptive schedule: its measurements, the times that it places, and repeating a run with them."""
 
 import itertools
 import json

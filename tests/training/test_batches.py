@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batches hold the photographs, masks and views of their cameras, though their memory is used again."""
+"""Batches have the photographs, masks and views of their cameras, although their memory is reused."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs that are fitted into a wall time, by clocks that the tests turn."""
+"""Runs are fitted into a wall time; the tests set the clocks."""
 
 import json
 import math

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures mean what they say: masked views, training views, and models without Gaussians."""
+"""Figures of masked views, of training views and of models without Gaussians."""
 
 import json
 

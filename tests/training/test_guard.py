@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Non-finite values are found, and the message names the step and the op."""
+"""Non-finite values stop a run, and the message names the step and the op."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The importance passes in a training: what they keep, what they leave behind, and their ablations."""
+"""The importance passes in a training: the Gaussians that they keep, their log, and their ablations."""
 
 import json
 import os

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever ends or disturbs a run, its model is kept; what a resume takes is sound and named."""
+"""Runs keep their model when they are interrupted or disturbed, and resume from a valid checkpoint."""
 
 import errno
 import json

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Very many steps of a trainer: the lazy optimiser stays with dense Adam, and memory does not grow.
+"""In very many steps of a trainer, the lazy optimiser stays with dense Adam and memory does not grow.
 
 torch's Adam goes along with the trainer, in float64: it is given the gradients of every step, zeros for the
 rows that the step does not show, and moves all rows. The trainer leaves most rows alone for a hundred steps

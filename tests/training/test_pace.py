@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Schedules whose pace changes on the way."""
+"""Schedules whose pace changes during a run."""
 
 import itertools
 import math

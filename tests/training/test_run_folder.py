@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs are read, rendered and exported without trainer, capture or photographs."""
+"""Finished runs are read, rendered and exported without trainer, capture or photographs."""
 
 import dataclasses
 import json

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training step allocates follows what its views see, not the table."""
+"""The memory of a training step follows the number of visible Gaussians, not the size of the table."""
 
 import numpy as np
 import pytest

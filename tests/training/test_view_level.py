@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The LOD gate and the cull mask in a training, and in what evaluates and renders its model."""
+"""The LOD gate and the cull mask in a training, in evaluations and in rendering."""
 
 import dataclasses
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The LOD gate and the cull mask against float64 by brute force; what they leave trains and renders alike."""
+"""LOD gate and cull mask agree with brute force in float64, and do not change training or rendering."""
 
 import math
 from dataclasses import replace
@@ -65,7 +65,7 @@ def bits(views, count):
 
 
 def some_rows(table, views, seed=0):
-    """Lists as of an active set that has room for more, and views at random."""
+    """Lists of an active set with spare capacity, and random views."""
     generator = torch.Generator().manual_seed(seed)
     ids = torch.randperm(len(table), generator=generator)[: len(table) // 2].sort().values
     allowed = torch.randint(0, 1 << views, (len(ids),), generator=generator)

@@ -124,7 +124,7 @@ def _blocks(residence, views, view):
 
 
 def test_a_step_waits_for_blocks_that_were_not_prefetched():
-    """The pool has room for each step alone: nothing of the next one replaces what the present one needs."""
+    """The pool fits one step at a time; blocks of the next step do not replace blocks of the present one."""
     _, residence = make_residence(slots=60)
     views = cameras(4)
     counts = [int((_blocks(residence, views, v) != 0).sum()) for v in range(4)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Smooth levels against their definition in float64: weights, images and gradients."""
+"""Smooth levels agree with their definition in float64: weights, images and gradients."""
 
 import math
 from dataclasses import replace
@@ -85,7 +85,7 @@ def test_images_are_those_of_faded_opacities(device, antialiased):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_gate_before_the_projection_changes_nothing(device):
-    """Whatever it leaves out has faded away."""
+    """All Gaussians that it leaves out have faded away."""
     table = faint_scene(6000, device)
     viewmats, Ks = make_views(device=device)
     views = Views(viewmats, Ks, WIDTH, HEIGHT)
