@@ -27,12 +27,7 @@ def main() -> None:
     device, n = args.device, args.rows
     scene = aerial(n, device)
     raw = scene.raw()
-    zeros = torch.zeros(n, dtype=torch.int32, device=device)
-    table = GaussianTable.create(
-        {name: raw[name] for name in PARAMETERS if name != "sh"}
-        | {"sh": raw["sh"][:, :1].contiguous(), "last_step": zeros, "id": torch.arange(n, device=device)}
-        | {"parent": torch.full((n,), -1, device=device), "birth": zeros, "level": zeros.to(torch.uint8)}
-    )
+    table = GaussianTable.create(raw | {"sh": raw["sh"][:, :1].contiguous()})
     views = scene.viewmats[:1].repeat(args.views, 1, 1), scene.Ks[:1].repeat(args.views, 1, 1)
     schedule = schedule_table(torch.full((100, 6), 1e-3, device=device), 0.9, 0.999)
     sort = median_ms(lambda means: morton_order(means), [(table["means"],)], 3, 1)

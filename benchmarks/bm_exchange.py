@@ -134,22 +134,14 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
 
 def aerial_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
     """Return the `aerial` scene, the same on every rank of one kind of device."""
-    scene, count = aerial(args.gaussians, device, views=args.batch * args.batches), args.gaussians
-    bookkeeping = {
-        "last_step": torch.zeros(count, dtype=torch.int32),
-        "id": torch.arange(count),
-        "parent": torch.full((count,), -1),
-        "birth": torch.zeros(count, dtype=torch.int32),
-        "level": torch.zeros(count, dtype=torch.uint8),
-    }
-    columns = scene.raw() | {name: column.to(device) for name, column in bookkeeping.items()}
+    scene = aerial(args.gaussians, device, views=args.batch * args.batches)
     keys = list(range(len(scene.viewmats)))
     batches = [
         (keys[at], Views(scene.viewmats[at], scene.Ks[at], scene.width, scene.height))
         for at in (slice(first, first + args.batch) for first in keys[:: args.batch])
     ]
     options = RenderOptions(sh_degree=3, near_plane=0.1, far_plane=1e6)
-    return Inputs(GaussianTable.create(columns), options, batches, 500.0)
+    return Inputs(GaussianTable.create(scene.raw()), options, batches, 500.0)
 
 
 class Workload:

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from bm_importance import median_ms, table_of
+from bm_importance import median_ms
 from harness import make_parser, report
 from scenes import aerial
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.model import GaussianTable
 from blitzgs.population.candidates import FEATURES, Candidates, spawn_features
 from blitzgs.population.spawn_gate import GateInfo, RankVeto, SpawnGate, write_info
 
@@ -61,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--candidates", type=int, default=1_000_000)
     parser.add_argument("--trees", type=int, default=200)
     options = parser.parse_args(arguments)
-    table = table_of(aerial(options.candidates, options.device))
+    table = GaussianTable.create(aerial(options.candidates, options.device).raw())
     ranks, rows = Ranks(device=table.device), torch.arange(options.candidates, device=options.device)
     is_split = rows % 3 == 0
     with tempfile.TemporaryDirectory() as folder:

@@ -32,23 +32,6 @@ from blitzgs.survey import survey
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e6)
 
 
-def table_of(scene: BenchmarkScene) -> GaussianTable:
-    """Return the scene's Gaussians as a trainer has them."""
-    raw = scene.raw()
-    count, device = len(raw["means"]), raw["means"].device
-    rows = {name: raw[name].contiguous() for name in ("means", "quats", "scales", "opacities", "sh")}
-    return GaussianTable.create(
-        rows
-        | {
-            "last_step": torch.zeros(count, dtype=torch.int32, device=device),
-            "id": torch.arange(count, device=device),
-            "parent": torch.full((count,), -1, device=device),
-            "birth": torch.zeros(count, dtype=torch.int32, device=device),
-            "level": torch.zeros(count, dtype=torch.uint8, device=device),
-        }
-    )
-
-
 def batches_of(scene: BenchmarkScene, length: int) -> list[ViewBatch]:
     """Return the scene's views, `length` at a time."""
     count = len(scene.viewmats)
@@ -85,7 +68,7 @@ def _wait(device: torch.device) -> None:
 
 def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, Any]]:
     """Time renders, survey and sweep of all views, and the compositing of the first batch."""
-    table, batches = table_of(scene), batches_of(scene, length)
+    table, batches = GaussianTable.create(scene.raw()), batches_of(scene, length)
     ranks, transport = Ranks(device=table.device), LocalTransport()
     n_views = len(scene.viewmats)
 

@@ -16,7 +16,6 @@ import time
 from pathlib import Path
 
 import torch
-from bm_importance import table_of
 from harness import make_parser, report
 from scenes import aerial
 
@@ -66,8 +65,8 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     scene = aerial(options.gaussians, options.device)
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
-        plain = events(table_of(scene), options.candidates, options.events, None)
-        table = table_of(scene)
+        plain = events(GaussianTable.create(scene.raw()), options.candidates, options.events, None)
+        table = GaussianTable.create(scene.raw())
         lineage = Lineage(Path(folder), Ranks(device=table.device), 0, Ledger())
         lineage.born(initial_births(table["id"], table["parent"], table["means"]), 0)
         logged = events(table, options.candidates, options.events, lineage)

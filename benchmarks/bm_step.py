@@ -25,7 +25,7 @@ from scenes import BenchmarkScene, aerial, garden_like
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
-from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, GaussianTable
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
@@ -85,14 +85,7 @@ class Clock:
 
 def make_table(scene: BenchmarkScene) -> GaussianTable:
     """Return the scene in the midst of a training: with moments, at step 0."""
-    raw, device = scene.raw(), scene.means.device
-    n = len(scene.means)
-    nothing = torch.zeros(n, dtype=torch.int32, device=device)
-    table = GaussianTable.create(
-        {name: raw[name] for name in PARAMETERS}
-        | {"last_step": nothing, "birth": nothing, "level": nothing.to(torch.uint8)}
-        | {"id": torch.arange(n, device=device), "parent": torch.full((n,), -1, device=device)}
-    )
+    table = GaussianTable.create(scene.raw())
     # Gradients of this loss are around 1e-7; their sizes spread over some orders of magnitude.
     for first, second in zip(EXP_AVGS, EXP_AVG_SQS, strict=True):
         size = 1e-7 * torch.exp(2 * torch.randn_like(table[first]))

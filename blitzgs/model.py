@@ -130,11 +130,23 @@ class GaussianTable:
 
     @classmethod
     def create(cls, rows: Mapping[str, Tensor]) -> GaussianTable:
-        """Build a table from new rows; see `append` for what they must hold."""
+        """Build a table from new rows; see `append` for what they may hold.
+
+        Of the columns of `REQUIRED`, only the parameters must be given. The others default to those of first
+        Gaussians: at step 0, with the ids 0 .. N - 1, without parents, born at time 0, at level 0.
+        """
         columns = schema(round(rows["sh"].shape[1] ** 0.5) - 1)
-        device = rows["means"].device
+        count, device = len(rows["means"]), rows["means"].device
         table = cls({n: torch.empty((0, *c.shape), dtype=c.dtype, device=device) for n, c in columns.items()})
-        table.append(rows)
+        zeros = torch.zeros(count, dtype=torch.int32, device=device)
+        first = {
+            "last_step": zeros,
+            "id": torch.arange(count, device=device),
+            "parent": torch.full((count,), NO_PARENT, device=device),
+            "birth": zeros,
+            "level": zeros.to(torch.uint8),
+        }
+        table.append(first | dict(rows))
         return table
 
     def __len__(self) -> int:

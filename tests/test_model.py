@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.model import GaussianTable, schema
+from blitzgs.model import NO_PARENT, PARAMETERS, GaussianTable, schema
 
 
 def filled_table(count: int, seed: int = 0) -> GaussianTable:
@@ -65,6 +65,15 @@ def test_new_rows_start_with_zero_moments_and_statistics():
             assert torch.equal(table[name], source[name])
         else:
             assert table[name].shape == source[name].shape and not table[name].any(), name
+
+
+def test_a_table_of_parameters_alone_holds_first_gaussians():
+    source = filled_table(5)
+    table = GaussianTable.create({name: source[name] for name in PARAMETERS})
+    assert table["id"].tolist() == [0, 1, 2, 3, 4] and (table["parent"] == NO_PARENT).all()
+    assert not any(table[name].any() for name in ("last_step", "moment_step", "birth", "level"))
+    with pytest.raises(ValueError, match=r"new rows lack the columns \['quats'\]"):
+        GaussianTable.create({name: source[name] for name in PARAMETERS if name != "quats"})
 
 
 def test_empty_table():

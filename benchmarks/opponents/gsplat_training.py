@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from blitzgs import rasterization
-from blitzgs.model import NO_PARENT, GaussianTable
+from blitzgs.model import GaussianTable
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.pipeline import RenderOptions
@@ -319,16 +319,5 @@ class GsplatTrainer:
     def table(self) -> GaussianTable:
         """Return the model as evaluations take it."""
         values = {name: value.detach() for name, value in self.params.items()}
-        count = len(values["means"])
-        zeros = torch.zeros(count, dtype=torch.int32, device=self.device)
         sh = torch.cat([values.pop("sh0"), values.pop("shN")], dim=1)
-        ids = torch.arange(count, device=self.device)
-        rest = {
-            "sh": sh,
-            "last_step": zeros,
-            "id": ids,
-            "parent": torch.full_like(ids, NO_PARENT),
-            "birth": zeros,
-            "level": zeros.byte(),
-        }
-        return GaussianTable.create(values | rest)
+        return GaussianTable.create(values | {"sh": sh})

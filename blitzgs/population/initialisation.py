@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from blitzgs.model import NO_PARENT, GaussianTable
+from blitzgs.model import GaussianTable
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.voxel_keys import voxel_keys
 from blitzgs.view.levels import Levels
@@ -74,10 +74,6 @@ def octree_gaussians(
             "scales": spacing.log().float()[:, None].repeat(1, 3),
             "opacities": torch.full((count,), math.log(opacity / (1.0 - opacity))),
             "sh": sh,
-            "last_step": torch.zeros(count, dtype=torch.int32),
-            "id": torch.arange(count),
-            "parent": torch.full((count,), NO_PARENT),
-            "birth": torch.zeros(count, dtype=torch.int32),
             "level": level_of,
         }
     )

@@ -24,6 +24,7 @@ from blitzgs.ops.projection import VIEW_TOTALS
 from blitzgs.ops.scatter import gather_splats, scatter_splats, words_of
 from blitzgs.survey import survey
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
+from tests.distributed.transports import IdleEvent, rasterize_into
 from tests.helpers import sum_of_ranks
 from tests.training.tiny import random_gaussians
 
@@ -100,35 +101,18 @@ def _send(columns, masks, everyone, rank, buffers, capacity):
     return places, torch.tensor([sum(sent[rank] for sent in splats)])
 
 
-def _rasterize_into(*arguments):
-    """Replaces `rasterize_fwd_packed_`."""
-    *rest, table, n_splats = arguments
-    table[: int(n_splats)] = 0
-    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_splats)[:6]
-
-
 def _intersect(*arguments):
     """Replaces `intersect` for a capacity below the number of entries, which the CPU op refuses."""
     *splats, grid, _, n_splats, _ = arguments
     return INTERSECT(*splats, grid, -1, n_splats, True)
 
 
-class Event:
-    """Replaces `torch.cuda.Event`."""
-
-    def record(self):
-        pass
-
-    def synchronize(self):
-        pass
-
-
 @pytest.fixture(autouse=True)
 def without_gpu(monkeypatch):
     monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", _send)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", _rasterize_into)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
     monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
-    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
     returned = PeerExchange.return_gradients
 
     def from_columns(self, gradients):

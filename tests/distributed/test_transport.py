@@ -16,7 +16,7 @@ from blitzgs.ops.scatter import scatter_splats
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.distributed.test_sharded_rendering import OPTIONS, cameras
-from tests.distributed.transports import LoneMemory, RecordingTransport
+from tests.distributed.transports import IdleEvent, LoneMemory, RecordingTransport, rasterize_into
 from tests.helpers import parameter_gradients, sum_of_ranks
 from tests.training.tiny import random_gaussians
 
@@ -181,22 +181,9 @@ def alone(monkeypatch):
 
     monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", send)
 
-    class Event:
-        def record(self):
-            pass
-
-        def synchronize(self):
-            pass
-
-    monkeypatch.setattr(torch.cuda, "Event", Event)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", _rasterize_into)
+    monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
+    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
     return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
-
-
-def _rasterize_into(*arguments):
-    *rest, table, n_splats = arguments
-    table[: int(n_splats)] = 0
-    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_splats)[:6]
 
 
 def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):

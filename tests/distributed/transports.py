@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test doubles: a transport that records its calls, and shared memory for a single rank."""
+"""Test doubles: a transport that records its calls, shared memory for a single rank, and what a GPU does."""
 
 from __future__ import annotations
 
@@ -77,3 +77,20 @@ class LoneMemory:
     def reserve(self, words: int) -> None:
         """Enlarge the buffer."""
         self.buffers = [torch.full((words,), -1, dtype=torch.int32)]
+
+
+class IdleEvent:
+    """Replaces `torch.cuda.Event` on a CPU, where nothing is pending."""
+
+    def record(self) -> None:
+        """Return at once."""
+
+    def synchronize(self) -> None:
+        """Return at once."""
+
+
+def rasterize_into(*arguments):
+    """Replaces `rasterize_fwd_packed_` on a CPU."""
+    *rest, table, n_splats = arguments
+    table[: int(n_splats)] = 0
+    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_splats)[:6]

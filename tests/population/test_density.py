@@ -32,8 +32,6 @@ def random_table(count: int, seed: int = 0) -> GaussianTable:
             "sh": torch.randn(count, 4, 3, generator=g),
             "last_step": torch.full((count,), STEP, dtype=torch.int32),
             "id": torch.randperm(10 * count, generator=g)[:count],
-            "parent": torch.full((count,), -1),
-            "birth": torch.zeros(count, dtype=torch.int32),
             "level": torch.randint(0, LEVELS, (count,), generator=g, dtype=torch.uint8),
         }
     )

@@ -24,15 +24,6 @@ from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, write_tiny_capture
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
-    write_tiny_capture(data)
-    flags = [f"--{text}" for text in OVERRIDES]
-    assert main(["train", "--data", str(data), "--out", str(folder), "--schedule.scale=0.4", *flags]) == 0
-    return data, folder
-
-
 def test_train_leaves_a_summary(trained):
     summary = json.loads((trained[1] / "summary.json").read_text())
     assert summary["images"] == 40 and summary["psnr"] > 15

@@ -48,17 +48,6 @@ def carpet(count, seed):
     }
 
 
-def bookkeeping(count):
-    numbers = torch.zeros(count, dtype=torch.int32)
-    return {
-        "last_step": numbers,
-        "id": torch.arange(count),
-        "parent": torch.full((count,), -1),
-        "birth": numbers.clone(),
-        "level": torch.zeros(count, dtype=torch.uint8),
-    }
-
-
 def carpet_capture(device):
     """A grid of cameras that look down, each on a hundredth of a carpet."""
     K, cameras = np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), []
@@ -68,9 +57,7 @@ def carpet_capture(device):
         pose[:3, 3] = [-at[0], -at[1], 3.0]
         cameras.append(Camera(f"{i:04}.png", WIDTH, HEIGHT, K, pose))
     parameters = carpet(COUNT, 1)
-    truth = GaussianTable.create(
-        {name: column.to(device) for name, column in (parameters | bookkeeping(COUNT)).items()}
-    )
+    truth = GaussianTable.create({name: column.to(device) for name, column in parameters.items()})
     views = ViewSet(cameras, Space((0.0, 0.0, 0.0), 1.0, 1.0), truth.device)
     images = [(picture(truth, views, i).clamp(0, 1) * 255 + 0.5).byte().cpu() for i in range(len(cameras))]
     colors = np.full((COUNT, 3), 128, np.uint8)

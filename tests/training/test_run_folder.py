@@ -22,17 +22,7 @@ from blitzgs.formats.ply import read_ply
 from blitzgs.training import checkpoint, run
 from blitzgs.training.export import export_ply, without_antialiasing
 from blitzgs.training.trainer import Trainer
-from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A capture and a short run of it, through the command line."""
-    data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
-    write_tiny_capture(data)
-    flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.4"]
-    assert main(["train", "--data", str(data), "--out", str(folder), *flags]) == 0
-    return data, folder
+from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene
 
 
 @pytest.fixture

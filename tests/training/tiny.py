@@ -108,11 +108,6 @@ def random_gaussians(count: int = COUNT) -> GaussianTable:
             "scales": torch.rand(count, 3, generator=g) - 3.0,
             "opacities": torch.rand(count, generator=g) * 4,
             "sh": torch.randn(count, 1, 3, generator=g) * 0.8,
-            "last_step": torch.zeros(count, dtype=torch.int32),
-            "id": torch.arange(count),
-            "parent": torch.full((count,), -1),
-            "birth": torch.zeros(count, dtype=torch.int32),
-            "level": torch.zeros(count, dtype=torch.uint8),
         }
     )
 

@@ -28,11 +28,6 @@ def make_table(n=3000, device="cpu", seed=0):
         "scales": scales,
         "opacities": 6 * draw(n) - 3,
         "sh": draw(n, 1, 3),
-        "last_step": torch.zeros(n, dtype=torch.int32),
-        "id": torch.arange(n),
-        "parent": torch.full((n,), -1),
-        "birth": torch.zeros(n, dtype=torch.int32),
-        "level": torch.zeros(n, dtype=torch.uint8),
     }
     table = GaussianTable.create({name: column.to(device) for name, column in rows.items()})
     table.permute(morton_order(table["means"]))
