@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy against time: each option's image and gradient error next to what it costs.
+"""Measures accuracy against time: each option's image error, gradient error and time.
 
 python benchmarks/bm_accuracy.py [--device cuda] [--gaussians 4000000] [--out runs/accuracy] [--json FILE]
 
 Renders the aerial scene with each option as training does, forward and backward. Times are medians, per view.
 Errors are against the float64 reference of the same mode in a few windows of the same images: the largest
 absolute error of the image away from the declared cut pixels, and the largest error of a parameter's gradient
-(max |difference| / max |reference|). Fails when the default setting misses its bounds.
+(max |difference| / max |reference|). The benchmark fails if the default setting misses its bounds.
 
-Writes a table (Markdown), the figures (JSON) and, with matplotlib, a Pareto plot; anew with each option, so
-that a run that is cut off leaves what it measured.
+Writes a table (Markdown), the figures (JSON) and, with matplotlib, a Pareto plot. They are written again
+after each option, so that an interrupted run keeps its measurements.
 
 The row "exact exponential" needs a second build of the kernels, whose folder --exact-library names:
 
@@ -55,24 +55,26 @@ class Option:
     tile_size: int = 16
     deterministic: bool = False
     views: int = 1
-    exchanged: bool = False  # through the exchange of the ranks, of which there is one: all but the wire
+    exchanged: bool = (
+        False  # through the exchange of a single rank, which includes all costs but the transfer
+    )
     half: bool = False
     dtype: torch.dtype = torch.float32
 
 
 @dataclass
 class Figures:
-    """What an option costs and how far it is from the definition."""
+    """Time of an option, and its errors against the definition."""
 
     name: str
     milliseconds: float  # per view
     image_error: float
     gradient_error: float
-    cut_pixels: float  # share of the pixels that sit on a cut and are left out
+    cut_pixels: float  # share of the pixels that lie on a cut and are left out
 
 
 def options_for(device: str) -> list[Option]:
-    """Return what can be chosen on this device; the first is the default."""
+    """Return the options of this device; the first is the default."""
     options = [
         Option("default"),
         Option("antialiased", antialiased=True),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time to find the active set of an aerial view, and how much larger than the visible set it is.
+"""Measures the time to find the active set of an aerial view, and its size relative to the visible set.
 
 python benchmarks/bm_blocks.py [--device cuda] [--rows 16000000] [--views 1]
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's training loop with its own parts and with ours: time, quality, and what each exchange brings.
+"""Runs gsplat's training loop with gsplat's parts and with ours, and compares time and quality.
 
     python benchmarks/bm_drop_in.py CAPTURE [--steps 7000] [--arms gsplat import four] [--device cuda]
 
@@ -8,7 +8,7 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 
 - gsplat: `gsplat.rasterization`, `torch.optim.Adam(fused=True)`, and L1 and SSIM by fused_ssim, or by our
   kernel where fused_ssim is not installed;
-- import: the same with `blitzgs.rasterization`, the one import exchanged;
+- import: the same with `blitzgs.rasterization` in place of gsplat's function;
 - four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order.
 
 Times are of the whole training, and of steps between two densifications at its end; PSNR is the mean over
@@ -97,7 +97,7 @@ class FourSwaps(OneImport):
 
     def _change_population(self, info: Any) -> None:
         refines = self.step % self._strategy.refine_every == 0
-        if refines:  # then the strategy reads parameters
+        if refines:  # the strategy then reads parameters
             self.catch_up()
         super()._change_population(info)
         if refines:
@@ -115,7 +115,7 @@ class FourSwaps(OneImport):
 
 
 class Gsplat(OneImport):
-    """gsplat's loop as it is."""
+    """gsplat's loop without changes."""
 
     def __init__(self, *arguments: Any) -> None:
         from gsplat import rasterization
@@ -128,7 +128,7 @@ ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps}
 
 
 def seconds_of(trainer: GsplatTrainer, until: int) -> float:
-    """Train on and return the seconds it took."""
+    """Continue the training and return the seconds it took."""
     synchronize = torch.cuda.synchronize if trainer.device.type == "cuda" else lambda: None
     synchronize()
     start = time.perf_counter()

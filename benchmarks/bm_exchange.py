@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training step on several ranks: time by stage, bytes exchanged, balance, and what half precision costs.
+"""Measures a training step on several ranks: time by stage, bytes exchanged, balance, half precision's error.
 
     python benchmarks/bm_exchange.py --data DIR [--downscale 2] [--ranks 1 2 4] [--batch 4]
     python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda [--ranks 1 2 4]
 
 With --data the Gaussians are the octree of the capture's points, seen from its training views; otherwise the
 `aerial` scene of `scenes.py`. Each number of ranks runs under torchrun, and takes the trainer's own steps
-(`blitzgs.training.step`): every batch is visited once with tiles divided by an estimate, then again and
-again by their measured cost.
+(`blitzgs.training.step`): every batch is visited once with tiles divided by an estimate, then
+several times with tiles divided by their measured cost.
 
-Stages: every step starts together on all ranks, behind a barrier; a stage is the time between its marks on
-the device, the slowest rank's, and the median over the batches and visits. "alone" is their sum. Where ranks
-share memory, splats travel in "project" and "sort", and gradients in "optimiser", whose kernel pulls them
-from the other ranks; "exchange" and "exchange back" are then the meetings before these are read.
-Step: all batches one after the other without a barrier, as in training; the time from the first to the last,
-by the host's clock, over their number; the median over the visits.
+Stages: a barrier precedes every step, so that all ranks start it together. The time of a stage is the time
+between its marks on the device, of the slowest rank, as a median over batches and visits. "alone" is the sum
+of all stages. If ranks share memory, splats are sent in "project" and "sort", and the kernel of "optimiser"
+reads the gradients from the other ranks; "exchange" and "exchange back" are then the barriers before these
+reads.
+
+Step: all batches run one after the other without a barrier, as in training. The time is that from the
+first to the last by the host's clock, divided by their number, as a median over the visits.
 """
 
 from __future__ import annotations
@@ -92,7 +94,7 @@ class Clock:
             self.marks.append((stage, time.perf_counter()))
 
     def milliseconds(self) -> list[float]:
-        """Time of each of `STAGES`."""
+        """The time of each of `STAGES`."""
         if self.cuda:
             torch.cuda.synchronize()
         times = dict.fromkeys(STAGES, 0.0)
@@ -102,7 +104,7 @@ class Clock:
 
 
 class Inputs(NamedTuple):
-    """The Gaussians of all ranks, and what they are seen by."""
+    """The Gaussians of all ranks, and the views."""
 
     table: GaussianTable
     options: RenderOptions
@@ -191,7 +193,7 @@ class Workload:
         }
 
     def staged(self) -> Iterator[tuple[list[float], dict[str, Any]]]:
-        """Visit all batches, each step behind a barrier; yield its stages' ms and what it did."""
+        """Visit all batches with a barrier before each step; yield its stages in ms and its figures."""
         for keys, views in self.batches:
             batch = self.batch(keys, views)
             self.ranks.barrier()
@@ -250,7 +252,7 @@ def measure(args: argparse.Namespace) -> None:
     with Ranks.from_environment(args.device) as ranks:
         load = Workload(args, ranks)
         estimated = [balance_of(result) for _, result in load.staged()]
-        load.in_a_row()  # warm
+        load.in_a_row()  # warm up
         row = statistics.median(load.in_a_row() for _ in range(args.visits))
         measured, times, totals = [], [], torch.zeros(3, dtype=torch.int64, device=ranks.device)
         for _ in range(args.visits):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spawn gate on many candidates: features, trees, and the veto with its ranks.
+"""Measures the spawn gate on many candidates: features, trees, and the veto over ranks.
 
     python benchmarks/bm_gate.py [--candidates 1000000] [--trees 200] [--repeats 7] [--json FILE]
 
-The trees are complete, of depth 6, with random splits: what a fitted gate has at most. Times are medians of
-wall time with the device idle before and after. The goal is 50 ms for a million candidates on one H200.
+The trees are complete, of depth 6, with random splits; fitted gates are at most this large. Times are medians
+of wall time with the device idle before and after. The goal is 50 ms for a million candidates on one H200.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images a second out of the image store: cold, from compressed memory, and from the decoded cache.
+"""Measures images per second of the image store: cold, from compressed memory, and from the decoded cache.
 
 python benchmarks/bm_images.py --data DIR [--downscale 2] [--threads 4] [--rounds 3]
 Without --data: 24 JPEG photographs of noise, 2000 x 1500, are made for it.
@@ -39,7 +39,7 @@ def make_capture(root: Path, count: int = 24, width: int = 2000, height: int = 1
 
 
 def throughput(store: ImageStore, ahead: int, rounds: int) -> float:
-    """Images a second in a shuffled order, decoding `ahead` of use."""
+    """Return images per second in a shuffled order; `ahead`: images decoded ahead of their use."""
     count = len(store.capture.cameras)
     order = np.concatenate([np.random.default_rng(r).permutation(count) for r in range(rounds)]).tolist()
     begin = time.perf_counter()
@@ -50,7 +50,7 @@ def throughput(store: ImageStore, ahead: int, rounds: int) -> float:
 
 
 def report(capture: Capture, threads: int, rounds: int) -> dict[str, float]:
-    """Print and return images a second by source, and the size of the compressed images."""
+    """Print and return images per second by source, and the size of the compressed images."""
     camera = capture.cameras[0]
     raw = 3 * camera.width * camera.height
     source = camera.rectification.lens

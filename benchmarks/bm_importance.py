@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The importance sweep against forward renders of the same views, in the same run.
+"""Compares the importance sweep with forward renders of the same views, in one run.
 
     python benchmarks/bm_importance.py [--gaussians 4000000] [--views 32] [--batch 4] [--json FILE]
 
 The views advance over one synthetic square kilometre (`scenes.aerial`). "renders": `pipeline.forward` of all
-views in batches, with colours of degree 3; "survey": what each Gaussian contributes to them; "sweep": that,
-the exact 99 % cut of each view, scores, phi and the cull matrix. The last rows are the compositing kernels
-alone, for the first batch. Times are medians of wall time with the device idle before and after; the sweep
-should take no longer than the renders.
+views in batches, with colours of degree 3; "survey": the contribution of each Gaussian to the views; "sweep":
+the survey, the exact 99 % cut of each view, scores, phi and the cull matrix. The last rows are the
+compositing kernels alone, for the first batch. Times are medians of wall time with the device idle before and
+after; the sweep should take no longer than the renders.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of lazy Adam's catch-up and step against byte floors and torch's fused dense Adam over every row.
+"""Compares lazy Adam's catch-up and step with byte floors and with torch's fused dense Adam over every row.
 
 python benchmarks/bm_lazy_adam.py [--device cuda] [--rows 4000000] [--fraction 0.1]
 """
@@ -52,7 +52,7 @@ class State:
         )  # fmt: skip
 
     def time(self, work: Callable[[], None], gaps: Tensor, repeats: int) -> float:
-        """Return the median ms of `work` on rows that stand `gaps` steps before `STEP` - 1."""
+        """Return the median ms of `work` on rows that are `gaps` steps behind `STEP` - 1."""
 
         def once() -> float:
             self.last_step.copy_(STEP - 1 - gaps)
@@ -94,11 +94,11 @@ def main() -> None:
     ):
         grads = [1e-6 * torch.randn((len(ids), *p.shape[1:]), device=device) for p in state.params]
         for label, work, gaps, touched in (
-            # Gradients read; parameters and moments read and written.
+            # The step reads gradients, and reads and writes parameters and moments.
             ("step, up to date", partial(state.step, ids, grads, False), none, 7),
             ("step, 1..39 steps behind", partial(state.step, ids, grads, False), some, 7),
             ("step, sparse variant", partial(state.step, ids, grads, True), none, 7),
-            # Parameters and moments read, parameters written.
+            # Catching up reads parameters and moments, and writes parameters.
             ("catch-up, 1..39 steps behind", partial(state.catch_up, ids), some, 4),
         ):
             report(f"{name}: {label}", state.time(work, gaps, args.repeats), len(ids), touched)

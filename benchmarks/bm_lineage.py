@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the log of births and deaths costs: density events with and without it, and a checkpoint's books.
+"""Measures the log of births and deaths: density events with and without it, and its check at a checkpoint.
 
     python benchmarks/bm_lineage.py [--gaussians 2000000] [--candidates 0.02] [--json FILE]
 
 Every event clones or splits a share of the Gaussians and prunes about as many. Times are medians of wall time
-with the device idle before and after; "books" brings the rows of all events to the disk and compares births
-less deaths with the population. A run has an event each 100 images and the books at each checkpoint.
+with the device idle before and after; "books" writes the rows of all events to disk and compares births less
+deaths with the population. A run has an event every 100 images and this check at each checkpoint.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def events(table: GaussianTable, share: float, count: int, lineage: Lineage | No
 
 
 def now(device: torch.device) -> float:
-    """Return the time at which the device has nothing left to do."""
+    """Return the time when the device is idle."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What training beyond the memory of a GPU costs: steps with all Gaussians on the device, and with a pool.
+"""Measures training beyond the memory of a GPU: steps with all Gaussians on the device, and with a pool.
 
     python benchmarks/bm_offload.py [--gaussians 16000000] [--ratios 1 2 4] [--steps 40] [--json FILE]
 
@@ -7,10 +7,10 @@ The scene is `scenes.aerial` with SH degree 3 under a survey: cameras on paralle
 kilometre, 150 m high, which look 60 degrees down, each at a few percent of the Gaussians. The trainer's own
 steps run with all Gaussians on the device ("resident"), then with a pool for 1 / ratio of them ("4x": a
 quarter; `blitzgs.training.offload`). The views come in the sampler's random order, as in a training, or
-along the flight lines. Measured: wall time of a step over all of them, after as many steps to warm up; what
-moved between host and device in a step; the share of the blocks in view that were on the device when they
-were looked for, a step ahead; "sweep", the time to bring the whole table through the pool and back, as events
-of the schedule do.
+along the flight lines. Measured are: the mean wall time of a step, after as many steps to warm up; the bytes
+moved between host and device in a step; the share of visible blocks that were on the device when they were
+tested, a step ahead; and "sweep", the time to move the whole table through the pool and back, as events of
+the schedule do.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from blitzgs.view.residence import Residence, ResidenceError
 
 LINES, VIEWS_A_LINE = 12, 20
 HEIGHT, LOOKS_DOWN = 150.0, math.radians(60)
-REACH = 400.0  # metres from the middle to the outermost places that cameras look at
+REACH = 400.0  # metres from the middle to the outermost points that cameras look at
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class FlightOrder(BatchSampler):
 
 
 class Survey:
-    """What the steps of all arms share."""
+    """The parts that the steps of all arms share."""
 
     def __init__(self, scene: BenchmarkScene, batch_size: int, device: torch.device) -> None:
         cameras = survey(scene)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of L1 + SSIM, forward and backward, against its byte floor and against plain PyTorch convolutions.
+"""Compares the time of L1 + SSIM, forward and backward, with its byte floor and plain PyTorch convolutions.
 
 python benchmarks/bm_photometric.py [--device cuda] [--height 1064 --width 1600] [--views 1] [--json FILE]
 """

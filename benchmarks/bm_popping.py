@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the levels of a model make jump along a descending flight: with the LOD gate's cuts, and smoothed.
+"""Measures how much levels pop along a descending flight: with the LOD gate's cuts, and smoothed.
 
     python benchmarks/bm_popping.py RUN [--frames 240] [--out FOLDER] [--device cuda] [--json FILE]
 
@@ -10,8 +10,8 @@ Gaussians ("full"), with the LOD gate ("gated") and with smooth levels ("smooth"
 Two things are measured, as means of |difference| over the pixels in 1/255. The change of a frame is its
 difference from the frame before, most of which is the flight itself: "full" says how much. The popping of a
 frame is its difference from the same view with the levels and weights that the frame before had, so that
-nothing but the levels has changed. Of both the mean and the largest over the frames count, and of the popping
-also what one pixel in 1,000 exceeds in the worst frame. More frames make smaller steps.
+only the levels have changed. Both are reported as the mean and the largest over the frames; of the popping,
+also the value that one pixel in 1,000 exceeds in the worst frame. More frames make smaller steps.
 
 Into the folder go a chart of the popping (popping.svg) and the clip (popping.mp4: full, gated, smooth).
 """
@@ -61,11 +61,11 @@ def popping(
 
     Args:
         run: folder of the run.
-        out: gets popping.svg and popping.mp4; None: nothing is written.
-        device: that renders.
-        frames: of the flight, at least 2.
-        width: of the frames in pixels, at most that of the camera.
-        camera: name of the view whose axis is flown along; None: the one closest to the mean axis of all.
+        out: folder for popping.svg and popping.mp4; None: write nothing.
+        device: renders the frames.
+        frames: number of frames of the flight, at least 2.
+        width: width of the frames in pixels, at most that of the camera.
+        camera: name of the view along whose axis the flight goes; None: the view closest to the mean axis.
 
     Returns:
         "frames", "levels" (K), and for each of "full", "gated" and "smooth" a dictionary: "mean_change" and
@@ -100,7 +100,7 @@ def popping(
 
 
 class _Flight:
-    """Renders one frame after the other in one way, and notes what changes."""
+    """Renders one frame after the other in one way, and records the changes."""
 
     def __init__(
         self, model: TrainedModel, K: Tensor, size: tuple[int, int], scene: SceneGate | None
@@ -131,7 +131,7 @@ class _Flight:
         return image
 
     def figures(self) -> dict[str, float]:
-        """Return what `popping` says of this way to render."""
+        """Return the figures of this way to render, as `popping` returns them."""
         found = {"mean_change": _mean(self._changes), "largest_change": max(self._changes)}
         if self._scene is None:
             return found
@@ -185,7 +185,7 @@ def _flight(
     K[1] *= size[1] / chosen.height
     points = model.table["means"].cpu().double() @ pose[:3, :3].T + pose[:3, 3]
     slopes = points[:, :2] / points[:, 2:]
-    # What is around the middle of the picture says how far away it is.
+    # The depths around the middle of the picture give the distance.
     seen = (points[:, 2] > 0) & (slopes.abs() < 0.1 * chosen.width / float(view.Ks[0, 0, 0])).all(1)
     if not bool(seen.any()):
         raise ValueError(
@@ -215,7 +215,7 @@ class _Clip:
 
     def __init__(self, path: Path, width: int, height: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # The codec wants even edges.
+        # The codec needs even edges.
         self._size = width // 2 * 2, height // 2 * 2
         self._writer = cv2.VideoWriter(
             str(path), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_SECOND, self._size

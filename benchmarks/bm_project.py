@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of projection, forward and backward, against the bytes it has to move.
+"""Compares the time of projection, forward and backward, with the bytes that it must move.
 
-The scene's Gaussians are in random order; the last lines are of a table in Morton order with the active rows
-given, as in training.
+The scene's Gaussians are in random order; the last lines are for a table in Morton order with given active
+rows, as in training.
 
 python benchmarks/bm_project.py [--device cuda] [--gaussians 4000000] [--views 1 4]
 """
@@ -23,8 +23,8 @@ from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, Projection
 from blitzgs.view.blocks import morton_order
 
 COLUMNS = ("means", "quats", "scales", "opacities", "sh")
-CULL_BYTES = 4 * (3 + 3 + 1)  # mean, scales, opacity: read for every Gaussian
-VISIBLE_BYTES = 4 * (4 + 48)  # quaternion, SH: read for the visible ones
+CULL_BYTES = 4 * (3 + 3 + 1)  # bytes of mean, scales and opacity, read for every Gaussian
+VISIBLE_BYTES = 4 * (4 + 48)  # bytes of quaternion and SH, read for visible Gaussians
 SPLAT_BYTES = 4 * (1 + 1 + 2 + 3 + 1 + 1 + 3 + 2 + 1)  # written
 SPLAT_GRADIENT_BYTES = 4 * (2 + 3 + 1 + 3)  # read backward
 GRADIENT_BYTES = 4 * 59  # parameters read and gradients written backward, each

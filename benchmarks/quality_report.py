@@ -26,7 +26,7 @@ def read_runs(source: Path) -> list[Run]:
 
     Raises:
         ValueError: a file holds something else.
-        OSError: nothing is there.
+        OSError: the folder or file does not exist.
     """
     if source.is_dir():
         inner = source / RUNS if (source / RUNS).is_dir() else source
@@ -42,7 +42,7 @@ def read_runs(source: Path) -> list[Run]:
 
 
 def collect(out: Path, sources: Iterable[Path]) -> None:
-    """Copy the runs of other folders and files into `out`; a failed one never replaces a finished one."""
+    """Copy the runs of other folders and files into `out`; a failed run never replaces a finished one."""
     (out / RUNS).mkdir(parents=True, exist_ok=True)
     for source in sources:
         for run in read_runs(source):
@@ -75,7 +75,7 @@ def report(out: Path, plot: bool = True) -> str:
 
 
 def labels(runs: Sequence[Run]) -> Callable[[Run], str]:
-    """Name the recipes; one that was trained with several settings gets each one's digest."""
+    """Name the recipes; if a recipe was trained with several settings, add the digest of each."""
     settings: dict[Group, set[str]] = defaultdict(set)
     for run in runs:
         settings[run["capture"], run["recipe"]].add(run["settings"])
@@ -97,7 +97,7 @@ def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
 
 
 def markdown(runs: Sequence[Run]) -> str:
-    """Return a table for each capture, what they were measured with, and the runs that failed."""
+    """Return a table for each capture, the hardware and code of the runs, and the runs that failed."""
     done = [run for run in runs if run["status"] == "done"]
     rows: dict[str, list[dict[str, str]]] = defaultdict(list)
     for (capture, label), group in grouped(done).items():
@@ -142,7 +142,7 @@ def table_row(label: str, images: int, found: Sequence[tuple[Run, dict[str, Any]
     """Return the cells of some seeds at one image count."""
     evaluations = [evaluation for _, evaluation in found]
     ends = [run for run, evaluation in found if evaluation["images"] == run["images"]]
-    # A capture without held-out views is measured in its training views.
+    # A capture without held-out views is measured on its training views.
     split = "test" if all("test" in e for e in evaluations) else "train"
     seconds = spread([e["seconds"] for e in evaluations], "{:.1f}", max)
     row = {"recipe": label, "images": f"{images:,}", "seeds": str(len(found))}

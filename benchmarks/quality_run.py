@@ -32,7 +32,8 @@ from blitzgs.training.population_report import population_report
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.views import Space, ViewSet, render_options
 
-# Where gsplat's results are commonly quoted; training views are measured there, too, and at every end.
+# Image counts at which gsplat's results are commonly quoted. Training views are measured there and at the
+# end.
 QUOTED_STEPS = (7_000, 15_000)
 Measure = Callable[[Sequence[int]], dict[str, Any]]
 
@@ -40,7 +41,7 @@ Measure = Callable[[Sequence[int]], dict[str, Any]]
 class Recorder:
     """Measures a model several times while it is trained, and keeps the figures.
 
-    Memory is that of the training: what evaluations take does not count.
+    Memory is that of the training, without evaluations.
     """
 
     def __init__(
@@ -49,11 +50,11 @@ class Recorder:
         """Plan the evaluations.
 
         Args:
-            spec: of the run.
+            spec: the run.
             quoted: image counts at which the training views are measured, too.
             end: images of the whole training.
-            capture: whose views are measured.
-            device: the training's.
+            capture: has the views to measure.
+            device: the device of the training.
         """
         self.quoted = {images for images in quoted if images < end} | {end}
         self.marks = sorted({images for images in spec.evaluate_at if images < end} | self.quoted)
@@ -70,7 +71,7 @@ class Recorder:
         return True
 
     def record(self, images: int, seconds: float, gaussians: int, end: bool, measure: Measure) -> None:
-        """Measure held-out views, and training views where that was planned."""
+        """Measure held-out views, and training views if that was planned."""
         self.peak_bytes = max(self.peak_bytes, run.peak_memory_bytes(self._device))
         found: dict[str, Any] = {"images": images, "seconds": seconds, "gaussians": gaussians}
         capture = self._capture
@@ -108,13 +109,13 @@ def synchronize(device: torch.device) -> None:
 
 
 class RecordedTrainer(Trainer):
-    """A trainer that measures on the way, and leaves no checkpoint."""
+    """A trainer that measures its model during training, and saves no checkpoint."""
 
     recorder: Recorder
     population: dict[str, Any]  # of the finished run
 
     def step(self, step: int) -> None:
-        """Take a step; measure where that was planned, before the schedule's events."""
+        """Take a step; if planned, measure before the schedule's events."""
         super().step(step)
         if step < self.state.schedule.steps and self.recorder.due(self.state.images_seen):
             self._record(end=False)
@@ -129,7 +130,7 @@ class RecordedTrainer(Trainer):
         state = self.state
         begin = time.monotonic()
         synchronize(state.ranks.device)
-        # The clock of the run stands where the host was when it had queued the step.
+        # The clock of the run has the time at which the host had queued the step.
         seconds = state.progress.seconds + time.monotonic() - begin
         with state.paused_clock():
             self.recorder.record(
@@ -217,7 +218,7 @@ def train_partition(spec: RunSpec) -> dict[str, Any]:
 
 
 def figures(recorder: Recorder, peak_gaussians: int) -> dict[str, Any]:
-    """Return what a finished run reports."""
+    """Return the figures of a finished run."""
     last = recorder.evaluations[-1]
     return {
         "images": last["images"],
@@ -232,7 +233,7 @@ def figures(recorder: Recorder, peak_gaussians: int) -> dict[str, Any]:
 
 
 def describe(spec: RunSpec) -> dict[str, Any]:
-    """Return what a result says about its run, whether that ended well or not."""
+    """Return the part of a result that describes its run, finished or failed."""
     return {
         "name": spec.name,
         "capture": spec.capture,

@@ -5,7 +5,7 @@
     python benchmarks/report.py --check   # fails when a page differs from the results
 
 Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` names the file and the command. A
-page holds a pair of comments around each table, `<!-- table: NAME -->` and `<!-- end: NAME -->`, and what is
+page has a pair of comments around each table, `<!-- table: NAME -->` and `<!-- end: NAME -->`; the text
 between them is replaced. All files must come from one commit, because figures of different code do not
 compare. In place of a table whose file is absent the page names the command that makes it.
 """
@@ -31,12 +31,12 @@ Results = dict[str, Json]
 
 
 class ReportError(Exception):
-    """The results cannot be reported, and why."""
+    """The results cannot be reported; the message says why."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """One table: the files that it needs, and what makes its lines.
+    """One table: the files that it needs, and the function that makes its lines.
 
     Attributes:
         files: names in `COMMANDS`.
@@ -80,7 +80,7 @@ def ms(value: float) -> str:
 
 
 def fastest_gsplat(result: Json) -> Json | None:
-    """Return the figures of gsplat's faster mode, or None where gsplat was not installed."""
+    """Return the figures of gsplat's faster mode, or None if gsplat was not installed."""
     modes = [result[name] for name in ("gsplat", "gsplat packed") if name in result]
     return min(modes, key=lambda mode: mode["total"]) if modes else None
 
@@ -171,7 +171,7 @@ def exchange_lines(exchange: Json) -> list[str]:
 
 
 def row_lines(file: Json) -> list[str]:
-    """The rows that a benchmark has put together itself."""
+    """The rows that a benchmark has written itself."""
     rows = file["rows"]
     cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
     return [f"{file['title']}.", "", *table(rows[0], cells)]
@@ -212,7 +212,7 @@ SUMMARY_HEAD = ["work", "BlitzGS", "compared with", "ratio", "command"]
 def summary_row(
     work: str, ours: float, theirs: float | None, unit: str, other: str, command: str
 ) -> list[str]:
-    """One line of the README's tables: a figure, what it is compared with, and how often better it is."""
+    """One line of the README's tables: a figure, the figure that it is compared with, and their ratio."""
     their_cells = [f"{other} {theirs:.2f} {unit}", f"{theirs / ours:.1f}"] if theirs else ["–", "–"]
     return [work, f"{ours:.2f} {unit}", *their_cells, f"`{command}`"]
 
@@ -313,7 +313,7 @@ def load_results(folder: Path = RESULTS) -> Results:
 
 
 def machine_line(file: Json) -> str:
-    """Say what a result was measured on, and with which command."""
+    """Return the hardware and the command of a result as text."""
     about = file["environment"]
     machine = f"{about['device']}, CUDA {about['cuda']}" if "device" in about else about["processor"]
     peers = f", gsplat {about['gsplat']}" if "gsplat" in about else ""
@@ -344,10 +344,10 @@ def section_lines(name: str, results: Results) -> list[str]:
 
 
 def render_page(text: str, results: Results) -> str:
-    """Return a page with every table made anew.
+    """Return a page with every table replaced.
 
     Raises:
-        ReportError: the page asks for a table that nothing here makes.
+        ReportError: the page names an unknown table.
     """
 
     def replace(match: re.Match[str]) -> str:

@@ -6,7 +6,7 @@ Both return a `BenchmarkScene` whose parameters are activated (what `rasterizati
 The numbers depend on the seed and on the kind of device, because CPU and CUDA generators differ;
 the distribution does not.
 
-Run as a script, the module prints what the camera sees of each scene.
+Run as a script, the module prints the share of each scene that the camera sees.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ def aerial(
     The surface is a grid of 25 × 25 lots of 40 m: two of three carry a building (a box of random
     footprint, 6 to 45 m high), the rest is open ground. Points are uniform over the surface (ground outside
     the buildings, roofs, walls). With the mean spacing h = sqrt(surface / N), a Gaussian's two tangential
-    axes are log-normal around 0.55 h (σ = 0.6 of the logarithm, drawn apart, so it is elongated), the axis
-    along the normal is five times thinner, and its centre is off the surface by 0.15 h; the frame is turned
-    at random in the surface and tilted by about 10°. Logit opacities are normal (0.5, 2).
+    axes are log-normal around 0.55 h (σ = 0.6 of the logarithm, drawn independently, so that it is
+    elongated), the axis along the normal is five times thinner, and its centre is off the surface by 0.15 h;
+    the frame is turned at random in the surface and tilted by about 10°. Logit opacities are normal (0.5, 2).
 
-    The cameras look 40° down along +y, 60° wide; further views advance by 20 m along x and are what a batch
-    of neighbouring images is. About 10 % of the Gaussians are in a view.
+    The cameras look 40° down along +y, 60° wide; further views advance by 20 m along x, like a batch of
+    neighbouring images. About 10 % of the Gaussians are in a view.
     """
     generator = torch.Generator(device=device).manual_seed(seed)
     origins, edges_u, edges_v = _lots(generator, device)

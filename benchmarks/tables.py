@@ -19,9 +19,9 @@ The ablation of the model level alone, for captures too small to have levels:
     python benchmarks/tables.py ablation --flags "--view.lod=false --view.cull=false" \
         --arms full no_importance no_phi no_pass_1 no_pass_2 no_gate all_off ...
 
---dry-run lists what would run. --resume carries on in a folder that has results: what is finished is not run
-again. --collect adds results of other folders, as bm_quality.py does; without --scenes and --runs, the table
-is made of those in TABLES alone.
+--dry-run lists the runs. --resume continues in a folder that has results; finished runs are not repeated.
+--collect adds results of other folders, as bm_quality.py does; without --scenes and --runs, the table is made
+of those in TABLES alone.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def recipes_of(
         plan: the table's entry of `paper_tables.yaml`.
         config: file that all arms start from, or "defaults".
         gate: model file of a spawn gate, or None.
-        flags: for all arms, before their own.
-        arms: those wanted; None: all.
+        flags: flags of all arms; those of an arm follow them.
+        arms: names of the arms; None: all.
 
     Raises:
         ValueError: the table has no such arm.
@@ -90,7 +90,7 @@ def recipes_of(
 
 
 def train(table: str, plan: dict[str, Any], args: argparse.Namespace, scenes: dict[str, str]) -> int:
-    """Train what a table needs and is not finished; returns the exit status."""
+    """Train the runs of a table that are not finished; returns the exit status."""
     recipes = recipes_of(plan, args.config, args.gate, args.flags, args.arms)
     common = ["--out", str(args.out), "--gpus", str(args.gpus), "--evaluate-at"]
     common += ["--seeds", *map(str, args.seeds)]
@@ -114,7 +114,7 @@ def train(table: str, plan: dict[str, Any], args: argparse.Namespace, scenes: di
 
 
 def result_path(table: str, args: argparse.Namespace, scene: str) -> Path:
-    """Return where the result of a scene lies that is not a training of `bm_quality.py`."""
+    """Return the path of a scene's result for tables that `bm_quality.py` does not train."""
     if table == "oracle":
         return Path(args.out / f"oracle.{scene}" / "replay.json")
     return Path(args.out / f"{table}.{scene}.json")
@@ -144,7 +144,7 @@ def measure(table: str, args: argparse.Namespace, scenes: dict[str, str]) -> Non
         if done or args.dry_run:
             continue
         if table == "popping":
-            from bm_popping import popping  # renders with OpenCV's video writer, which the others do not need
+            from bm_popping import popping  # needs OpenCV's video writer, which other tables do not need
 
             path.write_text(json.dumps(popping(Path(text), None, device), indent=1))
         else:
@@ -152,7 +152,7 @@ def measure(table: str, args: argparse.Namespace, scenes: dict[str, str]) -> Non
 
 
 def read_results(table: str, out: Path) -> dict[str, Any]:
-    """Return scene -> result of what `measure` left in a folder."""
+    """Return scene -> result, of the results that `measure` wrote into a folder."""
     pattern = "oracle.*/replay.json" if table == "oracle" else f"{table}.*.json"
     found = {}
     for path in sorted(out.glob(pattern)):

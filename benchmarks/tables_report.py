@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of the paper's tables out of finished results, for `tables.py`."""
+"""Makes rows of the paper's tables from finished results, for `tables.py`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def _mean_memory(run: Run) -> float | None:
     return max(values) / 1e9 if values else None
 
 
-# Of a finished run: name, value (None: not measured), format, which of the seeds is the worst.
+# Columns of a finished run: name, value (None: not measured), format, and the function that picks the worst
+# seed.
 FIGURES: tuple[tuple[str, Callable[[Run], float | None], str, Worst], ...] = (
     ("PSNR", lambda run: _end(run)["psnr"], "{:.2f}", min),
     ("SSIM", lambda run: _end(run)["ssim"], "{:.4f}", min),
@@ -84,7 +85,7 @@ def speedups(rows: list[Row]) -> None:
 
 
 def partition_rows(runs: Sequence[Run], arms: dict[str, dict[str, Any]]) -> list[Row]:
-    """Return what spatial partitions did twice: cameras per block, and Gaussians lost at the merge."""
+    """Return the overhead of spatial partitions: cameras per block, and Gaussians lost at the merge."""
     rows = []
     for run in runs:
         if run["recipe"] not in arms or "blocks" not in run:
@@ -177,7 +178,7 @@ def oracle_rows(scene: str, arms: Sequence[dict[str, Any]], reference: Sequence[
 
 
 def popping_rows(scene: str, found: dict[str, Any]) -> list[Row]:
-    """Return what the levels of one model make jump (`bm_popping.py`), in 1/255."""
+    """Return the popping of one model's levels (`bm_popping.py`), in 1/255."""
     names = ("largest_change", "mean_change", "largest", "mean", "pixel", "kept")
     return [
         {"scene": scene, "levels": mode} | {name: found[mode].get(name, "") for name in names}

@@ -16,7 +16,7 @@ def median_ms(
 ) -> float:
     """Return the median milliseconds of ``function(*inputs[i])``, rotating among the input sets.
 
-    Rotate among sets larger than the last-level cache together, or the cache is what is measured.
+    The sets together must be larger than the last-level cache; otherwise the cache is measured.
     """
     cuda = any(torch.is_tensor(x) and x.is_cuda for x in _flatten(inputs))
     for i in range(warm_up):
@@ -26,7 +26,9 @@ def median_ms(
         arguments = inputs[i % len(inputs)]
         if cuda:
             start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-            torch.cuda._sleep(200_000)  # the device is still busy when the work is queued: no launch gaps
+            torch.cuda._sleep(
+                200_000
+            )  # keeps the device busy while the work is queued, so that there are no gaps between launches
             start.record()
             function(*arguments)
             end.record()
