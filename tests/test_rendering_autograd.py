@@ -136,7 +136,7 @@ def test_checkpointing_recomputes_the_call(device, options):
     scene = random_scene(n=60, device=device)
     results = []
     for call in (lambda f, *a: f(*a), partial(torch.utils.checkpoint.checkpoint, use_reentrant=False)):
-        for _ in range(3):  # on CUDA the room for rows is learnt from call to call
+        for _ in range(3):  # on CUDA the capacity is estimated from earlier calls
             leaves = scene.leaves()
             inputs = [getattr(leaves, name) for name in PARAMETERS]
 

@@ -59,7 +59,7 @@ def test_packed_and_dense_meta_say_the_same():
 @pytest.mark.parametrize("device", DEVICES)
 def test_meta_may_be_changed_in_place(device):
     scene = random_scene(n=40, device=device).leaves()
-    for _ in range(2):  # the second call has room for its rows
+    for _ in range(2):  # the second call has enough capacity
         _, _, meta = rasterize_scene(scene)
         for name in ("means2d", "conics", "depths", "opacities", "radii", "tiles_per_gauss"):
             meta[name].mul_(2)

@@ -126,7 +126,7 @@ def contributions(
         )  # fmt: skip
         gaussians, cameras = (means, quats, scales, opacities), (viewmats[views], Ks[views])
         splats = project_splats(ProjectionInputs(gaussians, cameras, options))
-        splat_weights, splat_pixels = _of_splats(splats, n_views, width, height)
+        splat_weights, splat_pixels = _contributions_of_splats(splats, n_views, width, height)
         at = splats.camera_ids.long() + begin, splats.gaussian_ids.long()
         weights[at] = splat_weights.double() / UNITS
         pixels[at] = splat_pixels.long()
@@ -134,7 +134,9 @@ def contributions(
     return weights, pixels, visible
 
 
-def _of_splats(splats: ProjectedSplats, n_views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
+def _contributions_of_splats(
+    splats: ProjectedSplats, n_views: int, width: int, height: int
+) -> tuple[Tensor, Tensor]:
     """Return the weights and pixels of all splats of a projection."""
     geometry = splats.means2d, splats.conics, splats.opacities
     grid = [n_views, width, height, _TILE_SIZE, 0, -1]

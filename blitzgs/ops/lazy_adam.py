@@ -171,7 +171,7 @@ def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
 _tables: Any = WeakTensorKeyDictionary()
 
 
-def _once(lr_table: Tensor, key: tuple[object, ...], make: Callable[[], Tensor]) -> Tensor:
+def _cached(lr_table: Tensor, key: tuple[object, ...], make: Callable[[], Tensor]) -> Tensor:
     """Return the cached result of `make` for `lr_table` and `key`; renew it if `lr_table` has changed."""
     version, made = _tables.get(lr_table, (None, {}))
     if version != lr_table._version:
@@ -203,7 +203,7 @@ def schedule_tables(lr_table: Tensor, beta1: float, beta2: float, eps: float, li
     """
     table = schedule_table(lr_table, beta1, beta2)
     reach = explicit_steps(beta1, beta2, like.dtype)
-    rules = _once(
+    rules = _cached(
         lr_table,
         (beta1, beta2, eps, like.dtype),
         lambda: torch.ops.blitzgs.lazy_adam_final_rules(table, like, reach, eps),
@@ -225,7 +225,7 @@ def schedule_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     Raises:
         ValueError: decay rates outside their range.
     """
-    return _once(lr_table, (beta1, beta2), lambda: _make_table(lr_table, beta1, beta2))
+    return _cached(lr_table, (beta1, beta2), lambda: _make_table(lr_table, beta1, beta2))
 
 
 def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0) -> Tensor:

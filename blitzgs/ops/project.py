@@ -262,11 +262,11 @@ def _first_gradients(
     if not dense:
         ids = saved.splats[1].long()
         columns = zip(saved.gaussians, gradients, sparse, needed, strict=False)
-        found = [_of_all(ids, *column) if wanted else None for *column, wanted in columns]
+        found = [_full_gradient(ids, *column) if wanted else None for *column, wanted in columns]
     return (*found, *[None] * (5 - len(found)), v_viewmats if need_viewmats else None)
 
 
-def _of_all(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> Tensor:
+def _full_gradient(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> Tensor:
     """Return the gradient of a whole parameter from the gradient of its rows `ids`."""
     if sparse:
         return sparse_rows(ids, gradient, parameter.shape)

@@ -69,7 +69,7 @@ class Drift:
         self.lr_table.zero_()
 
     def is_full(self, step: int) -> bool:
-        """Tell whether the tables have no room for steps after `step`."""
+        """Tell whether the tables are full, so that no steps after `step` fit."""
         return step - self.begin >= len(self.lr_table) - 1
 
     def add(self, step: int, lr: float, lr_rest: float) -> None:

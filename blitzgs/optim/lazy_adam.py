@@ -127,7 +127,7 @@ class LazyAdam(torch.optim.Optimizer):
             return
         gradients = [values.new_empty(len(values), 0)] * 4 + [values]
         torch.ops.blitzgs.lazy_adam_step_(
-            _alone(param, state).tensors, [drift.table, drift.lr_table],
+            _as_adam_state(param, state).tensors, [drift.table, drift.lr_table],
             [int(state["step"]) - drift.begin, drift.reach, 0], [*drift.betas, group["eps"]], gradients, ids,
         )  # fmt: skip
 
@@ -154,7 +154,7 @@ class LazyAdam(torch.optim.Optimizer):
         self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift, rows: Tensor | None
     ) -> None:
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            _alone(param, state).tensors, [drift.table, drift.lr_table],
+            _as_adam_state(param, state).tensors, [drift.table, drift.lr_table],
             [int(state["step"]) - drift.begin, drift.reach, 0], [*drift.betas, group["eps"]], rows,
         )  # fmt: skip
 
@@ -353,7 +353,7 @@ def _check_group(group: dict[str, Any]) -> None:
             raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
 
 
-def _alone(param: Tensor, state: dict[str, Any]) -> AdamState:
+def _as_adam_state(param: Tensor, state: dict[str, Any]) -> AdamState:
     """Return a parameter and its state as the ops' SH column, with all their other columns empty."""
     nothing = param.new_empty(len(param), 0)
     params, exp_avgs, exp_avg_sqs = (

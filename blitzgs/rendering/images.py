@@ -107,7 +107,7 @@ def _queued(
 ) -> Rendered | None:
     """Queue all work on CUDA before the host knows the number of splats; None if that is not possible."""
     means = group.inputs.gaussians[0]
-    # Hooks on saved tensors (checkpointing) want the same shapes each time, without room behind splats.
+    # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
     if (
         not means.is_cuda
         or project.tile_size != CUDA_TILE_SIZE

@@ -115,10 +115,10 @@ def raw_rasterization(
     for optimizer in lazy:
         optimizer.catch_up(harmonics, ids)
     shaded = "RGB" in render_mode
-    seen = _Visible.apply(ids, sparse_grad, *geometry, *(harmonics if shaded else ()))  # type: ignore[no-untyped-call]
-    sh = None if not shaded else seen[4] if shN is None else torch.cat(seen[4:], dim=1)
+    visible = _Visible.apply(ids, sparse_grad, *geometry, *(harmonics if shaded else ()))  # type: ignore[no-untyped-call]
+    sh = None if not shaded else visible[4] if shN is None else torch.cat(visible[4:], dim=1)
     gaussians = gaussians_of(
-        seen[0], seen[1], seen[2], seen[3], sh, viewmats, Ks, sh_degree, shaded, raw=True
+        visible[0], visible[1], visible[2], visible[3], sh, viewmats, Ks, sh_degree, shaded, raw=True
     )
     named = {**whole.named, **({"sh0": (sh0,), "shN": (shN,)} if shN is not None else {"sh0": (sh0,)})}
     background = background_rows(backgrounds, gaussians, render_mode)
@@ -126,8 +126,8 @@ def raw_rasterization(
     renders, alphas, meta = render(
         "raw_rasterization", replace(gaussians, named=named), project, image, sizes
     )
-    of_seen = meta["gaussian_ids"]
-    meta["gaussian_ids"] = Later(lambda: ids.long()[of_seen])
+    index_in_visible = meta["gaussian_ids"]
+    meta["gaussian_ids"] = Later(lambda: ids.long()[index_in_visible])
     return renders, alphas, meta
 
 
@@ -174,13 +174,13 @@ class _Visible(torch.autograd.Function):
     def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
         ids = ctx.saved_tensors[0].long()
         gradients = (
-            None if v is None else _of_all(ids, v, shape, ctx.sparse)
+            None if v is None else _full_gradient(ids, v, shape, ctx.sparse)
             for v, shape in zip(v_rows, ctx.shapes, strict=True)
         )
         return None, None, *gradients
 
 
-def _of_all(ids: Tensor, v_rows: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
+def _full_gradient(ids: Tensor, v_rows: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
     """Return the gradient of a whole table, from that of its rows `ids`."""
     if sparse:
         return sparse_rows(ids, v_rows, shape)

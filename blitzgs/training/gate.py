@@ -77,12 +77,12 @@ def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tup
             f"{known[:12]}..., now {digest[:12]}...): put the files back, or start another run"
         )
     if ranks.rank == 0:
-        for problem in misfits(gate, config, capture):
+        for problem in reasons_against(gate, config, capture):
             warnings.warn(f"spawn gate {path}: {problem}", stacklevel=2)
     return RankVeto(gate, population.gate_rate), digest
 
 
-def misfits(gate: SpawnGate, config: Config, capture: Capture) -> list[str]:
+def reasons_against(gate: SpawnGate, config: Config, capture: Capture) -> list[str]:
     """List the reasons why a gate does not suit a run."""
     found = []
     scene = capture_fingerprint(capture)

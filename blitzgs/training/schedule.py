@@ -99,7 +99,7 @@ class Schedule:
             ("pass_1", config.t1, config.t1 + 1, min(config.t1, 1)),
             ("pass_2", config.t2, config.t2 + 1, min(config.t2, 1)),
             self._clear_cull(),
-            ("place", config.densify_from, config.iterations, self._looks_every()),
+            ("place", config.densify_from, config.iterations, self._placing_interval()),
             ("evaluate", config.evaluate_every, math.inf, config.evaluate_every),
             ("checkpoint", config.checkpoint_every, math.inf, config.checkpoint_every),
         ]
@@ -111,7 +111,7 @@ class Schedule:
         ]
         return sorted(found)
 
-    def _looks_every(self) -> int:
+    def _placing_interval(self) -> int:
         """Return the interval at which a run checks whether to place its next time; 0: never."""
         config = self._config
         is_open = config.adaptive and len(config.placed) < len(PLACED)

@@ -134,7 +134,7 @@ def test_splats_are_written_in_order(views, n):
         for part in torch.arange(n, dtype=torch.int32, device="cuda").chunk(7)
     ]
     expected = [torch.cat(columns) for columns in zip(*(part[:11] for part in parts), strict=True)]
-    for _ in range(3):  # the room for the splats is that of the call before
+    for _ in range(3):  # the capacity is estimated from the call before
         splats = scene.project("cuda")
         for i in (0, 1, 2, *range(4, 11)):
             assert torch.equal(splats[i], expected[i]), i

@@ -178,7 +178,7 @@ def test_all_ranks_repeat_a_frame_that_did_not_fit(sizes, frames, backward_follo
     def rank(ranks):
         transport, part = PeerTransport(ranks, CapacityEstimate(sizes)), _part(table, owner, ranks)
         assignment, before = TileAssignment(ranks, ranges), ranks.memory.generation
-        for count in (frames, 1):  # a second frame has the room that the first one needed
+        for count in (frames, 1):  # a second frame has the capacity that the first one needed
             frame = pipeline.forward(
                 part, views, OPTIONS, assignment=assignment, transport=transport,
                 backward_follows=backward_follows,

@@ -201,7 +201,7 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
         return counts, attempt.needed
 
     counts, needed = finished()
-    assert alone.memory.generation == 2  # the first had no room
+    assert alone.memory.generation == 2  # the first attempt had too small a capacity
     assert len(alone.memory.buffers[0]) >= len(counts.projected.depths) * WORDS_PER_SPLAT
     projected = project_splats(inputs)
     assert all(torch.equal(a, b) for a, b in zip(counts.projected[:11], projected[:11], strict=True))
@@ -216,7 +216,7 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
     later.way_back.check_still_valid()
     with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
         counts.way_back.check_still_valid()
-    # One entry more than there is room for: once more, with room.
+    # One entry more than the capacity: the frame is repeated with a larger capacity.
     short = CapacityEstimate(Sizes(1, 1, needed[2] - 1))
     again = PeerTransport(alone, short)
     transport, before = again, alone.memory.generation

@@ -21,7 +21,7 @@ from blitzgs.population.lineage import ABOUT, Cause, read_lineage
 from blitzgs.population.spawn_gate import GateError, GateInfo, info_path
 from blitzgs.training import run
 from blitzgs.training.events import importance
-from blitzgs.training.gate import life_fields, misfits
+from blitzgs.training.gate import life_fields, reasons_against
 from blitzgs.training.guard import ModelLostError
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import on_each_device, run_ranks
@@ -235,17 +235,17 @@ def test_a_schedule_that_a_gate_was_not_fitted_for_is_named():
         return SimpleNamespace(info=GateInfo(FEATURES, fitted, {}))
 
     here = tiny_config()
-    assert misfits(gate_of(life_fields(here)), here, capture) == []
+    assert reasons_against(gate_of(life_fields(here)), here, capture) == []
     for change in ("optimiser.opacity=0.01", "loss.scale=1", "view.lod=true", "schedule.scale=0.5"):
         name, _, value = change.partition("=")
-        (text,) = misfits(gate_of(life_fields(tiny_config(change))), here, capture)
+        (text,) = reasons_against(gate_of(life_fields(tiny_config(change))), here, capture)
         assert f"{name} ({value}" in text.lower() and "here" in text
     # What is newer than the gate had no effect when it was fitted: the default.
     older = {name: value for name, value in life_fields(here).items() if name != "optimiser.position_noise"}
-    assert misfits(gate_of(older), here, capture) == []
-    (text,) = misfits(gate_of(older), tiny_config("optimiser.position_noise=5"), capture)
+    assert reasons_against(gate_of(older), here, capture) == []
+    (text,) = reasons_against(gate_of(older), tiny_config("optimiser.position_noise=5"), capture)
     assert "optimiser.position_noise (0.0, here 5.0)" in text
-    (text,) = misfits(gate_of(life_fields(here)), tiny_config("schedule.minutes=3"), capture)
+    (text,) = reasons_against(gate_of(life_fields(here)), tiny_config("schedule.minutes=3"), capture)
     assert "with schedule.minutes the run finds its pace while it trains" in text
 
 

@@ -268,7 +268,7 @@ def test_memory_is_unpinned_before_it_goes(monkeypatch):
     columns = len(table.columns)
     assert runtime.calls == len(runtime.pinned) == columns
     kept = table.columns["sh"][5:9]
-    table.append({name: table[name].clone() for name in table})  # more than there is room for
+    table.append({name: table[name].clone() for name in table})  # more than the memory holds
     assert runtime.calls == 2 * columns and len(runtime.pinned) == columns + 1
     del kept
     assert len(runtime.pinned) == columns

@@ -122,10 +122,10 @@ class CollectiveExchange:
 
     def return_sums(self, sums: Tensor) -> Tensor:
         """See `WayBack.return_sums`."""
-        return carry_sums(sums, self._places, self._traffic, len(self._own.camera_ids), self._ranks)
+        return exchange_sums(sums, self._places, self._traffic, len(self._own.camera_ids), self._ranks)
 
 
-def carry_sums(sums: Tensor, places: Tensor, traffic: Traffic, splats: int, ranks: Ranks) -> Tensor:
+def exchange_sums(sums: Tensor, places: Tensor, traffic: Traffic, splats: int, ranks: Ranks) -> Tensor:
     """Carry integer sums of splats to their owners by a collective: `WayBack.return_sums`.
 
     Args:

@@ -35,7 +35,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.shared_memory import SharedMemory
-from blitzgs.distributed.transport.collective import carry_sums
+from blitzgs.distributed.transport.collective import exchange_sums
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
@@ -196,4 +196,4 @@ class PeerExchange:
     def return_sums(self, sums: Tensor) -> Tensor:
         """See `WayBack.return_sums`."""
         traffic = self._read()
-        return carry_sums(sums, self._places, traffic, int(traffic.counts[1]), self._ranks)
+        return exchange_sums(sums, self._places, traffic, int(traffic.counts[1]), self._ranks)

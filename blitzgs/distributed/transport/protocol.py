@@ -7,7 +7,7 @@ every rank::
 
     exchange = transport.start(inputs, assignment, attempt, mark)  # project; send splats to where they go
     exchange.arrived, exchange.gradient_table                      # for compositing
-    counts = exchange.finish()                                     # None: there was too little room
+    counts = exchange.finish()                                     # None: the capacity was too small
     counts.way_back.check_still_valid()                            # before the backward pass of compositing
     gradients = counts.way_back.return_gradients(gradients)        # those of this rank's own splats
 
