@@ -211,7 +211,7 @@ def draw(path: Path, runs: Sequence[Run]) -> bool:
     except ImportError:
         return False
     matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     groups = grouped(runs)
     captures, recipes = list(dict.fromkeys(c for c, _ in groups)), list(dict.fromkeys(r for _, r in groups))
@@ -227,6 +227,9 @@ def draw(path: Path, runs: Sequence[Run]) -> bool:
             color = f"C{recipes.index(label) % 10}"
             axis.plot(seconds, psnr, style, color=color, marker="o", markersize=3, label=label)
         axis.set(xscale="log", xlabel="training time, s", ylabel="held-out PSNR, dB", title=capture)
+        axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+        axis.xaxis.set_minor_formatter(ticker.NullFormatter())
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)
     figure.savefig(path, dpi=110)

@@ -56,6 +56,9 @@ COMMANDS = {
     "exchange": f"{EXCHANGE} --ranks 1 2 4",
     "training": "python benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000",
     "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
+    "importance": "python benchmarks/bm_importance.py",
+    "gate": "python benchmarks/bm_gate.py",
+    "scratch": "python benchmarks/bm_scratch.py",
     "photometric": "python benchmarks/bm_photometric.py",
     "accuracy": "python benchmarks/bm_accuracy.py",
     "quality": (
@@ -63,6 +66,7 @@ COMMANDS = {
         "--recipe aerial=configs/aerial.yaml --recipe gsplat=gsplat-default-reset --seeds 0 1 2"
     ),
 }
+OPPONENT = "gsplat-"  # begins the source of a run with one of gsplat's strategies
 # bm_quality.py takes no --json: it collects all of its runs in one file.
 COPIED = {"quality": "cp runs/quality/quality.json benchmarks/results/"}
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -269,6 +273,9 @@ SECTIONS = {
     "exchange": Section(("exchange",), exchange_lines),
     "training": Section(("training",), row_lines),
     "drop_in": Section(("drop_in",), row_lines),
+    "importance": Section(("importance",), row_lines),
+    "gate": Section(("gate",), row_lines),
+    "scratch": Section(("scratch",), row_lines),
     "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),
@@ -278,13 +285,26 @@ SECTIONS = {
 
 
 def with_origin(name: str, file: Json) -> Json:
-    """Return a file with "command", "commit" and "environment", which collected runs have one by one."""
+    """Return a file with "command", "commit" and "environment", which collected runs have one by one.
+
+    Runs of gsplat's strategies on other commits than our own recipes are named apart, as "opponents".
+    """
     if "runs" not in file:
         return file
     done = [run for run in file["runs"] if run["status"] == "done"]
-    commits = " and ".join(sorted({run["commit"] for run in done})) or "unknown"
-    environment = done[0]["environment"] if done else {}
-    return {"command": COMMANDS[name], "commit": commits, "environment": environment} | file
+    # An opponent's commit is that of the renderer below it, which may be older than our own recipes.
+    commits: dict[bool, set[str]] = {False: set(), True: set()}
+    for run in done:
+        commits[run["source"].startswith(OPPONENT)].add(run["commit"])
+    own, others = (" and ".join(sorted(commits[is_opponent])) for is_opponent in (False, True))
+    about = {
+        "command": COMMANDS[name],
+        "commit": own or others or "unknown",
+        "environment": done[0]["environment"] if done else {},
+    }
+    if own and others not in ("", own):
+        about["opponents"] = others
+    return about | file
 
 
 def load_results(folder: Path = RESULTS) -> Results:
@@ -317,7 +337,10 @@ def machine_line(file: Json) -> str:
     about = file["environment"]
     machine = f"{about['device']}, CUDA {about['cuda']}" if "device" in about else about["processor"]
     peers = f", gsplat {about['gsplat']}" if "gsplat" in about else ""
-    return f"`{file['command']}`, {machine}, torch {about['torch']}{peers}, commit {file['commit']}."
+    opponents = f"; gsplat's strategies on commit {file['opponents']}" if "opponents" in file else ""
+    return (
+        f"`{file['command']}`, {machine}, torch {about['torch']}{peers}, commit {file['commit']}{opponents}."
+    )
 
 
 def section_lines(name: str, results: Results) -> list[str]:

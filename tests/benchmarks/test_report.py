@@ -80,6 +80,7 @@ def quality_run(seed, psnr):
     about = {
         "capture": "park",
         "recipe": "aerial",
+        "source": "configs/aerial.yaml",
         "settings": "1",
         "seed": seed,
         "status": "done",
@@ -99,6 +100,9 @@ def test_quality_comes_from_its_collected_runs(results):
         "| park | aerial | 100 | 3 | 30.00 (29.00) | 0.9000 (0.9000) | 20.0 (20.0) | 2.000 M (2.000 M) |"
         in page
     )
+    opponent = quality_run(0, 28.0) | {"recipe": "mcmc", "source": "gsplat-mcmc", "commit": "def"}
+    (results / "quality.json").write_text(json.dumps({"runs": [*runs, opponent]}))
+    assert "commit abc; gsplat's strategies on commit def." in made(results, "quality")
     runs[1]["commit"] = "def"
     (results / "quality.json").write_text(json.dumps({"runs": runs}))
     with pytest.raises(report.ReportError, match="is of commit abc and def"):
