@@ -177,11 +177,12 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     options = parser.parse_args(arguments)
     capture = load_capture(options.capture, downscale=options.downscale)
     images = ImageStore(capture)
-    rows = [measure(name, capture, images, options) for name in options.arms]
+    title, rows = f"gsplat's loop, {options.steps} steps of {options.capture.name}", []
+    for name in options.arms:
+        rows.append(measure(name, capture, images, options))
+        # After each arm: a run that is cut off leaves what it measured.
+        report(title, rows, options.json, options.device)
     images.close()
-    report(
-        f"gsplat's loop, {options.steps} steps of {options.capture.name}", rows, options.json, options.device
-    )
     return rows
 
 
