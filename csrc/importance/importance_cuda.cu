@@ -125,11 +125,11 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
     for (int i = 0; i < quads && !__all_sync(kFullWarp, state.done()); i += kGroup / 4) {
       const int filled = min(kGroup / 4, quads - i);
       for (int quad = 0; quad < filled; ++quad) {
-        const QuadWeights weights = state.add(entries, QuadOffsets(list[i + quad]), pixel);
+        const QuadAlphas alpha = state.alphas(entries, QuadOffsets(list[i + quad]), pixel);
 #pragma unroll
         for (int k = 0; k < 4; ++k) {
           group[(4 * quad + k) * kEntryStride + lane] =
-              __float2uint_rn(weights.at[k] * static_cast<float>(kContributionScale));
+              __float2uint_rn(state.composite(alpha.at[k]) * static_cast<float>(kContributionScale));
         }
       }
       __syncwarp();

@@ -76,57 +76,54 @@ inline void prepare(const char* what, const RasterizeInput<float>& in, PackedSpl
 // List entries that a block copies at a time.
 inline constexpr int kForwardBatch = 256;
 
-// The weights alpha T of four entries of a batch at a pixel, zero for entries that are not composited, and
-// whether each entry is composited.
-struct QuadWeights {
+// The alphas of four entries of a batch at a pixel, zero for entries that are not composited, and whether
+// each entry is composited.
+struct QuadAlphas {
   float at[4];
   bool touched[4];
 };
 
-// The state of one pixel while its list is composited. `last` and `ended` are byte offsets of entries in the
-// current batch.
+// The state of one pixel while its list is composited. For each four entries, alphas() comes first, and then
+// composite() of each alpha in order. `ended` is a byte offset of an entry in the current batch.
 struct Compositor {
   static constexpr std::uint32_t kNone = ~0u;
   float transmittance = 1.f;
   float limit;                  // the least log2(alpha) that is composited; infinite once the pixel has ended
-  std::uint32_t last = kNone;   // the last entry that was composited
   std::uint32_t ended = kNone;  // the entry at which the pixel ended
 
-  // Composites four entries of a batch. It tests once for all four whether a pixel of the warp ends.
-  __device__ __forceinline__ QuadWeights add(const char* entries, const QuadOffsets& offsets,
-                                             const Pixel& pixel) {
-    float alpha[4];
-    QuadWeights weights;
+  // Finds the alphas of four entries of a batch. It tests once for all four whether a pixel of the warp ends.
+  __device__ __forceinline__ QuadAlphas alphas(const char* entries, const QuadOffsets& offsets,
+                                               const Pixel& pixel) {
+    QuadAlphas alpha;
     float after = transmittance;
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
       const float log2_a = log2_alpha(entry_at(entries, offsets.at[k]), pixel);
-      weights.touched[k] = log2_a >= limit;
-      alpha[k] = weights.touched[k] ? fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax)) : 0.f;
-      after = __fmaf_rn(-alpha[k], after, after);
+      alpha.touched[k] = log2_a >= limit;
+      alpha.at[k] = alpha.touched[k] ? fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax)) : 0.f;
+      after = __fmaf_rn(-alpha.at[k], after, after);
     }
-    if (__any_sync(kFullWarp, after < static_cast<float>(kMinTransmittance))) {
-      end(alpha, weights.touched, offsets);
-    }
-#pragma unroll
-    for (int k = 0; k < 4; ++k) {
-      weights.at[k] = alpha[k] * transmittance;
-      transmittance = __fmaf_rn(-alpha[k], transmittance, transmittance);
-      if (weights.touched[k]) last = offsets.at[k];
-    }
-    return weights;
+    if (__any_sync(kFullWarp, after < static_cast<float>(kMinTransmittance))) end(alpha, offsets);
+    return alpha;
+  }
+
+  // Composites an entry: returns its weight alpha T and reduces the transmittance T to (1 - alpha) T.
+  __device__ __forceinline__ float composite(float alpha) {
+    const float weight = alpha * transmittance;
+    transmittance = __fmaf_rn(-alpha, transmittance, transmittance);
+    return weight;
   }
 
   // If one of the four entries ends the pixel, removes this entry and the entries after it.
-  __device__ __forceinline__ void end(float (&alpha)[4], bool (&touched)[4], const QuadOffsets& offsets) {
+  __device__ __forceinline__ void end(QuadAlphas& alpha, const QuadOffsets& offsets) {
     float after = transmittance;
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
-      after = __fmaf_rn(-alpha[k], after, after);
+      after = __fmaf_rn(-alpha.at[k], after, after);
       if (ended == kNone && after < static_cast<float>(kMinTransmittance)) ended = offsets.at[k];
       if (ended != kNone) {
-        alpha[k] = 0.f;
-        touched[k] = false;
+        alpha.at[k] = 0.f;
+        alpha.touched[k] = false;
         limit = INFINITY;
       }
     }

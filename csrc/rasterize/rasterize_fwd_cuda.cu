@@ -23,17 +23,23 @@ struct ForwardArguments {
   const std::int64_t* known_splats;  // null, or the actual number of splats
 };
 
-// Adds the colours of four entries, times their weights, to the colour of a pixel.
+// Composites four entries of a batch into the colour of a pixel, and sets *last to the byte offset of the
+// last of them that touches the pixel. One loop computes the weights, *last and the colour: if they were in
+// separate loops, the compiler would emit divergent branches around the colours instead of predicated
+// instructions.
 template <int CHANNELS>
 __device__ __forceinline__ void add_colors(const char* entries, const QuadOffsets& offsets,
-                                           const QuadWeights& weights, float* color) {
+                                           const Pixel& pixel, Compositor& state, float* color,
+                                           std::uint32_t* last) {
+  const QuadAlphas alpha = state.alphas(entries, offsets, pixel);
 #pragma unroll
   for (int k = 0; k < 4; ++k) {
+    const float weight = state.composite(alpha.at[k]);
     const float4 splat_color = *reinterpret_cast<const float4*>(entry_at(entries, offsets.at[k]).color);
-    if (weights.touched[k]) {
+    if (alpha.touched[k]) {
+      *last = offsets.at[k];
 #pragma unroll
-      for (int c = 0; c < CHANNELS; ++c)
-        color[c] = __fmaf_rn(weights.at[k], channel(splat_color, c), color[c]);
+      for (int c = 0; c < CHANNELS; ++c) color[c] = __fmaf_rn(weight, channel(splat_color, c), color[c]);
     }
   }
 }
@@ -107,6 +113,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
 
   Compositor state;
   float color[CHANNELS] = {};
+  std::uint32_t touched = state.kNone;  // byte offset of the last entry of the batch that touches the pixel
   state.limit = pixel.inside ? kLog2Cut : INFINITY;
   int last = 0, work = pixel.inside ? count : 0;
   const auto splat_at = [&](int at) {
@@ -128,14 +135,12 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) forward_kernel(const Forwar
     const uint2* list = batch.quads(pixel.subtile);
     for (int i = 0; i < quads && !__all_sync(kFullWarp, state.done());) {
       for (const int stop = min(i + 8, quads); i < stop; ++i) {
-        const QuadOffsets offsets(list[i]);
-        const QuadWeights weights = state.add(entries, offsets, pixel);
-        add_colors<CHANNELS>(entries, offsets, weights, color);
+        add_colors<CHANNELS>(entries, QuadOffsets(list[i]), pixel, state, color, &touched);
       }
     }
-    if (state.last != state.kNone) last = base + entry_number(state.last) + 1;
+    if (touched != state.kNone) last = base + entry_number(touched) + 1;
     if (state.ended != state.kNone) work = base + entry_number(state.ended) + 1;
-    state.last = state.ended = state.kNone;
+    touched = state.ended = state.kNone;
   }
 
   if (pixel.inside) {
