@@ -16,6 +16,10 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 # are.
 _MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT = torch.ops.blitzgs.splat_gradient_layout()
 
+# Where the `gradient_columns` begin, and their shapes behind the number of splats.
+_BEGINS = (_MEAN2D, _CONIC, _OPACITY, _COLOR)
+_WIDTHS: tuple[tuple[int, ...], ...] = ((2,), (3,), (), (3,))
+
 
 def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """View a table of splat gradients as columns.
@@ -40,16 +44,21 @@ def absolute_column(packed: Tensor) -> Tensor:
 
 
 def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
-    """Return the table of which `columns` are the `gradient_columns`; None if they are not of one table."""
-    table = None if columns[0] is None else columns[0]._base
-    if table is None or table.dim() != 2 or table.shape[1] != SPLAT_GRADIENT or not table.is_contiguous():
+    """Return the table of which `columns` are the `gradient_columns`; None if they are not of one table.
+
+    The table may be the first rows of a longer one, because memory is allocated for more splats than there
+    are.
+    """
+    whole = None if columns[0] is None else columns[0]._base
+    if whole is None or whole.dim() != 2 or whole.shape[1] != SPLAT_GRADIENT or not whole.is_contiguous():
         return None
-    for column, view in zip(columns, gradient_columns(table), strict=True):
-        if column is None or column._base is not table or column.shape != view.shape:
+    first, count = whole.storage_offset(), len(columns[0])
+    for column, begin, width in zip(columns, _BEGINS, _WIDTHS, strict=True):
+        if column is None or column._base is not whole or column.storage_offset() != first + begin:
             return None
-        if (column.storage_offset(), column.stride()) != (view.storage_offset(), view.stride()):
+        if column.shape != (count, *width) or column.stride() != (SPLAT_GRADIENT, *(1 for _ in width)):
             return None
-    return table
+    return whole if len(whole) == count else whole[:count]
 
 
 class SplatGradients(NamedTuple):

@@ -9,7 +9,7 @@ import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.rasterize import rasterize
-from blitzgs.ops.splat_gradients import GradientBuffer
+from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, packed_table
 from tests.ops.splats import Splats, dense_composite, near_a_cut, random_splats
 
 WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
@@ -358,6 +358,44 @@ def test_a_gradient_buffer_gives_its_zeros_once():
         assert taken is not zeros and taken.shape == (5, 12) and not taken.any()
     assert GradientBuffer(torch.zeros(0, 12)).take(means2d[:0]).shape == (0, 12)
     assert GradientBuffer(zeros).take(means2d[:3]).data_ptr() == zeros.data_ptr()
+
+
+@pytest.mark.parametrize("capacity", [5, 9])
+def test_a_table_of_gradients_is_found_again_behind_autograd(capacity):
+    buffer, found = torch.rand(capacity, 12), []
+
+    class Projected(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, means):
+            return means[:, :2].clone(), means[:, :3].clone(), means[:, 0].clone(), means[:, :3].clone()
+
+        @staticmethod
+        def backward(ctx, *v_columns):
+            found.append(packed_table(v_columns))
+
+    class Composited(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, *columns):
+            return columns[0].sum()
+
+        @staticmethod
+        def backward(ctx, v_sum):
+            return gradient_columns(GradientBuffer(buffer).take(torch.zeros(5, 2)))
+
+    Composited.apply(*Projected.apply(torch.ones(5, 3, requires_grad=True))).backward()
+    assert found[0].data_ptr() == buffer.data_ptr()
+    assert torch.equal(found[0], buffer[:5])
+
+
+def test_columns_of_no_table_are_not_one():
+    table = torch.zeros(5, 12)
+    means2d, conics, opacities, colors = gradient_columns(table)
+    assert packed_table((means2d, conics.clone(), opacities, colors)) is None
+    assert packed_table((means2d, conics, opacities, None)) is None
+    assert packed_table((colors[:, :2], conics, opacities, colors)) is None
+    assert packed_table((means2d[:3], conics, opacities, colors)) is None
+    assert packed_table([column[1:] for column in gradient_columns(table)]) is None
+    assert packed_table([column.clone() for column in gradient_columns(table)]) is None
 
 
 def test_the_images_do_not_depend_on_a_backward_pass_to_follow():
