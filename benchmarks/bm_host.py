@@ -32,7 +32,9 @@ CALLS: dict[str, dict[str, Any]] = {
 }
 
 
-def measure(device: str, repeats: int, views: int = 1, read_meta: bool = False, **options: Any) -> list[float]:
+def measure(
+    device: str, repeats: int, views: int = 1, read_meta: bool = False, **options: Any
+) -> list[float]:
     """Return the median microseconds of the forward and of the backward pass.
 
     Args:

@@ -117,9 +117,10 @@ def differentiable_splats(
     """
     gaussians, (viewmats, Ks) = list(inputs.gaussians), inputs.cameras  # noqa: N806
     if not torch.compiler.is_compiling():
+        splats = project_splats(inputs) if splats is None else splats
         sh = gaussians[4] if len(gaussians) > 4 else None
         columns = _Project.apply(*gaussians[:4], sh, viewmats, inputs, sparse_grad, splats)  # type: ignore[no-untyped-call]
-        return ProjectedSplats._make(columns)
+        return splats._replace(**_Differentiable._make(columns)._asdict())
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
     *columns, _, totals = torch.ops.blitzgs.project_fwd(
@@ -211,6 +212,21 @@ def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats) -> None:
     ctx.options, ctx.n_gaussians = inputs.options, len(inputs.gaussians)
 
 
+class _Differentiable(NamedTuple):
+    """The columns of `ProjectedSplats` that have gradients; or these gradients, None for zero."""
+
+    means2d: Any
+    conics: Any
+    depths: Any
+    opacities: Any
+    colors: Any
+
+    @classmethod
+    def of(cls, splats: ProjectedSplats) -> _Differentiable:
+        """Take the columns from all columns."""
+        return cls(splats.means2d, splats.conics, splats.depths, splats.opacities, splats.colors)
+
+
 class _Saved(NamedTuple):
     """The tensors that `_save` saved, in its groups."""
 
@@ -227,7 +243,7 @@ class _Saved(NamedTuple):
 
 
 def _gradients(
-    ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: ProjectedSplats
+    ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: _Differentiable
 ) -> tuple[Tensor | None, ...]:
     """Return the gradients of all gaussians (None without sh) and viewmats, if they are needed.
 
@@ -250,7 +266,7 @@ def _first_gradients(
     needed: Sequence[bool],
     need_viewmats: bool,
     sparse: Sequence[bool],
-    v: ProjectedSplats,
+    v: _Differentiable,
 ) -> tuple[Tensor | None, ...]:
     # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
     dense = not any(sparse) and all(needed)
@@ -273,7 +289,7 @@ def _full_gradient(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: boo
     return torch.zeros_like(parameter).index_copy_(0, ids, gradient)
 
 
-def _splat_gradients(saved: _Saved, v: ProjectedSplats) -> list[Tensor]:
+def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:
     """Return the gradients of means2d, conics, opacities and colors as `project_bwd` takes them."""
     columns = [v.means2d, v.conics, v.opacities] + ([v.colors] if len(saved.gaussians) > 4 else [])
     if v.depths is None and len(columns) == 4 and (table := packed_table(columns)) is not None:
@@ -286,31 +302,25 @@ def _splat_gradients(saved: _Saved, v: ProjectedSplats) -> list[Tensor]:
 
 
 class _Project(torch.autograd.Function):
-    """`project_splats` for calls outside of `torch.compile`, with the gradient formula registered below.
+    """Makes the splats of `project_splats` differentiable, with the gradient formula registered below.
 
-    Calling an op with a registered formula through torch takes 0.2 ms of the host's time. Each argument adds
-    to it, so all arguments without a gradient are passed as one. Counts are no output of the op.
+    It is for calls outside of `torch.compile`. Calling an op with a registered formula through torch takes
+    0.2 ms of the host's time. Each argument and each result adds to it, so all arguments without a gradient
+    are passed as one, and only the columns that have gradients pass through.
     """
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        *tensors, inputs, sparse_grad, splats = arguments
-        *gaussians, viewmats = tensors
-        cameras = (viewmats, inputs.cameras[1])
-        inputs = inputs._replace(gaussians=[t for t in gaussians if t is not None], cameras=cameras)
-        if splats is None:
-            splats = project_splats(inputs)
+        _, _, _, opacities, sh, _, inputs, sparse_grad, splats = arguments
         _save(ctx, inputs, splats)
-        ctx.mark_non_differentiable(splats.counts)
-        opacities, sh = gaussians[3:5]
         leaves = [sh is not None and tensor.is_leaf for tensor in (opacities, sh)]
         ctx.sparse = (True, True, True, *leaves) if sparse_grad else (False,) * 5
-        return tuple(splats)
+        return tuple(_Differentiable.of(splats))
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
         *needed, need_viewmats = ctx.needs_input_grad[:6]
-        v = ProjectedSplats._make((*v_output[:-1], None))
+        v = _Differentiable._make(v_output)
         return (*_gradients(ctx, needed[: ctx.n_gaussians], need_viewmats, ctx.sparse, v), *(None,) * 3)
 
 
@@ -329,7 +339,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
     needed, (need_viewmats, _) = ctx.needs_input_grad[:2]
-    v = ProjectedSplats._make((*v_output[:12], None))
+    v = _Differentiable.of(ProjectedSplats._make((*v_output[:12], None)))
     *gradients, v_viewmats = _gradients(ctx, needed, need_viewmats, (False,) * 5, v)
     return gradients[: len(needed)], [v_viewmats, None], *ctx.no_gradients
 

@@ -24,7 +24,10 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
         shape: shape of the table.
     """
     indices = ids.long()[None]
-    _distinct.append(StorageWeakRef(indices.untyped_storage()))
+    storage = indices.untyped_storage()
+    # The gradients of one backward pass share their indices.
+    if not _distinct or _distinct[-1].cdata != storage._cdata:
+        _distinct.append(StorageWeakRef(storage))
     return torch.sparse_coo_tensor(indices, values, shape, is_coalesced=True, check_invariants=False)
 
 

@@ -208,11 +208,9 @@ def gaussians_of(
     colors = colors if with_colors else None
     whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
     scenes = _scenes(whole, batch)
-    named = {
-        name: tuple(getattr(scene, name) for scene in scenes)
-        for name in Scene._fields[:7]
-        if name != "colors" or colors is not None
-    }
+    named = dict(zip(Scene._fields[:7], zip(*scenes, strict=True), strict=False))
+    if colors is None:
+        del named["colors"]
     degree = sh_degree if with_colors else None
     return Gaussians(scenes, colors, opacities, degree, per_view, (*batch, C), raw, named)
 
@@ -288,5 +286,5 @@ def background_rows(backgrounds: Tensor | None, gaussians: Gaussians, render_mod
 
 
 def _require(name: str, tensor: Tensor, shape: tuple[int, ...], described: str) -> None:
-    if tuple(tensor.shape) != shape:
+    if tensor.shape != shape:
         raise ValueError(f"{name} must be {described} = {[*shape]}, got {list(tensor.shape)}")

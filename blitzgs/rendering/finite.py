@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from functools import lru_cache
 from itertools import count
@@ -24,26 +25,43 @@ def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return, by argument, the indices int64 [M] of Gaussians or views whose values are not finite.
 
     Indices count through all scenes of a batch. Arguments whose values are all finite have no entry.
+
+    One sum over each argument tells whether its rows have to be looked at, so finite arguments are read once
+    and need no memory of their size.
     """
+    activated = {
+        name: [_activated(t, name, gaussians.raw) for t in tensors]
+        for name, tensors in gaussians.named.items()
+    }
+    totals = [torch.stack([t.sum() for t in tensors]).sum() for tensors in activated.values()]
     found = {}
-    for name, tensors in gaussians.named.items():
+    for (name, tensors), finite in zip(
+        activated.items(), torch.stack(totals).isfinite().tolist(), strict=True
+    ):
+        if finite:
+            continue
         # Of colours per view, a Gaussian's are those of all views.
         rows = [t.movedim(1, 0) for t in tensors] if name == "colors" and gaussians.per_view else tensors
-        finite = torch.cat([_finite(t, name, gaussians.raw) for t in rows])
-        bad = (~finite).nonzero()[:, 0]
+        bad = torch.cat([_rows_not_finite(t) for t in rows]).nonzero()[:, 0]
         if len(bad):
             found[name] = bad
     return found
 
 
-def _finite(values: Tensor, name: str, raw: bool) -> Tensor:
-    """Return which rows [N, ...] are finite, after their activation."""
-    flat = values.reshape(len(values), -1)
+def _activated(values: Tensor, name: str, raw: bool) -> Tensor:
+    """Return the values that have to be finite: those after the activation, if there is one."""
     if raw and name == "opacities":
-        return ~flat.isnan().any(dim=1)
-    if raw and name == "scales":
-        return flat.exp().isfinite().all(dim=1)
-    return flat.isfinite().all(dim=1)
+        return values.sigmoid()
+    return values.exp() if raw and name == "scales" else values
+
+
+def _rows_not_finite(values: Tensor) -> Tensor:
+    """Return which rows of [N, ...] have a value that is not finite, bool [N]."""
+    flat = values.reshape(len(values), -1)
+    bad = ~flat.sum(dim=1).isfinite()
+    rows = bad.nonzero()[:, 0]
+    bad[rows] = ~flat[rows].isfinite().all(dim=1)  # the sum of finite values may overflow
+    return bad
 
 
 def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> None:
@@ -57,11 +75,10 @@ def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> N
         return
     summed = [t for name, given in gaussians.named.items() if name not in COLOURS for t in given]
     with torch.no_grad():
-        sums = [t.sum() for t in summed]
+        sums = torch.stack([t.sum() for t in summed]).tolist()
         # Splats whose colour is not finite have no opacity, and no other splat is below 1/255.
-        hidden = (layout.splats.opacities == 0).any()
-        looks_finite = bool(torch.stack(sums).sum().isfinite() & ~hidden)
-    if looks_finite:
+        none_hidden = bool(layout.splats.opacities.all())
+    if none_hidden and math.isfinite(sum(sums)):
         return
     names = ", ".join(non_finite(gaussians))
     if names:

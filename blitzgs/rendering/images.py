@@ -72,12 +72,13 @@ def render(
     splats = project_groups(groups, image.sparse_grad, None if ready is None else ready.splats)
     layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
     arranged = _arranged(layout, gaussians, project, image)
-    means2d, conics, opacities, depths = layout.gather(*arranged.values())
-    rendered = splats._replace(means2d=means2d, conics=conics, opacities=opacities, depths=depths)
+    rendered = splats
+    if layout.places is not None:
+        rendered = splats._replace(**dict(zip(arranged, layout.gather(*arranged.values()), strict=True)))
     channels, lead = _channels(rendered, layout, gaussians, image.render_mode), gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
-    count = -1 if compiling or job is not None else int(splats.counts[2])
+    count = -1 if compiling or job is not None or ready is not None else int(splats.counts[2])
     lists, composited_lists = _lists(rendered, math.prod(lead), project, ready, count)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
@@ -89,7 +90,7 @@ def render(
     if not compiling:
         warn_of_non_finite(gaussians, layout, function)
     size = (*lead, project.height, project.width)
-    alphas = alphas[..., None]
+    alphas = alphas.unsqueeze(-1)
     if image.render_mode.endswith("ED"):
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
     if len(lead) > 1:

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import blitzgs
+from blitzgs.ops import project, splat_gradients
 from tests.helpers import PARAMETERS, random_scene, relative_error
 
 PER_SPLAT = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")
@@ -125,3 +126,19 @@ def test_deterministic_gradients(channels):
         torch.use_deterministic_algorithms(False)
     for again in gradients[1:]:
         assert all(torch.equal(a, b) for a, b in zip(gradients[0], again, strict=True))
+
+
+def test_gradients_of_splats_stay_in_their_table(monkeypatch):
+    # The capacity exceeds the number of splats, so the table is the first part of its memory.
+    scene, found = random_scene(400, cameras=1, device="cuda"), []
+
+    def packed_table(columns):
+        found.append(splat_gradients.packed_table(columns))
+        return found[-1]
+
+    monkeypatch.setattr(project, "packed_table", packed_table)
+    for _ in range(3):
+        leaves = scene.leaves()
+        renders, _, meta = blitzgs.rasterization(*leaves.arguments(), sh_degree=scene.sh_degree)
+        renders.sum().backward()
+    assert [table.shape for table in found] == [(len(meta["depths"]), 12)] * 3

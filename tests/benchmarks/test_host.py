@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark of a call's host time measures every kind of call and writes them as JSON."""
+
+import json
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+import bm_host  # noqa: E402
+
+
+def test_every_call_is_measured(tmp_path, monkeypatch, capsys):
+    arguments = ["--device", "cpu", "--repeats", "3", "--json", str(tmp_path / "host.json")]
+    monkeypatch.setattr(sys, "argv", ["bm_host.py", *arguments])
+    bm_host.main()
+    rows = json.loads((tmp_path / "host.json").read_text())["rows"]
+    assert [row["call"] for row in rows] == list(bm_host.CALLS)
+    assert all(row["forward us"] > 0 and row["backward us"] > 0 for row in rows)
+    assert "sparse, meta" in capsys.readouterr().out
