@@ -4,7 +4,7 @@
     python benchmarks/bm_host.py [--device cpu] [--repeats 500] [--json FILE]
 
 50 Gaussians with SH of degree 1 in an image of 32 x 32 px; gradients for every parameter; autograd in one
-thread. On the CPU the kernels take a few microseconds of each figure. On CUDA each step ends with a
+thread. On the CPU each figure includes the kernels. On CUDA each step ends with a
 synchronisation, so a figure is the longer of host and device. Each figure is a median over repeats. To
 compare with another version of the package, put its folder into PYTHONPATH.
 """

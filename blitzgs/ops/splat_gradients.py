@@ -51,10 +51,10 @@ def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
     """
     if columns[0] is None:
         return None
-    whole, count = columns[0]._base, len(columns[0])
+    whole = columns[0]._base
     if whole is None or whole.dim() != 2 or whole.shape[1] != SPLAT_GRADIENT or not whole.is_contiguous():
         return None
-    first = whole.storage_offset()
+    first, count = whole.storage_offset(), len(columns[0])
     for column, begin, width in zip(columns, _BEGINS, _WIDTHS, strict=True):
         if column is None or column._base is not whole or column.storage_offset() != first + begin:
             return None
