@@ -31,7 +31,7 @@ constexpr std::int64_t kWidth = 128, kHeight = 96, kTileSize = 16, kViews = 1;
 template <std::size_t Results, class... Arguments>
 std::array<Tensor, Results> call(const char* op, const Arguments&... arguments) {
   std::array<StableIValue, std::max(sizeof...(Arguments), Results)> stack{abi::from(arguments)...};
-  STABLE_TORCH_ERROR_CODE_CHECK(torch_call_dispatcher(op, "", stack.data(), TORCH_ABI_VERSION));
+  TORCH_ERROR_CODE_CHECK(torch_call_dispatcher(op, "", stack.data(), TORCH_ABI_VERSION));
   std::array<Tensor, Results> results;
   for (std::size_t i = 0; i < Results; ++i) results[i] = abi::to<Tensor>(stack[i]);
   return results;
