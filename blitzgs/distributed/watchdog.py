@@ -34,8 +34,7 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
     """Connect to the job's key-value store at MASTER_ADDR and MASTER_PORT.
 
     Keys have a prefix of `name` and the number of the restart: torchrun keeps the store over restarts, and a
-        new rank must
-    not read the addresses of the rank that it replaces.
+    new rank must not read the addresses of the rank that it replaces.
 
     Args:
         name: name of this use of the store.

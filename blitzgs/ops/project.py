@@ -17,7 +17,7 @@ from blitzgs.ops.projection import (
     ProjectionOptions,
     project_splats,
 )
-from blitzgs.ops.sparse_rows import sparse_rows
+from blitzgs.ops.sparse_rows import full_gradient
 from blitzgs.ops.splat_gradients import packed_table
 
 
@@ -278,15 +278,11 @@ def _first_gradients(
     if not dense:
         ids = saved.splats[1].long()
         columns = zip(saved.gaussians, gradients, sparse, needed, strict=False)
-        found = [_full_gradient(ids, *column) if wanted else None for *column, wanted in columns]
+        found = [
+            full_gradient(ids, gradient, parameter.shape, is_sparse) if wanted else None
+            for parameter, gradient, is_sparse, wanted in columns
+        ]
     return (*found, *[None] * (5 - len(found)), v_viewmats if need_viewmats else None)
-
-
-def _full_gradient(ids: Tensor, parameter: Tensor, gradient: Tensor, sparse: bool) -> Tensor:
-    """Return the gradient of a whole parameter from the gradient of its rows `ids`."""
-    if sparse:
-        return sparse_rows(ids, gradient, parameter.shape)
-    return torch.zeros_like(parameter).index_copy_(0, ids, gradient)
 
 
 def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:

@@ -31,6 +31,20 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
     return torch.sparse_coo_tensor(indices, values, shape, is_coalesced=True, check_invariants=False)
 
 
+def full_gradient(ids: Tensor, gradient: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
+    """Return the gradient of a whole parameter from that of its rows `ids`, as a sparse or a dense tensor.
+
+    Args:
+        ids: int64 [U], without duplicates.
+        gradient: [U, ...].
+        shape: [N, ...], of the parameter.
+        sparse: return a sparse tensor.
+    """
+    if sparse:
+        return sparse_rows(ids, gradient, shape)
+    return gradient.new_zeros(shape).index_copy_(0, ids, gradient)
+
+
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
     """Return the indices int64 [U] and values [U, ...] of a sparse tensor, each index once.
 

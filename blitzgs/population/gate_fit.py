@@ -139,8 +139,7 @@ def fit(runs: Sequence[Spawns], path: Path, seed: int = 0) -> dict[str, Any]:
     """Fit a gate on all runs, and measure how well such a gate predicts on scenes that it was not fitted on.
 
     With several scenes, each scene is left out once: a gate is fitted on the runs of the other scenes and
-        evaluated on the
-    spawns of this one. With a single scene, a quarter of the parents is held out instead.
+    evaluated on the spawns of this one. With a single scene, a quarter of the parents is held out instead.
 
     Args:
         runs: at least one run.

@@ -14,7 +14,7 @@ from torch import Tensor
 from blitzgs.lazy_dict import Later
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
-from blitzgs.ops.sparse_rows import sparse_rows
+from blitzgs.ops.sparse_rows import full_gradient
 from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
 from blitzgs.rendering.groups import groups_of
 from blitzgs.rendering.images import ImageOptions, render
@@ -54,10 +54,9 @@ def raw_rasterization(
     """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
 
     The result is that of `blitzgs.rasterization` with `exp(scales)`, `sigmoid(opacities)` and `cat([sh0,
-    shN], 1)`, but
-    none of these tensors is made: the function first finds the visible Gaussians, and only gathers, activates
-        and renders
-    these. Gradients are sparse and have only the visible Gaussians, so the parameters must be leaves.
+    shN], 1)`, but none of these tensors is made: the function first finds the visible Gaussians, and only
+    gathers, activates and renders these. Gradients are sparse and have only the visible Gaussians, so the
+    parameters must be leaves.
 
     Args:
         means: [N, 3] in world units, float32, or float64 on the CPU.
@@ -174,14 +173,7 @@ class _Visible(torch.autograd.Function):
     def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
         ids = ctx.saved_tensors[0].long()
         gradients = (
-            None if v is None else _full_gradient(ids, v, shape, ctx.sparse)
+            None if v is None else full_gradient(ids, v, shape, ctx.sparse)
             for v, shape in zip(v_rows, ctx.shapes, strict=True)
         )
         return None, None, *gradients
-
-
-def _full_gradient(ids: Tensor, v_rows: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """Return the gradient of a whole table, from that of its rows `ids`."""
-    if sparse:
-        return sparse_rows(ids, v_rows, shape)
-    return v_rows.new_zeros(shape).index_copy_(0, ids, v_rows)

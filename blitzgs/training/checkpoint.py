@@ -189,10 +189,8 @@ def load(
     """Load this rank's share of one checkpoint.
 
     With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
-    rows are
-    redistributed: rank m gets the positions = m (mod M) of the global order (`sharding.global_positions`),
-        and opens
-    only the files that hold some of these rows.
+    rows are redistributed: rank m gets the positions = m (mod M) of the global order
+    (`sharding.global_positions`), and opens only the files that hold some of these rows.
 
     Args:
         path: folder returned by `save`.

@@ -33,8 +33,7 @@ class BlockIndex:
     """Bounds of blocks of 256 consecutive rows of one table, updated as an optimiser moves rows.
 
     Build a new index whenever rows were added, removed or reordered. Sort the table by `morton_order` first:
-        the
-    active set is right in any order, but in a random order blocks are large and no block is skipped.
+    the active set is right in any order, but in a random order blocks are large and no block is skipped.
     """
 
     def __init__(self, table: GaussianTable, schedule: Tensor | None = None) -> None:
