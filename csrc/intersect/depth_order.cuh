@@ -42,15 +42,19 @@ __device__ __forceinline__ SplatShape load_splat(const IntersectInput<float>& in
   return s;
 }
 
+// The owned tiles [begin, end) of tile row ty of a camera's image. Nothing is owned if first >= last.
+__device__ __forceinline__ Owned clip_to_owned(const TileGrid& grid, int camera, int ty, int begin, int end) {
+  const int image = camera * static_cast<int>(grid.per_image()) - static_cast<int>(grid.tile_begin);
+  const int base = image + ty * grid.tiles_x;
+  return {max(base + begin, 0), min(base + end, static_cast<int>(grid.tile_end - grid.tile_begin)), ty};
+}
+
 // Calls f(owned tiles) for each tile row that the splat touches.
 template <class F>
 __device__ __forceinline__ void for_each_owned(const TileGrid& grid, const SplatShape& splat, const F& f) {
-  const int n_owned = static_cast<int>(grid.tile_end - grid.tile_begin);
-  const int image = splat.camera * static_cast<int>(grid.per_image()) - static_cast<int>(grid.tile_begin);
   for_each_tile_row(splat.mean, splat.conic, splat.opacity, grid.width, grid.height, grid.tile_size,
                     [&](int ty, int begin, int end) {
-                      const int base = image + ty * grid.tiles_x;
-                      const Owned owned{max(base + begin, 0), min(base + end, n_owned), ty};
+                      const Owned owned = clip_to_owned(grid, splat.camera, ty, begin, end);
                       if (owned.first < owned.last) f(owned);
                     });
 }

@@ -55,6 +55,31 @@ __global__ void count_kernel(const Input in, std::int32_t* counts) {
   counts[i] = i < valid_splat_count(in) ? find_touched(in.grid, load_splat(in, i)).count() : 0;
 }
 
+struct LaneEntry {
+  int source;           // the lane that the entry belongs to
+  std::int32_t k;       // its number among that lane's entries
+  std::int32_t number;  // its number among all entries of the warp
+  bool valid;           // false if no entry is left for this lane
+};
+
+// Numbers the entries of a warp's lanes, `count` of each lane, one lane after the other, and shares them out
+// evenly: calls f(LaneEntry) for 32 entries at a time, on all lanes. Returns the number of entries.
+template <class F>
+__device__ __forceinline__ std::int32_t share_entries(std::int32_t count, int lane, const F& f) {
+  const std::int32_t until = sum_of_lanes_until(count, lane), total = __shfl_sync(kFullWarp, until, 31);
+  const std::int32_t begin = until - count;
+  for (std::int32_t first = 0; first < total; first += 32) {
+    const std::int32_t number = first + lane;
+    int source = 0;  // the last lane whose entries begin at `number` or before
+#pragma unroll
+    for (int step = 16; step > 0; step /= 2) {
+      if (__shfl_sync(kFullWarp, begin, source + step) <= number) source += step;
+    }
+    f(LaneEntry{source, number - __shfl_sync(kFullWarp, begin, source), number, number < total});
+  }
+  return total;
+}
+
 // Writes the entries of a warp's splats, one splat for each lane. The warp's entries begin at `turn`, the
 // lane's at `turn` + `start`.
 template <class Key>
@@ -63,44 +88,39 @@ __device__ __forceinline__ void write_entries(const Input& in, std::int32_t spla
                                               Key* keys, std::int32_t* entries, const TileDigits& digits,
                                               std::uint32_t* counts) {
   const int lane = threadIdx.x % 32;
-  // The warp numbers all entries of its compact splats and writes 32 of them at a time, one per lane. The
-  // splat of an entry (`source`) may belong to another lane.
-  const std::int32_t count = touched.compact() ? touched.count() : 0;
-  const std::int32_t until = sum_of_lanes_until(count, lane), total = __shfl_sync(kFullWarp, until, 31);
-  const std::int32_t begin = until - count;
-  for (std::int32_t first = 0; first < total; first += 32) {
-    const std::int32_t entry = first + lane;
-    int source = 0;  // the last lane whose entries begin at `entry` or before
-#pragma unroll
-    for (int step = 16; step > 0; step /= 2) {
-      if (__shfl_sync(kFullWarp, begin, source + step) <= entry) source += step;
-    }
-    const std::int32_t k = entry - __shfl_sync(kFullWarp, begin, source);
-    const std::int64_t at = turn + __shfl_sync(kFullWarp, start, source) + k;
-    const std::int32_t source_splat = __shfl_sync(kFullWarp, splat, source);
-    const Touched source_touched = touched.from_lane(source);
-    if (entry < total && at < capacity) {
-      const std::uint32_t tile = source_touched.tile(k, in.grid.tiles_x);
-      keys[at] = static_cast<Key>(tile);
-      entries[at] = source_splat;
-      digits.count(tile, counts);
-    }
-  }
-  // For each splat that is not compact, all lanes go through its tile rows together.
+  const auto write = [&](std::int64_t at, std::uint32_t tile, std::int32_t entry_splat) {
+    if (at >= capacity) return;
+    keys[at] = static_cast<Key>(tile);
+    entries[at] = entry_splat;
+    digits.count(tile, counts);
+  };
+  share_entries(touched.compact() ? touched.count() : 0, lane, [&](const LaneEntry& entry) {
+    const std::int64_t at = turn + __shfl_sync(kFullWarp, start, entry.source) + entry.k;
+    const std::int32_t entry_splat = __shfl_sync(kFullWarp, splat, entry.source);
+    const Touched entry_touched = touched.from_lane(entry.source);
+    if (entry.valid) write(at, entry_touched.tile(entry.k, in.grid.tiles_x), entry_splat);
+  });
+  // Splats that are not compact follow one by one. Each lane finds the tiles of every 32nd tile row.
+  const tiles::Divider tile_of(in.grid.tile_size);
   for (unsigned left = __ballot_sync(kFullWarp, !touched.compact()); left; left &= left - 1) {
-    const int source = __ffs(left) - 1;
-    const std::int32_t source_splat = __shfl_sync(kFullWarp, splat, source);
-    std::int64_t at = turn + __shfl_sync(kFullWarp, start, source);
-    const SplatShape shape = load_splat(in, source_splat);
-    for_each_owned(in.grid, shape, [&](const Owned& owned) {
-      const int n = owned.last - owned.first;
-      for (int k = lane; k < n && at + k < capacity; k += 32) {
-        keys[at + k] = static_cast<Key>(owned.first + k);
-        entries[at + k] = source_splat;
-        digits.count(owned.first + k, counts);
+    const int owner = __ffs(left) - 1;
+    const std::int32_t large_splat = __shfl_sync(kFullWarp, splat, owner);
+    std::int64_t at = turn + __shfl_sync(kFullWarp, start, owner);
+    const SplatShape shape = load_splat(in, large_splat);
+    const TileRows<float> rows =
+        find_tile_rows(shape.mean, shape.conic, shape.opacity, in.grid.height, tile_of);
+    for (int top = rows.first; top <= rows.last; top += 32) {
+      const int ty = top + lane;
+      int begin, end;
+      Owned owned{};
+      if (ty <= rows.last && rows.interval(ty, in.grid.width, tile_of, &begin, &end)) {
+        owned = clip_to_owned(in.grid, shape.camera, ty, begin, end);
       }
-      at += n;
-    });
+      at += share_entries(max(owned.last - owned.first, 0), lane, [&](const LaneEntry& entry) {
+        const std::int32_t first = __shfl_sync(kFullWarp, owned.first, entry.source);
+        if (entry.valid) write(at + entry.number, first + entry.k, large_splat);
+      });
+    }
   }
 }
 

@@ -167,28 +167,58 @@ BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
   return mul_add(side * kRounding, terms, end);
 }
 
+// The tile rows that a splat's ellipse may reach, and the interval of tiles in each of them.
+template <class T>
+struct TileRows {
+  SplatEllipse<T> ellipse;
+  T x, y;                   // the splat's mean
+  int row_first, row_last;  // pixel rows
+  int first, last;          // tile rows; first > last if there is none
+
+  // Sets the tiles [*begin, *end) that the splat touches in tile row ty, from first to last. Returns false if
+  // there is none.
+  BLITZGS_HD bool interval(int ty, int width, const tiles::Divider& tile_of, int* begin, int* end) const {
+    const int top = ty * tile_of.size, bottom = top + tile_of.size - 1;
+    const int band_first = row_first > top ? row_first : top,
+              band_last = row_last < bottom ? row_last : bottom;
+    const T low = static_cast<T>(band_first) + T(0.5) - y, high = static_cast<T>(band_last) + T(0.5) - y;
+    const T left = chord_end(ellipse, x, y, tiles::clamp_nan_low(-ellipse.turn, low, high), T(-1));
+    const T right = chord_end(ellipse, x, y, tiles::clamp_nan_low(ellipse.turn, low, high), T(1));
+    int column_first, column_last;
+    pixels_between(left, right, width, &column_first, &column_last);
+    *begin = tile_of(column_first);
+    *end = tile_of(column_last) + 1;
+    return column_first <= column_last;
+  }
+};
+
+template <class T>
+BLITZGS_HD TileRows<T> find_tile_rows(const T* mean2d, const T* conic, T opacity, int height,
+                                      const tiles::Divider& tile_of) {
+  constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
+  TileRows<T> rows{};
+  rows.last = -1;
+  rows.x = mean2d[0];
+  rows.y = mean2d[1];
+  if (!tiles::finite(rows.x) || !tiles::finite(rows.y)) return rows;
+  if (!make_ellipse(conic, opacity, &rows.ellipse)) return rows;
+  const T half = mul_add(kRounding, std::fabs(rows.y), rows.ellipse.half_height);
+  pixels_between(rows.y - half, rows.y + half, height, &rows.row_first, &rows.row_last);
+  if (rows.row_first > rows.row_last) return rows;
+  rows.first = tile_of(rows.row_first);
+  rows.last = tile_of(rows.row_last);
+  return rows;
+}
+
 // Calls f(ty, tx_begin, tx_end) for each tile row with a touched tile, top to bottom.
 template <class T, class F>
 BLITZGS_HD void for_each_tile_row(const T* mean2d, const T* conic, T opacity, int width, int height,
                                   int tile_size, const F& f) {
-  constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
-  const T x = mean2d[0], y = mean2d[1];
-  SplatEllipse<T> e;
-  if (!tiles::finite(x) || !tiles::finite(y) || !make_ellipse(conic, opacity, &e)) return;
-  const T half = mul_add(kRounding, std::fabs(y), e.half_height);
-  int row_first, row_last;
-  pixels_between(y - half, y + half, height, &row_first, &row_last);
   const tiles::Divider tile_of(tile_size);
-  int ty = tile_of(row_first);
-  for (int row = row_first; row <= row_last; ++ty) {
-    const int band_last = (ty + 1) * tile_size - 1 < row_last ? (ty + 1) * tile_size - 1 : row_last;
-    const T low = static_cast<T>(row) + T(0.5) - y, high = static_cast<T>(band_last) + T(0.5) - y;
-    const T left = chord_end(e, x, y, tiles::clamp_nan_low(-e.turn, low, high), T(-1));
-    const T right = chord_end(e, x, y, tiles::clamp_nan_low(e.turn, low, high), T(1));
-    int column_first, column_last;
-    pixels_between(left, right, width, &column_first, &column_last);
-    if (column_first <= column_last) f(ty, tile_of(column_first), tile_of(column_last) + 1);
-    row = band_last + 1;
+  const TileRows<T> rows = find_tile_rows(mean2d, conic, opacity, height, tile_of);
+  for (int ty = rows.first; ty <= rows.last; ++ty) {
+    int begin, end;
+    if (rows.interval(ty, width, tile_of, &begin, &end)) f(ty, begin, end);
   }
 }
 
