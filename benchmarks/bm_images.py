@@ -60,7 +60,7 @@ def report(capture: Capture, threads: int, rounds: int) -> dict[str, float]:
     few = ImageStore(capture, threads=threads, decoded_bytes=8 * threads * raw)
     results = {"cold, files to pixels": throughput(few, 2 * threads, 1)}
     results["from compressed memory"] = throughput(few, 2 * threads, rounds)
-    part = few.compressed_bytes / len(capture.cameras) / raw
+    part = few.compressed.bytes / len(capture.cameras) / raw
     ample = ImageStore(capture, threads=threads, decoded_bytes=2 * raw * len(capture.cameras))
     throughput(ample, 2 * threads, 1)
     results["from the decoded cache"] = throughput(ample, 2 * threads, rounds)

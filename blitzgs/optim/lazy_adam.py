@@ -26,9 +26,9 @@ class LazyAdam(torch.optim.Optimizer):
     Rows that are missing in a sparse gradient (`rasterization(..., sparse_grad=True)`) have the gradient
     zero. `step` does not touch them, so they fall behind. `catch_up` applies the steps that they missed, in
     closed form whatever their number, and gives them the values of `torch.optim.Adam` to rounding
-    (csrc/lazy_adam/lazy_adam.h). Call it
-    before the parameters are read: before a view is rendered, before a strategy reads the parameters, and
-    before evaluation. With a dense gradient, `step` is a step of plain Adam.
+    (csrc/lazy_adam/lazy_adam.h). Call it before the parameters are read: before a view is rendered, before a
+    strategy reads the parameters, and before evaluation. With a dense gradient, `step` is a step of plain
+    Adam.
 
     Parameters are [N, ...], contiguous, float32, or float64 on the CPU. Learning rates are rounded to
     float32. A parameter of SH coefficients may give its first coefficient (three values a row) another
@@ -44,6 +44,10 @@ class LazyAdam(torch.optim.Optimizer):
         rasterization(means, ..., sparse_grad=True)[0].sum().backward()
         optimizer.step()
         new = optimizer.keep(mask)  # {"means": Parameter, "sh": Parameter}
+
+    Attributes:
+        drifts: tables of the steps that rows missed, by the indices of a parameter's group and of the
+            parameter in it, because strategies replace the parameters and their state.
     """
 
     def __init__(
@@ -65,13 +69,11 @@ class LazyAdam(torch.optim.Optimizer):
         Raises:
             ValueError: an option is outside its range.
         """
-        # Keyed by the indices of group and parameter, because strategies replace the parameters and their
-        # state.
-        self._drifts: dict[tuple[int, int], Drift] = {}
+        self.drifts: dict[tuple[int, int], Drift] = {}
         super().__init__(params, {"lr": lr, "lr_rest": None, "betas": betas, "eps": eps})
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_drifts": self._drifts}
+        return {**super().__getstate__(), "drifts": self.drifts}
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add parameters with options of their own, see `__init__`."""
@@ -197,7 +199,7 @@ class LazyAdam(torch.optim.Optimizer):
         for group in state_dict["param_groups"]:
             _check_group({"lr_rest": None, **group})
         super().load_state_dict(state_dict)
-        self._drifts.clear()
+        self.drifts.clear()
         for _, group, param in self._placed():
             group.setdefault("lr_rest", None)
             state = self.state.get(param)
@@ -303,10 +305,10 @@ class LazyAdam(torch.optim.Optimizer):
     def _drift_of(self, place: tuple[int, int], group: dict[str, Any], param: Tensor) -> Drift:
         """Return the `Drift` of the parameter at these indices; make it on first use."""
         betas = tuple(group["betas"])
-        drift = self._drifts.get(place)
+        drift = self.drifts.get(place)
         if drift is None:
             taken = int(self.state[param]["step"])
-            drift = self._drifts[place] = Drift(betas, param.dtype, param.device, taken)
+            drift = self.drifts[place] = Drift(betas, param.dtype, param.device, taken)
         if drift.betas != betas:
             raise ValueError(f"LazyAdam: betas cannot change from {drift.betas} to {betas} after a step")
         return drift

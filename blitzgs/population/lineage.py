@@ -170,7 +170,7 @@ class Lineage:
             LineageError: on every rank, when births - deaths is not the live population.
             OSError: on every rank, when one could not write a part; a later call tries that part again.
         """
-        self._flush(step)
+        self.flush(step)
         self._wait()
         unwritten, self._unwritten = self._unwritten, []
         for name, columns, _ in unwritten:
@@ -215,9 +215,9 @@ class Lineage:
         self._pending[table].append(_Block(torch.stack(ints, 1), floats))
         self._rows += len(floats)
         if self._rows > _MOST_PENDING:
-            self._flush(step)
+            self.flush(step)
 
-    def _flush(self, step: int) -> None:
+    def flush(self, step: int) -> None:
         """Let another thread write the pending rows."""
         for table, blocks in self._pending.items():
             if not blocks:

@@ -39,13 +39,19 @@ _MAPS_KEPT = 4
 
 
 class BoundedCache(Generic[K, V]):
-    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored."""
+    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored.
+
+    Attributes:
+        budget: the largest size, in bytes.
+        bytes: the size now.
+        most_bytes: the largest size so far.
+    """
 
     def __init__(self, budget: int) -> None:
         """Hold at most `budget` bytes."""
         self.budget = budget
         self.bytes = 0
-        self.most_bytes = 0  # the largest size so far
+        self.most_bytes = 0
         self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -106,7 +112,13 @@ class _Maps:
 
 
 class ImageStore:
-    """Decoded images and masks of a capture's cameras, by index; any thread may call any method."""
+    """Decoded images and masks of a capture's cameras, by index; any thread may call any method.
+
+    Attributes:
+        capture: the capture that has the images.
+        compressed: the compressed images in memory.
+        decoded: the decoded images and masks in memory.
+    """
 
     def __init__(
         self,
@@ -127,8 +139,8 @@ class ImageStore:
         """
         self.capture = capture
         self._background = background if capture.has_alpha else None
-        self._packed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
-        self._decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(
+        self.compressed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
+        self.decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(
             budget_bytes // 4 if decoded_bytes is None else decoded_bytes
         )
         self._maps: OrderedDict[Rectification, _Maps] = OrderedDict()
@@ -163,25 +175,15 @@ class ImageStore:
         for index in indices:
             camera = self.capture.cameras[index]
             planned += 3 * camera.width * camera.height
-            if planned > self._decoded.budget:
+            if planned > self.decoded.budget:
                 return
             self._submit("image", index)
 
-    @property
-    def compressed_bytes(self) -> int:
-        """The memory that compressed images take now, in bytes."""
-        return self._packed.bytes
-
-    @property
-    def decoded_bytes(self) -> int:
-        """The memory that decoded images and masks take now, in bytes."""
-        return self._decoded.bytes
-
     def memory(self) -> ImageMemory:
         """Return the memory that images have taken so far."""
-        packed, decoded = self._packed, self._decoded
+        compressed, decoded = self.compressed, self.decoded
         return ImageMemory(
-            packed.most_bytes, packed.budget, decoded.most_bytes, decoded.budget, self._times_decoded
+            compressed.most_bytes, compressed.budget, decoded.most_bytes, decoded.budget, self._times_decoded
         )
 
     def close(self) -> None:
@@ -200,7 +202,7 @@ class ImageStore:
         with self._pending_lock:
             if key in self._pending:
                 return self._pending[key]
-            found = self._decoded.get(key)
+            found = self.decoded.get(key)
             if found is not None:
                 return found
             future = self._pending[key] = self._pool.submit(self._produce, kind, index)
@@ -210,7 +212,7 @@ class ImageStore:
         try:
             make = self._make_image if kind == "image" else self._make_mask
             pixels = make(index)
-            self._decoded.put((kind, index), pixels, pixels.nbytes)
+            self.decoded.put((kind, index), pixels, pixels.nbytes)
             return pixels
         finally:
             with self._pending_lock:
@@ -218,10 +220,10 @@ class ImageStore:
                 self._times_decoded += 1
 
     def _read(self, path: Path) -> bytes:
-        data = self._packed.get(path)
+        data = self.compressed.get(path)
         if data is None:
             data = read_whole(path)
-            self._packed.put(path, data, len(data))
+            self.compressed.put(path, data, len(data))
         return data
 
     def _make_image(self, index: int) -> UInt8:
@@ -229,12 +231,12 @@ class ImageStore:
         lens = camera.rectification.lens
         if camera.rectification.is_identity and (lens.width, lens.height) == (camera.width, camera.height):
             return self._decode(camera, self._read(camera.image_path))
-        packed = self._packed.get(index)
+        packed = self.compressed.get(index)
         if packed is not None:
             return _uint8(native_io().decode_qoi(packed))
         pixels = self._prepare(camera, self._decode(camera, read_whole(camera.image_path)))
         packed = native_io().encode_qoi(pixels)
-        self._packed.put(index, packed, len(packed))
+        self.compressed.put(index, packed, len(packed))
         return pixels
 
     def _prepare(self, camera: Camera, pixels: UInt8) -> UInt8:

@@ -73,8 +73,8 @@ class _Memory:
     """Memory in which batches of one shape are assembled and from which they are uploaded.
 
     On the CPU, host memory and device memory are the same. All parts of a batch are in one allocation, so
-    that few
-    calls upload it: during each call, this thread and the thread that launches kernels may block each other.
+    that few calls upload it: during each call, this thread and the thread that launches kernels may block
+    each other.
 
     Attributes:
         shape: views, height, width, and whether there are masks.
@@ -208,7 +208,7 @@ class BatchLoader:
         if self._used is not None:
             if stream is not None:
                 self._used.read.record(stream)
-            self._free.append(self._used)
+            self._give_back(self._used)
             self._used = None  # in case the next batch cannot be loaded
         if self._owners is not None:
             self._owners.forget_before(step)
@@ -258,8 +258,13 @@ class BatchLoader:
         try:
             return self._fill(slot, indices, ranges, rows, photographs), slot
         except BaseException:  # give the slot back, or it would be missing from then on
-            self._free.append(slot)
+            self._give_back(slot)
             raise
+
+    def _give_back(self, slot: _Slot) -> None:
+        """Let a later batch use a slot."""
+        assert slot not in self._free, "two batches would share this memory; this is a bug, please report it"
+        self._free.append(slot)
 
     def _read(self, index: int, y0: int, y1: int) -> _Photograph:
         """Read pixel rows [y0, y1) and the mask of a view."""

@@ -56,26 +56,30 @@ class Plan:
 
 
 class Budget:
-    """Keeps a run within `schedule.minutes`; does nothing if that is 0."""
+    """Keeps a run within `schedule.minutes`; does nothing if that is 0.
+
+    Attributes:
+        next_step: step after which the pace is reconsidered.
+    """
 
     def __init__(self, state: TrainingState) -> None:
         """Begin; the next few steps are not measured."""
         self._state = state
         self._seconds = 60 * state.config.schedule.minutes
         self._interval = WARM_UP_STEPS
-        self._next = state.progress.step + WARM_UP_STEPS
+        self.next_step = state.progress.step + WARM_UP_STEPS
         self._mark: tuple[int, float] | None = None
         self._shown = 0
 
     def after(self, step: int) -> None:
         """Change the pace after a step if that is due; every rank calls this after each step's events."""
         state = self._state
-        if self._seconds == 0 or step < self._next or step >= state.schedule.steps:
+        if self._seconds == 0 or step < self.next_step or step >= state.schedule.steps:
             return
         # Rank 0 decides, because the clocks of the ranks differ and all ranks must take the same steps.
         plan = state.ranks.broadcast_object(self._plan(step) if state.ranks.rank == 0 else None)
         assert plan is not None
-        self._next = plan.next
+        self.next_step = plan.next
         if plan.factor is not None:
             state.change_pace(plan.factor)
             self._report(plan)

@@ -59,6 +59,7 @@ def save(
     ranks: Ranks,
     keep: int = 3,
     shared: Mapping[str, Tensor] | None = None,
+    reached: Callable[[str], None] = lambda point: None,
 ) -> Path:
     """Write a checkpoint; return on every rank when it is on disk.
 
@@ -69,6 +70,8 @@ def save(
         ranks: the job.
         keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
         shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
+        reached: called at each point at which the save may be interrupted, with the point's name; the tests
+            of crashes stop the process there.
 
     Returns:
         The folder of the new checkpoint, `directory/checkpoint_NNNNNN`.
@@ -88,13 +91,13 @@ def save(
     unfinished = directory / (_UNFINISHED + name)
     mine, common, problem = None, None, None
     try:
-        _reached("begin")
+        reached("begin")
         unfinished.mkdir(parents=True, exist_ok=True)
         _check_space(unfinished, columns)
-        _reached("folder made")
+        reached("folder made")
         file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
         with ranks.working("writing a checkpoint"):
-            size, digest = write_shard(unfinished / file, columns, _reached)
+            size, digest = write_shard(unfinished / file, columns, reached)
         mine = Shard(file, rows, size, digest)
         if shared and ranks.rank == 0:
             common = Shard(SHARED, 0, *write_shard(unfinished / SHARED, shared, lambda point: None))
@@ -106,7 +109,7 @@ def save(
         try:
             with ranks.working("finishing a checkpoint"):
                 shards = [shard for shard, _ in results if shard]
-                _finish(directory, name, shards, common, state, ranks.world_size)
+                _finish(directory, name, shards, common, state, ranks.world_size, reached)
         except OSError as error:
             problems.append(f"rank 0 could not write: {_explain(error)}")
     problems = ranks.broadcast_object(problems)
@@ -118,7 +121,7 @@ def save(
             "Earlier checkpoints are untouched."
         )
     if ranks.rank == 0:
-        _delete_old(directory, keep)
+        _delete_old(directory, keep, reached)
     return directory / name
 
 
@@ -222,7 +225,7 @@ def load(
     if manifest.shared is not None:
         with _opened(path / manifest.shared.file) as file:
             shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    return _read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
+    return read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared
 
 
 @dataclass
@@ -232,11 +235,8 @@ class _Manifest:
     state: dict[str, Any]
 
 
-def _reached(point: str) -> None:
-    """Mark a labelled point of a save; crash tests replace this function and stop the process here."""
-
-
-def _read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
+def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
+    """Read this rank's share of the columns in a folder's shards, as `load` does, without verifying files."""
     sizes = [shard.rows for shard in shards]
     if len(shards) == ranks.world_size:
         with _opened(path / shards[ranks.rank].file) as file:
@@ -308,6 +308,7 @@ def _finish(
     shared: Shard | None,
     state: Mapping[str, Any],
     world_size: int,
+    reached: Callable[[str], None],
 ) -> None:
     """Write the manifest beside the shards and give the folder its final name, each step synced."""
     unfinished = directory / (_UNFINISHED + name)
@@ -324,23 +325,23 @@ def _finish(
     content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
     with open(unfinished / MANIFEST, "w") as file:
         json.dump(content | {"sha256": _digest(content)}, file, indent=1)
-        _reached("manifest written")
+        reached("manifest written")
         file.flush()
         os.fsync(file.fileno())
     sync_to_disk(unfinished)
-    _reached("manifest synced")
+    reached("manifest synced")
     unfinished.rename(directory / name)
-    _reached("renamed")
+    reached("renamed")
     sync_to_disk(directory)
-    _reached("finished")
+    reached("finished")
 
 
-def _delete_old(directory: Path, keep: int) -> None:
+def _delete_old(directory: Path, keep: int, reached: Callable[[str], None]) -> None:
     """Delete all but the newest `keep`."""
     for name in _names(directory)[:-keep]:
         # Rename first: an interrupted deletion must not leave half a checkpoint under a final name.
         (directory / name).rename(directory / (_UNFINISHED + name))
-        _reached("old one renamed")
+        reached("old one renamed")
     _delete_unfinished(directory)
 
 

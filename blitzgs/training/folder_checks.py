@@ -20,7 +20,7 @@ from blitzgs.model import GaussianTable
 
 LOCK = ".lock"
 # A rank that torchrun restarts may begin before the process that it replaces has ended.
-_LOCK_SECONDS = 5.0
+LOCK_SECONDS = 5.0
 _PROBE_BYTES = 4096
 
 
@@ -54,7 +54,7 @@ def locked(folder: Path, ranks: Ranks) -> Iterator[None]:
 def _lock(path: Path) -> tuple[int | None, str | None]:
     """Return the descriptor that holds the lock, or why there is none."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    deadline = time.monotonic() + _LOCK_SECONDS
+    deadline = time.monotonic() + LOCK_SECONDS
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -58,6 +58,7 @@ class RunLog:
             tensorboard: also write events to `folder/tensorboard`, if the package is installed.
             run_id: identifies the run in every record.
         """
+        self._failures = _Failures()
         self._file: _JsonLines | None = None
         self._board: _Board | None = None
         self._progress: Progress | None = None
@@ -68,12 +69,12 @@ class RunLog:
         self.console = Console(quiet=folder is None, highlight=False)
         if folder is None:
             return
-        with _optional("log file"):
+        with self._failures.tolerated("log file"):
             folder.mkdir(parents=True, exist_ok=True)
             _drop_repeated(folder / LOG, run_id, done, total)
-        self._file = _JsonLines(folder / LOG)
+        self._file = _JsonLines(folder / LOG, self._failures)
         if tensorboard:
-            self._board = _Board(folder / BOARD, done)
+            self._board = _Board(folder / BOARD, done, self._failures)
         if self.console.is_terminal:
             self._progress = Progress(
                 TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
@@ -110,7 +111,7 @@ class RunLog:
     def close(self) -> None:
         """Write remaining records and end the progress display."""
         if self._progress is not None:
-            with _optional("terminal"):
+            with self._failures.tolerated("terminal"):
                 self._progress.stop()
         if self._board is not None:
             self._board.close()
@@ -123,24 +124,24 @@ class RunLog:
             self._file.add({"t": t} | ({"run": self._run_id} if self._run_id else {}) | dict(values))
 
     def _print(self, text: str) -> None:
-        with _optional("terminal"):
+        with self._failures.tolerated("terminal"):
             self.console.print(text, soft_wrap=True, markup=False, emoji=False)
 
 
 class _JsonLines:
     """A file with one JSON record per line; records that cannot be written are kept in memory."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, failures: _Failures) -> None:
+        self._path, self._failures = path, failures
         self._waiting: deque[bytes] = deque(maxlen=_MOST_WAITING)
 
     def add(self, record: Mapping[str, Any]) -> None:
         self._waiting.append(json.dumps(record).encode() + b"\n")
-        with _optional("log file"):
+        with self._failures.tolerated("log file"):
             self._flush()
 
     def close(self) -> None:
-        with _optional("log file"):
+        with self._failures.tolerated("log file"):
             self._flush()
 
     def _flush(self) -> None:
@@ -161,13 +162,13 @@ class _JsonLines:
 class _Board:
     """Writes TensorBoard events while that is possible."""
 
-    def __init__(self, folder: Path, done: int) -> None:
-        self._folder, self._done = folder, done
+    def __init__(self, folder: Path, done: int, failures: _Failures) -> None:
+        self._folder, self._done, self._failures = folder, done, failures
         self._writer: Any = None
         self._open()
 
     def add(self, t: int, values: Mapping[str, float]) -> None:
-        with _optional("TensorBoard"):
+        with self._failures.tolerated("TensorBoard"):
             if self._writer is None:
                 self._open()
             try:
@@ -180,7 +181,7 @@ class _Board:
                 raise
 
     def close(self) -> None:
-        with _optional("TensorBoard"):
+        with self._failures.tolerated("TensorBoard"):
             if self._writer is not None:
                 self._writer.close()
 
@@ -189,26 +190,28 @@ class _Board:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
             return
-        with _optional("TensorBoard"):
+        with self._failures.tolerated("TensorBoard"):
             # Drop the steps after `done` that an interrupted run has logged: they will be logged again.
             self._writer = SummaryWriter(str(self._folder), purge_step=self._done + 1 if self._done else None)
 
 
-_warned: set[str] = set()
+class _Failures:
+    """Turns the errors of a log into warnings, one for each kind of log."""
 
+    def __init__(self) -> None:
+        self._warned: set[str] = set()
 
-@contextlib.contextmanager
-def _optional(what: str) -> Iterator[None]:
-    """Turn an OSError into a warning, once for each kind of log."""
-    try:
-        yield
-    except (OSError, ValueError, RuntimeError) as error:
-        if what not in _warned:
-            _warned.add(what)
-            with contextlib.suppress(OSError):
-                warnings.warn(
-                    f"{what}: {error}; training goes on, records may be missing there", stacklevel=4
-                )
+    @contextlib.contextmanager
+    def tolerated(self, kind: str) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError, RuntimeError) as error:
+            if kind not in self._warned:
+                self._warned.add(kind)
+                with contextlib.suppress(OSError):
+                    warnings.warn(
+                        f"{kind}: {error}; training goes on, records may be missing there", stacklevel=4
+                    )
 
 
 def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:

@@ -43,6 +43,7 @@ class Trainer:
 
     Attributes:
         state: state of the run.
+        loader: the batches of the coming steps.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class Trainer:
     ) -> None:
         """Set up the run; arguments and errors are those of `blitzgs.training.setup.set_up`."""
         self.state = state = set_up(config, capture, images, folder, ranks, resume)
-        self._loader = BatchLoader(
+        self.loader = BatchLoader(
             images,
             state.views,
             capture.train,
@@ -107,7 +108,7 @@ class Trainer:
                     budget.after(step)
                     if step == state.schedule.steps:
                         break
-                    decision = agreement.after(step, self._loader.lost is not None)
+                    decision = agreement.after(step, self.loader.lost is not None)
                     if decision.signal is not None:
                         self._stop_for(decision.signal)
                         return None
@@ -141,7 +142,7 @@ class Trainer:
 
     def _check_photographs(self) -> None:
         """Raise an error on all ranks if one of them continued without a photograph (`BatchLoader.lost`)."""
-        reasons = self.state.ranks.all_gather_object(self._loader.lost)
+        reasons = self.state.ranks.all_gather_object(self.loader.lost)
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:
             raise PhotographError(f"{'; '.join(lost)}. The last steps, {MOST_STEPS} at most, went without it")
@@ -157,7 +158,7 @@ class Trainer:
 
     def close(self) -> None:
         """Stop loading batches and close the log."""
-        self._loader.close()
+        self.loader.close()
         self.state.log.close()
         if self.state.lineage is not None:
             self.state.lineage.close()
@@ -167,7 +168,7 @@ class Trainer:
         state, config, schedule = self.state, self.state.config, self.state.schedule
         begin, end = (step - 1) * schedule.batch_size, step * schedule.batch_size
         try:
-            batch = self._loader.get(step - 1, schedule.steps)
+            batch = self.loader.get(step - 1, schedule.steps)
         except (OSError, ValueError) as error:
             raise PhotographError(str(error)) from error
         degree = schedule.sh_degree(begin, config.model.sh_degree)

@@ -34,6 +34,10 @@ class BlockIndex:
 
     Build a new index whenever rows were added, removed or reordered. Sort the table by `morton_order` first:
     the active set is right in any order, but in a random order blocks are large and no block is skipped.
+
+    Attributes:
+        bounds: the bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.
+        level_ranges: the coarsest and the finest level of each block, uint8 [blocks, 2].
     """
 
     def __init__(self, table: GaussianTable, schedule: Tensor | None = None) -> None:
@@ -46,26 +50,16 @@ class BlockIndex:
         """
         self._schedule = schedule
         count = -(-len(table) // BLOCK_ROWS)
-        self._bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
-        self._level_ranges = _level_ranges(table["level"], count)
+        self.bounds = torch.empty(count, 8, dtype=torch.float32, device=table.device)
+        self.level_ranges = _level_ranges(table["level"], count)
         self.update(table, None)
 
     @classmethod
     def of_bounds(cls, bounds: Tensor, level_ranges: Tensor, schedule: Tensor | None) -> BlockIndex:
         """Make an index from `bounds` and `level_ranges` that are known already."""
         index = cls.__new__(cls)
-        index._schedule, index._bounds, index._level_ranges = schedule, bounds, level_ranges
+        index._schedule, index.bounds, index.level_ranges = schedule, bounds, level_ranges
         return index
-
-    @property
-    def bounds(self) -> Tensor:
-        """The bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout."""
-        return self._bounds
-
-    @property
-    def level_ranges(self) -> Tensor:
-        """The coarsest and the finest level of each block, uint8 [blocks, 2]."""
-        return self._level_ranges
 
     def active(
         self,
@@ -87,8 +81,8 @@ class BlockIndex:
         """
         pending = self._pending(table)
         return cull_blocks(
-            self._bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
-            eps2d, pending, self._level_ranges, rules, capacity_blocks,
+            self.bounds, table["means"], table["scales"], viewmats, Ks, width, height, near_plane, far_plane,
+            eps2d, pending, self.level_ranges, rules, capacity_blocks,
         )  # fmt: skip
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:
@@ -96,7 +90,7 @@ class BlockIndex:
 
         No update is needed after `catch_up`, because the bounds contain all movement by pending steps.
         """
-        update_block_bounds_(self._bounds, ids, table["means"], table["scales"], self._pending(table))
+        update_block_bounds_(self.bounds, ids, table["means"], table["scales"], self._pending(table))
 
     def _pending(self, table: GaussianTable) -> PendingSteps | None:
         if self._schedule is None:

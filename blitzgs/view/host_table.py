@@ -16,7 +16,7 @@ from blitzgs.model import GaussianTable
 
 # Memory is allocated for this many times the present rows, so that a growing table is rarely moved.
 _GROWTH = 1.25
-_MEMORY_INFO = Path("/proc/meminfo")
+MEMORY_INFO = Path("/proc/meminfo")
 
 
 class HostMemoryError(RuntimeError):
@@ -67,7 +67,7 @@ class HostTable(GaussianTable):
 def available_bytes() -> int | None:
     """Return how many bytes the host can allocate without swapping; None if the system does not tell."""
     with contextlib.suppress(OSError, ValueError, IndexError):
-        for line in _MEMORY_INFO.read_text().splitlines():
+        for line in MEMORY_INFO.read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
     return None

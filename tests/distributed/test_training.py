@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.training import evaluation, run
+from blitzgs.training import run
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene, write_tiny_capture
@@ -222,15 +223,16 @@ def _stop_in_an_evaluation(ranks, folder):
     capture, images = tiny_scene()
     capture.test = capture.train * 6
     trainer = Trainer(tiny_config(*SETTINGS, "schedule.evaluate_every=22"), capture, images, folder, ranks)
-    compare, compared = evaluation._compare, []
+    get, compared = images.get, []
 
-    def stopping(*arguments):
-        compared.append(trainer.state.progress.step)
-        if ranks.rank == ranks.world_size - 1:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return compare(*arguments)
+    def stopping(index):
+        if threading.current_thread() is threading.main_thread():  # another one reads images for training
+            compared.append(trainer.state.progress.step)
+            if ranks.rank == ranks.world_size - 1:
+                os.kill(os.getpid(), signal.SIGTERM)
+        return get(index)
 
-    evaluation._compare = stopping
+    images.get = stopping
     return compared, trainer.train()
 
 

@@ -269,7 +269,7 @@ def test_full_tables_restart_and_still_equal_dense_adam(backend, monkeypatch):
         if number == 100:  # in the middle of the tables
             pair.ours.load_state_dict(copy.deepcopy(pair.ours.state_dict()))
     pair.require_equal()
-    assert all(len(kept.table) == 41 and kept.begin > 100 for kept in pair.ours._drifts.values())
+    assert all(len(kept.table) == 41 and kept.begin > 100 for kept in pair.ours.drifts.values())
     pair.ours.bring_up_to_date()
     for name in SHAPES:
         ours, dense = pair.ours.state[pair.lazy[name]], pair.torchs.state[pair.dense[name]]

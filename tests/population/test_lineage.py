@@ -121,7 +121,7 @@ def test_ledger_matches_the_log_after_random_events(data, tmp_path_factory):
             assert ledger.births - ledger.deaths == len(alive)
             if what == "resume":
                 lineage.born(some([next_id + 10_000]), step + 1)  # lost with the process
-                lineage._flush(step + 1)
+                lineage.flush(step + 1)
                 lineage.close()
                 lineage = Lineage(folder, Ranks(), step, ledger)
     lineage.flush_and_check(torch.tensor(sorted(alive), dtype=torch.int64), step + 1)

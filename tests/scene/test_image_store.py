@@ -49,7 +49,7 @@ def test_the_same_bits_for_every_budget_thread_count_and_order(capture):
     tight.prefetch(range(12))
     for i in [5, 3, 5, 11, 0, 1, 2, 3, 4, 6, 7, 8, 9, 10]:
         assert torch.equal(tight.get(i), first[i])
-    assert tight.decoded_bytes <= IMAGE_BYTES and tight.compressed_bytes <= 2000
+    assert tight.decoded.bytes <= IMAGE_BYTES and tight.compressed.bytes <= 2000
 
 
 def test_files_are_read_once_within_the_budget(capture):
@@ -62,30 +62,25 @@ def test_files_are_read_once_within_the_budget(capture):
         ImageStore(capture).get(4)
 
 
-def test_prepared_images_are_made_once_and_kept_without_loss(tmp_path, monkeypatch):
+def test_prepared_images_are_made_once_and_kept_without_loss(tmp_path):
     write_capture(tmp_path, NAMES[:3], model="SIMPLE_RADIAL", params=[60.0, 32.0, 24.0, -0.1])
     capture = load_capture(tmp_path, downscale=2)
-    made, original = [], ImageStore._prepare
-    monkeypatch.setattr(ImageStore, "_prepare", lambda s, c, p: made.append(c.name) or original(s, c, p))
     store = ImageStore(capture, decoded_bytes=0)
     first = [store.get(i) for i in range(3)]
     for camera in capture.cameras:
-        camera.image_path.unlink()
+        camera.image_path.unlink()  # so that no image can be made again
     for i in (2, 0, 1, 1):
         assert torch.equal(store.get(i), first[i])
-    assert made == NAMES[:3]
-    assert 0 < store.compressed_bytes <= sum(image.numel() // 3 * 4 + 22 for image in first)
+    assert 0 < store.compressed.bytes <= sum(image.numel() // 3 * 4 + 22 for image in first)
 
 
-def test_prefetch_decodes_ahead_as_far_as_the_budget_goes(capture, monkeypatch):
+def test_prefetch_decodes_ahead_as_far_as_the_budget_goes(capture):
     store = ImageStore(capture, decoded_bytes=4 * IMAGE_BYTES, threads=2)
-    made, original = [], ImageStore._make_image
-    monkeypatch.setattr(ImageStore, "_make_image", lambda s, i: made.append(i) or original(s, i))
     store.prefetch(range(12))
     for i in range(4):
         store.get(i)
-    assert sorted(made) == [0, 1, 2, 3]
-    assert store.decoded_bytes == 4 * IMAGE_BYTES
+    assert store.memory().decoded == 4
+    assert store.decoded.bytes == 4 * IMAGE_BYTES
     store.close()
     with pytest.raises(RuntimeError):
         store.get(5)
@@ -110,7 +105,7 @@ def test_two_thousand_images_stay_within_small_budgets(tmp_path):
         store.prefetch(order[begin : begin + 12])
         for index in order[begin : begin + 4]:
             assert torch.equal(store.get(index), expected[index % 8])
-        assert store.compressed_bytes <= packed and store.decoded_bytes <= 20 * IMAGE_BYTES
+        assert store.compressed.bytes <= packed and store.decoded.bytes <= 20 * IMAGE_BYTES
     memory = store.memory()
     assert 0.9 * packed < memory.compressed_bytes <= packed
     assert memory.decoded_bytes == memory.decoded_budget == 20 * IMAGE_BYTES
@@ -120,26 +115,25 @@ def test_two_thousand_images_stay_within_small_budgets(tmp_path):
 
 
 def test_an_image_wanted_by_many_threads_is_decoded_once(capture, monkeypatch):
-    store, calls, gate = ImageStore(capture, threads=4), [], threading.Event()
-    original = ImageStore._make_image
+    store, gate = ImageStore(capture, threads=4), threading.Event()
+    look = store.compressed.get
 
-    def slow(self, index):
-        calls.append(index)
+    def slow(key):
         gate.wait(5)
-        return original(self, index)
+        return look(key)
 
-    monkeypatch.setattr(ImageStore, "_make_image", slow)
+    monkeypatch.setattr(store.compressed, "get", slow)
     with ThreadPoolExecutor(8) as pool:
         results = [pool.submit(store.get, 3) for _ in range(8)]
         store.prefetch([3])
         gate.set()
         assert all(torch.equal(r.result(), store.get(3)) for r in results)
-    assert calls == [3]
+    assert store.memory().decoded == 1
 
 
 def test_a_delayed_thread_does_not_decode_an_image_twice(capture, monkeypatch):
-    store, calls, looked, others_done = ImageStore(capture), [], threading.Event(), threading.Event()
-    make, look = ImageStore._make_image, store._decoded.get
+    store, looked, others_done = ImageStore(capture), threading.Event(), threading.Event()
+    look = store.decoded.get
 
     def held_up(key):
         found = look(key)
@@ -148,15 +142,14 @@ def test_a_delayed_thread_does_not_decode_an_image_twice(capture, monkeypatch):
             others_done.wait(0.5)
         return found
 
-    monkeypatch.setattr(ImageStore, "_make_image", lambda s, i: calls.append(i) or make(s, i))
-    monkeypatch.setattr(store._decoded, "get", held_up)
+    monkeypatch.setattr(store.decoded, "get", held_up)
     with ThreadPoolExecutor(1) as pool:
         slow = pool.submit(store.get, 3)
         assert looked.wait(5)
         fast = store.get(3)
         others_done.set()
         assert torch.equal(slow.result(), fast)
-    assert calls == [3]
+    assert store.memory().decoded == 1
 
 
 @pytest.mark.parametrize("kept", [0, 1, 30, 0.5, 0.99])

@@ -12,7 +12,7 @@ from blitzgs.scene.synth.noise import Noise, cell_random, inside, stripes
 from blitzgs.scene.synth.options import PRESETS, CityOptions
 from blitzgs.scene.synth.plan import Plan
 from blitzgs.scene.synth.raycast import RayCaster
-from blitzgs.scene.synth.tracks import _ball, _may_see
+from blitzgs.scene.synth.tracks import ball, may_see
 
 
 def test_stripes_and_intervals_are_box_filtered():
@@ -91,10 +91,10 @@ def test_no_group_of_points_in_view_is_passed_over():
     rng = np.random.default_rng(0)
     views = plan_flight(CityOptions(extent=600, views=20))
     groups = [c + rng.normal(0, rng.uniform(1, 40), (30, 3)) for c in rng.uniform(-400, 400, (60, 3))]
-    balls = np.stack([_ball(g) for g in (*groups, np.zeros((0, 3)))])
+    balls = np.stack([ball(g) for g in (*groups, np.zeros((0, 3)))])
     passed_over = 0
     for view in views:
-        may = _may_see(view, balls)
+        may = may_see(view, balls)
         assert not may[-1]
         for group, considered in zip(groups, may, strict=False):
             pixels, depth = view.project(group)

@@ -115,7 +115,7 @@ def test_a_run_has_no_more_images_than_a_run_may_have():
     simulation = Simulation(1e6, lambda time, step: 1.0, iterations=30_000)
     budget, planned = Budget(simulation), 0
     for _ in range(40):
-        simulation.progress.step, simulation.progress.seconds = budget._next, budget._next * 1e-4
+        simulation.progress.step, simulation.progress.seconds = budget.next_step, budget.next_step * 1e-4
         budget.after(simulation.progress.step)
         planned = max(planned, simulation.schedule.iterations)
     assert 9_000_000 < planned <= 10_000_000

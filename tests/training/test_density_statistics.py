@@ -94,8 +94,8 @@ def test_statistics_are_those_of_autograd(tmp_path, batch_size):
     sums, counts = torch.zeros(len(table)).double(), torch.zeros(len(table)).int()
     radii = torch.zeros(len(table)).double()
     batches = []
-    get = trainer._loader.get
-    trainer._loader.get = lambda *step: batches.append(get(*step)) or batches[-1]
+    get = trainer.loader.get
+    trainer.loader.get = lambda *step: batches.append(get(*step)) or batches[-1]
     for step in range(steps):
         before = {name: table[name].clone() for name in table}
         take_steps(trainer, 1)
@@ -154,8 +154,8 @@ def absolute_of_one_view(trainer: Trainer, index: int, sh_degree: int) -> torch.
 def test_absolute_gradients_are_summed_pixel_by_pixel(tmp_path):
     trainer = make_trainer(tmp_path, "population.absolute_gradients=true", "schedule.batch_size=3", *STILL)
     table, sums, batches = trainer.state.table, 0.0, []
-    get = trainer._loader.get
-    trainer._loader.get = lambda *step: batches.append(get(*step)) or batches[-1]
+    get = trainer.loader.get
+    trainer.loader.get = lambda *step: batches.append(get(*step)) or batches[-1]
     with torch.enable_grad():
         for step in range(2):
             take_steps(trainer, 1)

@@ -56,7 +56,7 @@ def test_folders_are_checked_on_every_rank(tmp_path):
 def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
     from blitzgs.training import folder_checks
 
-    monkeypatch.setattr(folder_checks, "_LOCK_SECONDS", 0.1)
+    monkeypatch.setattr(folder_checks, "LOCK_SECONDS", 0.1)
     write_tiny_capture(tmp_path / "data")
     out = tmp_path / "run"
     program = (

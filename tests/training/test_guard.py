@@ -45,7 +45,7 @@ class Sums:
 def frame(tmp_path_factory):
     config = tiny_config("schedule.batch_size=2")
     running = Trainer(config, *tiny_scene(), tmp_path_factory.mktemp("frame"), Ranks())
-    batch = running._loader.get(0, 1)
+    batch = running.loader.get(0, 1)
     rendered, *_ = running.state.stepper.forward(1, running.state.render_options, batch)
     running.close()
     return running.state.table, rendered

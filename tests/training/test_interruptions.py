@@ -15,7 +15,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.lineage import read_lineage
-from blitzgs.training import checkpoint, run, run_log
+from blitzgs.training import checkpoint, run
 from blitzgs.training.agreement import Agreement, SaveClock, StopRequest
 from blitzgs.training.batches import PhotographError
 from blitzgs.training.events import save
@@ -39,11 +39,6 @@ def signals_as_in_a_terminal():
     yield
     for number, handler in zip(numbers, before, strict=True):
         signal.signal(number, handler)
-
-
-@pytest.fixture(autouse=True)
-def every_warning_is_shown():
-    run_log._warned.clear()
 
 
 def trainer(folder, *overrides, images=None, resume=False):
@@ -303,22 +298,18 @@ def test_an_evaluation_that_cannot_be_written_ends_nothing(tmp_path):
         assert trainer(tmp_path, "schedule.iterations=20").train()["psnr"] > 5
 
 
-def test_a_log_of_another_run_or_with_a_torn_line_ends_nothing(tmp_path):
+def test_a_log_of_another_run_or_with_a_torn_line_ends_nothing(tmp_path, monkeypatch):
     """A run that was killed before its first checkpoint leaves its log to the next one in the folder."""
     trainer(tmp_path / "clean").train()
     other = {"t": 20, "run": "another", "event": "densify", "gaussians": 123_456_789}
     torn = '{"t": 20, "run": "another", "ev'
 
-    running = trainer(tmp_path / "second")
-    announce = running._announce
-
-    def announce_behind_other_records():
-        with open(tmp_path / "second" / "log.jsonl", "a") as file:
+    def add_records(running):
+        with open(running.state.folder / "log.jsonl", "a") as file:
             file.write(json.dumps(other) + "\n" + torn + "\n")
-        announce()
 
-    running._announce = announce_behind_other_records
-    assert running.train() is not None
+    at_step(monkeypatch, 1, add_records)
+    assert trainer(tmp_path / "second").train() is not None
     pictures = [(tmp_path / name / "trajectory.svg").read_text() for name in ("clean", "second")]
     assert pictures[0] == pictures[1]
 

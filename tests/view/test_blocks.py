@@ -101,7 +101,7 @@ def test_rows_of_culled_blocks_are_not_read(device):
     viewmats[0, :3, :3] = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # at the origin, along +x
     index = BlockIndex(table)
     before = active_of(index, table, viewmats, Ks)
-    behind = (index._bounds[:, 3] < 0).repeat_interleave(256)[: len(table)]
+    behind = (index.bounds[:, 3] < 0).repeat_interleave(256)[: len(table)]
     assert len(before[0]) > 0 and behind.sum() > 2000
     table["means"][behind] = torch.tensor([5.0, 0.0, 0.0], device=device)
     after = active_of(index, table, viewmats, Ks)
@@ -121,7 +121,7 @@ def looking_down(device):
 def cull(index, table, views):
     """The active set of several cameras above the ground, as `BlockIndex.active` asks for it."""
     return cull_blocks(
-        index._bounds, table["means"], table["scales"], *views, WIDTH, HEIGHT, NEAR, 100.0
+        index.bounds, table["means"], table["scales"], *views, WIDTH, HEIGHT, NEAR, 100.0
     ).listed()
 
 
@@ -131,9 +131,9 @@ def test_rows_of_blocks_inside_all_views_that_see_them_are_not_read(device):
     views = looking_down(device)
     index = BlockIndex(table)
     before = cull(index, table, views)
-    low, high = index._bounds[:, :2], index._bounds[:, 3:5]
+    low, high = index.bounds[:, :2], index.bounds[:, 3:5]
     inside = (low > -20).all(1) & (high < 20).all(1)
-    finite = index._bounds[:, 7] == 1
+    finite = index.bounds[:, 7] == 1
     assert (inside & finite).sum() > 10 and (~finite).any()
     rows = (inside & finite).repeat_interleave(256)[: len(table)]
     assert torch.isin(rows.nonzero()[:, 0], before[0].long()).all()
@@ -150,10 +150,10 @@ def test_a_row_that_is_not_finite_is_not_seen_amidst_a_view(device):
     assert row in cull(BlockIndex(table), table, views)[0]
     table["scales"][row, 1] = math.nan
     index = BlockIndex(table)
-    assert row not in cull(index, table, views)[0] and index._bounds[row // 256, 7] == 0
+    assert row not in cull(index, table, views)[0] and index.bounds[row // 256, 7] == 0
     table["scales"][row, 1] = 0.0
     index.update(table, torch.tensor([row], dtype=torch.int32, device=device))
-    assert row in cull(index, table, views)[0] and index._bounds[row // 256, 7] == 1
+    assert row in cull(index, table, views)[0] and index.bounds[row // 256, 7] == 1
 
 
 def caught_up_and_projected(table, ids, views, count, viewmats, Ks):
@@ -274,10 +274,10 @@ def test_bounds_follow_the_rows_that_were_stepped(device):
 def test_no_rows_stepped_leave_all_bounds_alone(device):
     table = make_table(device=device)
     index = BlockIndex(table)
-    before = index._bounds.clone()
+    before = index.bounds.clone()
     table["means"].add_(1000.0)
     index.update(table, torch.empty(0, dtype=torch.int32, device=device))
-    assert torch.equal(index._bounds, before)
+    assert torch.equal(index.bounds, before)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -320,7 +320,7 @@ def test_errors_name_the_value():
 def test_opcheck(device):
     table = make_table(600, device)
     viewmats, Ks = make_views(2, device)
-    bounds = BlockIndex(table)._bounds
+    bounds = BlockIndex(table).bounds
     schedule = schedule_table(torch.ones(5, 6, device=device), 0.9, 0.999)
     moments = [
         table[name] for name in ("exp_avg.means", "exp_avg_sq.means", "exp_avg.scales", "exp_avg_sq.scales")

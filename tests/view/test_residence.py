@@ -107,7 +107,11 @@ def test_the_blocks_that_are_needed_last_go_first():
     residence.prefetch(1)
     residence.load_for_step(1, first(views, 1), 1)
     residence.prefetch(2)
-    here = set(residence._block_in[residence._block_in >= 0])
+    loaded = residence.traffic.loaded
+    residence.load_for_step(2, first(views, 2), 1)
+    assert residence.traffic.loaded == loaded  # all of them were loaded ahead
+    slots = torch.arange(0, len(residence.pool), BLOCK_ROWS, dtype=torch.int32)
+    here = set((residence.rows_of(slots) // BLOCK_ROWS).tolist()) & set(range(78))  # the full blocks
     assert seen[1] | seen[2] <= here
     gone = seen[0] - here
     # What went is not needed sooner than what stayed without being needed now.
@@ -119,8 +123,9 @@ def test_the_blocks_that_are_needed_last_go_first():
 
 
 def _blocks(residence, views, view):
-    one = first(views, view, 1)
-    return seen_blocks(residence._bounds[: residence._blocks], *one[:3], *LIMITS).numpy()
+    """Return the views, as bits, that see each full block of the table."""
+    one, full = first(views, view, 1), len(residence.table) // BLOCK_ROWS
+    return seen_blocks(BlockIndex(residence.table).bounds[:full], *one[:3], *LIMITS).numpy()
 
 
 def test_a_step_waits_for_blocks_that_were_not_prefetched():
@@ -226,10 +231,10 @@ def assert_same_bits(table, other):
 
 def test_a_host_without_room_is_named(monkeypatch, tmp_path):
     (tmp_path / "meminfo").write_text("MemTotal: 100 kB\nMemAvailable:       40 kB\n")
-    monkeypatch.setattr(host_table, "_MEMORY_INFO", tmp_path / "meminfo")
+    monkeypatch.setattr(host_table, "MEMORY_INFO", tmp_path / "meminfo")
     with pytest.raises(HostMemoryError, match=r"10,000 Gaussians needs 0.00 GB .*max_gaussians"):
         host_copy(make_table(10_000))
-    monkeypatch.setattr(host_table, "_MEMORY_INFO", tmp_path / "nothing")
+    monkeypatch.setattr(host_table, "MEMORY_INFO", tmp_path / "nothing")
     assert host_table.available_bytes() is None
     assert len(host_copy(make_table(1000))) == 1000
 

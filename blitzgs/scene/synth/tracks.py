@@ -98,10 +98,10 @@ def track(city: City, views: list[View], corners: list[Corners], seed: int, run:
     colors = np.concatenate([c.colors for c in corners])
     starts = np.cumsum([0] + [len(c.pixels) for c in corners])
     source = np.repeat(np.arange(len(views)), np.diff(starts))
-    balls = np.stack([_ball(c.positions) for c in corners])
+    balls = np.stack([ball(c.positions) for c in corners])
 
     def seen(index: int) -> Ints:
-        near = np.flatnonzero(_may_see(views[index], balls))
+        near = np.flatnonzero(may_see(views[index], balls))
         groups = [np.arange(starts[k], starts[k + 1]) for k in near]
         rows = np.concatenate([np.zeros(0, np.int64), *groups])
         own = source[rows] == index
@@ -130,7 +130,7 @@ def track(city: City, views: list[View], corners: list[Corners], seed: int, run:
     )
 
 
-def _ball(points: Doubles) -> Doubles:
+def ball(points: Doubles) -> Doubles:
     """Return centre and radius [4] of a ball around points [N, 3]; without points the radius is -inf."""
     if len(points) == 0:
         return np.array([0, 0, 0, -np.inf])
@@ -138,7 +138,7 @@ def _ball(points: Doubles) -> Doubles:
     return np.append(centre, np.linalg.norm(points - centre, axis=1).max())
 
 
-def _may_see(view: View, balls: Doubles) -> Bools:
+def may_see(view: View, balls: Doubles) -> Bools:
     """Return which balls [B, 4] reach into the pyramid of a view; conservative near its corners."""
     x, y, z = ((balls[:, :3] - view.centre) @ view.rotation.T).T
     half = np.array([view.width, view.height]) / (2 * view.focal)
