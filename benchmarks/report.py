@@ -66,7 +66,6 @@ COMMANDS = {
         "--recipe aerial=configs/aerial.yaml --recipe gsplat=gsplat-default-reset --seeds 0 1 2"
     ),
 }
-OPPONENT = "gsplat-"  # begins the source of a run with one of gsplat's strategies
 # bm_quality.py takes no --json: it collects all of its runs in one file.
 COPIED = {"quality": "cp runs/quality/quality.json benchmarks/results/"}
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -285,25 +284,15 @@ SECTIONS = {
 
 
 def with_origin(name: str, file: Json) -> Json:
-    """Return a file with "command", "commit" and "environment", which collected runs have one by one.
-
-    Runs of gsplat's strategies on other commits than our own recipes are named apart, as "opponents".
-    """
+    """Return a file with "command", "commit" and "environment", which collected runs have one by one."""
     if "runs" not in file:
         return file
     done = [run for run in file["runs"] if run["status"] == "done"]
-    # An opponent's commit is that of the renderer below it, which may be older than our own recipes.
-    commits: dict[bool, set[str]] = {False: set(), True: set()}
-    for run in done:
-        commits[run["source"].startswith(OPPONENT)].add(run["commit"])
-    own, others = (" and ".join(sorted(commits[is_opponent])) for is_opponent in (False, True))
     about = {
         "command": COMMANDS[name],
-        "commit": own or others or "unknown",
+        "commit": " and ".join(sorted({run["commit"] for run in done})) or "unknown",
         "environment": done[0]["environment"] if done else {},
     }
-    if own and others not in ("", own):
-        about["opponents"] = others
     return about | file
 
 
@@ -337,10 +326,7 @@ def machine_line(file: Json) -> str:
     about = file["environment"]
     machine = f"{about['device']}, CUDA {about['cuda']}" if "device" in about else about["processor"]
     peers = f", gsplat {about['gsplat']}" if "gsplat" in about else ""
-    opponents = f"; gsplat's strategies on commit {file['opponents']}" if "opponents" in file else ""
-    return (
-        f"`{file['command']}`, {machine}, torch {about['torch']}{peers}, commit {file['commit']}{opponents}."
-    )
+    return f"`{file['command']}`, {machine}, torch {about['torch']}{peers}, commit {file['commit']}."
 
 
 def section_lines(name: str, results: Results) -> list[str]:
@@ -357,7 +343,7 @@ def section_lines(name: str, results: Results) -> list[str]:
                 else [f"{COMMANDS[file]} --json benchmarks/results/{file}.json"]
             )
         ]
-        return ["Not measured on the current code yet. The commands that measure it:", "",
+        return ["Not measured yet. The commands that measure it:", "",
                 *(f"    {command}" for command in commands)]  # fmt: skip
     files = [results[file] for file in section.files]
     lines = section.lines(*files)
