@@ -4,9 +4,9 @@
     python benchmarks/bm_exchange.py --data DIR [--downscale 2] [--ranks 1 2 4] [--batch 4]
     python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda [--ranks 1 2 4]
 
-With --data the Gaussians are the octree of the capture's points, seen from its training views; otherwise the
-`aerial` scene of `scenes.py`. Each number of ranks runs under torchrun, and takes the trainer's own steps
-(`blitzgs.training.step`): every batch is visited once with tiles divided by an estimate, then
+With --data the Gaussians are the octree of the capture's points, seen from evenly spaced training views;
+otherwise the `aerial` scene of `scenes.py`. Each number of ranks runs under torchrun, and takes the trainer's
+own steps (`blitzgs.training.step`): every batch is visited once with tiles divided by an estimate, then
 several times with tiles divided by their measured cost.
 
 Stages: a barrier precedes every step, so that all ranks start it together. The time of a stage is the time
@@ -113,7 +113,7 @@ class Inputs(NamedTuple):
 
 
 def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
-    """Return the octree of a capture's points and its first training views."""
+    """Return the octree of a capture's points and evenly spaced training views."""
     capture, lod = load_capture(args.data, downscale=args.downscale), Config().lod
     space = Space.of(capture.offset, capture.extent)
     points = torch.from_numpy(capture.points) / space.unit
@@ -123,12 +123,13 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
         torch.from_numpy(capture.colors),
         centres,
         measure_levels(points.to(device), centres, lod.fork, lod.base_resolution),
-        visible_threshold=lod.visible_threshold,
+        visible_threshold=args.visible_threshold,
         sh_degree=3,
         opacity=0.5,
     )
     views = ViewSet(list(capture.cameras), space, device)
-    chosen = capture.train[: args.batch * args.batches]
+    count = min(args.batch * args.batches, len(capture.train))
+    chosen = [capture.train[k * len(capture.train) // count] for k in range(count)]
     groups = [chosen[i : i + args.batch] for i in range(0, len(chosen), args.batch)]
     options = render_options(Config(), space, 3)
     return Inputs(table, options, [(group, views.pick(group)) for group in groups], space.extent)
@@ -311,6 +312,12 @@ def main() -> None:
     parser = make_parser(__doc__, device="cpu")
     parser.add_argument("--data", help="a capture; its points become the Gaussians")
     parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument(
+        "--visible-threshold",
+        type=float,
+        default=Config().lod.visible_threshold,
+        help="as in `lod`; 0 where every camera sees a small part of the capture (%(default)s)",
+    )
     parser.add_argument("--gaussians", type=int, default=1_000_000, help="of the aerial scene (%(default)s)")
     parser.add_argument("--batch", type=int, default=4, help="views per step (%(default)s)")
     parser.add_argument("--batches", type=int, default=6, help="different batches (%(default)s)")

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -177,8 +177,8 @@ def measure_pool(
 
 def run(
     gaussians: int, ratios: list[float], orders: list[str], batch_size: int, steps: int, device: torch.device
-) -> dict[str, Any]:
-    """Measure all arms on one scene."""
+) -> Iterator[dict[str, Any]]:
+    """Measure all arms on one scene; yield the results so far after each pool."""
     scene = aerial(gaussians, device)
     rows = morton_order(scene.means)
     names = ("means", "quats", "scales", "opacities", "sh")
@@ -188,6 +188,8 @@ def run(
     about = {"scene": scene.name, "batch_size": batch_size, "table_gb": table_bytes(table) / 1e9}
     del scene
     results = measure_resident(table, over, orders, steps)
+    by_order = {result["order"]: result["step_ms"] for result in results}
+    yield about | {"results": with_cost(results, by_order)}
     at = 1 + 2 * steps * len(orders)
     host = {}
     for name in list(table.columns):
@@ -198,15 +200,19 @@ def run(
     for ratio in ratios:
         results += measure_pool(home, ratio, over, orders, steps, at)
         at += 2 * steps * len(orders)
-    by_order = {result["order"]: result["step_ms"] for result in results if result["arm"] == "resident"}
-    for result in results:
-        if "step_ms" in result:
-            result["cost"] = result["step_ms"] / by_order[result["order"]]
-    return about | {"results": results}
+        yield about | {"results": with_cost(results, by_order)}
+
+
+def with_cost(results: list[dict[str, Any]], resident: dict[str, float]) -> list[dict[str, Any]]:
+    """Add to each arm that ran the time of its step over that of the resident one in the same order."""
+    return [
+        result | {"cost": result["step_ms"] / resident[result["order"]]} if "step_ms" in result else result
+        for result in results
+    ]
 
 
 def main() -> None:
-    """Measure, print a table, and write it as JSON when a file is named."""
+    """Measure, and print a table; the JSON file is written again after each pool."""
     parser = make_parser(__doc__, device="cuda")
     parser.add_argument("--gaussians", type=int, default=16_000_000)
     parser.add_argument("--ratios", type=float, nargs="+", default=[1, 2, 4])
@@ -215,9 +221,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=40)
     args = parser.parse_args()
     with torch.no_grad():
-        found = run(
-            args.gaussians, args.ratios, args.orders, args.batch_size, args.steps, torch.device(args.device)
-        )
+        device = torch.device(args.device)
+        for found in run(args.gaussians, args.ratios, args.orders, args.batch_size, args.steps, device):
+            if args.json:
+                write_json(args.json, args.device, **found)
     print(f"{found['scene']}, B = {args.batch_size}, table {found['table_gb']:.2f} GB")
     columns = (
         "arm",
@@ -233,8 +240,6 @@ def main() -> None:
     for row in found["results"]:
         if "failed" in row:
             print(f"{row['arm']}, {row['order']}: {row['failed']}")
-    if args.json:
-        write_json(args.json, args.device, **found)
 
 
 if __name__ == "__main__":

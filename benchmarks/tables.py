@@ -12,8 +12,9 @@ r"""The paper's tables on any scenes: runs what is missing, and writes Markdown 
 main, ablation, rho, onset, scaling and trajectory train, by `bm_quality.py`: a process for each run, into
 TABLES/runs. `benchmarks/paper_tables.yaml` has their arms and the paper's figures; every arm is --config with
 importance passes, phi, LOD gate, per-view mask and --gate, less what its row leaves out. Without --gate the
-arms that differ by the gate alone are left out. cost runs `bm_exchange.py`; oracle `blitzgs gate replay` from
-a run with lineage and checkpoints; popping `bm_popping.py` on the model of a run with levels.
+arms that differ by the gate alone are left out. cost runs `bm_exchange.py`, on the octree by
+`--lod.visible_threshold` of --flags; oracle `blitzgs gate replay` from a run with lineage and checkpoints;
+popping `bm_popping.py` on the model of a run with levels.
 
 The ablation of the model level alone, for captures too small to have levels:
     python benchmarks/tables.py ablation --flags "--view.lod=false --view.cull=false" \
@@ -50,6 +51,7 @@ EVERYTHING = "--population.importance=true --view.lod=true --view.cull=true"
 TRAINED = ("main", "ablation", "rho", "onset", "scaling", "trajectory")
 OF_RUNS = ("oracle", "popping")
 ORACLE_ARMS = 5
+THRESHOLD = "--lod.visible_threshold="  # the one field of --flags that cost has a use for
 TABLES = (*TRAINED, "cost", *OF_RUNS)
 
 
@@ -130,6 +132,8 @@ def measure(table: str, args: argparse.Namespace, scenes: dict[str, str]) -> Non
             folder, *fields = shlex.split(text)
             downscale = next((f.partition("=")[2] for f in fields if f.startswith("--data.downscale=")), "1")
             command += [str(HERE / "bm_exchange.py"), "--data", folder, "--downscale", downscale]
+            threshold = [f.partition("=")[2] for f in shlex.split(args.flags) if f.startswith(THRESHOLD)]
+            command += ["--visible-threshold", threshold[-1]] if threshold else []
             command += ["--device", device, "--json", str(path), "--ranks", *map(str, args.ranks)]
         elif table == "oracle":
             if args.gate is None:
