@@ -115,16 +115,18 @@ def differentiable_splats(
         sparse_grad: see `project`.
         splats: the result of `project_splats` for these inputs, if it is already known.
     """
-    gaussians, (viewmats, Ks) = list(inputs.gaussians), inputs.cameras  # noqa: N806
+    viewmats, Ks = inputs.cameras  # noqa: N806
     if not torch.compiler.is_compiling():
         splats = project_splats(inputs) if splats is None else splats
-        sh = gaussians[4] if len(gaussians) > 4 else None
-        columns = _Project.apply(*gaussians[:4], sh, viewmats, inputs, sparse_grad, splats)  # type: ignore[no-untyped-call]
+        means, quats, scales, opacities, *sh = inputs.gaussians
+        columns = _Project.apply(  # type: ignore[no-untyped-call]
+            means, quats, scales, opacities, sh[0] if sh else None, viewmats, inputs, sparse_grad, splats
+        )
         return splats._replace(**_Differentiable._make(columns)._asdict())
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
     *columns, _, totals = torch.ops.blitzgs.project_fwd(
-        gaussians,
+        list(inputs.gaussians),
         [viewmats, Ks],
         list(inputs.active),
         inputs.options.ints,
@@ -276,7 +278,8 @@ def _first_gradients(
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if not dense:
-        ids = saved.splats[1].long()
+        _, visible_ids, _ = saved.splats
+        ids = visible_ids.long()
         columns = zip(saved.gaussians, gradients, sparse, needed, strict=False)
         found = [
             full_gradient(ids, gradient, parameter.shape, is_sparse) if wanted else None
@@ -321,10 +324,11 @@ class _Project(torch.autograd.Function):
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    gaussians, cameras, _, ints, floats, *_, level = inputs
+    gaussians, cameras, *others = inputs
+    _, ints, floats, *_, level = others
     options = ProjectionOptions.of(ints, floats)
     # Torch wants a gradient for each argument, and for each tensor of a list.
-    ctx.no_gradients = [_no_gradient(argument) for argument in inputs[2:]]
+    ctx.no_gradients = [_no_gradient(argument) for argument in others]
     *columns, _, _ = output
     _save(
         ctx,
@@ -334,8 +338,9 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
-    needed, (need_viewmats, _) = ctx.needs_input_grad[:2]
-    v = _Differentiable.of(ProjectedSplats._make((*v_output[:12], None)))
+    needed, (need_viewmats, _), *_ = ctx.needs_input_grad
+    *v_columns, _, _ = v_output
+    v = _Differentiable.of(ProjectedSplats._make((*v_columns, None)))
     *gradients, v_viewmats = _gradients(ctx, needed, need_viewmats, (False,) * 5, v)
     return gradients[: len(needed)], [v_viewmats, None], *ctx.no_gradients
 

@@ -38,19 +38,20 @@ class ProjectedSplats(NamedTuple):
     counts: Tensor  # int64 [3] on the CPU: U, P, and at least the sum of tiles_touched
 
 
-def splats_of(columns: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
+def splats_of(allocated: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
     """Return the valid splats of columns that were allocated with more capacity.
 
     Args:
-        columns: the columns of `ProjectedSplats` but the last; further ones are ignored.
-        counts: `ProjectedSplats.counts`.
+        allocated: a `ProjectedSplats`; its `counts` are not read.
+        counts: `counts` of the result.
     """
     visible, splats = counts[:2].tolist()
     lengths = (splats, splats, visible, visible + 1, *(splats,) * 8)
     # Hide from autograd that these are views: a Function may return views, but its caller could not change
     # them in place.
     with torch._C._AutoDispatchBelowADInplaceOrView():
-        return ProjectedSplats._make((*(c[:n] for c, n in zip(columns, lengths, strict=False)), counts))
+        columns = (column[:n] for column, n in zip(allocated, lengths, strict=False))
+        return ProjectedSplats._make((*columns, counts))
 
 
 class Splats(NamedTuple):
@@ -200,6 +201,11 @@ class Projected(NamedTuple):
     totals: Tensor
 
     @property
+    def n_splats(self) -> Tensor:
+        """Return the number of splats, int64 [1], on the device."""
+        return self.totals[1:2]
+
+    @property
     def composited(self) -> Splats:
         """Return the columns that compositing reads."""
         s = self.splats
@@ -214,7 +220,7 @@ def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
             counts = HostCopy(projected.totals).read()[:3]
             needed = Sizes(*counts.tolist())
             attempt.end(needed, attempt.sizes is None or attempt.sizes.holds(needed[:2]))
-        return splats_of(projected.splats[:12], counts)
+        return splats_of(projected.splats, counts)
 
 
 def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:

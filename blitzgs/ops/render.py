@@ -50,7 +50,7 @@ def render_queued(
     with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
         for attempt in estimate.attempts():
             projected, capacity = inputs.run(attempt.sizes), attempt.sizes
-            splats, n_splats = projected.splats, None if capacity is None else projected.totals[1:2]
+            splats, n_splats = projected.splats, None if capacity is None else projected.n_splats
             copy = HostCopy(projected.totals)
             n_isects = int(copy.read()[2]) if capacity is None else capacity.isects
             geometry = splats.means2d, splats.conics, splats.opacities
@@ -65,4 +65,4 @@ def render_queued(
             needed = counts.tolist()
             attempt.end(needed, capacity is None or capacity.holds(needed))
         listed = isect_splats[: needed[2]]
-        return Rendered(splats_of(splats[:12], counts), listed, tile_offsets, composited)
+        return Rendered(splats_of(splats, counts), listed, tile_offsets, composited)

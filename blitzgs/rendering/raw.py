@@ -114,11 +114,11 @@ def raw_rasterization(
     for optimizer in lazy:
         optimizer.catch_up(harmonics, ids)
     shaded = "RGB" in render_mode
-    visible = _Visible.apply(ids, sparse_grad, *geometry, *(harmonics if shaded else ()))  # type: ignore[no-untyped-call]
-    sh = None if not shaded else visible[4] if shN is None else torch.cat(visible[4:], dim=1)
-    gaussians = gaussians_of(
-        visible[0], visible[1], visible[2], visible[3], sh, viewmats, Ks, sh_degree, shaded, raw=True
+    means, quats, scales, opacities, *parts = _Visible.apply(  # type: ignore[no-untyped-call]
+        ids, sparse_grad, *geometry, *(harmonics if shaded else ())
     )
+    sh = torch.cat(parts, dim=1) if len(parts) > 1 else parts[0] if parts else None
+    gaussians = gaussians_of(means, quats, scales, opacities, sh, viewmats, Ks, sh_degree, shaded, raw=True)
     named = {**whole.named, **({"sh0": (sh0,), "shN": (shN,)} if shN is not None else {"sh0": (sh0,)})}
     background = background_rows(backgrounds, gaussians, render_mode)
     image = ImageOptions(render_mode, background, True, False, absgrad)

@@ -42,7 +42,7 @@ class Rank:
         counts, rest = totals[:3].cpu(), everyone[:, VIEW_TOTALS + VIEWS :]
         most = max(everyone[:, 1].max(), rest[:, ::2].sum(0).max(), rest[:, ::2].sum(1).max())
         assert plan[0] == (rest[:, 2 * self.number].sum() if most <= capacity else 0)
-        return [*splats_of(splats[:12], counts)[:12], places[: runs_of(int(counts[1]))]]
+        return [*splats_of(splats, counts)[:12], places[: runs_of(int(counts[1]))]]
 
 
 def exchange(counts, slack=0, capacity=None):
