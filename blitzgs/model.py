@@ -11,7 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.ops.cull_mask import SECTOR_WORDS, rows_of_sectors, sectors_of_rows
+from blitzgs.ops.cull_mask import SECTOR_WORDS, WORD_BITS, rows_of_sectors, sectors_of_rows
 from blitzgs.ops.take_rows import take_rows
 
 # The learned parameters, before activation: log scales, opacity logits, unnormalised quaternions.
@@ -194,7 +194,7 @@ class GaussianTable:
     def cull(self) -> Tensor | None:
         """The column `CULL` by blocks, int32 [ceil(N / 256), columns, 8], see `blitzgs.ops.cull_mask`."""
         stored = self.columns.get(CULL)
-        return None if stored is None else stored.view(-1, 32 * stored.shape[1], SECTOR_WORDS)
+        return None if stored is None else stored.view(-1, WORD_BITS * stored.shape[1], SECTOR_WORDS)
 
     def row_of(self, name: str) -> Column:
         """Return the dtype and the row shape of a column."""

@@ -9,7 +9,9 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.ops.blocks import BLOCK_ROWS
 
-SECTOR_WORDS = BLOCK_ROWS // 32
+# Bits of a word of a mask. In the layout by row, each bit is of one column.
+WORD_BITS = 32
+SECTOR_WORDS = BLOCK_ROWS // WORD_BITS
 
 
 @torch.no_grad()
@@ -41,9 +43,9 @@ def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
 
 @torch.library.register_fake("blitzgs::sectors_of_rows")
 def _(rows: Tensor) -> Tensor:
-    return rows.new_empty(-(-rows.shape[0] // BLOCK_ROWS), 32 * rows.shape[1], SECTOR_WORDS)
+    return rows.new_empty(-(-rows.shape[0] // BLOCK_ROWS), WORD_BITS * rows.shape[1], SECTOR_WORDS)
 
 
 @torch.library.register_fake("blitzgs::rows_of_sectors")
 def _(sectors: Tensor, n: int) -> Tensor:
-    return sectors.new_empty(n, sectors.shape[1] // 32)
+    return sectors.new_empty(n, sectors.shape[1] // WORD_BITS)

@@ -14,6 +14,8 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy
 
+# Largest number of views of one launch (kMaxViews of csrc/common/kernel.h): an int32 has a bit for each.
+MOST_VIEWS = 32
 # Where the splats of the views begin in `Projected.totals` (kTotalViews of csrc/project/project.h).
 VIEW_TOTALS = 4
 

@@ -21,7 +21,7 @@ from blitzgs.population.spawn_gate import GateInfo, write_info
 
 # Largest number of births that a fit takes from a scene, drawn evenly.
 MOST_ROWS = 4_000_000
-PARAMETERS = {
+XGBOOST_PARAMETERS = {
     "objective": "binary:logistic",
     "tree_method": "hist",
     "max_depth": 5,
@@ -204,7 +204,7 @@ def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[n
     data = xgboost.DMatrix(np.concatenate(features), np.concatenate(labels), feature_names=list(FEATURES))
     # A row's weight in a leaf is p (1 - p), at most 1/4.
     least = {"min_child_weight": LEAF_SHARE * data.num_row() / 4}
-    return xgboost.train(PARAMETERS | least | {"seed": seed}, data, ROUNDS)
+    return xgboost.train(XGBOOST_PARAMETERS | least | {"seed": seed}, data, ROUNDS)
 
 
 def _predict(xgboost: ModuleType, booster: Any, features: NDArray[np.float32]) -> NDArray[np.float32]:

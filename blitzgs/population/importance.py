@@ -31,6 +31,7 @@ from blitzgs.distributed.ownership import TileAssignment, TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
 from blitzgs.distributed.transport import open_transport
 from blitzgs.model import CULL, GaussianTable
+from blitzgs.ops.cull_mask import WORD_BITS
 from blitzgs.ops.view_sums import ViewSums, view_sums_
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.survey import Survey, survey
@@ -42,7 +43,6 @@ PHI_EPS = 0.1
 VIEW_MASS = 0.99
 # Column of a table from the first pass on, beside `CULL`.
 PHI = "phi"
-_WORD = 32
 ScoreRule = Literal["density", "root", "weight"]
 # Bits before the binary point of a view's term, for fewer than 2^31 pixels.
 _TERM_BITS: dict[ScoreRule, int] = {"density": 0, "root": 16, "weight": 31}
@@ -135,7 +135,7 @@ def sweep(
 
 def is_culled(cull: Tensor, column: int) -> Tensor:
     """Return the column of a view, bool [N], of the packed matrix, int32 [N, words]."""
-    return (cull[:, column // _WORD] >> (column % _WORD) & 1).bool()
+    return (cull[:, column // WORD_BITS] >> (column % WORD_BITS) & 1).bool()
 
 
 def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> TileAssignment | None:
@@ -187,6 +187,6 @@ class _Sums:
 
 def _all_culled(n_views: int, device: torch.device) -> Tensor:
     """Return the row of a Gaussian that counts in no view, int32 [1, words]."""
-    bits = torch.arange(-(-n_views // _WORD) * _WORD, device=device)
-    words = ((bits < n_views).long() << bits % _WORD).view(1, -1, _WORD).sum(2)
+    bits = torch.arange(-(-n_views // WORD_BITS) * WORD_BITS, device=device)
+    words = ((bits < n_views).long() << bits % WORD_BITS).view(1, -1, WORD_BITS).sum(2)
     return words.where(words < 1 << 31, words - (1 << 32)).int()

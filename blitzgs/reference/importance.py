@@ -9,10 +9,8 @@ from fractions import Fraction
 import torch
 from torch import Tensor
 
-from blitzgs.reference.compositing import composited_weights
+from blitzgs.reference.compositing import ALPHA_CUT, composited_weights
 from blitzgs.reference.projection import project_splats
-
-ALPHA_CUT = 1.0 / 255.0
 
 
 @dataclass

@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.project import differentiable_splats, gaussians_of
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.rendering.arguments import Gaussians, Scene
 from blitzgs.rendering.covariances import Decomposed, shaped_by
-
-MOST_VIEWS = 32  # of one launch: a bit mask holds them
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.transport import Mark, unmarked
+from blitzgs.ops.projection import MOST_VIEWS
 from blitzgs.pipeline import Frame, RenderOptions
 from blitzgs.population.position_noise import PositionNoise
 from blitzgs.training.batches import Batch
@@ -21,7 +22,7 @@ from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
 from blitzgs.training.views import ViewSet
-from blitzgs.view.block_visibility import MOST_VIEWS, Cameras
+from blitzgs.view.block_visibility import Cameras
 from blitzgs.view.gate import ViewGate
 from blitzgs.view.residence import Residence
 

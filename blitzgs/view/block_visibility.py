@@ -10,10 +10,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from blitzgs.ops.cull_mask import WORD_BITS
+from blitzgs.ops.projection import MOST_VIEWS
 from blitzgs.ops.residence import seen_blocks
 
-MOST_VIEWS = 32  # tested together
-_WORD = 32
 _MOST_WORDS = 1 << 26  # words of a mask that are processed together
 
 
@@ -91,11 +91,11 @@ def culled_blocks(cull: Tensor) -> Tensor:
     Args:
         cull: int32 [N, columns, 8], see `blitzgs.ops.cull_mask`; of whole blocks.
     """
-    bits = torch.arange(_WORD, device=cull.device)
+    bits = torch.arange(WORD_BITS, device=cull.device)
     length = max(1, _MOST_WORDS // max(1, cull[:1].numel()))
-    parts = [cull.new_empty(0, cull.shape[1] // _WORD)]
+    parts = [cull.new_empty(0, cull.shape[1] // WORD_BITS)]
     for some in cull.split(length):
-        is_culled = (some == -1).all(2).view(len(some), cull.shape[1] // _WORD, _WORD)
+        is_culled = (some == -1).all(2).view(len(some), cull.shape[1] // WORD_BITS, WORD_BITS)
         parts.append((is_culled.long() << bits).sum(2).int())
     return torch.cat(parts)
 
@@ -103,8 +103,8 @@ def culled_blocks(cull: Tensor) -> Tensor:
 def _culling_views(culled: Tensor, columns: Tensor) -> Tensor:
     """Return for each block the bits of the views (of columns [V]) that leave out all its rows, int32 [N]."""
     # In place and in 32 bits, because these are as many numbers as the table has blocks, for each view.
-    found = culled[:, columns // _WORD]
-    found >>= (columns % _WORD).int()
+    found = culled[:, columns // WORD_BITS]
+    found >>= (columns % WORD_BITS).int()
     found &= 1
     found <<= torch.arange(len(columns), dtype=torch.int32, device=columns.device)
     return found.sum(1, dtype=torch.int32)
