@@ -155,7 +155,8 @@ def train_ours(spec: RunSpec) -> dict[str, Any]:
         trainer.recorder = recorder
         if trainer.train() is None:
             raise InterruptedError("stopped by a signal")
-    return figures(recorder, trainer.state.progress.peak_gaussians) | {"population": trainer.population}
+    found = figures(recorder, trainer.state.progress.peak_gaussians) | {"population": trainer.population}
+    return found | ({"placed": trainer.state.placed_times} if config.schedule.adaptive else {})
 
 
 def train_opponent(spec: RunSpec) -> dict[str, Any]:

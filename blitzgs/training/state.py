@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -29,7 +30,7 @@ from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_log import RunLog
 from blitzgs.training.sampler import BatchSampler
-from blitzgs.training.schedule import Schedule
+from blitzgs.training.schedule import PLACED, Schedule
 from blitzgs.training.step import Stepper
 from blitzgs.training.views import Space, ViewSet, render_options
 from blitzgs.view.blocks import morton_order
@@ -115,6 +116,14 @@ class TrainingState:
         """The render options at the run's present spherical-harmonics degree."""
         lod = lod_gate(self.config, self.progress)
         return render_options(self.config, self.space, self.progress.sh_degree, lod)
+
+    @property
+    def placed_times(self) -> dict[str, dict[str, Any]]:
+        """What `schedule.adaptive` has placed: {name: {"time": as in `schedule.placed`, "reason": text}}."""
+        if self.signals is None:
+            return {}
+        places = zip(PLACED, self.config.schedule.placed, self.signals.reasons, strict=False)
+        return {name: {"time": time, "reason": reason} for name, time, reason in places}
 
     def start_clock(self) -> None:
         """Count training time from now on, in addition to the time before a resume."""

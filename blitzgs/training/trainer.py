@@ -30,7 +30,6 @@ from blitzgs.training.guard import LossGuard, ModelLostError
 from blitzgs.training.lod import lod_gate
 from blitzgs.training.population_report import MemoryMeter, describe, population_report, write_picture
 from blitzgs.training.run_log import RunLog
-from blitzgs.training.schedule import PLACED
 from blitzgs.training.setup import set_up
 from blitzgs.training.state import never
 from blitzgs.training.step_report import log_step, measure_step
@@ -269,8 +268,7 @@ class Trainer:
                 "scale": state.images_seen / state.config.schedule.iterations,
             }
         if state.signals is not None:
-            places = zip(PLACED, state.config.schedule.placed, state.signals.reasons, strict=False)
-            summary["placed"] = {name: {"time": time, "reason": reason} for name, time, reason in places}
+            summary["placed"] = state.placed_times
         if state.ranks.rank == 0:
             write_picture(state, population)
             try:

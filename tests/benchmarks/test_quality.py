@@ -21,6 +21,7 @@ from opponents.gsplat_training import GsplatOptions, GsplatTrainer  # noqa: E402
 from quality_plan import RunSpec, read_plan, runs_of  # noqa: E402
 
 from blitzgs.reference.gaussians import covariance_factors  # noqa: E402
+from blitzgs.training.schedule import PLACED  # noqa: E402
 from tests.helpers import DEVICES  # noqa: E402
 from tests.training.tiny import OVERRIDES, tiny_scene, write_tiny_capture  # noqa: E402
 
@@ -85,6 +86,14 @@ def test_shipped_plans_can_be_run(name, capture, monkeypatch):
     specs = runs_of({"tiny": str(capture)}, plan["recipes"], plan["seeds"], [], None, "cpu")
     assert len(specs) == 3 * len(plan["recipes"])
     assert len({spec.settings for spec in specs}) == len(plan["recipes"])  # no two arms are the same
+
+
+def test_the_result_of_an_adaptive_run_has_the_placed_times(capture):
+    adaptive = "--schedule.adaptive=true --population.importance=true --schedule.t1=40 --schedule.t2=95"
+    found = quality_run.train_ours(spec_of(capture, f"defaults {FLAGS} {adaptive}"))
+    name, place = next(iter(found["placed"].items()))
+    assert name == PLACED[0] and place["time"] > 0 and place["reason"]
+    assert "placed" not in quality_run.train_ours(spec_of(capture, f"defaults {FLAGS}"))
 
 
 def test_bad_plans_name_what_is_wrong(tmp_path, capture, capsys):
