@@ -37,7 +37,7 @@ from timing import median_ms
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileAssignment, TileRanges
+from blitzgs.distributed.tiles import TileAssignment, TileRanges
 from blitzgs.distributed.transport import CollectiveTransport, LocalTransport, Transport
 from blitzgs.model import PARAMETERS, GaussianTable, schema
 from blitzgs.ops.intersect import tile_counts

@@ -38,15 +38,9 @@ from scenes import aerial
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import (
-    LOSS_HALO,
-    TILE_COST,
-    TileAssignment,
-    TileOwners,
-    TileRanges,
-    cost_balance,
-)
+from blitzgs.distributed.ownership import TILE_COST, TileOwners, cost_balance
 from blitzgs.distributed.pixels import collect_images
+from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.transport import Mark, Traffic, open_transport, unmarked
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import TileAssignment
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport import (
     LocalTransport,
     Mark,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import TileAssignment
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport import LocalTransport, Transport, open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.blocks import ActiveRows

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import groupby, islice
 from typing import Any, NamedTuple
@@ -17,12 +16,10 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
+from blitzgs.distributed.tiles import TileRanges
 
 # Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
 TILE_COST = 8
-# The loss of an owned pixel reads pixels up to this distance: 5 px for its window, and 5 more for the
-# gradient.
-LOSS_HALO = 10
 # Costs that `divide` first adds up together.
 _STRETCH = 128
 # So many numbers tell what the tiles of a view cost, or one a tile where it has fewer: 16 KB at most.
@@ -32,101 +29,6 @@ _MOST_NUMBERS = 8192
 _LATE = 2
 # A view not yet seen is expected to cost what this many others do on average.
 _SIMILAR = 16
-
-
-@dataclass(frozen=True)
-class TileRanges:
-    """The tiles of B views of one size, one contiguous range per rank.
-
-    Tile (b, ty, tx) has index (b * tiles_y + ty) * tiles_x + tx; rank m owns [bounds[m], bounds[m + 1]).
-
-    Attributes:
-        bounds: M + 1 ascending tile indices, 0 first and B * tiles_y * tiles_x last.
-        n_views: B.
-        width: image width in pixels.
-        height: image height in pixels.
-        tile_size: tile edge in pixels.
-        halo: a rank also composites the tiles within this many pixels of its own; a tile that several ranks
-            composite has the same bits on each. With `LOSS_HALO` a rank can compute its loss without pixels
-            of other ranks. 0: only its own tiles.
-    """
-
-    bounds: tuple[int, ...]
-    n_views: int
-    width: int
-    height: int
-    tile_size: int = 16
-    halo: int = 0
-
-    @property
-    def tiles_x(self) -> int:
-        """Tiles in a row."""
-        return -(-self.width // self.tile_size)
-
-    @property
-    def tiles_per_view(self) -> int:
-        """Tiles of one view, T."""
-        return self.tiles_x * -(-self.height // self.tile_size)
-
-    def of(self, rank: int) -> tuple[int, int]:
-        """Return a rank's [first, one past last) tile."""
-        return self.bounds[rank], self.bounds[rank + 1]
-
-    def composited(self, rank: int) -> tuple[int, int]:
-        """Return the [first, one past last) tile that a rank composites: its own and those within `halo`.
-
-        The range may contain a few further tiles, because it is contiguous in the flattened order; it never
-        leaves the view. It is empty for a rank without tiles. The first tiles ascend with the ranks.
-        """
-        begin, end = self.of(rank)
-        ring = -(-self.halo // self.tile_size)
-        stretch = ring * (self.tiles_x + 1) if ring else 0
-        low = max(begin // self.tiles_per_view * self.tiles_per_view, begin - stretch)
-        if begin == end:
-            return low, low
-        return low, min(-(-end // self.tiles_per_view) * self.tiles_per_view, end + stretch)
-
-    def pixel_mask(self, rank: int, device: torch.device) -> Tensor:
-        """Mark the pixels of a rank's tiles, bool [B, H, W]."""
-        begin, end = self.of(rank)
-        tiles = torch.arange(self.n_views * self.tiles_per_view, device=device)
-        owned = ((tiles >= begin) & (tiles < end)).view(self.n_views, -1, self.tiles_x)
-        pixels = owned.repeat_interleave(self.tile_size, 1).repeat_interleave(self.tile_size, 2)
-        return pixels[:, : self.height, : self.width]
-
-    def pixel_rows(self, rank: int, view: int, margin: int = LOSS_HALO) -> tuple[int, int]:
-        """Return the rows [y0, y1) of a view's image that a rank's tiles and a margin around them cover.
-
-        (0, 0) when the rank owns no tile of the view.
-        """
-        first = view * self.tiles_per_view
-        begin = max(self.bounds[rank] - first, 0)
-        end = min(self.bounds[rank + 1] - first, self.tiles_per_view)
-        if begin >= end:
-            return 0, 0
-        y0 = begin // self.tiles_x * self.tile_size - margin
-        y1 = ((end - 1) // self.tiles_x + 1) * self.tile_size + margin
-        return max(y0, 0), min(y1, self.height)
-
-
-class TileAssignment:
-    """The division of tiles among the ranks in one rendering.
-
-    Attributes:
-        ranks: the job; all its ranks render together.
-        ranges: the tiles of each rank.
-        tiles: this rank's own [first, one past last) tile.
-        composited: the [first, one past last) tile that this rank composites: its own and the halo around
-            them.
-        all_composited: `composited` of every rank.
-    """
-
-    def __init__(self, ranks: Ranks, ranges: TileRanges) -> None:
-        """Look up who composites what."""
-        self.ranks, self.ranges = ranks, ranges
-        self.tiles = ranges.of(ranks.rank)
-        self.composited = ranges.composited(ranks.rank)
-        self.all_composited = [ranges.composited(rank) for rank in range(ranks.world_size)]
 
 
 class _ViewCost(NamedTuple):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileRanges
+from blitzgs.distributed.tiles import TileRanges
 
 
 def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destination: int) -> None:

@@ -27,8 +27,9 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileAssignment, TileOwners
+from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport import open_transport
 from blitzgs.model import CULL, GaussianTable
 from blitzgs.ops.cull_mask import WORD_BITS

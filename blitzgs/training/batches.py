@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import LOSS_HALO, TileOwners, TileRanges
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.distributed.tiles import LOSS_HALO, TileRanges
 from blitzgs.pipeline import Views
 from blitzgs.scene.images import ImageMemory
 from blitzgs.training.sampler import BatchSampler

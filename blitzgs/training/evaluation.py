@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from blitzgs import pipeline
-from blitzgs.distributed.ownership import TileAssignment, TileOwners
+from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.pixels import collect_images
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.ops.photometric import ssim
 from blitzgs.output import OutputFolder
 from blitzgs.pipeline import RenderOptions

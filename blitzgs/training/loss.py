@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import LOSS_HALO
+from blitzgs.distributed.tiles import LOSS_HALO
 from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.pipeline import Frame

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from blitzgs import pipeline
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.distributed.ownership import TileAssignment, TileOwners
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport import Mark, open_transport, unmarked
 from blitzgs.model import GaussianTable
 from blitzgs.ops.view_gate import gate_views_

@@ -8,14 +8,8 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.distributed.ownership import (
-    LOSS_HALO,
-    TILE_COST,
-    TileOwners,
-    TileRanges,
-    cost_balance,
-    divide,
-)
+from blitzgs.distributed.ownership import TILE_COST, TileOwners, cost_balance, divide
+from blitzgs.distributed.tiles import LOSS_HALO, TileRanges
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 4, 8])

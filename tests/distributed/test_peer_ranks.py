@@ -14,8 +14,8 @@ import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.shared_memory import Shared
+from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.transport import PeerTransport
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerExchange
 from blitzgs.model import GaussianTable

@@ -9,8 +9,9 @@ import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileOwners, TileRanges
+from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.pixels import collect_images
+from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.transport import open_transport
 from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views

@@ -12,8 +12,9 @@ import torch
 from blitzgs import pipeline
 from blitzgs.distributed import shared_memory
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileAssignment, TileOwners
+from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.shared_memory import MAX_VALUES, SharedMemory, control_words
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport import CollectiveTransport, PeerTransport
 from blitzgs.model import GaussianTable
 from blitzgs.ops.capacity import CapacityEstimate

@@ -6,7 +6,7 @@ import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import LOSS_HALO, TileAssignment, TileRanges
+from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes

@@ -6,8 +6,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.shared_memory import Shared
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Exchange, HostCounts, Mark, Transport, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.projection import ProjectionInputs

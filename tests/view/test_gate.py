@@ -10,7 +10,8 @@ import torch
 
 from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileAssignment, TileOwners
+from blitzgs.distributed.ownership import TileOwners
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.model import CULL, EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table

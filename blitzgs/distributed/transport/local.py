@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from blitzgs.distributed.ownership import TileAssignment
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.host import HostCopy

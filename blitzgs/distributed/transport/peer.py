@@ -33,8 +33,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.ownership import TileAssignment
 from blitzgs.distributed.shared_memory import SharedMemory
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.collective import exchange_sums
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes

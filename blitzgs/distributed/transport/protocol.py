@@ -23,7 +23,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.ownership import TileAssignment
+from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.projection import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Splats
 from blitzgs.ops.splat_gradients import SplatGradients
