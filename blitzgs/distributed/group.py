@@ -6,8 +6,7 @@ from __future__ import annotations
 import os
 import re
 import socket
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
 from types import TracebackType
@@ -18,8 +17,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.distributed.shared_memory import SharedMemory, connect
-from blitzgs.distributed.watchdog import BUSY_SECONDS, Watchdog, open_store
-from blitzgs.ops.host import to_host
+from blitzgs.distributed.watchdog import BUSY_SECONDS, NoWatchdog, Watchdog, open_store
 
 T = TypeVar("T")
 ReduceOp = Literal["sum", "min", "max"]
@@ -46,6 +44,8 @@ class Ranks:
         device: where this rank computes.
         timeout_seconds: the job ends if a rank does not arrive at a collective within this time.
         shares_gpu: several ranks of this host compute on one GPU.
+        watchdog: ends the job if a rank waits for another for too long; collectives and other waits for ranks
+            run in its `Watchdog.waiting`, and long work on the host in its `Watchdog.working`.
         memory: memory that the ranks share; None: splats are sent by collectives.
         transport: describes for the log how splats are sent.
     """
@@ -56,7 +56,7 @@ class Ranks:
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
     shares_gpu: bool = False
-    watchdog: Watchdog | None = None
+    watchdog: Watchdog | NoWatchdog = field(default_factory=NoWatchdog)
     memory: SharedMemory | None = None
     transport: str = "none: one rank"
 
@@ -163,62 +163,25 @@ class Ranks:
         """Leave the job; if an exception caused this, tell the other ranks its message."""
         if error is None:
             self.close()
-        elif self.watchdog is not None:
+        else:
             # Do not destroy the process group: that could wait for ranks that have ended.
             self.watchdog.report_failure(f"{type(error).__name__}: {error}")
             self.watchdog.stop()
 
     def close(self) -> None:
         """Leave the job. Safe to call twice."""
-        if self.watchdog is not None:
-            self.watchdog.stop()
-            self.watchdog = None
+        self.watchdog.stop()
+        self.watchdog = NoWatchdog()
         self.memory = None
         if self.world_size > 1 and dist.is_initialized():
             dist.destroy_process_group()
 
-    def _collective(self, name: str, call: Callable[[], T]) -> T:
-        """Run a collective; if it fails, raise an error that names the rank that caused it."""
-        if self.watchdog is None:
-            return call()
-        self.watchdog.enter(name)
-        try:
-            result = call()
-        except torch.OutOfMemoryError:
-            self.watchdog.leave()
-            raise  # the error is this rank's own; its message is for the other ranks
-        except RuntimeError as error:
-            self.watchdog.leave()
-            raise RuntimeError(f"{self.watchdog.diagnose(name)} ({error})") from error
-        self.watchdog.leave()
-        return result
-
-    def working(self, what: str) -> AbstractContextManager[None]:
-        """Announce long work on this rank's host, so that the other ranks wait for it; see `Watchdog`."""
-        return nullcontext() if self.watchdog is None else self.watchdog.working(what)
-
     def all_reduce(self, tensor: Tensor, op: ReduceOp = "sum") -> Tensor:
         """Reduce `tensor` over the ranks in place and return it; every rank gets the same bits."""
         if self.world_size > 1:
-            self._collective("all_reduce", lambda: dist.all_reduce(tensor, op=_REDUCE_OPS[op]))
+            with self.watchdog.waiting("all_reduce"):
+                dist.all_reduce(tensor, op=_REDUCE_OPS[op])
         return tensor
-
-    def share(self, values: Tensor) -> Tensor:
-        """Gather a few numbers from all ranks.
-
-        Args:
-            values: int64 [n] on `device`; the same n on all ranks, at most 256.
-
-        Returns:
-            int64 [M, n], the numbers of each rank.
-        """
-        if self.world_size == 1:
-            return values[None]
-        everyone = values.new_empty(self.world_size * len(values))
-        # Newer versions of torch have this function under another name and warn about the old one.
-        gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
-        self._collective("share", lambda: gather(everyone, values))
-        return everyone.view(self.world_size, -1)
 
     def exchange_counts(self, counts: Tensor) -> Tensor:
         """Exchange the numbers of items that the ranks will send each other.
@@ -232,20 +195,9 @@ class Ranks:
         if self.world_size == 1:
             return counts.clone()
         received = torch.empty_like(counts)
-        self._collective("exchange_counts", lambda: dist.all_to_all_single(received, counts.contiguous()))
+        with self.watchdog.waiting("exchange_counts"):
+            dist.all_to_all_single(received, counts.contiguous())
         return received
-
-    def wait(self, event: torch.cuda.Event) -> None:
-        """Wait on the host for an event of the device; the device may be waiting for other ranks."""
-        self._collective("wait", event.synchronize)
-
-    def read(self, tensor: Tensor) -> Any:
-        """Return a small tensor as nested lists; wait for the device, which may wait for other ranks."""
-        return self.reading(lambda: to_host(tensor).tolist())
-
-    def reading(self, call: Callable[[], T]) -> T:
-        """Return the result of a function that waits for the device, which may be waiting for other ranks."""
-        return self._collective("read", call)
 
     def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
         """Send consecutive groups of rows, one to each rank, and return those received, by source rank.
@@ -261,10 +213,8 @@ class Ranks:
         if self.world_size == 1:
             return rows.clone()
         result = rows.new_empty((sum(received), *rows.shape[1:]))
-        self._collective(
-            "all_to_all",
-            lambda: dist.all_to_all_single(result, rows.contiguous(), list(received), list(sent)),
-        )
+        with self.watchdog.waiting("all_to_all"):
+            dist.all_to_all_single(result, rows.contiguous(), list(received), list(sent))
         return result
 
     def all_gather(self, tensor: Tensor) -> list[Tensor]:
@@ -272,7 +222,8 @@ class Ranks:
         if self.world_size == 1:
             return [tensor.clone()]
         parts = [torch.empty_like(tensor) for _ in range(self.world_size)]
-        self._collective("all_gather", lambda: dist.all_gather(parts, tensor.contiguous()))
+        with self.watchdog.waiting("all_gather"):
+            dist.all_gather(parts, tensor.contiguous())
         return parts
 
     def all_gather_object(self, value: T) -> list[T]:
@@ -280,7 +231,8 @@ class Ranks:
         if self.world_size == 1:
             return [value]
         parts: list[Any] = [None] * self.world_size
-        self._collective("all_gather_object", lambda: dist.all_gather_object(parts, value))
+        with self.watchdog.waiting("all_gather_object"):
+            dist.all_gather_object(parts, value)
         return parts
 
     def broadcast_object(self, value: T, source: int = 0) -> T:
@@ -288,10 +240,8 @@ class Ranks:
         if self.world_size == 1:
             return value
         holder: list[Any] = [value]
-        self._collective(
-            "broadcast_object",
-            lambda: dist.broadcast_object_list(holder, src=source, device=self.device),
-        )
+        with self.watchdog.waiting("broadcast_object"):
+            dist.broadcast_object_list(holder, src=source, device=self.device)
         result: T = holder[0]
         return result
 
@@ -300,12 +250,9 @@ class Ranks:
         if self.world_size > 1:
             # An all-reduce whose result is read, because with NCCL only reading it waits for the other ranks.
             token = torch.zeros(1, device=self.device)
-
-            def wait() -> None:
+            with self.watchdog.waiting("barrier"):
                 dist.all_reduce(token)
                 token.item()
-
-            self._collective("barrier", wait)
 
     def compare_across_ranks(self, fields: Mapping[str, object]) -> None:
         """Check that every rank has the same values: configuration, code version, data fingerprint.

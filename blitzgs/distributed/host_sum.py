@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -50,7 +50,8 @@ class HostSum:
         stream.wait_stream(torch.cuda.current_stream(ranks.device))
         with torch.cuda.stream(stream):
             if ranks.memory is not None:
-                boards = ranks.reading(partial(ranks.memory.boards, words))
+                with ranks.watchdog.waiting("boards"):
+                    boards = ranks.memory.boards(words)
                 report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, boards)
                 ranks.memory.side_barrier()
                 total = boards[ranks.rank]
@@ -74,7 +75,8 @@ class HostSum:
         """
         if self._total is None:
             if self._copied is not None:
-                self._ranks.wait(self._copied)
+                with self._ranks.watchdog.waiting("sums"):
+                    self._copied.synchronize()
             self._total = self._folded(self._value)
             del self._value  # pinned memory serves the next one
         return self._total

@@ -17,10 +17,11 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 
+import torch
 from torch._C._distributed_c10d import PrefixStore, TCPStore
 
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
@@ -70,6 +71,24 @@ class _Report:
     busy: str
 
 
+class NoWatchdog:
+    """Takes the place of a `Watchdog` in a process that waits for no other process; it does nothing."""
+
+    def waiting(self, name: str) -> AbstractContextManager[None]:
+        """See `Watchdog.waiting`."""
+        return nullcontext()
+
+    def working(self, what: str) -> AbstractContextManager[None]:
+        """See `Watchdog.working`."""
+        return nullcontext()
+
+    def report_failure(self, message: str) -> None:
+        """See `Watchdog.report_failure`."""
+
+    def stop(self) -> None:
+        """See `Watchdog.stop`."""
+
+
 class Watchdog:
     """Publishes the progress of one rank every few seconds, and compares it with that of the other ranks.
 
@@ -106,15 +125,31 @@ class Watchdog:
         """Seconds between two looks at the clock."""
         return min(2.0, timeout_seconds / 5)
 
-    def enter(self, name: str) -> None:
-        """Note that this rank waits in a collective."""
+    @contextmanager
+    def waiting(self, name: str) -> Iterator[None]:
+        """Note, while the context lasts, that this rank waits for other ranks.
+
+        Enter it for collectives, and to wait for this rank's device, which may itself be waiting for other
+        ranks. A rank that has entered fewer of these contexts than another is called late, so all ranks must
+        enter the same ones.
+
+        Raises:
+            RuntimeError: the work in the context failed; the message names the rank that caused it. If this
+                rank is out of memory, its own `torch.OutOfMemoryError` is raised instead, and its message is
+                for the other ranks.
+        """
         self.calls += 1
         self.name = name
         self.waiting_since = time.monotonic()
-
-    def leave(self) -> None:
-        """Note that the collective is done."""
-        self.waiting_since = None
+        try:
+            yield
+        except torch.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            self.waiting_since = None
+            raise RuntimeError(f"{self.diagnose(name)} ({error})") from error
+        finally:
+            self.waiting_since = None
 
     @contextmanager
     def working(self, what: str) -> Iterator[None]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packs splats by destination rank, unpacks received ones, and sums the values that return for each."""
+"""Packs splats by destination rank, and unpacks received ones."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def scatter_splats(
 
     Returns:
         packed int32 [words]: one group after the other, in each the columns one after the other; and places
-        int64 [ceil(P / RUN), M], where in each group the splats are: what `sum_splats` needs. The order of
-        the splats of a run is kept; on CUDA that of runs is not.
+        int64 [ceil(P / RUN), M], where in each group the splats are: what `splat_gradients.sum_splats`
+        needs. The order of the splats of a run is kept; on CUDA that of runs is not.
 
     Raises:
         RuntimeError: columns of different lengths, or too many.
@@ -57,28 +57,6 @@ def gather_splats(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[
     widths = [words_per_splat(column) for column in like]
     parts = torch.ops.blitzgs.gather_splats(packed, widths, list(group_sizes))
     return [as_column(part, column) for part, column in zip(parts, like, strict=True)]
-
-
-def sum_splats(
-    values: Tensor, places: Tensor, group_sizes: Sequence[int], splats: int, widths: Sequence[int]
-) -> list[Tensor]:
-    """Sum, for each splat, the values that the ranks returned for it, in the order of the ranks.
-
-    Args:
-        values: [sum(group_sizes), F], float32 (CPU also float64), in the order in which `scatter_splats`
-            packed them.
-        places: from `scatter_splats`.
-        group_sizes: as for `scatter_splats`.
-        splats: P.
-        widths: widths of the columns that the F values consist of; they add up to F.
-
-    Returns:
-        [P, width] each; zero for splats that went nowhere. Deterministic.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
-    """
-    return torch.ops.blitzgs.sum_splats(values, places, list(group_sizes), splats, list(widths))
 
 
 def runs_of(splats: int) -> int:
@@ -120,14 +98,3 @@ def _(columns: Sequence[Tensor], masks: Tensor, group_sizes: Sequence[int]) -> t
 @torch.library.register_fake("blitzgs::gather_splats")
 def _(packed: Tensor, widths: Sequence[int], group_sizes: Sequence[int]) -> list[Tensor]:
     return [packed.new_empty((sum(group_sizes), width)) for width in widths]
-
-
-@torch.library.register_fake("blitzgs::sum_splats")
-def _(
-    values: Tensor,
-    places: Tensor,
-    group_sizes: Sequence[int],
-    splats: int,
-    widths: Sequence[int],
-) -> list[Tensor]:
-    return [values.new_empty((splats, width)) for width in widths]

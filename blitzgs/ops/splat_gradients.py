@@ -87,24 +87,57 @@ class SplatGradients(NamedTuple):
         """The gradient of means2d, [P, 2] per pixel; None if its parts are at several ranks."""
         return None if self.places is not None else self._columns()[0]
 
-    def side_by_side(self) -> tuple[Tensor, list[int]]:
-        """Return all columns, and `means2d_abs` if it is there, as one [P, F], and how wide each is.
+    def side_by_side(self) -> Tensor:
+        """Return all columns, and `means2d_abs` if it is there, as one [P, F].
 
         For gradients without `places`.
         """
         flat = [column.reshape(len(column), math.prod(column.shape[1:])) for column in self._columns()]
-        return torch.cat(flat, 1), [column.shape[1] for column in flat]
+        return torch.cat(flat, 1)
 
-    def of_sums(self, sums: Sequence[Tensor]) -> SplatGradients:
-        """Return the gradients of Q splats from the columns of `side_by_side`, summed: [Q, width] each."""
-        columns = zip(sums, self._columns(), strict=True)
-        parts = [total.reshape(-1, *column.shape[1:]) for total, column in columns]
+    def sum_returned(
+        self, values: Tensor, places: Tensor, group_sizes: Sequence[int], splats: int
+    ) -> SplatGradients:
+        """Return the gradients of a rank's own splats, summed over the ranks that composited them.
+
+        Args:
+            values: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats.
+            places: as for `sum_splats`, like the next two.
+            group_sizes: number of splats that this rank sent to each rank.
+            splats: number P of this rank's own splats.
+        """
+        columns = self._columns()
+        widths = [math.prod(column.shape[1:]) for column in columns]
+        sums = sum_splats(values, places, group_sizes, splats, widths)
+        parts = [total.reshape(-1, *like.shape[1:]) for total, like in zip(sums, columns, strict=True)]
         return SplatGradients(parts[:4], None, parts[4] if self.means2d_abs is not None else None)
 
     def _columns(self) -> list[Tensor]:
         """Return the four columns, and `means2d_abs` if it is there."""
         columns = gradient_columns(self.parts[0]) if len(self.parts) == 1 else self.parts
         return [*columns, *([] if self.means2d_abs is None else [self.means2d_abs])]
+
+
+def sum_splats(
+    values: Tensor, places: Tensor, group_sizes: Sequence[int], splats: int, widths: Sequence[int]
+) -> list[Tensor]:
+    """Sum, for each splat, the values that the ranks returned for it, in the order of the ranks.
+
+    Args:
+        values: [sum(group_sizes), F], float32 (CPU also float64), in the order in which `scatter_splats`
+            packed them.
+        places: from `blitzgs.ops.scatter.scatter_splats`.
+        group_sizes: as for `scatter_splats`.
+        splats: P.
+        widths: widths of the columns that the F values consist of; they add up to F.
+
+    Returns:
+        [P, width] each; zero for splats that went nowhere. Deterministic.
+
+    Raises:
+        RuntimeError: wrong shapes or dtypes.
+    """
+    return torch.ops.blitzgs.sum_splats(values, places, list(group_sizes), splats, list(widths))
 
 
 class GradientBuffer:
@@ -135,3 +168,14 @@ class GradientBuffer:
 @torch.library.register_fake("blitzgs::splat_gradient_layout")
 def _() -> list[int]:
     return [_MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT]
+
+
+@torch.library.register_fake("blitzgs::sum_splats")
+def _(
+    values: Tensor,
+    places: Tensor,
+    group_sizes: Sequence[int],
+    splats: int,
+    widths: Sequence[int],
+) -> list[Tensor]:
+    return [values.new_empty((splats, width)) for width in widths]

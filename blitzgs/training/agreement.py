@@ -18,6 +18,7 @@ from types import FrameType
 import torch
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.ops.host import to_host
 
 # The ranks agree at least this often: in steps, and in seconds as far as single steps allow.
 MOST_STEPS = 16
@@ -121,7 +122,9 @@ class Agreement:
             dtype=torch.float64,
             device=self._ranks.device,
         )
-        number, due, slowest, any_lost = self._ranks.read(self._ranks.all_reduce(values, "max"))
+        self._ranks.all_reduce(values, "max")
+        with self._ranks.watchdog.waiting("agreement"):
+            number, due, slowest, any_lost = to_host(values).tolist()
         interval = max(1, min(MOST_STEPS, int(MOST_SECONDS / max(slowest, 1e-9))))
         self._next, self._last = (step // interval + 1) * interval, (step, time.monotonic())
         self._agreed_to_stop = number > 0

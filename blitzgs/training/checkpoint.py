@@ -96,7 +96,7 @@ def save(
         _check_space(unfinished, columns)
         reached("folder made")
         file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
-        with ranks.working("writing a checkpoint"):
+        with ranks.watchdog.working("writing a checkpoint"):
             size, digest = write_shard(unfinished / file, columns, reached)
         mine = Shard(file, rows, size, digest)
         if shared and ranks.rank == 0:
@@ -107,7 +107,7 @@ def save(
     problems = [text for _, text in results if text]
     if not problems and ranks.rank == 0:
         try:
-            with ranks.working("finishing a checkpoint"):
+            with ranks.watchdog.working("finishing a checkpoint"):
                 shards = [shard for shard, _ in results if shard]
                 _finish(directory, name, shards, common, state, ranks.world_size, reached)
         except OSError as error:
@@ -212,7 +212,7 @@ def load(
     try:
         manifest = _read_manifest(path)
         # Each rank checks some of the files, so that every file is read for its digest once.
-        with ranks.working("reading a checkpoint"):
+        with ranks.watchdog.working("reading a checkpoint"):
             files = [*manifest.shards, *([manifest.shared] if manifest.shared else [])]
             for shard in files[ranks.rank :: ranks.world_size]:
                 _verify(path, shard)

@@ -208,7 +208,7 @@ def evaluate(
             report(position + 1, len(indices))
         if render is None:
             continue
-        with ranks.working(f"comparing view {cameras[index].name}"):
+        with ranks.watchdog.working(f"comparing view {cameras[index].name}"):
             try:
                 target, mask = images.get(index).to(render.device), images.mask(index)
             except (OSError, ValueError) as error:

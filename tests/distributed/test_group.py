@@ -17,7 +17,6 @@ def _collectives(ranks):
     ]
     assert ranks.all_reduce(torch.tensor(m, device=place), "max").item() == size - 1
     assert ranks.all_reduce(torch.tensor(float(m), device=place), "min").item() == 0
-    assert ranks.share(torch.tensor([m, 7], device=place)).tolist() == [[n, 7] for n in range(size)]
     # Rank m sends m + n + 1 rows to rank n, and nothing to itself.
     sent = [0 if n == m else m + n + 1 for n in range(size)]
     for dtype in (torch.int64, torch.uint8, torch.float32, torch.float16):
@@ -96,17 +95,14 @@ def test_ranks_share_gpus_only_when_told(monkeypatch):
         places("cuda", 2, True)
 
 
-def _out_of_memory():
-    raise torch.OutOfMemoryError("no room for shard 1")
-
-
 def _fail(ranks, how):
     ranks.barrier()
     if ranks.rank == 1:
         if how == "raise":
             raise ValueError("shard 1 has a hole")
         if how == "memory":
-            ranks.reading(_out_of_memory)
+            with ranks.watchdog.waiting("projection"):
+                raise torch.OutOfMemoryError("no room for shard 1")
         if how == "kill":
             os.kill(os.getpid(), 9)
         time.sleep(60)
@@ -139,7 +135,7 @@ def _work(ranks, hang):
     ranks.watchdog._announce = lambda work, waited: announced.append(work)
     ranks.barrier()
     if ranks.rank == 1:
-        with ranks.working("writing to a slow disk"):
+        with ranks.watchdog.working("writing to a slow disk"):
             time.sleep(9)
         if hang:
             time.sleep(60)

@@ -17,7 +17,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
 from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.transport import PeerTransport
-from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, PeerExchange
+from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
+from blitzgs.distributed.transport.way_back import PeerWayBack
 from blitzgs.model import GaussianTable
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
 from blitzgs.ops.projection import VIEW_TOTALS
@@ -113,15 +114,15 @@ def without_gpu(monkeypatch):
     monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
     monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
-    returned = PeerExchange.return_gradients
+    returned = PeerWayBack.return_gradients
 
     def from_columns(self, gradients):
-        table = self._buffers.tables[self._ranks.rank]  # where compositing has them on a GPU
+        table = self.tables[self.ranks.rank]  # where compositing has them on a GPU
         flat = torch.cat([part.reshape(len(part), -1) for part in gradients.parts], 1)
         table[: len(flat), :9] = flat
         return returned(self, gradients)
 
-    monkeypatch.setattr(PeerExchange, "return_gradients", from_columns)
+    monkeypatch.setattr(PeerWayBack, "return_gradients", from_columns)
 
 
 def _on_all(world_size, function):

@@ -85,7 +85,7 @@ def _round_trip(ranks, half, capacity):
         returned = way_back.return_gradients(SplatGradients(gradients_of(got, ranks.rank)))
     assert returned.places is None
     ids = (inputs.ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
-    return ids, returned.parts, got._asdict(), visible
+    return ids, returned.parts, got._asdict(), visible, traffic.splats
 
 
 def masks_by_lists(projected, world_size):
@@ -123,7 +123,12 @@ def test_splats_reach_their_tiles_and_gradients_return(world_size, capacity):
         got = torch.cat([a[1][i] for a in answers])[order]
         torch.testing.assert_close(got, want[reference], rtol=1e-12, atol=1e-12)
     place = {int(key): at for at, key in enumerate(keys)}
-    for rank, (_, _, received, visible) in enumerate(answers):
+    counts = []
+    for owned, *_ in answers:
+        reaches = masks[[place[int(key)] for key in owned]]
+        counts.append([int((reaches >> m & 1).sum()) for m in range(world_size)])
+    for rank, (_, _, received, visible, splats) in enumerate(answers):
+        assert splats == counts  # every rank knows how many splats each rank sends to each other
         key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
         at = torch.tensor([place[int(k)] for k in key], dtype=torch.int64)
         # Exactly the splats that touch this rank's tiles, once each, unchanged.
@@ -139,7 +144,7 @@ def test_half_precision_is_close():
     projected = project_splats(scene())
     keys = (scene().ids[projected.gaussian_ids.long()] - 2**40) * CAMERAS + projected.camera_ids
     place = {int(key): splat for splat, key in enumerate(keys)}
-    for _, gradients, received, _ in answers:
+    for _, gradients, received, *_ in answers:
         key = (received["ids"] - 2**40) * CAMERAS + received["camera_ids"]
         at = torch.tensor([place[int(k)] for k in key])
         assert torch.equal(received["means2d"], projected.means2d[at])
@@ -152,7 +157,7 @@ def test_half_precision_is_close():
         assert (a * c - b * b > 0).all()
         assert all(g.isfinite().all() for g in gradients)
     exact = [project_splats(owned_by(scene(), rank, 2)) for rank in range(2)]
-    for rank, (_, gradients, _, _) in enumerate(answers):
+    for rank, (_, gradients, *_) in enumerate(answers):
         mine, inputs = exact[rank], owned_by(scene(), rank, 2)
         masks = masks_by_lists(mine, 2)
         times = ((masks & 1) + (masks >> 1) * 2).float()

@@ -2,7 +2,8 @@
 import pytest
 import torch
 
-from blitzgs.ops.scatter import RUN, gather_splats, scatter_splats, sum_splats
+from blitzgs.ops.scatter import RUN, gather_splats, scatter_splats
+from blitzgs.ops.splat_gradients import sum_splats
 from tests.helpers import DEVICES
 
 RANKS = 3

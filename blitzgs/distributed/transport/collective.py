@@ -1,28 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sends splats, and returns their gradients, by an all-to-all of NCCL or Gloo."""
+"""Sends splats by an all-to-all of NCCL or Gloo; their gradients return in the same way (`way_back`)."""
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
+import torch.distributed as dist
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
+from blitzgs.distributed.transport.way_back import CollectiveWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
+from blitzgs.ops.host import to_host
 from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
-from blitzgs.ops.scatter import (
-    RUN,
-    as_column,
-    gather_splats,
-    scatter_splats,
-    sum_splats,
-    words_of,
-    words_per_splat,
-)
-from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.ops.scatter import gather_splats, scatter_splats, words_per_splat
 
 
 class CollectiveTransport:
@@ -53,7 +45,7 @@ class CollectiveTransport:
 
 
 class CollectiveExchange:
-    """See `Exchange` and `WayBack`."""
+    """See `Exchange`."""
 
     def __init__(
         self,
@@ -65,25 +57,30 @@ class CollectiveExchange:
         mark: Mark,
     ) -> None:
         """Project, show the other ranks how many splats there are for whom, and carry the splats."""
-        self._ranks, self._codec, self._attempt = ranks, codec, attempt
-        tiles, n_views = assignment.all_composited, assignment.ranges.n_views
-        # Waiting may mean to wait for other ranks, whose collectives are queued before.
-        projected = ranks.reading(partial(inputs.run, attempt.sizes, tiles))
-        everyone = ranks.share(projected.totals)
-        self._visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
-        self._traffic = traffic = Traffic.of(ranks.read(everyone), n_views, ranks.rank)
-        sizes, needed = attempt.sizes, Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
+        sizes, tiles, n_views = attempt.sizes, assignment.all_composited, assignment.ranges.n_views
+        # The host may have to wait for the collectives of other ranks that are queued before the projection.
+        with ranks.watchdog.waiting("projection"):
+            projected = inputs.run(sizes, tiles)
+        everyone = projected.totals.new_empty(ranks.world_size, len(projected.totals))
+        # Newer versions of torch have this function under another name and warn about the old one.
+        gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
+        with ranks.watchdog.waiting("splat counts"):
+            gather(everyone.view(-1), projected.totals)
+            visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
+            totals = to_host(everyone).tolist()
+        traffic = Traffic.of(totals, n_views, ranks.rank)
+        needed = Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
         if sizes is not None and not sizes.holds(needed[:2]):
-            projected = ranks.reading(partial(inputs.run, None, tiles))
+            projected = inputs.run(None, tiles)  # nothing is queued any more that waits for another rank
         # All ranks decide the same, because they have estimated the same number of blocks.
         attempt.end(needed, sizes is None or needed.blocks <= sizes.blocks)
         mark("project")
-        self._own = splats_of(projected.splats[:12], traffic.counts)
-        own = projected.composited.first(len(self._own.camera_ids))
-        shape = (own.conics, own.opacities, own.colors)
-        columns = [own.means2d, own.depths, own.camera_ids, own.ids]
+        own = splats_of(projected.splats[:12], traffic.counts)
+        sent = projected.composited.first(needed.splats)
+        shape = (sent.conics, sent.opacities, sent.colors)
+        columns = [sent.means2d, sent.depths, sent.camera_ids, sent.ids]
         columns += [codec.encode(*shape)] if codec is not None else shape
-        packed, self._places = scatter_splats(columns, self._own.rank_masks, traffic.sent)
+        packed, places = scatter_splats(columns, own.rank_masks, traffic.sent)
         rows = packed.view(-1, sum(map(words_per_splat, columns)))
         arrived = ranks.all_to_all(rows, traffic.sent, traffic.received)
         means2d, depths, camera_ids, ids, *rest = gather_splats(arrived.view(-1), columns, traffic.received)
@@ -92,59 +89,13 @@ class CollectiveExchange:
         self.gradient_table: Tensor | None = None
         # After rounding, splats may touch a few more tiles.
         self.arrived = Arrived(splats, None, traffic.n_isects if codec is None else -1)
+        way_back = CollectiveWayBack(ranks, traffic, places, half=codec is not None)
+        self._counts = HostCounts(own, splats, visible, traffic, way_back) if attempt.fits else None
         mark("exchange")
 
     def finish(self) -> HostCounts | None:
-        """See `Exchange.finish`."""
-        if not self._attempt.fits:
-            return None
-        return HostCounts(self._own, self.arrived.splats, self._visible, self._traffic, self)
-
-    def check_still_valid(self) -> None:
-        """Nothing of a frame is overwritten by the next one."""
-
-    def cleared_table(self) -> None:
-        """Return None: any memory can be used."""
-
-    def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
-        """See `WayBack.return_gradients`."""
-        rows, widths = gradients.side_by_side()
-        sent, received = self._traffic.sent, self._traffic.received
-        if self._codec is None:
-            returned = self._ranks.all_to_all(rows, received, sent)
-        else:
-            # Gradients span too many magnitudes for float16.
-            halves = rows.bfloat16()
-            carried = self._ranks.all_to_all(words_of(halves), received, sent)
-            returned = as_column(carried, halves).to(rows.dtype)
-        sums = sum_splats(returned, self._places, sent, len(self._own.camera_ids), widths)
-        return gradients.of_sums(sums)
-
-    def return_sums(self, sums: Tensor) -> Tensor:
-        """See `WayBack.return_sums`."""
-        return exchange_sums(sums, self._places, self._traffic, len(self._own.camera_ids), self._ranks)
-
-
-def exchange_sums(sums: Tensor, places: Tensor, traffic: Traffic, splats: int, ranks: Ranks) -> Tensor:
-    """Carry integer sums of splats to their owners by a collective: `WayBack.return_sums`.
-
-    Args:
-        sums: int64 [R, C], of the splats that arrived here.
-        places: of this rank's splats, as `scatter_splats` returns them.
-        traffic: what went where.
-        splats: P.
-        ranks: the job.
-    """
-    returned = ranks.all_to_all(sums, traffic.received, traffic.sent)
-    total = sums.new_zeros(splats, sums.shape[1])
-    lanes = torch.arange(RUN, device=sums.device)
-    for group, runs in zip(returned.split(traffic.sent), places.unbind(1), strict=True):
-        # The splats of a run lie together: the first one's place, and which of them are there (csrc/scatter).
-        here = runs[:, None] >> (32 + lanes) & 1
-        at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
-        which = here.flatten().nonzero().squeeze(1)
-        total.index_add_(0, which, group[at.flatten()[which]])
-    return total
+        """See `Exchange.finish`; the host has known all numbers since the splats were sent."""
+        return self._counts
 
 
 class HalfCodec:

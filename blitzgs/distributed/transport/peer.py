@@ -20,14 +20,13 @@ Splats are queued for writing behind A, and for compositing, while the counts ar
 Where they do not fit into some rank's buffer no rank writes any: each finds that from the same counts, and
 composites nothing. All ranks then enlarge their buffers and start the frame again. So it is where one rank
 has more tile entries than all have room for. A rank that dies leaves the others in a barrier: their hosts
-wait in `Ranks.reading`, where the watchdog finds them, and a barrier that lasts longer than that aborts the
+wait in `Watchdog.waiting`, so the watchdog finds them, and a barrier that lasts longer than that aborts the
 process's kernels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -35,12 +34,12 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.distributed.transport.collective import exchange_sums
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
+from blitzgs.distributed.transport.way_back import PeerWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
 from blitzgs.ops.scatter import runs_of
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
+from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
 
 # Columns of a splat as peers write them, those of `Splats` (kSentColumns of csrc/transport/transport.h):
 # dtype, words and shape of an element.
@@ -109,14 +108,15 @@ class PeerTransport:
         if attempt.sizes is not None:
             splats = -(-attempt.sizes.splats // _ALIGNMENT) * _ALIGNMENT
             if len(self._memory.buffers[0]) < splats * WORDS_PER_SPLAT:
-                self._ranks.reading(partial(self._memory.reserve, splats * WORDS_PER_SPLAT))
+                with self._ranks.watchdog.waiting("larger buffers"):
+                    self._memory.reserve(splats * WORDS_PER_SPLAT)
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
         return PeerExchange(self._ranks, self._memory, self._buffers, inputs, assignment, attempt, mark)
 
 
 class PeerExchange:
-    """See `Exchange` and `WayBack`."""
+    """See `Exchange`."""
 
     def __init__(
         self,
@@ -161,39 +161,18 @@ class PeerExchange:
         if not fits:
             return None
         own = splats_of(self._own[:12], traffic.counts)
-        self._places = self._places[: runs_of(len(own.camera_ids))]
         visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
         composited = self._buffers.splats.first(sum(traffic.received))
-        return HostCounts(own, composited, visible, traffic, self)
+        way_back = PeerWayBack(
+            self._ranks, self._memory, self._generation, self._buffers.tables, traffic,
+            self._places[: runs_of(len(own.camera_ids))],
+        )  # fmt: skip
+        return HostCounts(own, composited, visible, traffic, way_back)
 
     def _read(self) -> Traffic:
         """Wait for the counts of all ranks."""
         if self._traffic is None:
-            self._ranks.reading(self._counted.synchronize)
+            with self._ranks.watchdog.waiting("splat counts"):
+                self._counted.synchronize()
             self._traffic = Traffic.of(self._shared.host.tolist(), self._n_views, self._ranks.rank)
         return self._traffic
-
-    def check_still_valid(self) -> None:
-        """See `WayBack.check_still_valid`."""
-        if self._generation != self._memory.generation:
-            raise RuntimeError(
-                "a later exchange has overwritten this one's splats: run the backward pass of a frame before "
-                "the next forward pass"
-            )
-
-    def cleared_table(self) -> Tensor:
-        """See `WayBack.cleared_table`."""
-        self._memory.barrier()
-        return self._buffers.tables[self._ranks.rank][: sum(self._read().received)].zero_()
-
-    def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
-        """See `WayBack.return_gradients`; the gradients are in the tables, where their owners read them."""
-        self._memory.barrier()  # C
-        traffic = self._read()
-        mine = zip(self._buffers.tables, traffic.starts, traffic.sent, strict=True)
-        return SplatGradients([table[start : start + n] for table, start, n in mine], self._places)
-
-    def return_sums(self, sums: Tensor) -> Tensor:
-        """See `WayBack.return_sums`."""
-        traffic = self._read()
-        return exchange_sums(sums, self._places, traffic, int(traffic.counts[1]), self._ranks)

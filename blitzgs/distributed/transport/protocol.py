@@ -11,7 +11,8 @@ every rank::
     counts.way_back.check_still_valid()                            # before the backward pass of compositing
     gradients = counts.way_back.return_gradients(gradients)        # those of this rank's own splats
 
-The last two may be repeated. One file has each transport: `local`, `collective`, `peer`.
+The last two may be repeated. `local`, `collective` and `peer` each have one transport; `way_back` returns the
+gradients for the last two.
 """
 
 from __future__ import annotations
