@@ -75,7 +75,7 @@ class HostSum:
         """
         if self._total is None:
             if self._copied is not None:
-                with self._ranks.watchdog.waiting("sums"):
+                with self._ranks.watchdog.waiting("read_sums"):
                     self._copied.synchronize()
             self._total = self._folded(self._value)
             del self._value  # pinned memory serves the next one

@@ -123,7 +123,7 @@ class Agreement:
             device=self._ranks.device,
         )
         self._ranks.all_reduce(values, "max")
-        with self._ranks.watchdog.waiting("agreement"):
+        with self._ranks.watchdog.waiting("agree"):
             number, due, slowest, any_lost = to_host(values).tolist()
         interval = max(1, min(MOST_STEPS, int(MOST_SECONDS / max(slowest, 1e-9))))
         self._next, self._last = (step // interval + 1) * interval, (step, time.monotonic())

@@ -101,7 +101,7 @@ def _fail(ranks, how):
         if how == "raise":
             raise ValueError("shard 1 has a hole")
         if how == "memory":
-            with ranks.watchdog.waiting("projection"):
+            with ranks.watchdog.waiting("project"):
                 raise torch.OutOfMemoryError("no room for shard 1")
         if how == "kill":
             os.kill(os.getpid(), 9)

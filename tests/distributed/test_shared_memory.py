@@ -200,7 +200,7 @@ def test_a_rank_that_leaves_a_barrier_is_named(world_size, device, how, blame):
     with pytest.raises(RankError) as failure:
         run_ranks(_abandoned, world_size, how, device=device, timeout_seconds=3.0, limit=50)
     assert time.monotonic() - start < 50
-    assert f"waited 3 s in read: rank 1 has {blame}" in failure.value.blame
+    assert f"waited 3 s in share_counts: rank 1 has {blame}" in failure.value.blame
 
 
 @pytest.fixture

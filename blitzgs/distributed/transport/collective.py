@@ -59,12 +59,12 @@ class CollectiveExchange:
         """Project, show the other ranks how many splats there are for whom, and carry the splats."""
         sizes, tiles, n_views = attempt.sizes, assignment.all_composited, assignment.ranges.n_views
         # The host may have to wait for the collectives of other ranks that are queued before the projection.
-        with ranks.watchdog.waiting("projection"):
+        with ranks.watchdog.waiting("project"):
             projected = inputs.run(sizes, tiles)
         everyone = projected.totals.new_empty(ranks.world_size, len(projected.totals))
         # Newer versions of torch have this function under another name and warn about the old one.
         gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
-        with ranks.watchdog.waiting("splat counts"):
+        with ranks.watchdog.waiting("share_counts"):
             gather(everyone.view(-1), projected.totals)
             visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
             totals = to_host(everyone).tolist()
@@ -89,8 +89,10 @@ class CollectiveExchange:
         self.gradient_table: Tensor | None = None
         # After rounding, splats may touch a few more tiles.
         self.arrived = Arrived(splats, None, traffic.n_isects if codec is None else -1)
-        way_back = CollectiveWayBack(ranks, traffic, places, half=codec is not None)
-        self._counts = HostCounts(own, splats, visible, traffic, way_back) if attempt.fits else None
+        self._counts: HostCounts | None = None
+        if attempt.fits:
+            way_back = CollectiveWayBack(ranks, traffic, places, half=codec is not None)
+            self._counts = HostCounts(own, splats, visible, traffic, way_back)
         mark("exchange")
 
     def finish(self) -> HostCounts | None:

@@ -108,7 +108,7 @@ class PeerTransport:
         if attempt.sizes is not None:
             splats = -(-attempt.sizes.splats // _ALIGNMENT) * _ALIGNMENT
             if len(self._memory.buffers[0]) < splats * WORDS_PER_SPLAT:
-                with self._ranks.watchdog.waiting("larger buffers"):
+                with self._ranks.watchdog.waiting("reserve"):
                     self._memory.reserve(splats * WORDS_PER_SPLAT)
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
@@ -172,7 +172,7 @@ class PeerExchange:
     def _read(self) -> Traffic:
         """Wait for the counts of all ranks."""
         if self._traffic is None:
-            with self._ranks.watchdog.waiting("splat counts"):
+            with self._ranks.watchdog.waiting("share_counts"):
                 self._counted.synchronize()
             self._traffic = Traffic.of(self._shared.host.tolist(), self._n_views, self._ranks.rank)
         return self._traffic
