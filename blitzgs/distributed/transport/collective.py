@@ -75,7 +75,7 @@ class CollectiveExchange:
         # All ranks decide the same, because they have estimated the same number of blocks.
         attempt.end(needed, sizes is None or needed.blocks <= sizes.blocks)
         mark("project")
-        own = splats_of(projected.splats[:12], traffic.counts)
+        own = splats_of(projected.splats, traffic.counts)
         sent = projected.composited.first(needed.splats)
         shape = (sent.conics, sent.opacities, sent.colors)
         columns = [sent.means2d, sent.depths, sent.camera_ids, sent.ids]

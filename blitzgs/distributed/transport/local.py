@@ -56,7 +56,7 @@ class LocalExchange:
         totals = self._copy.read()
         counts, needed = totals[:3], Sizes._make(totals[:VIEW_TOTALS].tolist())
         # If the capacity was too small, the splats are undefined.
-        own = splats_of(self._projected.splats[:12], counts)
+        own = splats_of(self._projected.splats, counts)
         composited = self.arrived.splats.first(needed.splats)
         fits = self._capacity is None or self._capacity.holds(needed)
         self._attempt.end(needed, fits)

@@ -160,7 +160,7 @@ class PeerExchange:
         self._attempt.end(traffic.needed, fits)
         if not fits:
             return None
-        own = splats_of(self._own[:12], traffic.counts)
+        own = splats_of(self._own, traffic.counts)
         visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
         composited = self._buffers.splats.first(sum(traffic.received))
         way_back = PeerWayBack(
