@@ -59,26 +59,34 @@ __device__ __forceinline__ void for_each_owned(const TileGrid& grid, const Splat
                     });
 }
 
-// The owned tiles that a splat touches. The compact form has the first tile (counted from tile_begin) and a
-// byte for each of up to twelve tile rows. The low half of a byte is the number of tiles in the row. The high
-// half is 8 plus the column of the row's first tile minus the column of the first tile of all. Shapes that do
-// not fit this form have first = kWalk, and rows[0] is their number of tiles.
+// The owned tiles that a splat touches: the first tile (counted from tile_begin) and a byte for each of up to
+// twelve tile rows. The low half of a byte is the number of tiles in the row. The high half is 8 plus the
+// column of the row's first tile minus the column of the first tile of all. A splat that does not fit this
+// form is called large. It has first = kLarge; rows[0] is its number of tiles, rows[1] and rows[2] are the
+// position of its first list entry once that is known.
 struct alignas(16) Touched {
-  static constexpr std::uint32_t kWalk = ~0u;
+  static constexpr std::uint32_t kLarge = ~0u;
   static constexpr int kWords = 3;
   std::uint32_t first, rows[kWords];
 
   static constexpr std::uint32_t kCounts = 0x0f0f0f0fu, kOnes = 0x01010101u, kHighBits = 0x80808080u;
 
+  __device__ bool large() const { return first == kLarge; }
+
+  // The position of a large splat's first list entry.
+  __device__ std::int64_t begin() const { return static_cast<std::int64_t>(rows[2]) << 32 | rows[1]; }
+  __device__ void set_begin(std::int64_t position) {
+    rows[1] = static_cast<std::uint32_t>(position);
+    rows[2] = static_cast<std::uint32_t>(position >> 32);
+  }
+
   __device__ std::int32_t count() const {
-    if (first == kWalk) return static_cast<std::int32_t>(rows[0]);
+    if (large()) return static_cast<std::int32_t>(rows[0]);
     const std::uint32_t sums = (rows[0] & kCounts) + (rows[1] & kCounts) + (rows[2] & kCounts);
     return static_cast<std::int32_t>(sums * kOnes >> 24);
   }
 
-  __device__ bool compact() const { return first != kWalk; }
-
-  // Returns tile k < count() of a compact splat, counted from tile_begin.
+  // Returns tile k < count() of a splat that is not large, counted from tile_begin.
   __device__ std::uint32_t tile(std::uint32_t k, std::uint32_t tiles_x) const {
     std::uint32_t start = first, word = rows[0];
     // Byte j of `through` is the number of tiles in rows 0 to j of the word.
@@ -109,7 +117,7 @@ struct alignas(16) Touched {
 // Finds the owned tiles that a splat touches.
 __device__ __forceinline__ Touched find_touched(const TileGrid& grid, const SplatShape& splat) {
   int count = 0, first = 0, top = 0;
-  bool compact = true;
+  bool fits = true;
   Touched touched{};
   for_each_owned(grid, splat, [&](const Owned& owned) {
     if (count == 0) {
@@ -118,15 +126,15 @@ __device__ __forceinline__ Touched find_touched(const TileGrid& grid, const Spla
     }
     const int n = owned.last - owned.first, down = owned.ty - top;
     const unsigned shift = static_cast<unsigned>(owned.first - first - down * grid.tiles_x + 8);
-    compact &= down < 4 * Touched::kWords && n < 16 && shift < 16;
+    fits &= down < 4 * Touched::kWords && n < 16 && shift < 16;
     const std::uint32_t bits = (shift << 4 | n) << 8 * (down & 3);
 #pragma unroll
     for (int i = 0; i < Touched::kWords; ++i) touched.rows[i] |= down >> 2 == i ? bits : 0u;
     count += n;
   });
   touched.first = static_cast<std::uint32_t>(first);
-  if (!compact) {
-    touched.first = Touched::kWalk;
+  if (!fits) {
+    touched.first = Touched::kLarge;
     touched.rows[0] = static_cast<std::uint32_t>(count);
   }
   return touched;

@@ -3,7 +3,9 @@
 // 1. range_kernel, depth_keys_kernel, three passes of sweep_kernel and order_ties_kernel sort the splats by
 //    (depth, id) and find the tiles of each splat (depth_order.cuh, radix_sweep.cuh).
 // 2. emit_kernel writes the list entries in the order of the splats, with the tile as key (16 bits if the
-//    number of tiles allows it).
+//    number of tiles allows it). It leaves large splats to emit_large_kernel, which has a warp for each:
+//    neighbours in the order of depth are often large together, as everything close to a camera is, and one
+//    warp of emit_kernel would have to write the entries of all of them.
 // 3. Passes of sweep_kernel, a stable radix sort, order the entries by tile and keep their order otherwise.
 // 4. tile_offsets_kernel finds where each tile's list begins.
 //
@@ -27,6 +29,7 @@ namespace {
 using Input = IntersectInput<float>;
 constexpr int kThreads = 256;
 constexpr int kEmitItems = 4, kEmitSplats = kThreads * kEmitItems;  // splats per thread and per block
+constexpr int kLargeBlocks = 4;  // blocks of emit_large_kernel per multiprocessor
 
 // The digits by which entries are sorted by tile: as few passes as the number of tiles allows, and the fewest
 // bits per digit for this number of passes.
@@ -80,61 +83,51 @@ __device__ __forceinline__ std::int32_t share_entries(std::int32_t count, int la
   return total;
 }
 
+// The list entries in the order of the splats: the tile (keys) and the splat of each, [capacity].
+template <class Key>
+struct Entries {
+  std::int64_t capacity;
+  Key* keys;
+  std::int32_t* splats;
+  TileDigits digits;
+  std::uint64_t* histograms;  // of the tiles' digits
+
+  __device__ void write(std::int64_t at, std::uint32_t tile, std::int32_t splat,
+                        std::uint32_t* counts) const {
+    if (at >= capacity) return;
+    keys[at] = static_cast<Key>(tile);
+    splats[at] = splat;
+    digits.count(tile, counts);
+  }
+};
+
 // Writes the entries of a warp's splats, one splat for each lane. The warp's entries begin at `turn`, the
 // lane's at `turn` + `start`.
 template <class Key>
 __device__ __forceinline__ void write_entries(const Input& in, std::int32_t splat, const Touched& touched,
-                                              std::int32_t start, std::int64_t turn, std::int64_t capacity,
-                                              Key* keys, std::int32_t* entries, const TileDigits& digits,
-                                              std::uint32_t* counts) {
+                                              std::int32_t start, std::int64_t turn,
+                                              const Entries<Key>& entries, std::uint32_t* counts) {
   const int lane = threadIdx.x % 32;
-  const auto write = [&](std::int64_t at, std::uint32_t tile, std::int32_t entry_splat) {
-    if (at >= capacity) return;
-    keys[at] = static_cast<Key>(tile);
-    entries[at] = entry_splat;
-    digits.count(tile, counts);
-  };
-  share_entries(touched.compact() ? touched.count() : 0, lane, [&](const LaneEntry& entry) {
+  share_entries(touched.large() ? 0 : touched.count(), lane, [&](const LaneEntry& entry) {
     const std::int64_t at = turn + __shfl_sync(kFullWarp, start, entry.source) + entry.k;
     const std::int32_t entry_splat = __shfl_sync(kFullWarp, splat, entry.source);
     const Touched entry_touched = touched.from_lane(entry.source);
-    if (entry.valid) write(at, entry_touched.tile(entry.k, in.grid.tiles_x), entry_splat);
+    if (entry.valid) entries.write(at, entry_touched.tile(entry.k, in.grid.tiles_x), entry_splat, counts);
   });
-  // Splats that are not compact follow one by one. Each lane finds the tiles of every 32nd tile row.
-  const tiles::Divider tile_of(in.grid.tile_size);
-  for (unsigned left = __ballot_sync(kFullWarp, !touched.compact()); left; left &= left - 1) {
-    const int owner = __ffs(left) - 1;
-    const std::int32_t large_splat = __shfl_sync(kFullWarp, splat, owner);
-    std::int64_t at = turn + __shfl_sync(kFullWarp, start, owner);
-    const SplatShape shape = load_splat(in, large_splat);
-    const TileRows<float> rows =
-        find_tile_rows(shape.mean, shape.conic, shape.opacity, in.grid.height, tile_of);
-    for (int top = rows.first; top <= rows.last; top += 32) {
-      const int ty = top + lane;
-      int begin, end;
-      Owned owned{};
-      if (ty <= rows.last && rows.interval(ty, in.grid.width, tile_of, &begin, &end)) {
-        owned = clip_to_owned(in.grid, shape.camera, ty, begin, end);
-      }
-      at += share_entries(max(owned.last - owned.first, 0), lane, [&](const LaneEntry& entry) {
-        const std::int32_t first = __shfl_sync(kFullWarp, owned.first, entry.source);
-        if (entry.valid) write(at + entry.number, first + entry.k, large_splat);
-      });
-    }
-  }
 }
 
-// Writes the list entries (keys and entries, [capacity]: the tile and the splat) in depth order, their
-// number, and the histograms of the tiles' digits. A block handles kEmitSplats consecutive sorted splats, a
-// warp 32 * kEmitItems of them.
+// Writes the list entries in depth order, except for those of large splats, and the number of all entries.
+// Lists the large splats (large_splats, n_large) and sets the positions of their first entries in
+// all_touched. A block handles kEmitSplats consecutive sorted splats, a warp 32 * kEmitItems of them.
 template <class Key>
 __global__ void __launch_bounds__(kThreads, 4)
-    emit_kernel(const Input in, const Touched* all_touched, const std::int32_t* splats,
-                const std::int64_t* n_splats, RunningSum running, std::int64_t capacity, TileDigits digits,
-                Key* keys, std::int32_t* entries, std::uint64_t* histograms, std::int64_t* n_entries) {
+    emit_kernel(const Input in, Touched* all_touched, const std::int32_t* splats,
+                const std::int64_t* n_splats, RunningSum running, const Entries<Key> entries,
+                std::int64_t* n_entries, std::int32_t* large_splats, std::int32_t* n_large) {
   __shared__ std::int64_t warp_sums[kThreads / 32];
   __shared__ std::uint32_t counts[TileDigits::kMost * TileDigits::kBins];
-  for (int bin = threadIdx.x; bin < digits.passes * TileDigits::kBins; bin += kThreads) counts[bin] = 0;
+  const int bins = entries.digits.passes * TileDigits::kBins;
+  for (int bin = threadIdx.x; bin < bins; bin += kThreads) counts[bin] = 0;
   wait_for_earlier_kernels();
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const std::int64_t n = *n_splats;
@@ -166,16 +159,57 @@ __global__ void __launch_bounds__(kThreads, 4)
     sum += warp_sums[i];
   }
   const std::int64_t earlier = running.sum_before<kThreads>(block, sum);
-  if (threadIdx.x == 0 && end >= n) *n_entries = min(earlier + sum, capacity);
+  if (threadIdx.x == 0 && end >= n) *n_entries = min(earlier + sum, entries.capacity);
   before += earlier;
 
 #pragma unroll
   for (int k = 0; k < kEmitItems; ++k) {
-    write_entries(in, splat[k], touched[k], start[k], before + turn[k], capacity, keys, entries, digits,
-                  counts);
+    if (touched[k].large()) {
+      all_touched[splat[k]].set_begin(before + turn[k] + start[k]);
+      large_splats[atomicAdd(n_large, 1)] = splat[k];
+    }
+    write_entries(in, splat[k], touched[k], start[k], before + turn[k], entries, counts);
   }
   __syncthreads();
-  add_counts(counts, digits.passes * TileDigits::kBins, histograms);
+  add_counts(counts, bins, entries.histograms);
+}
+
+// Writes the entries of large splats, one warp for each splat in a grid-stride loop. Each lane finds the
+// tiles of every 32nd tile row.
+template <class Key>
+__global__ void __launch_bounds__(kThreads)
+    emit_large_kernel(const Input in, const Touched* all_touched, const std::int32_t* large_splats,
+                      const std::int32_t* n_large, const Entries<Key> entries) {
+  __shared__ std::uint32_t counts[TileDigits::kMost * TileDigits::kBins];
+  const int bins = entries.digits.passes * TileDigits::kBins;
+  for (int bin = threadIdx.x; bin < bins; bin += kThreads) counts[bin] = 0;
+  wait_for_earlier_kernels();
+  constexpr int kWarps = kThreads / 32;
+  const int lane = threadIdx.x % 32, n = *n_large;
+  if (static_cast<int>(blockIdx.x) * kWarps >= n) return;
+  __syncthreads();
+  const tiles::Divider tile_of(in.grid.tile_size);
+  for (int i = blockIdx.x * kWarps + threadIdx.x / 32; i < n; i += gridDim.x * kWarps) {
+    const std::int32_t splat = large_splats[i];
+    std::int64_t at = all_touched[splat].begin();
+    const SplatShape shape = load_splat(in, splat);
+    const TileRows<float> rows =
+        find_tile_rows(shape.mean, shape.conic, shape.opacity, in.grid.height, tile_of);
+    for (int top = rows.first; top <= rows.last && at < entries.capacity; top += 32) {
+      const int ty = top + lane;
+      int begin, end;
+      Owned owned{};
+      if (ty <= rows.last && rows.interval(ty, in.grid.width, tile_of, &begin, &end)) {
+        owned = clip_to_owned(in.grid, shape.camera, ty, begin, end);
+      }
+      at += share_entries(max(owned.last - owned.first, 0), lane, [&](const LaneEntry& entry) {
+        const std::int32_t first = __shfl_sync(kFullWarp, owned.first, entry.source);
+        if (entry.valid) entries.write(at + entry.number, first + entry.k, splat, counts);
+      });
+    }
+  }
+  __syncthreads();
+  add_counts(counts, bins, entries.histograms);
 }
 
 // tile_offsets[t] = the position of the first sorted entry whose tile is >= t. One warp per tile.
@@ -204,6 +238,7 @@ struct Counters {
   // range_kernel sets all of these to zero, except for the ranges, which it writes.
   std::uint64_t *depth_histograms, *tile_histograms, *running, *turns;
   std::int64_t *n_splats, *n_entries;
+  std::int32_t* n_large;
   int *dropped_bits, *width;
   State *depth_states, *tile_states;
   DepthRange* ranges;
@@ -233,6 +268,7 @@ struct Counters {
     take(turns, kDepthPasses + digits.passes);
     take(n_splats, 1);
     take(n_entries, 1);
+    take(n_large, 1);
     take(dropped_bits, 1);
     take(width, 1);
     take(depth_states, std::int64_t{depth_blocks} * kDepthPasses * kDepthBins);
@@ -246,6 +282,7 @@ struct Counters {
 struct DepthOrder {
   Touched* touched;      // [P], the tiles of each splat
   std::int32_t* splats;  // [P], the splats sorted by (depth, id)
+  std::int32_t* spare;   // [P], memory that the sort has used and that is free now
 };
 
 template <class State>
@@ -274,7 +311,7 @@ DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Work
   }
   launch_early("intersect", order_ties_kernel, {blocks_for(n, kTieSplats), kDepthThreads, stream}, keys[from],
                splats[from], counters.n_splats, {in.depths, in.ids}, counters.dropped_bits);
-  return {touched, splats[from]};
+  return {touched, splats[from], splats[1 - from]};
 }
 
 template <class Key, class State>
@@ -288,9 +325,14 @@ void list_splats(const Input& in, std::int64_t capacity, std::int32_t* isect_spl
   // The two buffers are chosen such that the last pass writes isect_splats.
   const bool even = digits.passes % 2 == 0;
   std::int32_t* const entries[] = {even ? isect_splats : unsorted, even ? unsorted : isect_splats};
+  const Entries<Key> written{capacity, keys[0], entries[0], digits, counters.tile_histograms};
   launch_early("intersect", emit_kernel<Key>, {counters.emit_blocks, kThreads, stream}, in, order.touched,
-               order.splats, counters.n_splats, RunningSum(counters.running), capacity, digits, keys[0],
-               entries[0], counters.tile_histograms, counters.n_entries);
+               order.splats, counters.n_splats, RunningSum(counters.running), written, counters.n_entries,
+               order.spare, counters.n_large);
+  const unsigned large_blocks = std::min(blocks_for(in.n_splats, kThreads / 32),
+                                         static_cast<unsigned>(kLargeBlocks * multiprocessors()));
+  launch_early("intersect", emit_large_kernel<Key>, {large_blocks, kThreads, stream}, in, order.touched,
+               order.spare, counters.n_large, written);
   int from = 0;
   for (int pass = 0; pass < digits.passes; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * TileDigits::kBins;
