@@ -68,14 +68,15 @@ class OneImport(GsplatTrainer):
             optimiser.step()
             optimiser.zero_grad(set_to_none=True)
         self._decay.step()
-        self._change_population(info)
+        self.change_population(info)
 
 
 class FourSwaps(OneImport):
     """The loop with our renderer of raw parameters, optimiser and loss, and rows in Morton order."""
 
-    def _initialise(self, capture: Any) -> Any:
-        params, adams = super()._initialise(capture)
+    def initialise(self, capture: Any) -> Any:
+        """Make the parameters and a `LazyAdam` for each."""
+        params, adams = super().initialise(capture)
         lazy = {
             name: LazyAdam([{**adam.param_groups[0], "lr_rest": None}], eps=1e-15)
             for name, adam in adams.items()
@@ -95,11 +96,12 @@ class FourSwaps(OneImport):
         )  # fmt: skip
         return image, info
 
-    def _change_population(self, info: Any) -> None:
+    def change_population(self, info: Any) -> None:
+        """Bring all rows up to date before the strategy reads them, and sort them afterwards."""
         refines = self.step % self._strategy.refine_every == 0
         if refines:  # the strategy then reads parameters
             self.catch_up()
-        super()._change_population(info)
+        super().change_population(info)
         if refines:
             order = blitzgs.morton_order(self.params["means"].detach())
             for name, optimiser in self._optimisers.items():

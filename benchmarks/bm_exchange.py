@@ -180,7 +180,7 @@ class Workload:
         self.guard.check(self.steps, [str(key) for key in batch.indices], sums, self.table, frame)
         self.stepper.backward(self.steps, frame, terms, mark)
         return {
-            "rows": len(frame.projected.gaussian_ids),
+            "splats": len(frame.projected.gaussian_ids),
             "visible": len(frame.projected.visible_ids),
             "sent": 0 if frame.traffic is None else _sent_elsewhere(frame.traffic, self.ranks.rank),
             "work": sums,
@@ -257,17 +257,17 @@ def measure(args: argparse.Namespace) -> None:
                 )
                 measured.append(balance_of(result))
                 totals += torch.tensor(
-                    [result[name] for name in ("rows", "visible", "sent")], device=ranks.device
+                    [result[name] for name in ("splats", "visible", "sent")], device=ranks.device
                 )
-        rows, visible, sent = (x / len(times) for x in ranks.all_reduce(totals).tolist())
+        splats, visible, sent = (x / len(times) for x in ranks.all_reduce(totals).tolist())
         report = {
             "ranks": ranks.world_size,
             "device": torch.cuda.get_device_name() if ranks.device.type == "cuda" else "cpu",
             "gaussians": load.total,
             "order": args.order,
             "visible per step": visible,
-            "rows per step": rows,
-            "rows sent to other ranks": sent,
+            "splats per step": splats,
+            "splats sent to other ranks": sent,
             "bytes per step": {"splats": 52 * sent, "gradients": (36 if ranks.memory is None else 48) * sent},
             "balance": {"estimated": max(estimated), "measured": max(measured)},
             "ms": {s: statistics.median(t[i] for t in times) for i, s in enumerate(STAGES)},
@@ -292,8 +292,9 @@ def show(report: dict[str, Any]) -> None:
             f"{report['bytes per visible gaussian']:.1f} bytes per visible Gaussian"
         )
         print(
-            f"  {report['visible per step']:,.0f} visible Gaussians, {report['rows per step']:,.0f} splats, "
-            f"{report['rows sent to other ranks']:,.0f} of them sent to another rank; "
+            f"  {report['visible per step']:,.0f} visible Gaussians, "
+            f"{report['splats per step']:,.0f} splats, "
+            f"{report['splats sent to other ranks']:,.0f} of them sent to another rank; "
             f"exchange {100 * exchange / report['ms']['alone']:.1f} % of the step"
         )
         print(

@@ -78,7 +78,7 @@ def main() -> None:
         ) -> None:
             floor = megabytes / bandwidth
             results.append(
-                {"views": views, "work": name, "rows": n_splats, "ms": milliseconds, "floor_ms": floor}
+                {"views": views, "work": name, "splats": n_splats, "ms": milliseconds, "floor_ms": floor}
             )
             each = 1e6 * milliseconds / max(n_splats, 1)
             print(f"  {name:32s} {milliseconds:9.3f} ms  {each:7.1f} ns a splat  byte floor {floor:.3f} ms")

@@ -251,9 +251,7 @@ def test_an_argument_that_gsplat_has_not_is_refused(value):
     ],
 )
 def test_what_is_not_supported_is_refused_by_name(options, message):
-    scene = random_scene(n=4, cameras=1)
-    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height")
-    arguments = {**dict(zip(names, scene.arguments(), strict=True)), "sh_degree": 3, **options}
+    arguments = {**vars(random_scene(n=4, cameras=1)), **options}
     with pytest.raises(ValueError, match=message):
         blitzgs.rasterization(**arguments)
 

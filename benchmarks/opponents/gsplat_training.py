@@ -196,7 +196,7 @@ class GsplatTrainer:
         self.total, self.step = options.scaled(options.steps), 0
         torch.manual_seed(seed)
         self._strategy, self._is_mcmc = make_strategy(strategy, options), strategy == "mcmc"
-        self.params, self._optimisers = self._initialise(capture)
+        self.params, self._optimisers = self.initialise(capture)
         self.peak = len(self.params["means"])
         self._strategy.check_sanity(self.params, self._optimisers)
         self._state = (
@@ -215,7 +215,8 @@ class GsplatTrainer:
             self._batches.append((self.views.pick([index]), images.get(index)[None].to(device), mask))
         self._order = self._shuffled(seed)
 
-    def _initialise(self, capture: Capture) -> tuple[Any, dict[str, torch.optim.Optimizer]]:
+    def initialise(self, capture: Capture) -> tuple[Any, dict[str, torch.optim.Optimizer]]:
+        """Make the parameters and their optimisers."""
         o = self.options
         points = torch.from_numpy(capture.points / self.space.unit).float().to(self.device)
         # Points may coincide; gsplat would give those a size of zero, which has no logarithm.
@@ -290,9 +291,9 @@ class GsplatTrainer:
             optimiser.step()
             optimiser.zero_grad(set_to_none=True)
         self._decay.step()
-        self._change_population(info)
+        self.change_population(info)
 
-    def _change_population(self, info: Any) -> None:
+    def change_population(self, info: Any) -> None:
         """Let the strategy do what it does after a step."""
         strategy, arguments = self._strategy, (self.params, self._optimisers, self._state, self.step, info)
         if self._is_mcmc:

@@ -121,8 +121,6 @@ def test_one_process_without_a_group_is_one_rank():
     ids=["absgrad", "colors"],
 )
 def test_unsupported_distributed_options_are_refused(options):
-    scene = random_scene(n=20)
-    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height")
-    arguments = {**dict(zip(names, scene.arguments(), strict=True)), "sh_degree": 3, **options}
+    arguments = {**vars(random_scene(n=20)), **options}
     with pytest.raises(ValueError, match="distributed=True supports no batch dimensions"):
         blitzgs.rasterization(**arguments, distributed=True)
