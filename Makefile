@@ -2,10 +2,10 @@
 # make demo: set up, generate the default city, train, evaluate, export.   make test: everything CI runs.
 VENV ?= .venv
 PYTHON ?= $(VENV)/bin/python
-# Installed only when the environment has no torch. A machine with a GPU wants its CUDA build:
+# This package is installed only if the environment has no torch. On a machine with a GPU, name the CUDA build:
 #   make TORCH=torch demo
 TORCH ?= torch==2.13.0
-# Folders of the environment's tools first, so that cmake and ninja from PyPI are used.
+# The folders of the environment's tools come first in PATH, so that cmake and ninja from PyPI are used.
 RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 CXX_FILES = $(shell git ls-files 'csrc/*.h' 'csrc/*.cuh' 'csrc/*.cpp' 'csrc/*.cu' 'examples/*.cpp')
 DEMO ?= runs/demo
@@ -23,7 +23,7 @@ $(VENV)/.torch: | $(VENV)/bin/python
 	$(PYTHON) -c "import torch" 2>/dev/null || $(PYTHON) -m pip install --quiet "$(TORCH)"
 	touch $@
 
-# Editable: the sources run in place and the kernels are built into blitzgs/_lib.
+# The installation is editable: the sources run in place and the kernels are built into blitzgs/_lib.
 $(VENV)/.installed: pyproject.toml setup.py $(VENV)/.torch
 	$(PYTHON) -m pip install --quiet cmake ninja "pybind11>=2.13" "setuptools>=77" wheel
 	$(RUN) $(PYTHON) -m pip install --quiet --no-build-isolation -e ".[synth,log]"
@@ -37,7 +37,7 @@ $(VENV)/.installed-test: $(VENV)/.installed
 build:
 	$(RUN) $(PYTHON) setup.py --quiet build_ext --inplace
 
-# The one module that depends on Python's version, where the kernels are already built: without CMake and torch.
+# Builds the one module that depends on Python's version, without CMake and torch, for kernels that are built already.
 io:
 	$(CXX) -O3 -std=c++20 -shared -fPIC -fvisibility=hidden -Icsrc $$($(PYTHON) -m pybind11 --includes) \
 	  $(filter-out %_test.cpp,$(wildcard csrc/io/*.cpp)) \

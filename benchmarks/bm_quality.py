@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How good models become, and how soon: captures x recipes x seeds, beside gsplat's strategies.
+r"""Measures quality against training time: captures x recipes x seeds, also with gsplat's strategies.
 
     python benchmarks/bm_quality.py --out RESULTS \
         --capture park=DATA/park --capture "town=DATA/town --data.downscale=2" \
@@ -11,19 +11,20 @@ r"""How good models become, and how soon: captures x recipes x seeds, beside gsp
 A recipe is a configuration file or "defaults", with overrides; or one of gsplat's strategies, with options
 of its trainer (`benchmarks/opponents/gsplat_training.py`): gsplat-default (as in its wheel),
 gsplat-default-reset (with the resets of opacities that 1.5.3 skips by mistake) and gsplat-mcmc; or
-"partition-4x5:" before a configuration, for blocks that are trained apart and merged
-(`benchmarks/opponents/spatial_partition.py`). A --plan holds the same in YAML:
+"partition-4x5:" before a configuration, for blocks that are trained separately and then merged
+(`benchmarks/opponents/spatial_partition.py`). A --plan has the same in YAML:
 
     captures: {park: DATA/park}
     recipes: {aerial: configs/aerial.yaml, mcmc: gsplat-mcmc --cap_max=2000000}
     seeds: [0, 1, 2]
 
-Every run is a process. Each GPU has one at a time; more (--per-gpu) leave the models as good, but times no
-longer compare, and the table says so. RESULTS/runs gets a JSON file as each run ends: the same command again
-skips the runs that are finished and repeats those that failed. quality.json holds all of them, quality.csv a
-line per evaluation, quality.md the tables, quality.png held-out PSNR against training time (with
-matplotlib). --collect adds the runs of other folders or of their quality.json, as when several machines did
-them, or to carry on elsewhere. Without a repository, BLITZGS_COMMIT names the commit.
+Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
+good, but times no longer compare, and the table says so. When a run ends, it writes a JSON file into
+RESULTS/runs. The same command then skips the runs that are finished and repeats those that failed.
+quality.json has all runs, quality.csv one line per evaluation, quality.md the tables, and quality.png
+held-out PSNR against training time (with matplotlib). --collect adds the runs of other folders, or of their
+quality.json, for example if several machines share the runs. In a copy without a repository, BLITZGS_COMMIT
+names the commit.
 """
 
 from __future__ import annotations
@@ -48,19 +49,19 @@ from quality_plan import RunSpec, parse_named, read_plan, runs_of
 from quality_run import describe, write
 
 EVALUATE_AT = (1_000, 2_000, 4_000, 7_000, 10_000, 15_000, 20_000)
-LOG_LINES = 12  # of a process that died, kept in its result
-TELL_EVERY = 60.0  # seconds between two lines about the runs that are going
+LOG_LINES = 12  # number of lines that a failed run's result has of the run's log
+PRINT_EVERY = 60.0  # seconds between two lines about the present runs
 
 
 @dataclass
 class Job:
-    """A run in its process.
+    """A run and its process.
 
     Attributes:
-        spec: what it trains.
-        slot: its GPU and place there.
-        process: doing it.
-        log: what it prints.
+        spec: the run.
+        slot: number of the run's slot, which decides its GPU.
+        process: process of the run.
+        log: file to which the process prints.
     """
 
     spec: RunSpec
@@ -70,10 +71,10 @@ class Job:
 
 
 class Pool:
-    """Runs trainings side by side, one a slot."""
+    """Runs trainings side by side, one in each slot."""
 
     def __init__(self, out: Path, gpus: int, per_gpu: int, ranks: int = 1) -> None:
-        """Share the GPUs, or without any the CPU, among `per_gpu` runs each, or in groups of `ranks`."""
+        """Make `per_gpu` slots for each group of `ranks` GPUs; without a GPU, `per_gpu` slots for the CPU."""
         self.out, self.gpus, self.per_gpu, self.ranks = out, gpus, per_gpu, ranks
         self.slots = list(range(max(gpus // ranks, 1) * per_gpu))
         self.jobs: list[Job] = []
@@ -108,11 +109,11 @@ class Pool:
         self.jobs.append(Job(spec, slot, process, log))
 
     def result_path(self, spec: RunSpec) -> Path:
-        """Return where a run's result goes."""
+        """Return the path of a run's result."""
         return self.out / quality_report.RUNS / f"{spec.name}.json"
 
     def ended(self) -> list[Job]:
-        """Return the runs that have ended since the last call, their results complete."""
+        """Return the runs that have ended since the last call, and complete their results."""
         over = [job for job in self.jobs if job.process.poll() is not None]
         for job in over:
             job.log.close()
@@ -122,7 +123,7 @@ class Pool:
         return over
 
     def _complete(self, job: Job) -> None:
-        """Add to the result what the run could not know; make one for a process that died without."""
+        """Add to the result how many runs shared the machine; write one if the process ended without it."""
         path = self.result_path(job.spec)
         result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
         if not result or (job.process.returncode != 0 and result["status"] == "done"):
@@ -132,7 +133,7 @@ class Pool:
         write(path, result | {"per_gpu": self.per_gpu, "side_by_side": max(self.gpus, 1) * self.per_gpu})
 
     def stop(self) -> None:
-        """End all runs that are still going, which leaves them to be done again."""
+        """End all present runs; the next call of this program repeats them."""
         for job in self.jobs:
             job.process.terminate()
         for job in self.jobs:
@@ -141,7 +142,7 @@ class Pool:
 
 
 def summary(result: dict[str, Any]) -> str:
-    """Return a run's result in a line."""
+    """Return a run's result as one line."""
     if result["status"] != "done":
         return f"FAILED: {result['error']}"
     last = result["evaluations"][-1]
@@ -153,25 +154,25 @@ def summary(result: dict[str, Any]) -> str:
 
 
 def last_line(job: Job) -> str:
-    """Return what a run printed last."""
+    """Return the last line that a run printed."""
     lines = Path(job.log.name).read_text(errors="replace").split("\n")
     return next((line.strip() for line in reversed(lines) if line.strip()), "starting")
 
 
 def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
-    """Do the runs that are not done, and write the tables as each one ends."""
+    """Train the runs that are not finished, and write the tables whenever one ends."""
     left = [spec for spec in specs if not quality_report.is_done(pool.out, spec.name)]
     print(
         f"{len(specs)} runs, {len(specs) - len(left)} of them done before; {len(pool.slots)} at a time",
         flush=True,
     )
-    begin, count, total, told = time.monotonic(), 0, len(left), 0.0
+    begin, count, total, printed = time.monotonic(), 0, len(left), 0.0
     try:
         while left or pool.jobs:
             elapsed = time.monotonic() - begin
             is_late = minutes is not None and elapsed > 60 * minutes
             while left and pool.slots and not is_late:
-                # A result of an earlier try would look like this run's.
+                # The result of an earlier, failed attempt could be taken for this one's.
                 pool.result_path(left[0]).unlink(missing_ok=True)
                 pool.start(left.pop(0))
             for job in pool.ended():
@@ -179,8 +180,8 @@ def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
                 result = json.loads(pool.result_path(job.spec).read_text())
                 print(f"[{count}/{total}, {elapsed:.0f} s] {job.spec.name}: {summary(result)}", flush=True)
                 quality_report.report(pool.out, plot=False)
-            if elapsed > told + TELL_EVERY:
-                told = elapsed
+            if elapsed > printed + PRINT_EVERY:
+                printed = elapsed
                 for job in pool.jobs:
                     print(f"  {elapsed:.0f} s: {job.spec.name}: {last_line(job)}", flush=True)
             if is_late and left and not pool.jobs:

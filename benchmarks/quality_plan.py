@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `bm_quality.py` has to train: captures x recipes x seeds, from the command line and a YAML file."""
+"""Lists the runs of `bm_quality.py`: captures x recipes x seeds, from the command line and a YAML file."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ SAFE = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+=")
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One training, as the process that does it gets it.
+    """One run, as it is passed to its process.
 
     Attributes:
-        capture: its name.
-        data: overrides of the section `data`, the path among them.
-        recipe: its name.
+        capture: name of the capture.
+        data: overrides of the section `data`, including the path.
+        recipe: name of the recipe.
         source: a YAML file, "defaults", "gsplat-" and one of gsplat's strategies, or
             "partition-COLUMNSxROWS:" and a YAML file or "defaults".
         overrides: "--section.field=value" of the configuration, or "--option=value" of the opponent.
-        seed: of the training.
-        evaluate_at: image counts at which held-out views are measured, beside the end.
+        seed: seed of the training.
+        evaluate_at: image counts at which held-out views are measured, in addition to the end.
         lpips: TorchScript file, or None.
         device: "cpu" or "cuda".
-        ranks: processes, and GPUs, that train together.
+        ranks: number of processes (and GPUs) that train together.
     """
 
     capture: str
@@ -92,7 +92,7 @@ class RunSpec:
 
     @property
     def settings(self) -> str:
-        """A digest of what decides the result, but for the seed, the code and the place of the capture."""
+        """A digest of all settings that decide the result; without seed, code and folder of the capture."""
         values: dict[str, Any] = to_dict(self.config())
         del values["log"], values["data"]["path"], values["seed"]
         if self.strategy is not None:
@@ -103,7 +103,7 @@ class RunSpec:
 
     @property
     def name(self) -> str:
-        """Of the run's files."""
+        """The name of the run's files."""
         together = f".r{self.ranks}" if self.ranks > 1 else ""
         return f"{self.capture}.{self.recipe}.s{self.seed}.{self.settings}{together}"
 
@@ -127,7 +127,7 @@ def parse_named(text: str) -> tuple[str, str]:
     """Split "NAME=rest".
 
     Raises:
-        ValueError: there is no name, or one that cannot be part of a file's name.
+        ValueError: there is no name, or the name cannot be part of a file name.
     """
     name, equals, rest = text.partition("=")
     if not equals or not name or not set(name) <= SAFE or not rest.strip():
@@ -139,7 +139,7 @@ def read_plan(path: Path) -> dict[str, Any]:
     """Read a YAML plan: mappings `captures` and `recipes` (name: text) and a list `seeds`, each optional.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: the file has another content.
     """
     try:
         plan = yaml.safe_load(path.read_text()) or {}
@@ -170,14 +170,14 @@ def runs_of(
     Args:
         captures: name -> "DIR [--data.field=value ...]".
         recipes: name -> "SOURCE [--field=value ...]".
-        seeds: of the trainings.
+        seeds: seeds of the trainings.
         evaluate_at: see `RunSpec`.
         lpips: TorchScript file, or None.
         device: "cpu" or "cuda".
-        ranks: of each run.
+        ranks: number of ranks of each run.
 
     Raises:
-        ValueError: something is missing or cannot be used; names it.
+        ValueError: an argument is missing or cannot be used; the message names it.
     """
     if not captures or not recipes or not seeds:
         raise ValueError("nothing to train: give at least one --capture, one --recipe and one seed")

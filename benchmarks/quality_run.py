@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One training of `bm_quality.py`, in a process of its own: python benchmarks/quality_run.py SPEC RESULT.
+"""Trains one run of `bm_quality.py` in a separate process: python benchmarks/quality_run.py SPEC RESULT.
 
-SPEC is a JSON file of a `quality_plan.RunSpec`; RESULT gets the figures, or the error.
+SPEC is a JSON file of a `quality_plan.RunSpec`. The figures, or the error, are written to RESULT.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class Recorder:
         Args:
             spec: the run.
             quoted: image counts at which the training views are measured, too.
-            end: images of the whole training.
-            capture: has the views to measure.
+            end: number of images of the whole training.
+            capture: capture whose views are measured.
             device: the device of the training.
         """
         self.quoted = {images for images in quoted if images < end} | {end}
@@ -112,7 +112,7 @@ class RecordedTrainer(Trainer):
     """A trainer that measures its model during training, and saves no checkpoint."""
 
     recorder: Recorder
-    population: dict[str, Any]  # of the finished run
+    population: dict[str, Any]  # `population_report` of the finished run
 
     def step(self, step: int) -> None:
         """Take a step; if planned, measure before the schedule's events."""
@@ -120,17 +120,17 @@ class RecordedTrainer(Trainer):
         if step < self.state.schedule.steps and self.recorder.due(self.state.images_seen):
             self._record(end=False)
 
-    def _finish(self) -> dict[str, Any]:
+    def finish(self) -> dict[str, Any]:
         """Measure the trained model."""
         self._record(end=True)
-        self.population = population_report(self.state, self._memory)
+        self.population = population_report(self.state, self.memory)
         return {}
 
     def _record(self, end: bool) -> None:
         state = self.state
         begin = time.monotonic()
         synchronize(state.ranks.device)
-        # The clock of the run has the time at which the host had queued the step.
+        # The run's clock has the time until the host had queued the step. Add the time until the GPU ends it.
         seconds = state.progress.seconds + time.monotonic() - begin
         with state.paused_clock():
             self.recorder.record(
@@ -148,7 +148,7 @@ def train_ours(spec: RunSpec) -> dict[str, Any]:
     ranks = Ranks.from_environment(spec.device)
     capture, images = open_capture(config, ranks)
     with tempfile.TemporaryDirectory() as folder:
-        shared = Path(ranks.broadcast_object(folder))  # of all ranks, which are on one host
+        shared = Path(ranks.broadcast_object(folder))  # all ranks are on one host
         trainer = RecordedTrainer(config, capture, images, shared, ranks)
         schedule = trainer.state.schedule
         recorder = Recorder(spec, (), schedule.iterations, capture, ranks.device)

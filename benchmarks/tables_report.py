@@ -16,7 +16,7 @@ from quality_report import Run, labels, spread
 
 Row = dict[str, Any]
 Worst = Callable[[Iterable[float]], float]
-PAPER_GPUS = 4  # that shared the paper's blocks
+PAPER_GPUS = 4  # number of GPUs on which the paper trained its blocks
 
 
 def _end(run: Run) -> dict[str, float]:
@@ -49,7 +49,7 @@ def arm_rows(runs: Sequence[Run], arms: dict[str, dict[str, Any]]) -> tuple[list
     """Return a row for each capture, arm and number of ranks: as text, and as numbers for the CSV file.
 
     Args:
-        runs: finished ones.
+        runs: finished runs.
         arms: name of the recipe -> its "title" and, where the paper has it, its row in "paper".
     """
     groups: dict[tuple[str, int, int, str], list[Run]] = defaultdict(list)
@@ -192,9 +192,9 @@ def write(out: Path, table: str, source: str, parts: Sequence[tuple[str, list[Ro
     Args:
         out: the folder.
         table: name of both files.
-        source: where the paper has its figures.
+        source: place of the figures in the paper.
         parts: title and rows of each table of the Markdown; those without rows are left out.
-        rows: of the CSV file.
+        rows: rows of the CSV file.
 
     Returns:
         The Markdown.

@@ -2,7 +2,7 @@
 # The CUDA library: kernels free of torch headers, and the same *_op.cpp files compiled a second time
 # against the CUDA backend.
 if(BLITZGS_CUDA_ARCHS STREQUAL "all")
-  # For a library that goes elsewhere; PTX of the last alone, for what comes after it.
+  # This library runs on other machines. GPUs newer than the last architecture compile its PTX when they load it.
   set(
     CMAKE_CUDA_ARCHITECTURES
     80-real

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trainings of others, to compare the quality of models with (benchmarks/bm_quality.py)."""
+"""Trainings by other methods, whose models benchmarks/bm_quality.py compares with ours."""

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's density strategies, unchanged from its wheel, in a trainer of ours over `blitzgs.rasterization`.
+"""Trains with gsplat's density strategies, unchanged from its wheel, over `blitzgs.rasterization`.
 
 Learning rates, initialisation, schedule, loss weights and the scene's unit are those of the trainer in
-gsplat's examples (`simple_trainer.py`, 1.5.3). What differs:
+gsplat's examples (`simple_trainer.py`, 1.5.3). This trainer differs from it in three points:
 
-- Rendering and loss are our kernels, and photographs lie on the device before the clock starts: times are
-  those of gsplat's algorithm with our kernels, not gsplat's own.
-- The SSIM of the loss is zero-padded at the image's edge, as in evaluations; there, windows that reach
-  beyond the edge are left out.
-- DefaultStrategy 1.5.3 announces a reset of opacities every 3,000 steps and never does it: `step %
-  reset_every == 0 & step > 0` compares with `0 & step`. Versions before and after do. With `reset`, this
-  trainer calls gsplat's own `reset_opa` where that line would have.
+- Rendering and loss use our kernels, and photographs are on the device before the clock starts. Times are
+  therefore those of gsplat's algorithm with our kernels, not gsplat's own.
+- The SSIM of the loss is zero-padded at the image's edge, as in evaluations. gsplat's trainer leaves out the
+  windows that extend beyond the edge.
+- DefaultStrategy 1.5.3 announces a reset of opacities every 3,000 steps and never makes one, because `step %
+  reset_every == 0 & step > 0` compares with `0 & step`. Versions before and after it make the resets. With
+  `reset`, this trainer calls gsplat's own `reset_opa` at those steps.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class GsplatOptions:
 
     Attributes:
         steps: length of the training; the strategy's own times do not follow it.
-        steps_scaler: multiplies every time, the strategy's too.
+        steps_scaler: multiplies every time, also those of the strategy.
         reset: reset opacities where DefaultStrategy 1.5.3 fails to.
-        cap_max: most Gaussians of MCMCStrategy.
+        cap_max: largest number of Gaussians of MCMCStrategy.
     """
 
     steps: int = 30_000
@@ -165,11 +165,11 @@ class GsplatTrainer:
     """A training with one of gsplat's strategies, batch size 1.
 
     Attributes:
-        options: of the trainer.
-        total: steps of the whole training.
-        step: steps taken.
+        options: options of the trainer.
+        total: number of steps of the whole training.
+        step: number of steps taken.
         params: the Gaussians before activation: means, scales, quats, opacities, sh0, shN.
-        peak: most Gaussians so far.
+        peak: largest number of Gaussians so far.
     """
 
     def __init__(
@@ -188,8 +188,8 @@ class GsplatTrainer:
             options: see `GsplatOptions.of`.
             capture: cameras, points and split.
             images: its photographs.
-            device: to train on.
-            seed: of the order of views and of everything drawn.
+            device: device to train on.
+            seed: seed of the order of views and of every random draw.
         """
         self.options, self.device = options, device
         self.space = space_of(capture)
@@ -250,7 +250,7 @@ class GsplatTrainer:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the next step."""
+        """The SH degree of the next step."""
         return min(self.step // self.options.scaled(self.options.sh_degree_interval), self.options.sh_degree)
 
     def train_to(self, step: int) -> None:
@@ -294,7 +294,7 @@ class GsplatTrainer:
         self.change_population(info)
 
     def change_population(self, info: Any) -> None:
-        """Let the strategy do what it does after a step."""
+        """Call the strategy after a step, so that it adds, removes or moves Gaussians."""
         strategy, arguments = self._strategy, (self.params, self._optimisers, self._state, self.step, info)
         if self._is_mcmc:
             strategy.step_post_backward(*arguments, lr=self._decay.get_last_lr()[0])
@@ -308,7 +308,7 @@ class GsplatTrainer:
 
     @property
     def render_options(self) -> RenderOptions:
-        """How the model of now is rendered."""
+        """The options with which the present model is rendered."""
         return RenderOptions(
             sh_degree=self.options.sh_degree,
             near_plane=self.options.near_plane,
@@ -318,7 +318,7 @@ class GsplatTrainer:
 
     @torch.no_grad()
     def table(self) -> GaussianTable:
-        """Return the model as evaluations take it."""
+        """Return the model as a table, which evaluations take."""
         values = {name: value.detach() for name, value in self.params.items()}
         sh = torch.cat([values.pop("sh0"), values.pop("shN")], dim=1)
         return GaussianTable.create(values | {"sh": sh})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What gsplat's MCMCStrategy takes from its CUDA extension, so that its wheel serves without that."""
+"""Two functions of gsplat's CUDA extension that MCMCStrategy calls, so that it runs without the extension."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# gsplat tabulates the binomial coefficients up to here; a Gaussian is split into no more parts at once.
+# gsplat tabulates the binomial coefficients up to this number, the largest number of parts of a Gaussian.
 MOST_PARTS = 51
 
 
@@ -27,9 +27,10 @@ def _series(device: torch.device) -> Tensor:
 def compute_relocation(
     opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return opacity and scales of each of the N Gaussians that together look as one does.
+    """Return opacity and scales of each of N Gaussians that together look like one Gaussian.
 
-    "3D Gaussian Splatting as Markov Chain Monte Carlo" (arXiv 2404.09591), equation 9. With the new opacity
+    The formula is equation 9 of "3D Gaussian Splatting as Markov Chain Monte Carlo" (arXiv 2404.09591). With
+    the new opacity
     a = 1 - (1 - o)^(1/N), the scales are multiplied by
     o / sum_{i=1..N} sum_{k=0..i-1} C(i-1, k) (-1)^k a^(k+1) / sqrt(k + 1).
     The sum over i of C(i-1, k) is C(N, k + 1), which leaves one sum.
@@ -55,9 +56,9 @@ def compute_relocation(
 def covariances(
     quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor, None]:
-    """Return R S S^T R^T of each Gaussian, [N, 3, 3], where gsplat calls `quat_scale_to_covar_preci`.
+    """Return R S S^T R^T of each Gaussian, [N, 3, 3]; replaces gsplat's `quat_scale_to_covar_preci`.
 
-    Written out, because a batched product of matrices this small would take most of a step.
+    The products are written out, because a batched product of such small matrices would take most of a step.
 
     Args:
         quats: [N, 4] (w, x, y, z), need not be normalised.
@@ -84,6 +85,6 @@ def covariances(
 
 
 def use_in(strategy_ops: Any) -> None:
-    """Let gsplat's strategies (the module `gsplat.strategy.ops`) call these where they would call CUDA."""
+    """Replace the CUDA functions of the module `gsplat.strategy.ops` by those of this module."""
     strategy_ops.compute_relocation = compute_relocation
     strategy_ops.quat_scale_to_covar_preci = covariances

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The usual way to a large scene: a uniform grid of blocks with halos, trained one by one, then merged.
+"""Spatial partition: divides a scene into a uniform grid of blocks with halos, trains each, and merges them.
 
-The grid divides the box around the capture's points, the farthest 2 % at each end left out, on the plane that
-the cameras fly in (the two main axes of their centres). The outermost blocks reach to infinity. A block is
-grown by its halo, a share of a cell's edge on each side. It starts from the points in its grown cell and is
-trained on the cameras that
+The grid divides the box around the capture's points, without the farthest 2 % at each end, in the plane in
+which the cameras fly (the two main axes of their centres). The outermost cells extend to infinity. Each cell
+is enlarged by a halo, a share of the cell's edge on each side. A block is trained from the points in its
+enlarged cell. Its cameras are those that
 
-- stand in the grown cell (VastGaussian's position rule), or
-- have at least a quarter of the points in their picture in it (VastGaussian's visibility rule, with points
-  in the place of its projected boxes; Lin et al. 2024, section 3.2).
+- are inside the enlarged cell (VastGaussian's position rule), or
+- have at least a quarter of the points in their picture inside it (VastGaussian's visibility rule, with
+  points instead of its projected boxes; Lin et al. 2024, section 3.2).
 
-All else is the training of the whole scene: its configuration, its unit of length and its extent. Of each
-block's model the Gaussians in its own cell, without the halo, are kept; together they are the merged model.
+Configuration, unit of length and extent are those of the whole scene. The merged model takes from each block
+the Gaussians inside the cell without the halo.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from blitzgs.training.config import Config
 from blitzgs.training.trainer import Trainer
 
 Float64 = npt.NDArray[np.float64]
-LEFT_OUT = 0.02  # of the points, on each side of the box that is divided
-HALO = 0.2  # of a cell's edge, on each side
-LEAST_SEEN = 0.25  # of the points in a camera's picture
-LEAST_POINTS = 4  # to start a block from
-_SAMPLED_POINTS = 20_000  # that decide what cameras see
+LEFT_OUT = 0.02  # share of the points outside the divided box, on each side
+HALO = 0.2  # width of the halo on each side, as a share of a cell's edge
+LEAST_SEEN = 0.25  # share of the points in a camera's picture from which the camera belongs to a block
+LEAST_POINTS = 4  # smallest number of points from which a block is trained
+_SAMPLED_POINTS = 20_000  # number of points by which the visibility rule is computed
 
 
 class Grid:
@@ -51,7 +51,7 @@ class Grid:
         """Divide the box around most points on the plane of the cameras' flight.
 
         Raises:
-            ValueError: the training cameras stand in a line, or the points do.
+            ValueError: the training cameras, or the points, are on one line.
         """
         self.shape = np.array([columns, rows])
         centres = camera_centers(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
@@ -68,15 +68,15 @@ class Grid:
 
     @property
     def cells(self) -> int:
-        """How many there are."""
+        """The number of cells."""
         return int(self.shape.prod())
 
     def coordinates(self, points: Float64) -> Float64:
-        """Return where points [N, 3] of the re-centred capture lie, in cells from a corner, [N, 2]."""
+        """Return the positions of points [N, 3] of the re-centred capture, in cells from a corner, [N, 2]."""
         return ((points - self._middle) @ self._axes.T - self._low) / self._edge
 
     def inside(self, coordinates: Float64, cell: int, halo: float = 0.0) -> npt.NDArray[np.bool_]:
-        """Return which coordinates [N, 2] lie in a cell grown by `halo` of its edge, [N]."""
+        """Return which coordinates [N, 2] are in a cell that is enlarged by `halo` of its edge, [N]."""
         place = np.array([cell % self.shape[0], cell // self.shape[0]])
         low = np.where(place == 0, -np.inf, place - halo)
         high = np.where(place == self.shape - 1, np.inf, place + 1 + halo)
@@ -86,12 +86,12 @@ class Grid:
 
 @dataclass(frozen=True)
 class Block:
-    """What one cell is trained on.
+    """The cameras and points on which one cell is trained.
 
     Attributes:
-        cell: its number.
-        cameras: of the capture.
-        points: bool [M], of the capture's points those that it starts from.
+        cell: number of the cell.
+        cameras: indices of cameras in the capture.
+        points: bool [M], the points of the capture from which the training starts.
     """
 
     cell: int
@@ -118,7 +118,7 @@ def divide(capture: Capture, grid: Grid) -> list[Block]:
 
 
 def coverage(capture: Capture, blocks: list[Block]) -> dict[str, int]:
-    """Return the training cameras, those in some block and in several, and the assignments of all."""
+    """Count the training cameras, those in some block, those in several, and all assignments to blocks."""
     counts = np.zeros(len(capture.cameras), np.int64)
     for block in blocks:
         counts[block.cameras] += 1
@@ -132,14 +132,14 @@ def coverage(capture: Capture, blocks: list[Block]) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Merged:
-    """A model put together from blocks.
+    """A model that was merged from blocks.
 
     Attributes:
-        table: its Gaussians, in the unit of the whole scene.
-        sh_degree: that it is rendered with.
+        table: the Gaussians, in the unit of the whole scene.
+        sh_degree: SH degree with which the model is rendered.
         blocks: a record for each cell: "cameras", "points", "seconds" of training, "images" trained on,
             "gaussians" trained and "kept" of them, "peak"; those that could not be trained have zeros.
-        merge_seconds: of putting the models together.
+        merge_seconds: time for merging the models.
     """
 
     table: GaussianTable
@@ -151,7 +151,8 @@ class Merged:
 class _BlockTrainer(Trainer):
     """A trainer that leaves its model in memory."""
 
-    def _finish(self) -> dict[str, Any]:
+    def finish(self) -> dict[str, Any]:
+        """Apply all pending steps; write nothing."""
         self.state.catch_up()
         return {}
 
@@ -162,11 +163,11 @@ def train(
     """Train every block that has cameras and points, and merge the models.
 
     Args:
-        config: of each block's training.
+        config: configuration of each block's training.
         capture: the whole scene.
         images: its photographs.
         ranks: the job, of one rank.
-        grid: whose cells the blocks are.
+        grid: the grid of the blocks.
         blocks: from `divide`.
 
     Raises:
@@ -219,7 +220,7 @@ def _train_block(config: Config, capture: Capture, images: Images, ranks: Ranks,
 
 
 def makespan(seconds: list[float], gpus: int) -> float:
-    """Return when the last of some GPUs is done with all blocks, the longest blocks being given out first."""
+    """Return the time after which `gpus` GPUs have trained all blocks, if the longest blocks start first."""
     ends = [0.0] * gpus
     for value in sorted(seconds, reverse=True):
         ends[ends.index(min(ends))] += value
@@ -227,7 +228,7 @@ def makespan(seconds: list[float], gpus: int) -> float:
 
 
 def _in_picture(points: Float64, camera: Any) -> npt.NDArray[np.bool_]:
-    """Return which points [N, 3] a camera has in its picture, whatever hides them."""
+    """Return which points [N, 3] are inside a camera's picture, also if something hides them."""
     seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels = seen @ camera.K.T
     x, y, depth = pixels[:, 0], pixels[:, 1], seen[:, 2]

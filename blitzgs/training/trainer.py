@@ -43,6 +43,7 @@ class Trainer:
     Attributes:
         state: state of the run.
         loader: the batches of the coming steps.
+        memory: measures the GPU's memory over the run.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class Trainer:
             state.owners if ranks.world_size > 1 else None,
         )
         self._guard = LossGuard()
-        self._memory = MemoryMeter()
+        self.memory = MemoryMeter()
 
     @torch.no_grad()
     def train(self) -> dict[str, Any] | None:
@@ -117,7 +118,7 @@ class Trainer:
                         save.run(state)
             state.stops = never
             self._check_photographs()
-            return self._finish()
+            return self.finish()
         except PhotographError as error:  # on every rank
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
             raise PhotographError(
@@ -194,7 +195,7 @@ class Trainer:
         state.stepped(step, degree)
         if measured is not None:
             log_step(state, measured, batch, names, sums)
-            self._memory.sample(state.ranks.device)
+            self.memory.sample(state.ranks.device)
 
     def _gather(self, frame: Frame, v_means2d: Tensor) -> None:
         """Add a step's screen-space gradients to the statistics that density control reads."""
@@ -232,7 +233,7 @@ class Trainer:
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
         )
 
-    def _finish(self) -> dict[str, Any]:
+    def finish(self) -> dict[str, Any]:
         """Save and evaluate the trained model; return and write the summary."""
         state, step = self.state, self.state.progress.step
         residency = state.stepper.report(whole=True)
@@ -242,7 +243,7 @@ class Trainer:
         with StopRequest() as stop:
             agreement = Agreement(state.ranks, stop, state.save_clock)
             save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
-        population = population_report(state, self._memory)
+        population = population_report(state, self.memory)
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()
         state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
