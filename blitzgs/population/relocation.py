@@ -101,9 +101,9 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
     """Return opacity and scales for N Gaussians at one position that together look like one Gaussian.
 
     Along a line through the centre, the integral of what the N Gaussians composite equals that of the one
-        Gaussian: with
-    o' = 1 - (1 - o)^(1/N),
+    Gaussian:
 
+        o' = 1 - (1 - o)^(1/N),
         s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k + 1)
 
     (Kheradmand et al. 2024, eq. 9). The sum over i of C(i-1, k) is C(N, k+1), which leaves one sum.

@@ -35,9 +35,8 @@ def choose_views(state: TrainingState) -> None:
     """If the LOD gate is open, choose the training views in which it leaves out enough to pay. Collective.
 
     The choice holds until the gate's levels change or an importance pass prunes Gaussians. It is saved with
-    the
-    checkpoints: a resumed run has other Gaussians than at the time of the choice, and might choose other
-        views.
+    the checkpoints: a resumed run has other Gaussians than at the time of the choice, and might choose
+    other views.
     """
     if state.progress.finest_level is None:
         return
