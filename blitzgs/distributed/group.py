@@ -104,7 +104,7 @@ class Ranks:
                 f"share_gpus is for the ranks of one host, but {local_world_size} of {world_size} are on this"
                 " one; leave it out, and start no more processes per node than it has GPUs"
             )
-        place, shared = _resolve_device(device, local_rank, local_world_size, share_gpus)
+        place, shared = resolve_device(device, local_rank, local_world_size, share_gpus)
         ranks = cls(
             rank=rank,
             world_size=world_size,
@@ -290,7 +290,7 @@ def _shorten(text: str, limit: int = 200) -> str:
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
-def _resolve_device(
+def resolve_device(
     device: str, local_rank: int, local_world_size: int, share_gpus: bool
 ) -> tuple[torch.device, bool]:
     """Return a rank's device, and whether ranks of its host share GPUs."""

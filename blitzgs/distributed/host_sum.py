@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gathers numbers from the ranks that only the host reads, later, without delaying the step."""
+"""Adds up numbers of all ranks for the host, which reads them after the step, without delaying the step."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from blitzgs.ops.report import report_
 
 
 class HostSum:
-    """The loss's sums over all ranks and what every rank's tiles cost, on their way to the host. Collective.
+    """Sums of the loss over all ranks, and the costs of all tiles, which the host reads later. Collective.
 
-    On CUDA everything happens on a stream beside the step's, after what was queued so far; only `read`
-    waits. Ranks that share memory write to one another, others add up by a collective. On the CPU the sum is
-    there at once.
+    On CUDA the work is queued on a second stream, after the work that is queued on the step's stream so far;
+    only `read` waits. Ranks that share memory write the numbers to each other's memory, other ranks use an
+    all-reduce. On the CPU the constructor computes the sums.
     """
 
     def __init__(
@@ -28,13 +28,13 @@ class HostSum:
         tile_work: Tensor | None = None,
         tiles: tuple[int, int] = (0, 0),
     ) -> None:
-        """Start to gather.
+        """Queue the sums.
 
         Args:
             ranks: the job.
             parts: float64 [B, K, 2], sums of this rank's loss in parts (`photometric_fwd_bwd`); None: none.
-            tile_work: int32 [T], list entries each tile went through; None: none.
-            tiles: those of this rank, [first, one past last).
+            tile_work: int32 [T], number of list entries that were composited in each tile; None: none.
+            tiles: the tiles of this rank, [first, one past last).
         """
         self._ranks = ranks
         self._sums = 0 if parts is None else 2 * len(parts)
@@ -69,20 +69,21 @@ class HostSum:
                 tensor.record_stream(stream)
 
     def read(self) -> Tensor:
-        """Return the sums, float32 on the CPU, the same bits on every rank; waits for them the first time.
+        """Return the sums, float32 on the CPU, the same bits on every rank. The first call waits for them.
 
-        The B views' sums of |render - photograph|, those of the SSIM map, the T tiles' work.
+        The result has the sum of |render - photograph| of each of the B views, then the sum of the SSIM map
+        of each view, then the cost of each of the T tiles.
         """
         if self._total is None:
             if self._copied is not None:
                 with self._ranks.watchdog.waiting("read_sums"):
                     self._copied.synchronize()
             self._total = self._folded(self._value)
-            del self._value  # pinned memory serves the next one
+            del self._value  # so that the next object can use its pinned memory
         return self._total
 
     def _folded(self, value: Tensor) -> Tensor:
-        """Add up the sums of the ranks, in their order; a copy."""
+        """Add up the sums of the ranks in the order of the ranks; the result is a copy."""
         numbers, end = value.numpy(), self._ranks.world_size * self._sums
         total = numbers[:end].reshape(self._ranks.world_size, self._sums).sum(0)
         return torch.from_numpy(np.concatenate((total, numbers[end:])))
@@ -90,5 +91,5 @@ class HostSum:
 
 @lru_cache(maxsize=16)
 def _side_stream(device: torch.device) -> torch.cuda.Stream | None:
-    """Return the stream for what the step need not wait for, one for each device; None on the CPU."""
+    """Return the device's stream for work that the step does not wait for; None on the CPU."""
     return torch.cuda.Stream(device) if device.type == "cuda" else None

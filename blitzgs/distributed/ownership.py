@@ -20,14 +20,14 @@ from blitzgs.distributed.tiles import TileRanges
 
 # Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
 TILE_COST = 8
-# Costs that `divide` first adds up together.
+# Number of neighbouring costs that `divide` adds up first.
 _STRETCH = 128
-# So many numbers tell what the tiles of a view cost, or one a tile where it has fewer: 16 KB at most.
+# Largest number of costs that are stored for a view, 16 KB; a view with fewer tiles has one for each tile.
 _MOST_NUMBERS = 8192
-# Borders follow from what was measured this many batches ago and before. The host has read that by then for
-# the sake of the losses, so it waits for nothing, and all ranks know the same.
+# The costs of this number of latest batches are not used for a division. The host has read the sums of
+# earlier batches already, with their losses. It therefore does not wait, and all ranks have the same costs.
 _LATE = 2
-# A view not yet seen is expected to cost what this many others do on average.
+# The cost of a view that was not visited yet is estimated as the mean cost of this number of other views.
 _SIMILAR = 16
 
 
@@ -58,7 +58,7 @@ def _grain(tiles: int) -> int:
 
 
 def _measured(sums: HostSum, keys: Sequence[Hashable], tiles: int, first: int) -> list[_ViewCost]:
-    """Read what the views of a batch cost; those of the first begin at `first`."""
+    """Read the costs of the views of a batch; in the sums, those of the first view begin at `first`."""
     values = sums.read().numpy()[first:]
     return [_ViewCost.of(key, values[tiles * view :][:tiles]) for view, key in enumerate(keys)]
 
@@ -72,17 +72,17 @@ class TileOwners:
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks = ranks
-        self._costs: dict[Hashable, _ViewCost] = {}  # of the last visits, the latest last
-        self._late: deque[Callable[[], Sequence[_ViewCost]]] = deque()  # the newest batches
-        self._typical: dict[int, NDArray[np.float32]] = {}  # by number of tiles, of views not yet seen
+        self._costs: dict[Hashable, _ViewCost] = {}  # by view, in the order of the last visits
+        self._late: deque[Callable[[], Sequence[_ViewCost]]] = deque()  # read the costs of the latest batches
+        self._typical: dict[int, NDArray[np.float32]] = {}  # by number of tiles, for views without a visit
         self._planned: dict[int, tuple[int, ...]] = {}
 
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
         """Divide the tiles of the batch of a later step, as `divide` does, and store the division.
 
         Args:
-            step: of the batch; plans of steps before it are kept until `forget_before`.
-            keys: as for `divide`, like the others.
+            step: step of the batch; its division is stored until `forget_before`.
+            keys: identifies each of the B views.
             width: image width in pixels.
             height: image height in pixels.
             halo: see `TileRanges`.
@@ -94,16 +94,17 @@ class TileOwners:
         return ranges
 
     def forget_before(self, step: int) -> None:
-        """Drop the plans of steps before this one."""
+        """Drop the divisions of steps before this one."""
         self._planned = {other: bounds for other, bounds in self._planned.items() if other >= step}
 
     def columns(self) -> dict[str, Tensor]:
         """Return what a resumed run needs to make the same divisions; the same on every rank.
 
         Returns:
-            views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: what was measured; ages int64
-            [V]: 0 for what borders follow from, the others by batch; steps int64 [S] and bounds int64
-            [S, M + 1]: what was planned. Keys must be integers.
+            views int64 [V], tiles int64 [V] and costs float16 [sum of pieces]: the measured views, their
+            numbers of tiles and their costs; ages int64 [V]: 0 for costs that divisions use, else the number
+            of the batch, from 1, among the latest; steps int64 [S] and bounds int64 [S, M + 1]: the stored
+            divisions. Keys must be integers.
         """
         batches = [list(self._costs.values()), *(measured() for measured in self._late)]
         ages = [age for age, batch in enumerate(batches) for _ in batch]
@@ -167,15 +168,15 @@ class TileOwners:
         ranges: TileRanges,
         parts: Tensor | None = None,
     ) -> HostSum:
-        """Remember what the tiles of a batch cost, for borders from the batch after the next on. Collective.
+        """Store the costs of a batch's tiles for divisions from the batch after the next on. Collective.
 
-        On CUDA the host waits for no batch of which the losses were read.
+        On CUDA the host does not wait for a batch whose losses it has read.
 
         Args:
             keys: the B views.
-            tile_work: int32 [B * T], list entries each composited tile went through.
-            ranges: who owns which tiles; each tile counts at its owner.
-            parts: float64 [B, K, 2], sums of this rank's loss, to be gathered on this occasion.
+            tile_work: int32 [B * T], number of list entries that were composited in each tile.
+            ranges: the tiles of each rank; the cost of a tile is that measured by its owner.
+            parts: float64 [B, K, 2], sums of this rank's loss, which are sent together with the costs.
 
         Returns:
             The sums; see `HostSum.read`.
@@ -195,7 +196,7 @@ class TileOwners:
         self._typical.clear()
 
     def _cost(self, key: Hashable, tiles: int) -> NDArray[np.float32]:
-        """Work of each tile of a view: measured at its last visit, else the mean of the views visited."""
+        """Return the costs of a view's tiles: those of its last visit, or the mean of other views."""
         known = self._costs.get(key)
         if known is not None and known.tiles == tiles:
             return known.of_tiles()

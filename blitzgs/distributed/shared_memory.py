@@ -35,7 +35,7 @@ MAX_PEERS = 16
 # sums.
 MAX_VALUES = 256
 _LEAST_WORDS = 1 << 20
-_LEAST_BOARD = 1 << 16
+LEAST_BOARD = 1 << 16
 
 
 class Job(Protocol):
@@ -97,18 +97,18 @@ class SharedMemory:
         self.buffers: list[Tensor] = []
         self.generation = 0
         self._barriers = 0
-        self._shared = 0  # how many of them had numbers
-        self._handles: dict[str, Any] = {}  # the mappings live as long as these
-        self._control = self._map("control", control)
+        self._shared = 0  # number of barriers that gathered numbers
+        self._handles: dict[str, Any] = {}  # a mapping exists as long as its handle
+        self._control = self.map_symmetric("control", control)
         self._side_control = [words[-self.world_size :] for words in self._control]
         self._side_barriers = 0
         self._host = torch.empty(
             2, MAX_VALUES * self.world_size, dtype=torch.int64, pin_memory=control.is_cuda
         )
         self._boards: list[Tensor] = []
-        self._places: dict[tuple[int, int], list[Tensor]] = {}  # on the boards; made once
+        self._places: dict[tuple[int, int], list[Tensor]] = {}  # parts of the boards, by length and half
 
-    def _map(self, name: str, mine: Tensor) -> list[Tensor]:
+    def map_symmetric(self, name: str, mine: Tensor) -> list[Tensor]:
         """Map every rank's counterpart of a symmetric tensor; collective."""
         handle = symmetric.rendezvous(mine, dist.distributed_c10d._get_default_group())
         self._handles[name] = handle
@@ -155,9 +155,9 @@ class SharedMemory:
             torch.cuda.current_stream(self.device).synchronize()
             self._boards = []
             self._places.clear()
-            mine = symmetric.empty(2 * max(words, _LEAST_BOARD), dtype=torch.float32, device=self.device)
+            mine = symmetric.empty(2 * max(words, LEAST_BOARD), dtype=torch.float32, device=self.device)
             torch.cuda.current_stream(self.device).synchronize()
-            self._boards = self._map("board", mine)
+            self._boards = self.map_symmetric("board", mine)
         key = words, self._side_barriers % 2
         if key not in self._places:
             begin = key[1] * (len(self._boards[0]) // 2)
@@ -182,7 +182,7 @@ class SharedMemory:
         # rank's queued work may still read the other ranks' old buffers, which are freed when all ranks have
         # reached the mapping.
         torch.cuda.current_stream(self.device).synchronize()
-        self.buffers = self._map("rows", mine)
+        self.buffers = self.map_symmetric("rows", mine)
 
 
 def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
@@ -196,7 +196,7 @@ def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
     """
     place = (socket.gethostname(), job.device.index if job.device.type == "cuda" else None)
     places = job.all_gather_object(place)
-    obstacle, control = _obstacle(places, job), None
+    obstacle, control = find_obstacle(places, job), None
     if obstacle is None:
         try:
             words = control_words(job.world_size)
@@ -212,7 +212,7 @@ def connect(job: Job, timeout_seconds: float) -> SharedMemory | str:
     return memory
 
 
-def _obstacle(places: list[tuple[str, Any]], job: Job) -> str | None:
+def find_obstacle(places: list[tuple[str, Any]], job: Job) -> str | None:
     """Return why a rank cannot reach the others' memory; None if it can."""
     hosts, devices = {host for host, _ in places}, [device for _, device in places]
     mine = job.device.index

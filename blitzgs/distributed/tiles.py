@@ -103,7 +103,7 @@ class TileAssignment:
     """
 
     def __init__(self, ranks: Ranks, ranges: TileRanges) -> None:
-        """Look up who composites what."""
+        """Compute which tiles each rank composites."""
         self.ranks, self.ranges = ranks, ranges
         self.tiles = ranges.of(ranks.rank)
         self.composited = ranges.composited(ranks.rank)

@@ -270,15 +270,15 @@ class Watchdog:
                     and (work := self._waits_for_work())
                 ):
                     self._excused = time.monotonic()
-                    self._announce(work, waited)
+                    self.announce(work, waited)
                     continue
                 # A rank that has finished its work needs some time to arrive and to publish that.
                 if time.monotonic() - max(since, self._excused) > limit:
                     self._abort(f"waited {limit:.0f} s in {self.name}")
             except RuntimeError:
-                return  # the store's host is gone; the collectives report that themselves
+                return  # the store's host has ended; the collectives report that themselves
 
-    def _announce(self, work: str, waited: float) -> None:
+    def announce(self, work: str, waited: float) -> None:
         """Print about once a minute what this rank waits for."""
         if time.monotonic() - self._announced > 60:
             self._announced = time.monotonic()

@@ -5,7 +5,7 @@ import time
 import pytest
 import torch
 
-from blitzgs.distributed.group import MismatchError, Ranks, _resolve_device
+from blitzgs.distributed.group import MismatchError, Ranks, resolve_device
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 
 
@@ -81,7 +81,7 @@ def test_ranks_share_gpus_only_when_told(monkeypatch):
     first, second = torch.device("cuda:0"), torch.device("cuda:1")
 
     def places(device, ranks, share_gpus):
-        return [_resolve_device(device, m, ranks, share_gpus) for m in range(ranks)]
+        return [resolve_device(device, m, ranks, share_gpus) for m in range(ranks)]
 
     assert places("cuda", 2, False) == places("cuda", 2, True) == [(first, False), (second, False)]
     assert places("cuda", 3, True) == [(first, True), (second, True), (first, True)]
@@ -132,7 +132,7 @@ def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
 
 def _work(ranks, hang):
     announced = []
-    ranks.watchdog._announce = lambda work, waited: announced.append(work)
+    ranks.watchdog.announce = lambda work, waited: announced.append(work)
     ranks.barrier()
     if ranks.rank == 1:
         with ranks.watchdog.working("writing to a slow disk"):

@@ -207,7 +207,7 @@ def test_a_rank_that_leaves_a_barrier_is_named(world_size, device, how, blame):
 def alone(monkeypatch):
     """Shared memory of one rank without a GPU: its control words, the memory, and the barriers it queued."""
     queued = []
-    monkeypatch.setattr(SharedMemory, "_map", lambda self, name, mine: [mine])
+    monkeypatch.setattr(SharedMemory, "map_symmetric", lambda self, name, mine: [mine])
 
     def barrier(control, rank, number, values, first, timeout, host=None):
         queued.append((number, values is not None, first, host is not None))
@@ -257,7 +257,7 @@ def test_boards_alternate_between_two_halves_and_grow(alone, monkeypatch):
     monkeypatch.setattr(
         shared_memory.symmetric, "empty", lambda words, dtype, device: torch.arange(words, dtype=dtype)
     )
-    half = shared_memory._LEAST_BOARD
+    half = shared_memory.LEAST_BOARD
     for words, begin in ((5, 0), (5, half), (half, 0), (7, half), (half + 1, 0), (5, half + 1), (5, 0)):
         (board,) = memory.boards(words)
         assert len(board) == words and board[0] == begin
@@ -282,9 +282,9 @@ def test_ranks_on_one_gpu_need_to_be_told(monkeypatch):
     places = [("host", 0), ("host", 1), ("host", 0)]
     monkeypatch.setattr(torch.cuda, "can_device_access_peer", lambda mine, other: mine != other)
     gpu = torch.device("cuda:0")
-    assert "under the same number" in shared_memory._obstacle(places, Ranks(device=gpu))
-    assert shared_memory._obstacle(places, Ranks(device=gpu, shares_gpu=True)) is None
-    assert shared_memory._obstacle(places[:2], Ranks(device=gpu)) is None
+    assert "under the same number" in shared_memory.find_obstacle(places, Ranks(device=gpu))
+    assert shared_memory.find_obstacle(places, Ranks(device=gpu, shares_gpu=True)) is None
+    assert shared_memory.find_obstacle(places[:2], Ranks(device=gpu)) is None
 
 
 def _falls_back(ranks):

@@ -18,16 +18,17 @@ from blitzgs.ops.scatter import gather_splats, scatter_splats, words_per_splat
 
 
 class CollectiveTransport:
-    """The transport for ranks that do not reach each other's memory.
+    """The transport for ranks that cannot access each other's memory.
 
-    The ranks show each other how many splats each has for whom; the host waits for these numbers. Splats are
-    then packed by rank, carried, and unpacked; their gradients likewise. They are added up at the owner in
-    the order of ranks, so that the sum does not depend on which was faster. The places of splats among those
-    of a rank are kept in 8 bytes per 32 splats, and serve the way back too.
+    The ranks exchange the numbers of splats that each sends to each other, and the host waits for these
+    numbers. Then splats are packed by rank, sent, and unpacked. Gradients return in the same way; their owner
+    adds them up in the order of the ranks, so the sum does not depend on which rank was faster. The position
+    of each splat among those sent to a rank is stored in 8 bytes per 32 splats, and is used again to return
+    the gradients.
     """
 
     def __init__(self, ranks: Ranks, half: bool = False) -> None:
-        """Serve `ranks`; with `half`, send splats through a `HalfCodec`."""
+        """Send splats between `ranks`; with `half`, in half precision by a `HalfCodec`."""
         self.capacity = CapacityEstimate()
         self._ranks, self._codec = ranks, HalfCodec() if half else None
 
@@ -56,7 +57,7 @@ class CollectiveExchange:
         attempt: Attempt,
         mark: Mark,
     ) -> None:
-        """Project, show the other ranks how many splats there are for whom, and carry the splats."""
+        """Project, exchange the numbers of splats, and send the splats."""
         sizes, tiles, n_views = attempt.sizes, assignment.all_composited, assignment.ranges.n_views
         # The host may have to wait for the collectives of other ranks that are queued before the projection.
         with ranks.watchdog.waiting("project"):
@@ -71,7 +72,7 @@ class CollectiveExchange:
         traffic = Traffic.of(totals, n_views, ranks.rank)
         needed = Sizes._make((*traffic.counts.tolist(), traffic.most_blocks))
         if sizes is not None and not sizes.holds(needed[:2]):
-            projected = inputs.run(None, tiles)  # nothing is queued any more that waits for another rank
+            projected = inputs.run(None, tiles)  # no queued work waits for another rank now
         # All ranks decide the same, because they have estimated the same number of blocks.
         attempt.end(needed, sizes is None or needed.blocks <= sizes.blocks)
         mark("project")
@@ -101,9 +102,9 @@ class CollectiveExchange:
 
 
 class HalfCodec:
-    """Splats in half precision, for slow links.
+    """Encodes splats in half precision, for slow links.
 
-    Conics (as Cholesky factors, which stay positive definite), opacities and colours travel in float16, and
+    Conics (as Cholesky factors, which stay positive definite), opacities and colours are sent in float16, and
     gradients in bfloat16; positions and depths are not rounded. A splat with three colours then takes 40
     bytes instead of 52, and its gradient 20 instead of 36. The tiles that a splat touches are found before it
     is rounded. If rounding moves its border into a further tile, it is missing there, where its alpha is
@@ -120,7 +121,7 @@ class HalfCodec:
         return torch.cat((factors, opacities[:, None], colors), 1).half()
 
     def decode(self, halves: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Return conics, opacities and colours; the same bits wherever it is called."""
+        """Return conics, opacities and colours; the same bits on every rank."""
         values = halves.to(dtype)
         l11, l21, l22 = values[:, :3].unbind(1)
         conics = torch.stack((l11 * l11, l11 * l21, l21 * l21 + l22 * l22), 1)

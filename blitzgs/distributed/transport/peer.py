@@ -1,27 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats written straight into the memory of the GPUs that composite them, and gradients read there.
+"""Writes splats into the memory of the GPUs that composite them, and lets their owners read gradients there.
 
-Each rank's buffer (`SharedMemory.buffers`) holds, one behind the other, the columns of the splats that arrive
-at this rank, and the table in which compositing's backward pass adds up their gradients. Each has room for as
-many splats as every rank has for its own, so that all ranks know, on the device too, whether everything fits.
+Each rank has a buffer (`SharedMemory.buffers`) that all ranks have mapped. The buffer has two parts: the
+columns of the splats that arrive at this rank, and the table in which compositing's backward pass adds up
+their gradients. Every buffer has room for the same number of splats, which is also the capacity of every
+rank's projection. Each rank can therefore compute from the counts, also on the device, whether the splats of
+all ranks fit.
 
-A step is, in stream order on every rank: project; barrier A, which brings the counts of all ranks; write
-splats to the other ranks; barrier B; sort; composite, which zeroes the table; the gradient of compositing;
-barrier C; read the tables of all ranks. Work that is queued behind a barrier, on any rank, finds done what
-any rank queued before it. Hence
+In stream order, a step on every rank consists of
 
-- splats and tables are read after the barrier that follows their writing: B for splats, C for gradients;
-- the splats of a step overwrite those of the step before after A, and each rank has queued the reading of
-  those before its own A;
-- a table is zeroed after B, and each rank has queued the reading of the step before's before its own B. A
-  second backward pass of one frame has a barrier of its own before the table is zeroed again.
+- projection;
+- barrier A, which brings the counts of all ranks;
+- writing splats into the buffers of other ranks;
+- barrier B;
+- sorting, and compositing, which zeroes the rank's table;
+- the gradient of compositing, which is added up in this table;
+- barrier C;
+- reading the tables of all ranks.
 
-Splats are queued for writing behind A, and for compositing, while the counts are on their way to the host.
-Where they do not fit into some rank's buffer no rank writes any: each finds that from the same counts, and
-composites nothing. All ranks then enlarge their buffers and start the frame again. So it is where one rank
-has more tile entries than all have room for. A rank that dies leaves the others in a barrier: their hosts
-wait in `Watchdog.waiting`, so the watchdog finds them, and a barrier that lasts longer than that aborts the
-process's kernels.
+Work that a rank queues after a barrier begins when all work that any rank queued before it has ended. Hence
+
+- splats are complete when they are read, because they are written before B and read after it; gradients are
+  complete, because they are added up before C and read after it;
+- no splat is overwritten while a rank reads it: a step writes its splats after its A, and every rank queues
+  its reading of the previous step's splats before this A;
+- no table is zeroed while a rank reads it: a step zeroes its table after its B, and every rank queues its
+  reading of the previous step's tables before this B. A second backward pass of one frame has an additional
+  barrier before the table is zeroed again.
+
+The host queues writing and compositing before it knows the counts. If the splats do not fit into the buffer
+of some rank, every rank finds this from the same counts, writes no splats and composites nothing. All ranks
+then enlarge their buffers and start the frame again. They do the same if one rank has more tile entries than
+the common capacity. If a rank dies, the others wait in a barrier. Their hosts wait in `Watchdog.waiting`, so
+the watchdog names the dead rank. A barrier on the device that exceeds the timeout aborts the kernels of its
+process.
 """
 
 from __future__ import annotations
@@ -41,7 +53,7 @@ from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
 
-# Columns of a splat as peers write them, those of `Splats` (kSentColumns of csrc/transport/transport.h):
+# The columns of `Splats` in the order in which ranks write them (kSentColumns of csrc/transport/transport.h):
 # dtype, words and shape of an element.
 _COLUMNS = (
     (torch.float32, 2, (2,)),
@@ -59,17 +71,17 @@ _ALIGNMENT = 32
 
 
 class PeerBuffers:
-    """What lies where in the buffers of all ranks.
+    """The parts of the buffers of all ranks.
 
     Attributes:
         buffers: int32 [words] of each rank, mapped here.
-        length: how many splats each has room for.
-        splats: columns of this rank's, [length].
-        tables: of splat gradients of each rank, float32 [length, 12].
+        length: capacity of each buffer, in splats.
+        splats: columns in this rank's buffer, [length].
+        tables: table of splat gradients of each rank, float32 [length, 12].
     """
 
     def __init__(self, buffers: Sequence[Tensor], rank: int) -> None:
-        """Divide buffers of one length."""
+        """Divide buffers of equal length."""
         self.buffers = list(buffers)
         self.length = len(buffers[0]) // WORDS_PER_SPLAT // _ALIGNMENT * _ALIGNMENT
         columns, begin = [], 0
@@ -85,10 +97,10 @@ class PeerBuffers:
 
 
 class PeerTransport:
-    """For ranks of one host whose GPUs reach each other's memory."""
+    """The transport for ranks of one host whose GPUs can access each other's memory."""
 
     def __init__(self, ranks: Ranks, capacity: CapacityEstimate | None = None) -> None:
-        """Serve `ranks`, which have shared memory; the estimate must be the same on all of them."""
+        """Use the shared memory of `ranks`; the estimate must be the same on all ranks."""
         if ranks.memory is None:
             raise ValueError(f"the ranks share no memory; their transport is {ranks.transport}")
         self.capacity = capacity or CapacityEstimate()
@@ -128,7 +140,7 @@ class PeerExchange:
         attempt: Attempt,
         mark: Mark,
     ) -> None:
-        """Queue the writing of the splats."""
+        """Queue the projection and the writing of the splats."""
         self._ranks, self._memory, self._buffers, self._attempt = ranks, memory, buffers, attempt
         self._n_views = inputs.n_views
         self._traffic: Traffic | None = None

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The interface of transports, which send splats to the ranks that composite them, and gradients back.
 
-Every rank projects the Gaussians it owns. Each splat (a Gaussian in a view) then has to reach the ranks that
-composite tiles which it touches, and its gradient has to return (paper §3.1). The calls of one frame, on
+Every rank projects the Gaussians that it owns. Each splat (a Gaussian in a view) is then sent to the ranks
+that composite tiles which it touches, and its gradient is returned (paper §3.1). The calls of one frame, on
 every rank::
 
-    exchange = transport.start(inputs, assignment, attempt, mark)  # project; send splats to where they go
+    exchange = transport.start(inputs, assignment, attempt, mark)  # project; send splats to other ranks
     exchange.arrived, exchange.gradient_table                      # for compositing
     counts = exchange.finish()                                     # None: the capacity was too small
     counts.way_back.check_still_valid()                            # before the backward pass of compositing
-    gradients = counts.way_back.return_gradients(gradients)        # those of this rank's own splats
+    gradients = counts.way_back.return_gradients(gradients)        # gradients of this rank's own splats
 
 The last two may be repeated. `local`, `collective` and `peer` each have one transport; `way_back` returns the
 gradients for the last two.
@@ -39,11 +39,11 @@ def unmarked(stage: str) -> None:
 
 @dataclass(frozen=True)
 class Traffic:
-    """How many splats go where, over all ranks.
+    """The numbers of splats that the ranks send each other.
 
     Attributes:
         counts: int64 [3] on the CPU: this rank's visible Gaussians, splats and tiles they touch.
-        splats: splats[s][d] that rank s sends to rank d.
+        splats: splats[s][d] is the number of splats that rank s sends to rank d.
         sent: number of splats sent to each rank.
         received: number of splats received from each rank.
         starts: index at which this rank's splats begin among those that each rank receives.
@@ -65,7 +65,7 @@ class Traffic:
 
     @classmethod
     def of(cls, totals: Sequence[Sequence[int]], n_views: int, rank: int) -> Traffic:
-        """Read it from every rank's `Projected.totals`."""
+        """Read the numbers from every rank's `Projected.totals`."""
         first = VIEW_TOTALS + n_views
         splats = [list(numbers[first::2]) for numbers in totals]
         most = max(*(n[1] for n in totals), *map(sum, splats), *map(sum, zip(*splats, strict=True)))
@@ -151,24 +151,24 @@ class WayBack(Protocol):
         """
 
     def cleared_table(self) -> Tensor | None:
-        """Return `gradient_table` for another backward pass, zeros, once no rank reads it. Collective."""
+        """Zero `gradient_table` for another backward pass, when no rank reads it any more. Collective."""
 
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
         """Return the gradients of this rank's own splats. Collective.
 
         Args:
-            gradients: of the splats that arrived; in `gradient_table` where there is one.
+            gradients: gradients of the splats that arrived, in `gradient_table` if there is one.
         """
 
     def return_sums(self, sums: Tensor) -> Tensor:
         """Return integer sums over the tiles of each rank to the splats' owners, and add them up. Collective.
 
         Args:
-            sums: int64 [R, C], of the splats that arrived here.
+            sums: int64 [R, C], sums of the splats that arrived here.
 
         Returns:
-            int64 [P, C], of this rank's own splats; zero for splats that touch no tile. The total depends on
-            nothing but the splats, as integers add up exactly.
+            int64 [P, C], sums of this rank's own splats; zero for splats that touch no tile. Integers add up
+            exactly, so the result does not depend on the number of ranks.
         """
 
 

@@ -28,7 +28,7 @@ class CollectiveWayBack:
         ranks: the job.
         traffic: numbers of splats sent between the ranks.
         places: positions of this rank's own splats among those that it sent, from `scatter_splats`.
-        half: whether gradients travel in bfloat16.
+        half: whether gradients are sent in bfloat16.
     """
 
     ranks: Ranks
@@ -37,21 +37,21 @@ class CollectiveWayBack:
     half: bool
 
     def check_still_valid(self) -> None:
-        """Nothing of a frame is overwritten by the next one."""
+        """Do nothing, because a frame does not overwrite the data of an earlier one."""
 
     def cleared_table(self) -> None:
         """Return None: any memory can be used."""
 
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
         """See `WayBack.return_gradients`."""
-        rows, traffic = gradients.side_by_side(), self.traffic
+        columns, traffic = gradients.side_by_side(), self.traffic
         if self.half:
             # Gradients span too many magnitudes for float16.
-            halves = rows.bfloat16()
-            carried = self.ranks.all_to_all(words_of(halves), traffic.received, traffic.sent)
-            returned = as_column(carried, halves).to(rows.dtype)
+            halves = columns.bfloat16()
+            words = self.ranks.all_to_all(words_of(halves), traffic.received, traffic.sent)
+            returned = as_column(words, halves).to(columns.dtype)
         else:
-            returned = self.ranks.all_to_all(rows, traffic.received, traffic.sent)
+            returned = self.ranks.all_to_all(columns, traffic.received, traffic.sent)
         return gradients.sum_returned(returned, self.places, traffic.sent, int(traffic.counts[1]))
 
     def return_sums(self, sums: Tensor) -> Tensor:
@@ -65,9 +65,9 @@ class PeerWayBack:
 
     Attributes:
         ranks: the job.
-        memory: the memory that they share.
+        memory: the memory that the ranks share.
         generation: number of the frame, `SharedMemory.generation`.
-        tables: of splat gradients of each rank, float32 [length, 12], mapped here.
+        tables: table of splat gradients of each rank, float32 [length, 12], mapped here.
         traffic: numbers of splats sent between the ranks.
         places: positions of this rank's own splats among those that it sent, as from `scatter_splats`.
     """
@@ -93,7 +93,7 @@ class PeerWayBack:
         return self.tables[self.ranks.rank][: sum(self.traffic.received)].zero_()
 
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
-        """See `WayBack.return_gradients`; the gradients are in the tables, where their owners read them."""
+        """See `WayBack.return_gradients`; the result refers to the tables, in which the owner reads."""
         self.memory.barrier()  # C
         mine = zip(self.tables, self.traffic.starts, self.traffic.sent, strict=True)
         return SplatGradients([table[start : start + n] for table, start, n in mine], self.places)
@@ -107,7 +107,7 @@ def _return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) -
     """Send integer sums of splats to their owners and add them up; see `WayBack.return_sums`.
 
     Args:
-        sums: int64 [R, C], of the splats that arrived here.
+        sums: int64 [R, C], sums of the splats that arrived here.
         places: positions of this rank's own splats among those that it sent.
         traffic: numbers of splats sent between the ranks.
         ranks: the job.
@@ -116,7 +116,8 @@ def _return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) -
     total = sums.new_zeros(int(traffic.counts[1]), sums.shape[1])
     lanes = torch.arange(RUN, device=sums.device)
     for group, runs in zip(returned.split(traffic.sent), places.unbind(1), strict=True):
-        # The splats of a run lie together: the first one's place, and which of them are there (csrc/scatter).
+        # The splats of a run are consecutive. `runs` has the position of the first one, and bits that tell
+        # which splats of the run were sent (csrc/scatter).
         here = runs[:, None] >> (32 + lanes) & 1
         at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
         which = here.flatten().nonzero().squeeze(1)
