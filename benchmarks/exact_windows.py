@@ -65,24 +65,38 @@ class ExactWindows:
         found = torch.zeros(len(inputs[0]), dtype=torch.bool)
         for view in range(len(self.scene.viewmats)):
             splats = self._project(inputs, view)
-            variances = splats.factors.square().sum(dim=-1) + EPS2D
-            reach = (2 * torch.log(255 * splats.opacities).clamp(min=0)[:, None] * variances).sqrt()
-            low, high = splats.means2d - reach, splats.means2d + reach
+            low, high = _boxes(splats)
             for _, rows, columns in (place for place in self.places if place[0] == view):
-                first = torch.tensor([columns.start, rows.start])
-                last = torch.tensor([columns.stop, rows.stop])
-                found[splats.ids[((low < last) & (high > first)).all(dim=1)]] = True
+                found[splats.ids[_overlap(low, high, rows, columns)]] = True
         return found.nonzero()[:, 0]
 
     def _composite(self) -> list[Composite]:
         splats = [self._project(self.inputs, view) for view in range(len(self.scene.viewmats))]
+        boxes = [_boxes(s) for s in splats]
         results = []
         for view, rows, columns in self.places:
-            s = splats[view]
-            offset = torch.tensor([columns.start, rows.start])
+            s, near = splats[view], _overlap(*boxes[view], rows, columns)
+            means2d = s.means2d[near] - torch.tensor([columns.start, rows.start])
             size = columns.stop - columns.start, rows.stop - rows.start
-            results.append(composite(s.means2d - offset, s.conics, s.opacities, s.colors, s.depths, *size))
+            parts = (s.conics[near], s.opacities[near], s.colors[near], s.depths[near])
+            results.append(composite(means2d, *parts, *size))
         return results
+
+
+@torch.no_grad()
+def _boxes(splats: Splats) -> tuple[Tensor, Tensor]:
+    """Return the lower and upper corners [M, 2], px, of the boxes outside which alpha is below 1/255."""
+    variances = splats.factors.square().sum(dim=-1) + EPS2D
+    reach = (2 * torch.log(255 * splats.opacities).clamp(min=0)[:, None] * variances).sqrt()
+    # The tenth of a pixel leaves room for rounding.
+    return splats.means2d - reach - 0.1, splats.means2d + reach + 0.1
+
+
+def _overlap(low: Tensor, high: Tensor, rows: slice, columns: slice) -> Tensor:
+    """Return which boxes reach into a window, bool [M]."""
+    first = torch.tensor([columns.start, rows.start])
+    last = torch.tensor([columns.stop, rows.stop])
+    return ((low < last) & (high > first)).all(dim=1)
 
 
 def _places(scene: BenchmarkScene, size: int) -> Iterator[tuple[int, slice, slice]]:
