@@ -20,7 +20,7 @@ NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 FOLDERS = ("benchmarks", "blitzgs", "cmake", "configs", "csrc", "docs", "examples", "tests")
-# benchmarks/results is there only when something was measured.
+# The folder benchmarks/results exists only if something was measured.
 MADE_LATER = ("benchmarks/results/",)
 SHELL = ("sh", "bash")
 
@@ -151,7 +151,7 @@ def commands(page):
 
 
 def check_blitzgs(words, folder, monkeypatch, capsys):
-    """Check a command by running it where there is no capture and no run: only its usage can be wrong."""
+    """Check a command by running it in a folder without captures and runs: only its usage can be wrong."""
     monkeypatch.chdir(folder)
     (folder / "taken").write_text("")
     words = [str(ROOT / word) if word.startswith("configs/") else word for word in words]
@@ -195,7 +195,7 @@ def test_commands_are_used_rightly(name, tmp_path, monkeypatch, capsys):
             program, rest = "blitzgs", rest[2:]
         if program == "python" and rest[:1] == ["train.py"]:
             program, rest = "blitzgs", ["train", *rest[1:]]
-        # "..." and "COMMAND" stand for what the reader fills in.
+        # The reader replaces "..." and "COMMAND".
         if not rest or any("..." in word or "COMMAND" in word or "|" in word for word in rest):
             continue
         if program == "make":

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 CSRC = ROOT / "csrc"
-# Two kernels that compute the same of these must get the same bits.
+# Kernels that compute the same of these values must get the same bits.
 EXACT = ("project_splat", "splat_color", "splat_tiles", "for_each_tile_row", "for_each_tile")
 DEFINED_IN = ("math/tiles.h", "project/project_splat.h")
 LIBRARY = ROOT / "blitzgs" / "_lib" / "libblitzgs_cuda.so"

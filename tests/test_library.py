@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The libraries that are loaded belong to the sources."""
+"""The loaded libraries were built from the present sources."""
 
 import os
 import subprocess

@@ -117,7 +117,7 @@ def test_lazy_steps_are_those_of_dense_adam(backend, in_one):
     adam = torch.optim.Adam([{"params": [p], "lr": rates[name]} for name, p in dense.items()], eps=1e-15)
     if in_one:
         optimizers = LazyAdam(groups, eps=1e-15)
-    else:  # as gsplat's strategies want them
+    else:  # in the form that gsplat's strategies need
         optimizers = {group["name"]: LazyAdam([group], eps=1e-15) for group in groups}
     generator = torch.Generator().manual_seed(2)
     for _ in range(14):

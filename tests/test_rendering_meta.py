@@ -207,7 +207,7 @@ def test_tree_map_reaches_into_meta():
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"])
 def test_what_is_not_finite_is_named(device, name):
-    # A number of Gaussians of its own: on CUDA the first call with it looks.
+    # No other test has this number of Gaussians, so on CUDA its first call makes the check.
     n = 31 + ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"].index(name)
     scene = random_scene(n=n, cameras=2, device=device)
     seen = int(rasterize_scene(scene)[2]["gaussian_ids"][0])

@@ -28,18 +28,18 @@ from tests.training.tiny import tiny_config, tiny_scene
 
 T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
-STEPS_BEFORE = 3  # of warm-up: the first steps know no sizes
-# What CUDA calls where the CPU calls something else, and beside that.
+STEPS_BEFORE = 3  # steps of warm-up; the first steps have no estimates of sizes
+# Ops that CUDA calls instead of the CPU's, and additional ops that it calls.
 ON_CUDA = {"rasterize_bwd": "rasterize_bwd_packed_"}
 MORE_ON_CUDA = ("copy_to_host_",)
 
 
 class Walk(NamedTuple):
-    """One step, as it is read.
+    """The files and ops of one step.
 
     Attributes:
         stops: files of `blitzgs/`, in the order in which their functions are first called.
-        ops: that were called, in order.
+        ops: the called ops, in order.
     """
 
     stops: list[str]
@@ -57,7 +57,7 @@ class Walk(NamedTuple):
 
 
 class _Trace:
-    """Notes the files of functions at their first calls, while those that it is `of` run."""
+    """Records the files of functions at their first calls, while the functions given to `of` run."""
 
     def __init__(self) -> None:
         self.files: dict[object, str] = {}
@@ -79,7 +79,7 @@ class _Trace:
 
 
 def walk_of_a_step(ranks: Ranks, *overrides: str, whole: bool = False) -> Walk:
-    """Train a few steps and follow the next one on this thread; `whole`: with the trainer's own part."""
+    """Train a few steps and follow the next one on this thread; `whole`: with the trainer's own functions."""
     scene, images = tiny_scene()
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         shared = Path(ranks.broadcast_object(folder))
@@ -100,8 +100,8 @@ def walk_of_a_step(ranks: Ranks, *overrides: str, whole: bool = False) -> Walk:
 
 
 def walk_of_ranks(world_size: int) -> Walk:
-    """Follow a step of rank 0 of so many, whose splats travel by collectives."""
-    from tests import walk  # the ranks know it by this name, also where this file is the program
+    """Follow a step of rank 0 of `world_size` ranks, which send splats by collectives."""
+    from tests import walk  # ranks import this file by its name, also if it is the program
 
     return run_ranks(walk.walk_of_a_step, world_size)[0]
 

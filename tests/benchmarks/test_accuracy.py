@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The accuracy benchmark must see an error where there is one."""
+"""The accuracy benchmark measures an error that a test puts into the image or a gradient."""
 
 import json
 import sys

@@ -58,14 +58,14 @@ def test_runs_are_done_once_and_a_failure_stops_no_other(tmp_path, capture, caps
     assert list(done["views"].values()) == [pytest.approx(last["test"]["psnr"])]
     assert broken["status"] == "failed" and "missing.txt" in broken["error"]
 
-    # The same again: what is done is not done twice. The budget of no time starts nothing.
+    # A second call repeats no finished run. A budget of no time starts no run.
     written = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("tiny.ours*")}
     assert bm_quality.main([*flags, "--seeds", "3"]) == 0
     assert bm_quality.main([*flags, "--seeds", "3", "4", "--minutes", "0"]) == 0
     assert "1 runs left" in capsys.readouterr().out
     assert written == {path: path.stat().st_mtime_ns for path in (out / "runs").glob("tiny.ours*")}
 
-    # Elsewhere, from the one file: a failed run does not replace a finished one.
+    # Another folder collects the file; a failed run does not replace a finished one.
     elsewhere = tmp_path / "elsewhere"
     failed = tmp_path / "failed.json"
     failed.write_text(json.dumps(done | {"status": "failed", "error": "no"}))
@@ -173,7 +173,7 @@ def test_relocation_is_equation_9():
         )
         assert new_opacities[i].item() == pytest.approx(a, rel=1e-5)
         torch.testing.assert_close(new_scales[i], scales[i] * (o / total), rtol=1e-5, atol=0)
-    # One part is the Gaussian itself; several that lie on one another let as much light through.
+    # One part is the Gaussian itself; several parts at one place have the same transmittance together.
     torch.testing.assert_close(new_scales[0], scales[0])
     torch.testing.assert_close(
         (1 - new_opacities) ** ratios.clamp(max=51), 1 - opacities, rtol=1e-4, atol=1e-6
@@ -197,7 +197,7 @@ def test_gsplats_strategies_train(capture, strategy, device):
     source = f"gsplat-{strategy} --steps_scaler=0.008 "
     source += "--cap_max=450" if strategy == "mcmc" else "--grow_grad2d=0.002"
     result = quality_run.train_opponent(spec_of(capture, source, device))
-    # Quoted after 7,000 and 15,000 of 30,000 steps, beside those asked for.
+    # Training views are measured after 7,000 and 15,000 of 30,000 steps and at the end.
     assert [e["images"] for e in result["evaluations"]] == [40, 56, 120, 240]
     quoted = [e["images"] for e in result["evaluations"] if "train" in e]
     assert quoted == [56, 120, 240] and result["images"] == 240

@@ -79,7 +79,7 @@ def test_a_trajectory_is_trained_once_and_tabulated(tmp_path, capture, capsys):
     with pytest.raises(SystemExit):
         tables.main([*flags, "--arms", "fuller"])
     assert "there is no fuller in this table" in capsys.readouterr().err
-    # What was refused does not count as results.
+    # Refused calls leave no results.
     assert tables.main(flags) == 0
     assert "| final | 0.0" in capsys.readouterr().out
     rows = {row["stage"]: row for row in csv.DictReader((out / "trajectory.csv").open())}

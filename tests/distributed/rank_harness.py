@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs a function on M ranks: Gloo on the CPU, NCCL on as many GPUs; where there are fewer, ranks share them.
+"""Runs a function on M ranks, with Gloo on the CPU and NCCL on M GPUs; with fewer GPUs, ranks share them.
 
 A fork server imports torch once, so CPU ranks start quickly; a CUDA context does not survive a fork.
 """
@@ -46,9 +46,9 @@ def _child(function, rank, world_size, port, timeout_seconds, join, device, tran
 
 
 class RankError(AssertionError):
-    """A rank failed; `messages[rank]` is its traceback, or its exit code when it left none.
+    """A rank failed; `messages[rank]` is its traceback, or its exit code if there is none.
 
-    `blame` is what the first rank to fail told the others.
+    `blame` is the message of the first failed rank to the others.
     """
 
     def __init__(self, messages, blame):
@@ -137,7 +137,7 @@ def run_ranks(
                 results[rank] = value
             else:
                 failures[rank] = value
-                # As torchrun does: once a rank has failed, the others get a little time and are ended.
+                # As torchrun does, end the other ranks a short time after a rank has failed.
                 deadline = min(deadline, time.monotonic() + 6)
     for process in processes:
         process.join(10)

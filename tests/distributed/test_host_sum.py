@@ -16,17 +16,17 @@ def _share(tiles, ranks):
 
 def _sums(ranks):
     out = []
-    # One that needs more memory than those before it, and one without a loss.
+    # One sum needs more memory than those before it, and one has no loss.
     for step, tiles in enumerate((1000, 1000, 999, 300_000, 5, 1000)):
         parts = torch.arange(VIEWS * 8.0, dtype=torch.float64).view(VIEWS, 4, 2) * (ranks.rank + 1)
         parts = None if step == 4 else parts.to(ranks.device)
         work = torch.arange(tiles, dtype=torch.int32, device=ranks.device) + step
         total = HostSum(ranks, parts, work, _share(tiles, ranks))
-        del parts, work  # their memory must not be handed on before it was read
+        del parts, work  # their memory must not be used again before it was read
         torch.full((tiles,), -1, device=ranks.device)
         out.append(total)
     first = out[0].read()
-    assert first is out[0].read()  # waits and copies once
+    assert first is out[0].read()  # the first call waits and copies
     return [total.read() for total in out]
 
 

@@ -79,14 +79,14 @@ def test_costs_are_used_two_batches_later():
         visit(owners, {"b": 0})
     assert owners.divide(["a", "b"], *SIZE).bounds == (0, 6, 24)
     assert owners.divide(["b", "a"], *SIZE).bounds == (0, 18, 24)
-    # A view never seen is expected to cost what the others do on average.
+    # The cost of a view without a visit is the mean cost of the others.
     assert owners.divide(["c", "a"], *SIZE).bounds[1] in (13, 14, 15, 16)
-    # Another resolution: nothing is known.
+    # Nothing is known about another resolution.
     assert owners.divide(["a"], 32, 32).bounds == (0, 2, 4)
 
 
 def test_batches_are_divided_without_waiting_for_the_device(monkeypatch):
-    """The borders of every view follow from sums that the guard of the losses has already read."""
+    """Every division uses sums that the host has already read with the losses."""
     owners, queued, reads = TileOwners(TwoRanks()), [], []
     read = HostSum.read
 
@@ -103,7 +103,7 @@ def test_batches_are_divided_without_waiting_for_the_device(monkeypatch):
 
 
 def test_cost_memory_of_many_4k_views_is_small():
-    """Sums of whole batches are freed, and each 4K view keeps 16 KB; the borders stay equally good."""
+    """Sums of whole batches are freed, and each 4K view takes 16 KB; the division stays as good."""
     owners, alive, generator = TileOwners(TwoRanks()), [], torch.Generator().manual_seed(0)
     size, tiles = (3840, 2160), 240 * 135
     work = torch.randint(0, 3000, (40, tiles), generator=generator, dtype=torch.int32)
@@ -131,7 +131,7 @@ def test_pixel_rows_and_composited_tiles():
     ranges = TileRanges((0, 9, 9, 40, 56), 2, 100, 60, halo=LOSS_HALO)  # 7 x 4 tiles a view
     assert ranges.of(2) == (9, 40)
     assert ranges.composited(0) == (0, 17)
-    assert ranges.composited(1) == (1, 1)  # owns nothing, needs nothing
+    assert ranges.composited(1) == (1, 1)  # a rank without tiles composites none
     assert ranges.composited(2) == (1, 48)
     assert ranges.composited(3) == (32, 56)
     plain = TileRanges(ranges.bounds, 2, 100, 60)
@@ -146,7 +146,7 @@ def test_pixel_rows_and_composited_tiles():
 @pytest.mark.parametrize("tile_size", [4, 8, 16])
 @pytest.mark.parametrize("bounds", [(0, 0, 1), (0.1, 0.35, 0.35, 0.7), (0.24, 0.25, 0.26, 0.5, 0.98, 1)])
 def test_composited_tiles_cover_the_halo_of_the_loss(tile_size, bounds):
-    """Every pixel within 10 pixels of an owned one is composited, and few others; none without tiles."""
+    """A rank composites every pixel within 10 pixels of an owned one, and few others."""
     n_views, width, height = 3, 71, 50
     per_view = -(-width // tile_size) * -(-height // tile_size)
     cuts = (0, *(round(n_views * per_view * at) for at in bounds), n_views * per_view)
@@ -167,7 +167,7 @@ def test_composited_tiles_cover_the_halo_of_the_loss(tile_size, bounds):
             continue
         ring = -(-LOSS_HALO // tile_size)
         assert low - begin <= ring * (ranges.tiles_x + 1) and end - high <= ring * (ranges.tiles_x + 1)
-        # No view is entered in which nothing is owned.
+        # A rank composites nothing in a view in which it owns nothing.
         views_owned = owned.flatten(1).any(1)
         assert not there.flatten(1).any(1)[~views_owned].any()
 
@@ -178,7 +178,7 @@ def test_restored_costs_give_the_same_borders():
     for saved_at in range(len(batches)):
         owners, again = TileOwners(TwoRanks()), TileOwners(TwoRanks())
         for step, keys in enumerate(batches):
-            planned = owners.plan(step + 1, keys, *SIZE, 0)  # a batch ahead, as training does
+            planned = owners.plan(step + 1, keys, *SIZE, 0)  # one batch ahead, as in training
             if step == saved_at:
                 again.restore(owners.columns())
             if step >= saved_at:
@@ -189,7 +189,7 @@ def test_restored_costs_give_the_same_borders():
         assert all(torch.equal(saved[name], whole[name]) for name in ("views", "tiles", "costs", "ages"))
         again.forget_before(99)
         assert again.plan(1, [5, 2], *SIZE, 0).bounds != owners.plan(1, [5, 2], *SIZE, 0).bounds
-    # Plans for another number of ranks mean nothing; costs do.
+    # Divisions for another number of ranks are ignored, costs are used.
     four = TileOwners(Ranks(world_size=4))
     four.restore(whole)
     assert len(four.plan(1, [5, 2], *SIZE, 0).bounds) == 5

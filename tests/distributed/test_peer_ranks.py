@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several ranks that write to each other's memory, without a GPU: each is a thread, and ops are played.
+"""Several ranks that write to each other's memory, without a GPU: ranks are threads, CUDA ops are replaced.
 
-What is tested is what the ranks do together: as many barriers on each, also where some of them have too
-little room, and splats and gradients that are found where their transport says.
+The tests check that all ranks reach the same number of barriers, also if the capacity of some of them is too
+small, and that splats and gradients are in the places that the transport names.
 """
 
 import threading
@@ -117,7 +117,7 @@ def without_gpu(monkeypatch):
     returned = PeerWayBack.return_gradients
 
     def from_columns(self, gradients):
-        table = self.tables[self.ranks.rank]  # where compositing has them on a GPU
+        table = self.tables[self.ranks.rank]  # compositing on a GPU writes them here
         flat = torch.cat([part.reshape(len(part), -1) for part in gradients.parts], 1)
         table[: len(flat), :9] = flat
         return returned(self, gradients)
@@ -164,8 +164,8 @@ def _keys(ids, camera_ids):
     [
         (None, 2),
         (Sizes(10**4, 10**4, 10**5, 10), 1),
-        (Sizes(10**4, 1000, 10**5, 10), 2),  # too few for one rank's, enough for the others'
-        (Sizes(10**4, 10**4, 3000, 10), 2),  # enough for one rank's lists, too few for the others'
+        (Sizes(10**4, 1000, 10**5, 10), 2),  # too small for the splats of one rank, sufficient for the others
+        (Sizes(10**4, 10**4, 3000, 10), 2),  # sufficient for the lists of one rank, too small for the others
         (Sizes(1, 1, 1), 2),
     ],
 )
@@ -192,7 +192,7 @@ def test_all_ranks_repeat_a_frame_that_did_not_fit(sizes, frames, backward_follo
             for _ in range(2):
                 gradients = pipeline.backward_splats(frame, weights)
                 found = sum_of_ranks(gradients, len(frame.projected.depths))
-                ranks.memory.barrier()  # or the next pass would write while others read
+                ranks.memory.barrier()  # otherwise the next pass could write while other ranks read
         ids = part["id"][frame.projected.gaussian_ids.long()]
         return _keys(ids, frame.projected.camera_ids), found, transport.capacity.sizes
 

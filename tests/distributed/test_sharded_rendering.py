@@ -25,12 +25,12 @@ from tests.training.tiny import look_at_origin, random_gaussians
 WIDTH, HEIGHT, EXTENT = 150, 90, 0.3
 LOSS = LossConfig(opacity=0.1, size=0.1)
 OPTIONS = RenderOptions(sh_degree=0, near_plane=0.05, far_plane=100.0, background=(0.1, 0.2, 0.3))
-# Owner of row i: shards of every shape, among them an empty one and 3 : 1.
+# Return the owner of each row: shards of several sizes, an empty one and 3 : 1 among them.
 LAYOUTS = {1: [0], 2: [0, 0, 0, 1], 3: [0, 2, 2], 4: [0, 3, 1, 0, 0, 3]}
 
 
 def cameras(n_views, blind=False, device="cpu"):
-    """Views around the scene; with `blind` the first looks away from it."""
+    """Return views around the scene; with `blind` the first one does not see it."""
     poses = [
         look_at_origin(np.array([3 * np.cos(a), 3 * np.sin(a), 1.5])) for a in np.linspace(0, 5, n_views)
     ]
@@ -59,7 +59,7 @@ def photographs(n_views):
 
 
 def uneven(world_size, n_views):
-    """Borders in the middle of a tile row, ranks without tiles, a rank with more than a view."""
+    """Return borders in the middle of a tile row, ranks without tiles, a rank with more than a view."""
     total = TileRanges((0,), n_views, WIDTH, HEIGHT).tiles_per_view * n_views
     bounds = (0, *[0, 34, 34][: world_size - 1], total)
     return TileRanges(bounds, n_views, WIDTH, HEIGHT, halo=LOSS_HALO)
@@ -93,7 +93,7 @@ def _render(ranks):
             tile_work = tile_work[slice(*assignment.tiles)]
         targets, masks, samples = photographs(n_views)
         if ranges is not None:
-            for view in range(n_views):  # pixels that this rank was never given
+            for view in range(n_views):  # this rank did not get these pixels
                 y0, y1 = ranges.pixel_rows(ranks.rank, view)
                 targets[view, :y0], targets[view, y1:] = 77, 77
         on_device = [tensor.to(ranks.device) for tensor in (targets, masks, samples)]
@@ -142,7 +142,7 @@ def test_images_are_the_same_bits_and_losses_agree(alone, world_size, device, tr
     if device == "cpu" and transport == "auto":
         pytest.skip("ranks on CPUs share no memory")
     ids, expected = alone(device)
-    assert expected[0]["image"].std() > 0.1  # there is something to see
+    assert expected[0]["image"].std() > 0.1  # the image is not empty
     assert torch.equal(expected[1]["image"][0], torch.tensor([0.1, 0.2, 0.3]).expand(HEIGHT, WIDTH, 3))
     answers = run_ranks(_render, world_size, device=device, transport=transport)
     rank_ids = torch.cat([a[0] for a in answers])

@@ -72,7 +72,7 @@ def _both_ways(ranks):
         table = _table(count, ranks)
         transport = PeerTransport(ranks)
         written, needed = _exchange(table, ranks, transport)
-        for isects in (needed.isects, needed.isects // 2):  # for lists: enough, too little
+        for isects in (needed.isects, needed.isects // 2):  # capacities of lists: sufficient, too small
             given = needed._replace(splats=min(needed.splats, 1000), isects=max(isects, 1))
             transport, before = PeerTransport(ranks, CapacityEstimate(given)), memory.generation
             again, _ = _exchange(table, ranks, transport)
@@ -118,14 +118,15 @@ def _gradients(ranks):
                 kept = torch.full_like(frame.projected.means2d, torch.nan)
             optimiser.step(copy, frame, splats[-1], None, None, None, 1, kept, absolute)
             moments.append(copy.exp_avgs)
-            # From zeros again; what the first pass left in the tables is read before.
+            # The second pass starts from zeros; the gradients of the first one are read before.
             gradients.append(parameter_gradients(table, frame, v_renders))
             frames.append(frame)
         assert splats[0].places is None and splats[1].means2d is None
         found = sum_of_ranks(splats[1], len(frames[1].projected.means2d))
         for x, y in zip(gradient_columns(found), splats[0].parts[:4], strict=True):
             assert torch.equal(x, y)
-        for pair in (gradients, moments):  # the first moments of a first step are the gradients, but a factor
+        # After one step, the first moments are the gradients times a factor.
+        for pair in (gradients, moments):
             for x, y in zip(*pair, strict=True):
                 atol = 2e-6 * float(x.abs().max()) if x.numel() else 0.0
                 torch.testing.assert_close(x, y, rtol=1e-5, atol=atol)
@@ -141,7 +142,7 @@ def test_returned_gradients_equal_the_tables(world_size, device):
 
 
 def _hidden(ranks):
-    """Ranks composite what one rank would when the colours of some splats are not finite."""
+    """Ranks composite the same image as one rank if the colours of some splats are not finite."""
     whole = random_gaussians(2000)
     whole["scales"].add_(1)
     whole["sh"][::5] = torch.nan
@@ -172,7 +173,7 @@ def _overtaken(ranks):
     table, (views, assignment) = _table(300, ranks), _assignment(ranks, 2)
     transport = PeerTransport(ranks)
     frame = pipeline.forward(table, views, OPTIONS, assignment=assignment, transport=transport)
-    pipeline.forward(table, views, OPTIONS, assignment=assignment)  # another transport, the same memory
+    pipeline.forward(table, views, OPTIONS, assignment=assignment)  # another transport with the same memory
     with pytest.raises(RuntimeError, match="a later exchange has overwritten"):
         pipeline.backward_splats(frame, torch.ones_like(frame.renders))
     return True
@@ -262,7 +263,7 @@ def test_boards_alternate_between_two_halves_and_grow(alone, monkeypatch):
         (board,) = memory.boards(words)
         assert len(board) == words and board[0] == begin
         memory.side_barrier()
-    memory.barrier()  # counts by itself
+    memory.barrier()  # these barriers are counted separately
     assert [number for number, *_ in queued] == [1, 2, 3, 4, 5, 6, 7, 1]
 
 

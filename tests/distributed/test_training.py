@@ -90,13 +90,13 @@ def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
     assert len(events) == 4 and sum(e["cloned"] + e["split"] for e in events) > 50
     for got, want in zip(events, expected_events, strict=True):
         assert all(got[name] == want[name] for name in ("t", "cloned", "split", "pruned", "gaussians"))
-    assert events[-1]["held_back"] > 0  # the cap chose among all ranks' candidates
+    assert events[-1]["held_back"] > 0  # the limit chose among the candidates of all ranks
     assert any(e.get("redistributed") for e in events)
     got, want = sorted_table(folder), sorted_table(whole)
     for name in ("id", "parent", "birth", "level", "last_step", "moment_step"):
         assert torch.equal(got[name], want[name]), name
-    # On CUDA sums are rounded in any order, and Adam takes a whole step for a gradient that is nothing
-    # else: two trainings on one GPU that differ in nothing are 2e-4 to 3e-3 apart after 30 steps.
+    # On CUDA sums are added in no particular order, and Adam takes a whole step for a gradient that is only a
+    # rounding error: two equal trainings on one GPU differ by 2e-4 to 3e-3 after 30 steps.
     limit = 1e-4 if device == "cuda" else 1e-5
     for name in ("means", "quats", "scales", "opacities", "sh"):
         assert (got[name] - want[name]).norm() <= limit * want[name].norm(), name
@@ -219,7 +219,7 @@ def test_a_held_out_photograph_lost_on_several_ranks_is_named_by_all_and_costs_n
 
 
 def _stop_in_an_evaluation(ranks, folder):
-    """Ask rank 1 to stop when it has compared its first view of many; count what each compares."""
+    """Ask rank 1 to stop when it compares its first view; return the views that each rank compares."""
     capture, images = tiny_scene()
     capture.test = capture.train * 6
     trainer = Trainer(tiny_config(*SETTINGS, "schedule.evaluate_every=22"), capture, images, folder, ranks)

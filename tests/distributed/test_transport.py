@@ -169,7 +169,7 @@ def test_half_precision_is_close():
 
 @pytest.fixture
 def alone(monkeypatch):
-    """One rank that writes to its own memory, without a GPU: the op that sends is played by another."""
+    """One rank that writes to its own memory, without a GPU: a function replaces the op that sends."""
 
     def send(columns, masks, everyone, rank, buffers, capacity):
         n_splats = int(everyone[0, 1])

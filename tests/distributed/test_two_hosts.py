@@ -60,7 +60,7 @@ def test_a_host_is_lost_and_both_resume(tmp_path):
     arguments += [f"--{text}" for text in SETTINGS]
     hosts = []
     try:
-        # The first to start serves the meeting point; it is the second that is lost.
+        # The first agent serves the rendezvous, so the second one is killed.
         port = free_port()
         with open(tmp_path / "first", "wb") as first, open(tmp_path / "second", "wb") as second:
             hosts = [start_host(port, arguments, first)]

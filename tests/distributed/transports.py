@@ -63,7 +63,7 @@ class LoneMemory:
     """A `SharedMemory` of a single rank, on any device, for tests of transports that need one."""
 
     def __init__(self, words: int) -> None:
-        """Begin with a buffer of so many words."""
+        """Begin with a buffer of this number of words."""
         self.buffers = [torch.full((words,), -1, dtype=torch.int32)]
         self.generation = 0
 

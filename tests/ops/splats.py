@@ -116,7 +116,7 @@ def near_a_cut(splats, width, height, margin=1e-5):
 
 
 def with_capacity(column, capacity):
-    """Return a column of `capacity` splats that begins with these; the rest would spoil any result."""
+    """Return a column of `capacity` splats that begins with these; the others would change any result."""
     garbage = float("nan") if column.is_floating_point() else torch.iinfo(column.dtype).max - 3
     padded = column.new_full((capacity, *column.shape[1:]), garbage)
     padded[: len(column)] = column

@@ -10,11 +10,11 @@ def test_an_estimate_follows_the_largest_recent_sizes():
     estimate = CapacityEstimate()
     assert estimate.sizes is None
     estimate.learn((800, 1600, 0))
-    assert estimate.sizes == (900, 1800, 1, 1)  # some more, and never nothing
+    assert estimate.sizes == (900, 1800, 1, 1)  # some more than needed, and at least one
     estimate.learn((80, 3200, 16))
     assert estimate.sizes == (900 - 900 // 256, 3600, 18, 1)
     assert estimate.sizes.holds((897, 3600, 18)) and not estimate.sizes.holds((898,))
-    for _ in range(3000):  # forgotten slowly
+    for _ in range(3000):  # the estimate shrinks slowly
         estimate.learn((80, 80, 16))
     assert estimate.sizes.splats < 400
 

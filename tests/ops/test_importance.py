@@ -73,7 +73,8 @@ def test_parts_add_up_and_repeat(backend):
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_contributions_equal_the_definition(backend, mode):
-    scene = random_scene(70, 10, seed=5, scale=0.15).to(backend[1], backend[0])  # more views than go at once
+    # These are more views than one call takes.
+    scene = random_scene(70, 10, seed=5, scale=0.15).to(backend[1], backend[0])
     scene.means[:25] *= 4  # beyond the borders and in front of the near plane, in some views
     arguments = (
         scene.means, scene.quats, scene.scales, scene.opacities, scene.viewmats, scene.Ks, scene.width,
@@ -88,7 +89,7 @@ def test_contributions_equal_the_definition(backend, mode):
     weights, pixels, visible = weights.cpu(), pixels.cpu(), visible.cpu()
     assert weights.dtype == torch.float64 and pixels.dtype == torch.int64 and visible.dtype == torch.bool
     exact = backend[1] == torch.float64
-    # Where a pixel lies on a cut, rounding decides, and what is behind may change with it.
+    # At a pixel on a cut, rounding decides, and the splats behind may change, too.
     allowed = 0 if exact else 3 * expected.undecided + 3
     assert ((pixels - expected.pixels).abs() <= allowed).all()
     decided = expected.undecided == 0

@@ -136,7 +136,7 @@ def test_a_partition_of_the_tiles_adds_up_to_the_whole(device, tile_size):
             ((index >= begin) & (index < end)).repeat_interleave(tile_size, 1).repeat_interleave(tile_size, 2)
         )
         owned = owned[:, :75, :61]
-        # A rank knows its own tiles and a ring of 10 pixels around them; the rest must not matter.
+        # A rank has pixels of its own tiles and a ring of 10 pixels around them; the loss reads no others.
         known = F.max_pool2d(owned[:, None].float(), 21, 1, 10)[:, 0, :, :, None] > 0
         known_x = torch.where(known, x, torch.full_like(x, 7.0))
         part = sums_and_gradient(

@@ -152,7 +152,7 @@ def test_gradient_is_zero_where_alpha_is_clipped():
 
 
 def test_thousands_of_layers_stay_accurate():
-    """2300 faint layers cover every pixel, about as many as it takes to use up the transmittance."""
+    """2300 faint layers cover every pixel, about as many as end a pixel."""
     splats = random_splats(2300, WIDTH, HEIGHT, smallest=300, largest=900, opacity=(0.0041, 0.0044))
     splats.means2d = (splats.means2d / 10 + 20).float()
     v_renders = torch.rand(1, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
@@ -353,7 +353,7 @@ def test_a_gradient_buffer_gives_its_zeros_once():
     means2d, zeros = torch.ones(5, 2), torch.zeros(5, 12)
     gradients = GradientBuffer(zeros)
     assert gradients.take(means2d) is zeros
-    for others in (gradients, GradientBuffer(torch.zeros(0, 12))):  # taken, or never written
+    for others in (gradients, GradientBuffer(torch.zeros(0, 12))):  # taken by a tile, or not written
         taken = others.take(means2d)
         assert taken is not zeros and taken.shape == (5, 12) and not taken.any()
     assert GradientBuffer(torch.zeros(0, 12)).take(means2d[:0]).shape == (0, 12)
@@ -407,7 +407,7 @@ def test_the_images_do_not_depend_on_a_backward_pass_to_follow():
     )
     for x, y in zip(plain[:4], prepared[:4], strict=True):
         assert torch.equal(x, y)
-    assert plain[6].shape == prepared[6].shape == (0, 12)  # on the CPU nothing is left packed
+    assert plain[6].shape == prepared[6].shape == (0, 12)  # the CPU returns no packed splats
 
 
 @pytest.mark.parametrize("absgrad", [False, True])

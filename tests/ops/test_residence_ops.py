@@ -25,7 +25,7 @@ def test_blocks_that_no_view_sees_have_no_active_rows(device, seed):
     seen = seen_blocks(index.bounds, viewmats, Ks, sizes_of(4, device), NEAR, FAR)
     ids, views = index.active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR).listed()
     assert (views & ~seen[ids.long() // BLOCK_ROWS] == 0).all()
-    # Little more is seen than what has active rows.
+    # Few blocks are seen that have no active rows.
     used = torch.unique(ids.long() // BLOCK_ROWS)
     assert len(used) <= (seen != 0).sum() <= 1.3 * len(used) + 10
     assert (seen == 0).any()

@@ -81,7 +81,7 @@ def test_no_scale_falls_below_the_floor_in_a_run(tmp_path, batch_size):
     assert (floors > -80).any() and summary["psnr"] > 15
     assert (table["scales"][seen["ids"]] >= floors[seen["ids"], None]).all()
     assert (table["scales"] == floors[:, None]).any(dim=1).sum() > 3
-    # Children have the floor of their parents until it is found anew.
+    # Children have the floor of their parents until floors are computed again.
     born = table["birth"] > 20
     assert born.any() and (floors[born] > -80).any()
     assert GaussianTable(table.columns)[FLOOR] is floors

@@ -1,3 +1,3 @@
 # SPDX-License-Identifier: Apache-2.0
-# pycolmap brings a libpng and a zlib of its own that cv2 would call if pycolmap were imported first.
+# pycolmap has its own libpng and zlib; cv2 would call these if pycolmap were imported first.
 import cv2  # noqa: F401

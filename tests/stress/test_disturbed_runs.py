@@ -23,7 +23,7 @@ from tests.training.tiny_runs import steps_of
 
 TRIALS = int(os.environ.get("BLITZGS_TRIALS", "20"))
 INTERVAL = 0.5
-# A step, a save and the scheduling of a loaded machine.
+# Time for a step, for a save and for the scheduling of a busy machine.
 SLACK = 1.0
 SETTINGS = (
     *OVERRIDES,
@@ -82,7 +82,7 @@ def finish(data, out):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A capture, the table of an undisturbed run, and how long that takes after its first checkpoint."""
+    """Return a capture, the table of an undisturbed run, and its seconds after the first checkpoint."""
     data, out = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("whole") / "run"
     write_tiny_capture(data)
     process = start(data, out)
@@ -110,7 +110,7 @@ def hang_up(process, data, out):
 
 
 def fill_disk(process, data, out):
-    """For two seconds every file may be no longer than it takes to fail anything but an empty one."""
+    """For two seconds, no file may get longer than 16 bytes, so every write fails."""
     soft, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (16, hard))
     process.join(2.0)
@@ -126,7 +126,7 @@ def take_photographs_away(process, data, out):
     (data / "images").rename(aside)
     try:
         process.join(60)
-        # Where the last batches were loaded already, the evaluation is the first to miss them.
+        # If the last batches were loaded before, the evaluation is the first to read a lost photograph.
         assert process.exitcode == 1
     finally:
         aside.rename(data / "images")

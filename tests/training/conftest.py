@@ -8,7 +8,7 @@ from tests.training.tiny import OVERRIDES, write_tiny_capture
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    """Tests of this folder take one thread: they compare bits, and their models are tiny."""
+    """Use one thread in the tests of this folder, which compare bits and have tiny models."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

@@ -64,7 +64,7 @@ def test_t1_comes_when_demand_has_fallen():
     assert place(signals([0.2, 0.2, 0.15, 0.15, 0.15]), CONFIG, late - 1) is None
     where, reason = place(signals([0.2] * 5), CONFIG, late + 3)
     assert (where, reason) == (late, "the latest that schedule.adaptive_limit allows")
-    assert place(signals(falling[-3:]), CONFIG, early) is None  # too little is known
+    assert place(signals(falling[-3:]), CONFIG, early) is None  # there are too few measurements
     assert place(signals(), replace(CONFIG, t1=0), 0.0) == (0, "there is none")
 
 
@@ -78,10 +78,10 @@ def test_densification_ends_with_demand_or_when_the_loss_settles():
         found = place(signals(wanted, epochs_of_50(rate, 950)), config, now)
         assert (found is not None) == settled
         assert not settled or "until 950, over 1 epochs each" in found[1]
-    # What came before T1 says nothing about what came after.
+    # Measurements before T1 are not used for the times after it.
     assert place(signals(wanted, epochs_of_50(0, 750)), config, now) is None
     assert place(signals(wanted, epochs_of_50(0, 800)), config, now) is not None
-    # Short epochs are put together to spans of a sixtieth of the schedule.
+    # Short epochs are joined to spans of a sixtieth of the schedule.
     short = [(end, 0.1) for end in range(20, 801, 20)]
     assert "over 3 epochs each" in place(signals(wanted, [*short, (820, 0.1)]), config, now)[1]
     assert place(signals(wanted, short), config, now) is None
@@ -181,7 +181,7 @@ def test_a_fixed_run_with_the_places_is_the_same(whole_run, tmp_path):
 
 @pytest.mark.parametrize("last", [32, 41, 57, 90])
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
-    """Stopped at a look, within an epoch, and after places."""
+    """The run stops when it reads its signals, within an epoch, and after placed times."""
     _, whole, _ = whole_run
     stop_at(monkeypatch, last)
     assert train(tmp_path)[1] is None

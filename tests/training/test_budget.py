@@ -32,7 +32,7 @@ BUDGET = ("schedule.minutes=0.04", "schedule.densify_until=50")
 
 
 class Simulation:
-    """Stands for a run whose images take as long as a function of the time in the configuration says."""
+    """Simulates a run: a function of the time in the configuration gives the seconds per image."""
 
     def __init__(self, minutes, cost, **schedule):
         self.config = Config(schedule=ScheduleConfig(minutes=minutes, **schedule))
@@ -82,7 +82,7 @@ def test_a_run_that_slows_down_ends_on_time(minutes, batch_size, factor):
 
 
 def test_the_shape_of_the_schedule_stays():
-    """Where images take three times as long in the end, both halves get about as many of them."""
+    """If images take three times as long at the end, both halves get about the same number of images."""
     simulation = Simulation(5.0, growing(0.004, 3.0))
     simulation.train()
     half = simulation.schedule.pace.image(15_000) / simulation.schedule.iterations
@@ -105,7 +105,7 @@ def test_a_short_budget_is_used_and_an_impossible_one_ends_soon():
     simulation = Simulation(1.0, lambda time, step: 3.0)
     seconds, _ = simulation.train()
     assert seconds == pytest.approx(60.0, abs=6.0)
-    # Less than it takes to see how fast the run is: the schedule is over soon after.
+    # The budget ends before the run has measured its speed, so the schedule ends soon after.
     impossible = Simulation(0.01, lambda time, step: 3.0)
     impossible.train()
     assert impossible.progress.step <= 24
@@ -158,7 +158,7 @@ def timed_run(tmp_path_factory):
 
 def test_training_ends_on_time_and_says_what_it_chose(timed_run):
     folder, trainer, summary = timed_run
-    assert summary["gaussians"] > 450  # it has slowed down
+    assert summary["gaussians"] > 450  # the run has slowed down
     assert summary["seconds"] == pytest.approx(SECONDS, rel=0.05)
     assert summary["budget_seconds"] == pytest.approx(SECONDS)
     assert summary["scale"] == summary["images"] / 100
@@ -189,7 +189,7 @@ def test_a_run_resumes_before_and_after_it_has_chosen_its_pace(tmp_path, stop):
         warnings.simplefilter("error")
         assert run.open_model(tmp_path, Ranks()).config.schedule.pace == before
     second = start(tmp_path, resume=True)
-    # What the checkpoint was trained with counts, whatever the command says.
+    # The time that the checkpoint was trained counts, also if the command changes the budget.
     assert second.state.config.schedule.pace == before
     taken = second.state.optimiser.lr_table[: stop + 1]
     assert torch.equal(taken, first.state.optimiser.lr_table[: stop + 1])

@@ -16,7 +16,7 @@ from tests.helpers import needs_cuda
 from tests.training.tiny import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 STATISTICS = ("grad_sum", "grad_count", "max_radii")
-# Nothing grows or is reset within the steps of a test; statistics gather.
+# No event changes the Gaussians within the steps of a test; statistics are gathered.
 QUIET = (
     "schedule.iterations=200",
     "schedule.densify_from=150",
@@ -73,7 +73,7 @@ def of_one_view(trainer: Trainer, index: int, sh_degree: int) -> tuple[torch.Ten
     norms, seen, radii = torch.zeros(count).double(), torch.zeros(count).bool(), torch.zeros(count).double()
     norms[splats.ids] = (gradient * torch.tensor([WIDTH / 2, HEIGHT / 2])).norm(dim=1)
     a, b, c = splats.conics.detach().unbind(dim=1)
-    # A Gaussian counts where the box around alpha >= 1/255 overlaps the image.
+    # A Gaussian counts if the box around alpha >= 1/255 overlaps the image.
     sigmas = (2 * (255 * splats.opacities.detach()).clamp(min=1).log()).sqrt()
     spread = torch.stack([c, a], dim=1) / (a * c - b * b)[:, None]
     half, size = sigmas[:, None] * spread.sqrt(), torch.tensor([WIDTH, HEIGHT])
@@ -100,7 +100,7 @@ def test_statistics_are_those_of_autograd(tmp_path, batch_size):
         before = {name: table[name].clone() for name in table}
         take_steps(trainer, 1)
         after = {name: table[name].clone() for name in table}
-        for name in table:  # as the step saw it
+        for name in table:  # the values that the step read
             table[name].copy_(before[name])
         trainer.state.optimiser.catch_up(table, None, step)
         degree = trainer.state.schedule.sh_degree(step * batch_size, 3)
@@ -116,7 +116,7 @@ def test_statistics_are_those_of_autograd(tmp_path, batch_size):
     assert counts.max() == steps * batch_size and counts.min() < counts.max()
     assert torch.equal(table["grad_count"], counts)
     error = (table["grad_sum"] - sums).abs() / sums.mean()
-    # Where rounding decides whether a splat covers a pixel, the few splats of that pixel feel it.
+    # If rounding decides whether a splat covers a pixel, the gradients of that pixel's few splats differ.
     assert error.median() < 1e-6 and error.quantile(0.9) < 2e-5 and error.max() < 0.02
     excess = table["max_radii"] - radii  # rounded up to whole pixels
     assert excess.min() > -1e-3 and excess.max() < 1 + 1e-3
@@ -189,11 +189,11 @@ def test_cuda_sums_the_same_absolute_gradients(tmp_path):
 
 @pytest.mark.parametrize("batch_size", [2, 4, 8])
 def test_statistics_do_not_depend_on_the_batch_size(tmp_path, batch_size):
-    """The gradients of a view's own loss, added up: METHOD, section 3. With the Gaussians standing still."""
+    """The gradients of each view's own loss are added up. The Gaussians do not move."""
     tables = {}
     for size in (1, batch_size):
         trainer = make_trainer(tmp_path / str(size), f"schedule.batch_size={size}", *STILL)
-        # Two epochs in which every view has its turn, at degrees that do not depend on the step's length.
+        # Two epochs over all views, with SH degrees that do not depend on the batch size.
         trainer.state.schedule.sh_degree = lambda begin, limit: limit
         take_steps(trainer, 16 // size)
         tables[size] = trainer.state.table

@@ -52,7 +52,7 @@ def test_the_corrected_psnr_forgives_an_affine_change_of_colour_and_nothing_else
     turned = clean @ torch.tensor([[0.8, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.1, 0.7]]).T + 0.04
     target = (turned * 255).round().byte()
     metrics = image_metrics(clean, target, None)
-    # What is left is the photograph's rounding to 256 values: a twelfth of a step squared.
+    # Only the photograph's rounding to 256 values remains: a twelfth of a squared step.
     assert metrics["psnr"] < 30 and metrics["psnr_corrected"] == pytest.approx(
         -10 * math.log10(1 / 255**2 / 12), abs=0.3
     )
@@ -64,7 +64,7 @@ def test_the_corrected_psnr_forgives_an_affine_change_of_colour_and_nothing_else
     known = torch.cat([pixels, torch.ones(500, 1, dtype=torch.float64)], dim=1)
     expected = known @ torch.linalg.lstsq(known, wanted).solution
     torch.testing.assert_close(correct_colours(pixels, wanted), expected.clamp(0, 1))
-    # One colour everywhere: any map to the mean colour is the best.
+    # The image has one colour, so any map to the mean colour is the best one.
     flat = correct_colours(torch.full((500, 3), 0.25, dtype=torch.float64), wanted)
     torch.testing.assert_close(flat, wanted.mean(0).expand(500, 3))
 

@@ -75,7 +75,7 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay"), "--rate", "0.5"]) == 0
     arms = {row["arm"]: row for row in json.loads((tmp_path / "replay" / "replay.json").read_text())}
     assert list(arms) == ["reference", "oracle", "oracle_rate", "gate", "random"]
-    # Training repeats: the reference is the run itself.
+    # Training repeats bit for bit, so the reference is the run itself.
     summary = json.loads((folder / "run" / "summary.json").read_text())
     assert arms["reference"]["psnr"] == summary["psnr"]
     assert arms["reference"]["final"] == summary["gaussians"]
@@ -85,7 +85,7 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
         assert arms[name]["peak"] < arms["reference"]["peak"]
     table = (tmp_path / "replay" / "replay.md").read_text()
     assert table.count("\n") == 7 and table in capsys.readouterr().out
-    # The first gated event is that of the reference, so the oracle knows each candidate there.
+    # The first gated event is the same as in the reference, so the oracle knows each of its candidates.
     assert [r["t"] for r in events_of(tmp_path / "replay" / "oracle", "densify")] == [60, 80]
     assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
     assert "already holds a replay: choose another --out" in capsys.readouterr().err.replace("\n", " ")
@@ -104,7 +104,7 @@ def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys):
     assert read.initial_survival == run.initial_survival
     assert main([*flags, str(part), "--rows", str(len(run.survived) // 2)]) == 0
     drawn = set(read_sample(part).parents.tolist())
-    # Whole families, about as many as wanted.
+    # The sample has whole families, about as many as requested.
     assert len(read_sample(part).parents) == np.isin(run.parents, list(drawn)).sum()
     assert 0.35 < len(read_sample(part).parents) / len(run.parents) < 0.65
     # A feature that the log does not have is unknown.

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training of 100 steps on the CPU must go as it did when golden.json was written.
+"""A training of 100 steps on the CPU must follow the curves in golden.json.
 
-A change that is meant to alter training writes the file anew, from the repository's root:
+After an intended change of training, write the file again, from the repository's root:
 
     python -m tests.training.test_golden
 
-golden.json holds the whole configuration, so that other defaults do not move the run; a field that is new
-since then has its default. Rounding differs between processors and grows from step to step: the command
-also prints how far apart runs end whose first parameters differ by 1e-7 to 1e-5, which is half of the
-tolerances at most. What a small change does, `test_the_tolerance_tells_a_small_change` shows.
+golden.json has the whole configuration, so changed defaults do not change the run; fields that were added
+later have their defaults. Rounding differs between processors, and its effect grows from step to step. The
+command therefore also prints the differences between runs whose first parameters differ by 1e-7 to 1e-5;
+they are at most half of the tolerances. `test_the_tolerance_tells_a_small_change` shows that a small change
+exceeds the tolerances.
 """
 
 from __future__ import annotations
@@ -50,13 +51,13 @@ OVERRIDES = (
     "log.every=10",
     "log.pictures=0",
 )
-# Until the first density event a run follows its start smoothly. From then on rounding decides, now and
-# again, whether a Gaussian near a threshold grows.
+# Up to the first density event, small differences stay small. After it, rounding occasionally decides
+# whether a Gaussian near a threshold grows.
 SMOOTH_UNTIL = 80  # images
 SMOOTH, ROUGH = (0.0015, 0.012), (0.02, 0.2)  # loss, relative; PSNR, dB
 COUNT_TOLERANCE = 0.02  # relative
 DENSIFIED_TOLERANCE = (0.1, 5)  # of all Gaussians cloned, split and pruned: relative, and in number
-# Events that change the Gaussians; others only tell of them.
+# Events that change the Gaussians.
 CHANGES = ("densify", "reset_opacities")
 Curves = dict[str, Any]
 
@@ -97,7 +98,7 @@ def train(config: dict[str, Any], folder: Path, jitter: float = 0.0) -> Curves:
 
 
 def differences(found: Curves, golden: Curves) -> list[str]:
-    """Return what lies outside the tolerances, in words."""
+    """Describe all values that exceed the tolerances."""
     if found["images"] != golden["images"]:
         return [f"logged after {found['images']} images, not {golden['images']}"]
     wrong = []
@@ -152,7 +153,7 @@ def test_the_tolerance_tells_a_small_change(golden, tmp_path, section, field, fa
 
 
 def spread(found: Curves, other: Curves) -> str:
-    """Return how far apart two runs are at most, before and after the first density event."""
+    """Return the largest differences of two runs before and after the first density event."""
     loss = [abs(a / b - 1) for a, b in zip(found["loss"], other["loss"], strict=True)]
     psnr = [abs(a - b) for a, b in zip(found["psnr"], other["psnr"], strict=True)]
     smooth = sum(images <= SMOOTH_UNTIL for images in found["images"])
@@ -161,7 +162,7 @@ def spread(found: Curves, other: Curves) -> str:
 
 
 def write(path: Path) -> None:
-    """Write the golden file, and print how far rounding carries the run."""
+    """Write golden.json, and print the differences that rounding causes."""
     config = to_dict(tiny_config(*OVERRIDES))
     with tempfile.TemporaryDirectory() as folder:
         curves = train(config, Path(folder) / "golden")

@@ -11,7 +11,7 @@ from tests.training.tiny import tiny_config, tiny_scene
 
 
 class Broken:
-    """A frame's device says CUDA, so that the guard looks a step late, as it does there."""
+    """A frame that names CUDA as its device, so that the guard reads sums a step later, as on CUDA."""
 
     def __init__(self, frame, device="cpu"):
         self._frame, self._device = frame, device
@@ -79,7 +79,7 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
         NonFiniteError, match="projected Gaussians and images are finite: it comes from op photom"
     ):
         LossGuard().check(9, ("a", "b"), bad, table, rendered)
-    # A step late, it does not claim to have seen what is gone.
+    # A step later, the message does not name data that no longer exist.
     guard, late = LossGuard(), Broken(rendered, "cuda")
     guard.check(9, ("a", "b"), bad, table, late)
     with pytest.raises(NonFiniteError) as failure:

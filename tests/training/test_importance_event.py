@@ -57,7 +57,7 @@ def test_how_many_gaussians_the_importance_passes_keep(whole_run):
     table = trainer.state.table
     assert summary["gaussians"] == len(table) == second["gaussians"]
     assert table[PHI].shape == (len(table),)
-    assert CULL not in table  # which no view asks for: a bit for each Gaussian and view, 0.5 GB and more
+    assert CULL not in table  # no view uses the mask, which has a bit for each Gaussian and view
     assert ((table[PHI] >= 0) & (table[PHI] < 1)).all()
     assert trainer.state.progress.milestones == {
         "initial": 400,
@@ -91,13 +91,13 @@ def test_the_population_is_reported(whole_run):
     # The start, density events at 20, 40, 60 and 80, before and after each pass, and the end.
     assert len(points) == 1 + 4 + 4 + 1
     assert points == sorted(points, key=lambda point: point[0])
-    # Upwards is smaller; the first pass drops from 40's peak, at one time.
+    # Smaller y is higher in the chart. The first pass makes the population fall at one time, from 40's peak.
     (x1, top), (x2, low) = points[3:5]
     assert x1 == x2 and low > top
 
 
 def test_resume_is_exact_and_carries_the_columns(whole_run, tmp_path, monkeypatch):
-    """Stopped between the passes, when children have inherited phi."""
+    """The run stops between the passes, when children have inherited phi."""
     _, whole, _ = whole_run
     stop_at(monkeypatch, 50)
     first, summary = train(tmp_path)
@@ -134,18 +134,18 @@ def test_phi_weighs_the_gradients_from_the_first_pass_on(tmp_path):
         trainer, _ = train(tmp_path / phi, *flags)
         sums[phi] = trainer.state.table
     weighed, plain = sums["true"], sums["false"]
-    assert torch.equal(weighed["id"], plain["id"])  # density control at 40 came before
+    assert torch.equal(weighed["id"], plain["id"])  # the density event at 40 came before the pass
     assert torch.allclose(weighed["grad_sum"], plain["grad_sum"] * plain[PHI], rtol=1e-5)
     assert torch.equal(weighed["means"], plain["means"]) and torch.equal(weighed[PHI], plain[PHI])
     assert plain["grad_sum"].max() > 0 and plain[PHI].std() > 0.01
 
 
-# Checkpoints before the first pass, too.
+# There are checkpoints before the first pass, too.
 EARLY = ("schedule.checkpoint_every=30", "log.keep_checkpoints=9")
 
 
 def _passes_from(ranks, folder):
-    """Both passes on a model that is dealt to the ranks; ids and what they have."""
+    """Make both passes on a model that is divided among the ranks; return ids and their columns."""
     config = tiny_config(*PASSES, *EARLY, "view.cull=true")
     trainer = Trainer(config, *tiny_scene(), folder, ranks, resume=True)
     state, out = trainer.state, []
@@ -155,7 +155,7 @@ def _passes_from(ranks, folder):
             table = state.table
             out.append([table[name].cpu() for name in ("id", PHI, CULL, "means")])
             sizes = [int(n) for n in ranks.all_gather(torch.tensor([len(table)], device=ranks.device))]
-            assert max(sizes) - min(sizes) <= 1  # dealt anew
+            assert max(sizes) - min(sizes) <= 1  # redistributed
     trainer.close()
     return out, state.progress.milestones
 
@@ -196,7 +196,7 @@ def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
 
 
 def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
-    """Fitted on the lineage of one run, used in another; both of its warnings are due."""
+    """A gate that is fitted on the lineage of one run is used in another run, which prints both warnings."""
     pytest.importorskip("pyarrow")
     pytest.importorskip("xgboost")
     train(tmp_path / "lineage", "population.lineage=true", "population.grad_threshold=1e-4")
@@ -217,7 +217,7 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
         grown = events[t]["cloned"] + events[t]["split"]
         assert grown > 10 and grown <= events[t]["vetoed"] <= grown + 2
         assert events[t]["held_back"] == 0
-    # The gate decides the result: a run goes on with the files that it began with.
+    # The gate decides the result, so a run continues only with the gate's files that it began with.
     for file in (path, info_path(path)):
         content = file.read_text()
         file.write_text(content + " ")
@@ -228,7 +228,7 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
 
 
 def test_a_schedule_that_a_gate_was_not_fitted_for_is_named():
-    """Fields that decide how long Gaussians live, of all sections, and what only a run finds out."""
+    """The fields of all sections that decide how long Gaussians live, and values that only a run knows."""
     capture, _ = tiny_scene()
 
     def gate_of(fitted):
@@ -240,7 +240,7 @@ def test_a_schedule_that_a_gate_was_not_fitted_for_is_named():
         name, _, value = change.partition("=")
         (text,) = reasons_against(gate_of(life_fields(tiny_config(change))), here, capture)
         assert f"{name} ({value}" in text.lower() and "here" in text
-    # What is newer than the gate had no effect when it was fitted: the default.
+    # A field that is newer than the gate has its default, because it had no effect when the gate was fitted.
     older = {name: value for name, value in life_fields(here).items() if name != "optimiser.position_noise"}
     assert reasons_against(gate_of(older), here, capture) == []
     (text,) = reasons_against(gate_of(older), tiny_config("optimiser.position_noise=5"), capture)
@@ -250,7 +250,7 @@ def test_a_schedule_that_a_gate_was_not_fitted_for_is_named():
 
 
 def test_lineage_says_at_what_pace_its_run_went(tmp_path):
-    """`schedule.minutes` changes the pace on the way, and survival follows the pace."""
+    """`schedule.minutes` changes the pace during the run, and survival depends on the pace."""
     pytest.importorskip("pyarrow")
     trainer, _ = train(tmp_path, "population.lineage=true", "schedule.minutes=0.02")
     pace = [[image, factor] for image, factor in trainer.state.config.schedule.pace]
@@ -297,7 +297,7 @@ def stop_in_the_sweep_of(monkeypatch, time):
 
 @pytest.mark.parametrize("time, left", [(40, ["pass_1"]), (80, ["pass_2", "checkpoint"])])
 def test_a_pass_that_a_signal_cuts_short_happens_after_the_resume(tmp_path, monkeypatch, time, left):
-    """It does not hold up the stop, and the run is bit for bit the one that was never stopped."""
+    """The pass does not delay the stop, and the resumed run has the bits of the uninterrupted one."""
     options = ("schedule.checkpoint_every=80", "population.lineage=true", "view.cull=true")
     whole, _ = train(tmp_path / "whole", *options)
     stop_in_the_sweep_of(monkeypatch, time)
@@ -305,7 +305,7 @@ def test_a_pass_that_a_signal_cuts_short_happens_after_the_resume(tmp_path, monk
     assert summary is None and cut.state.progress.step == time + 1
     assert [event[2] for event in cut.state.progress.events_left] == left
     assert (PHI in cut.state.table) == (time > 40)
-    # Stopped in the same place once more.
+    # The run stops at the same place once more.
     again, summary = train(tmp_path / "cut", *options, resume=True)
     assert summary is None and again.state.progress == cut.state.progress
     monkeypatch.undo()

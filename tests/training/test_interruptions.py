@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(autouse=True)
 def signals_as_in_a_terminal():
-    # What started the tests may have ignored signals, as nohup and a shell's background jobs do.
+    # The tests may have been started with ignored signals, as by nohup or as a shell's background job.
     numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
     before = [
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
@@ -58,7 +58,7 @@ def test_what_is_not_finite_is_not_saved(tmp_path, monkeypatch, column):
     def spoil(self):
         self.state.table[column][7] = float("nan")
 
-    # The checkpoint at 39 images follows step 40; nothing else looks at the table between.
+    # The checkpoint at 39 images follows step 40; nothing reads the table in between.
     at_step(monkeypatch, 40, spoil)
     running = trainer(tmp_path, "schedule.checkpoint_every=13", "log.every=1000")
     message = rf"step 40: rank 0: column '{column}' is not finite in 1 Gaussians \(ids \d+\).*earlier ones"
@@ -159,7 +159,7 @@ def _agreements_within(ranks, seconds, most):
     return _agreements(ranks, seconds)
 
 
-# Photographs, disks and terminals that go away.
+# Photographs, disks and terminals that disappear.
 
 
 def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
@@ -204,7 +204,7 @@ def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
 
 
 def fail_saves(monkeypatch, count, also=lambda: None):
-    """Let the next `count` checkpoints meet a full disk."""
+    """Let the next `count` checkpoints fail as on a full disk."""
     left = [count]
     real = checkpoint.write_shard
 
@@ -225,7 +225,7 @@ def test_a_full_disk_in_the_middle_is_survived(tmp_path, monkeypatch, capsys):
     assert summary is not None
     shown = capsys.readouterr().out.replace("\n", " ")
     assert "was not saved" in shown and "Training goes on" in shown
-    assert len(checkpoints(tmp_path)) >= 2  # tried again at the next step, and the last one
+    assert len(checkpoints(tmp_path)) >= 2  # the run tried again at the next step, and wrote the last one
 
 
 def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
@@ -264,7 +264,7 @@ def test_a_lineage_that_cannot_be_written_waits_as_well(tmp_path, monkeypatch):
 
 
 def test_a_log_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch):
-    """A disk full for a while: records wait in memory, and TensorBoard gets another writer."""
+    """While a disk is full, records are kept in memory; afterwards TensorBoard gets another writer."""
 
     class FullBoard:
         def __init__(self, folder, purge_step=None):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """In very many steps of a trainer, the lazy optimiser stays with dense Adam and memory does not grow.
 
-torch's Adam goes along with the trainer, in float64: it is given the gradients of every step, zeros for the
-rows that the step does not show, and moves all rows. The trainer leaves most rows alone for a hundred steps
-and more between their views.
+The test runs torch's Adam beside the trainer, in float64. Adam gets the gradients of every step, with zeros
+for the rows that no view of the step sees, and moves all rows. The trainer does not touch most rows for a
+hundred steps and more between their views.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from tests.helpers import needs_cuda
 from tests.training.tiny import Camera, Capture, Images, tiny_config
 
 WIDTH, HEIGHT = 32, 24
-ACROSS, SPACING = 16, 2.0  # cameras in a row and a column, and how far apart
+ACROSS, SPACING = 16, 2.0  # number of cameras in a row and in a column, and the distance between neighbours
 COUNT = 2400
-# What a parameter may be off by after T steps. Each rounds it to float32, by 2^-24 of its size at most, and
-# the errors walk at random: 2^-24 sqrt(T) times the size. The largest of 50,000 normal numbers is 4.4 times
-# their deviation; the rest of the factor is for gradients and moments, which are rounded, too.
+# The largest allowed error of a parameter after T steps. Each step rounds it to float32, by at most 2^-24 of
+# its size, and the errors make a random walk: 2^-24 sqrt(T) times the size. The largest of 50,000 normal
+# numbers is 4.4 times their deviation; the rest of the factor is for the rounding of gradients and moments.
 WALK, LARGEST = 2.0**-24, 8
-# Bytes that the host and the GPU may need more at the end than at a fifth of the run.
+# Largest growth of the memory of host and GPU, in bytes, from a fifth of the run to its end.
 MOST_GROWTH = 8_000_000, 1_000_000
 
 
 def carpet(count, seed):
-    """Gaussians beneath all cameras, turned every way, no two axes alike."""
+    """Return Gaussians below all cameras, with random rotations and three different axes each."""
     g = torch.Generator().manual_seed(seed)
     size = torch.tensor([ACROSS * SPACING, ACROSS * SPACING, 0.5])
     return {
@@ -49,7 +49,7 @@ def carpet(count, seed):
 
 
 def carpet_capture(device):
-    """A grid of cameras that look down, each on a hundredth of a carpet."""
+    """Return a grid of cameras that look down, each on a hundredth of the Gaussians."""
     K, cameras = np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), []
     for i in range(ACROSS**2):
         pose = np.eye(4)
@@ -82,16 +82,16 @@ class DenseAdam:
     def __init__(self, table, optimiser):
         self.params = flat(table.parameters)
         self.widths = [p[0].numel() for p in table.parameters]
-        # Rates differ between columns: Adam moves `move` from zero at a rate of one.
+        # Learning rates differ between columns, so Adam moves `move` from zero with a rate of one.
         self.move = torch.zeros_like(self.params, requires_grad=True)
         self.move.grad = torch.zeros_like(self.params)
-        # One image a step: Adam's own constants.
+        # With one image per step, the trainer uses Adam's constants without scaling.
         self.adam = torch.optim.Adam([self.move], 1.0, (0.9, 0.999), 1e-15, fused=True)
         groups = torch.tensor([3, 4, 3, 1, 3, 45], device=table.device)  # the colours have two rates
         self.rates = optimiser.lr_table.double().repeat_interleave(groups, 1)
 
     def step(self, table, frame, gradients, scale_reg, step):
-        """Take a step with the gradients that the trainer's optimiser is about to be given."""
+        """Take a step with the gradients that the trainer's optimiser gets next."""
         splats, options = frame.projected, frame.options.projection(frame.views)
         *v, _ = torch.ops.blitzgs.project_bwd(
             list(table.parameters), [frame.views.viewmats, frame.views.Ks, scale_reg],
@@ -121,7 +121,8 @@ def start_trainer(folder, device, steps):
     )  # fmt: skip
     trainer = Trainer(config, capture, images, folder, Ranks(device=torch.device(device)))
     table, unit = trainer.state.table, trainer.state.space.unit
-    # The octree's Gaussians are round: their quaternions' gradients are rounding alone, which Adam magnifies.
+    # The octree's Gaussians are round, so gradients of quaternions would be rounding errors, which Adam
+    # magnifies.
     for name, values in carpet(len(table), 2).items():
         values = values / unit if name == "means" else values
         table[name].copy_(values - np.log(unit) if name == "scales" else values)
@@ -144,7 +145,7 @@ def test_a_long_run_stays_with_dense_adam_and_needs_no_more_memory(tmp_path, dev
     dense, start, lazy_step = DenseAdam(table, optimiser), flat(table.parameters), optimiser.step
 
     def both(table, frame, gradients, scale_reg, opacity_reg, size_reg, step, *others):
-        assert opacity_reg is None and size_reg is None  # the twin has no terms for them
+        assert opacity_reg is None and size_reg is None  # `DenseAdam` has no such terms
         dense.step(table, frame, gradients, scale_reg, step)
         lazy_step(table, frame, gradients, scale_reg, opacity_reg, size_reg, step, *others)
 

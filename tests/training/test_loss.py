@@ -54,7 +54,7 @@ def test_regularisers_are_means_over_the_visible_gaussians_of_a_view(device):
 
 
 def test_the_logged_loss_has_all_terms(tmp_path):
-    """In the first step all Gaussians are round and of one opacity, so that the terms are known."""
+    """In the first step all Gaussians are round and have the same opacity, so the terms are known."""
     first, fixed = {}, ("log.every=1", "schedule.iterations=8", "model.initial_opacity=0.25", "loss.scale=0")
     for override in ("loss.opacity=0", "loss.opacity=2", "loss.size=3", "loss.scale=5"):
         Trainer(tiny_config(*fixed, override), *tiny_scene(), tmp_path / override, Ranks()).train()

@@ -34,7 +34,7 @@ def test_times_and_images_are_those_of_a_walk_image_by_image(scale):
 
 
 def phases_of(schedule, begin):
-    """All that a schedule says of the step that begins with an image, besides events and rates."""
+    """Return all properties of the step that begins with an image, except for events and rates."""
     return (
         schedule.sh_degree(begin, 3),
         schedule.finest_level(begin, 9, 0.2, 1.5),
@@ -46,7 +46,7 @@ def phases_of(schedule, begin):
 
 
 def test_a_change_of_pace_does_not_change_past_events():
-    """A run that changes its pace at random has the events and the rates of the schedule it ends with."""
+    """A run that changes its pace at random has the events and rates of its last schedule."""
     chance = random.Random(3)
     for batch_size in (1, 4):
         config = ScheduleConfig(
@@ -85,7 +85,7 @@ def test_a_change_of_pace_does_not_change_past_events():
         assert len(set(phases)) > 10
         kinds = [event.kind for event in happened]
         assert kinds.count("pass_1") == kinds.count("pass_2") == 1
-        # Two events on one image are one; all others are there.
+        # Two events at one image become one; no other event is lost.
         wanted = {math.floor(schedule.pace.image(time) + 1e-6) for time in range(50, 1_500, 40)}
         assert [event.time for event in happened if event.kind == "densify"] == sorted(wanted)
 
@@ -128,7 +128,7 @@ def test_pending_steps_are_the_same_after_a_change_of_pace(factor):
         root = (second / (1 - config.beta2**step)).sqrt() + config.eps
         means[rows] -= (rates[step, 0] * corrected / root)[rows]
     optimiser = LazyAdam(config, Schedule(before), 3.0, "cpu")
-    # Some rows are caught up in between, the others not.
+    # Some rows are caught up in between, the others are not.
     optimiser.catch_up(table, torch.arange(0, 200, 3, dtype=torch.int32), changed_at - 5)
     optimiser.follow(Schedule(after))
     optimiser.catch_up(table, None, end)
@@ -145,7 +145,7 @@ def test_every_phase_begins_at_its_own_time(pace):
     plain = Schedule(replace(config, pace=()))
     for time in range(10, 4_000, 10):
         image = schedule.pace.image(time)
-        # Clear of the rounding at the very image.
+        # Avoid the image at which rounding decides.
         for shift in (-2, 2):
             assert (
                 phases_of(schedule, round(image) + shift)[1:]
@@ -179,7 +179,7 @@ def test_impossible_paces_and_budgets_are_refused(overrides, message):
 
 
 def test_every_piece_of_the_final_drift_has_its_own_step_numbers():
-    """A change within a batch's images would leave a step in two pieces: it falls between two steps."""
+    """A change of pace cannot happen within a step's images, so it happens between two steps."""
     schedule = Schedule(ScheduleConfig(iterations=100, batch_size=4, pace=((8, 0.5),)))
     assert schedule.iterations == 56  # 8 + 92 / 2 = 54, in steps of 4
     for begin, end in itertools.pairwise(range(0, 60, 4)):

@@ -27,7 +27,7 @@ from tests.training.tiny import OVERRIDES, tiny_config, tiny_scene
 
 @pytest.fixture
 def copy(trained, tmp_path):
-    """The same, to be changed."""
+    """A copy of the run that a test may change."""
     shutil.copytree(trained[0], tmp_path / "data")
     shutil.copytree(trained[1], tmp_path / "run")
     return tmp_path / "data", tmp_path / "run"
@@ -86,7 +86,7 @@ def test_render_and_export_need_no_photographs(copy, tmp_path):
 def test_a_lost_photograph_costs_its_view_alone(copy, capsys):
     data, folder = copy
     whole = json.loads((folder / "evaluation" / "000040" / "metrics.json").read_text())
-    for name in ("01.png", "05.png"):  # of training views: the split and the world stay as they were
+    for name in ("01.png", "05.png"):  # photographs of training views are lost; split and world do not change
         (data / "images" / name).unlink()
     flags = ["--data", str(data)]
     assert main(["eval", str(folder), *flags]) == 1
@@ -171,7 +171,7 @@ def test_georeferenced_models_are_exported_around_their_origin(trained, tmp_path
     torch.testing.assert_close(found.means, model.means * model.space.unit)
     sidecar = json.loads((tmp_path / "far.ply.offset.json").read_text())
     assert sidecar["file"] == "far.ply" and sidecar["offset"] == [5e5, 4.6e6, 120.0]
-    # Asked for, the coordinates are written as they are, and the loss is known.
+    # On request, coordinates are written unchanged, and a warning states the loss of precision.
     rounded = export_ply(far, tmp_path / "rounded.ply", "capture")
     assert rounded.offset is None and rounded.rounding == 0.25
     error = (read_ply(tmp_path / "rounded.ply").means.double()[:, 1] - 4.6e6).float() - found.means[:, 1]
@@ -221,7 +221,7 @@ def test_export_replaces_regular_files_only(trained, tmp_path, capsys, kind):
     assert kind == "device" or (tmp_path / "target").read_text() == "precious"
 
 
-# Paths with any characters.
+# Paths may have any characters.
 
 
 @pytest.mark.parametrize(

@@ -34,10 +34,10 @@ def table_of(unseen: int, device: str) -> GaussianTable:
 
 
 def peak_bytes(run, device: str) -> int:
-    """How much more memory than before is asked for at a time while `run()` runs."""
+    """Return the largest number of bytes requested at one time while `run()` runs, beyond those before it."""
     if device == "cuda":
-        # Not what is handed out (`max_memory_allocated`): for more than 1 MiB, torch hands out a free block
-        # whole where less than 1 MiB of it would be left, and which blocks are free depends on the table.
+        # Requested bytes, and not allocated ones (`max_memory_allocated`): for more than 1 MiB, torch uses a
+        # free block whole if less than 1 MiB of it would remain, and the free blocks depend on the table.
         torch.cuda.synchronize()
         before = torch.cuda.memory_stats()["requested_bytes.all.current"]
         torch.cuda.reset_peak_memory_stats()
@@ -67,7 +67,7 @@ def scratch_of_a_step(unseen: int, device: str) -> int:
         stepper.backward(number, frame, terms, keep_means2d=True)
         sums.read()
 
-    for number in range(1, 6):  # capacities are learnt, and every row is behind
+    for number in range(1, 6):  # capacities are estimated, and every row is behind
         step(number)
     return peak_bytes(lambda: step(6), device)
 
@@ -75,5 +75,5 @@ def scratch_of_a_step(unseen: int, device: str) -> int:
 @pytest.mark.parametrize("device", DEVICES)
 def test_scratch_of_a_step_does_not_grow_with_what_is_not_seen(device):
     few, many = scratch_of_a_step(40_000, device), scratch_of_a_step(16 * 40_000, device)
-    assert few > 8 * SEEN  # it was seen, and measured
+    assert few > 8 * SEEN  # the step saw Gaussians, and its memory was measured
     assert many <= 1.01 * few, f"{(many - few) / (15 * 40_000):.3f} bytes for each row that no view sees"

@@ -57,7 +57,7 @@ def test_what_a_run_leaves_behind(whole_run):
 
 
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
-    """50 steps, SIGTERM, resume, 50 more: bit for bit the run that was never stopped."""
+    """50 steps, SIGTERM, resume and 50 more steps give the bits of the uninterrupted run."""
     _, whole, _ = whole_run
     stop_at(monkeypatch, 50)
     first, summary = train(tmp_path)

@@ -48,7 +48,7 @@ def train(folder, *overrides, resume=False):
 
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
-    """A run, and of each of its steps what the views had left: (step, gate, views by row, table then)."""
+    """Train; return the run and, for each step, (step, gate, views of each row, copy of the table)."""
     folder, steps = tmp_path_factory.mktemp("run"), {}
     forward = Stepper.forward
 
@@ -69,7 +69,7 @@ def test_gate_and_mask_apply_in_the_scheduled_phases(whole_run):
     dropped = {"lod": 0, "cull": 0}
     active, compared = {record["t"]: record["active"] for record in steps_of(folder)}, 0
     for step, (gate, rows, (index,), table) in steps.items():
-        t = step - 1  # of one image each
+        t = step - 1  # steps of one image each
         has_lod, has_mask = t >= 60, 40 < t <= 85
         if gate is None:
             assert not has_mask and (not has_lod or "0" in progress.gated_views)
@@ -118,7 +118,7 @@ def test_what_the_run_says_and_saves(whole_run):
 
 
 def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
-    """While the mask is in use."""
+    """The following holds while the mask is used."""
     stop_at(monkeypatch, 80)
     trainer, _ = train(tmp_path)
     state = trainer.state
@@ -140,7 +140,7 @@ def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("last", [50, 65, 80])
 def test_resume_is_exact(whole_run, tmp_path, monkeypatch, last):
-    """Stopped with the mask alone, with the gate and the mask of the first pass, and of the second."""
+    """The run stops with the mask alone, with gate and first mask, and with gate and second mask."""
     _, whole, _, _ = whole_run
     stop_at(monkeypatch, last)
     assert train(tmp_path)[1] is None
@@ -219,7 +219,7 @@ def test_masks_stay_with_their_views_when_a_photograph_is_lost(tmp_path, monkeyp
 
 
 def test_a_photograph_that_is_lost_does_not_change_how_long_a_run_is(tmp_path, monkeypatch):
-    """Even where the number of training views made it longer, and the same configuration is given again."""
+    """This also holds if the number of views made the run longer and the configuration is unchanged."""
     longer = ("schedule.images_per_view=20",)
     stop_at(monkeypatch, 75)
     before, _ = train(tmp_path, *longer)
@@ -243,7 +243,7 @@ def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypat
     trainer, _ = train(tmp_path / "whole", "view.smooth=true")
     state = trainer.state
     assert_same_table(resumed.state.table, state.table)
-    assert set(state.progress.gated_views) == {"1"}  # whatever they keep
+    assert set(state.progress.gated_views) == {"1"}  # for any share that the views keep
     scene = scene_gate(state.config, state.progress, state.table, Ranks())
     view, camera = state.views.pick([3]), state.capture.cameras[3]
     weights = scene.gate.weights(state.table["means"], state.table["level"], centres_of(view.viewmats)[0])

@@ -115,11 +115,11 @@ def random_gaussians(count: int = COUNT) -> GaussianTable:
 def photographed(
     truth: GaussianTable, cameras: list[Camera], test: int, extent: float
 ) -> tuple[Capture, Images]:
-    """A capture of Gaussians: what the cameras see of them, and their centres as points.
+    """Return a capture of Gaussians: renders from the cameras, and the centres as points.
 
     Args:
         truth: the Gaussians.
-        cameras: of the views.
+        cameras: cameras of the views.
         test: the view that is held out.
         extent: radius of the cameras' positions.
     """

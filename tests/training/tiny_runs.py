@@ -27,7 +27,7 @@ def train(
 
 
 def at_step(monkeypatch, number: int, action: Callable[[Trainer], object]) -> None:
-    """Have `action(trainer)` happen after step `number`."""
+    """Call `action(trainer)` after step `number`."""
     step = Trainer.step
 
     def changed(self, taken):

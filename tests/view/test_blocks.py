@@ -49,7 +49,7 @@ def make_views(count=4, device="cpu", seed=1):
 
 
 def seen(table, viewmats, Ks):
-    """(row, view) pairs that projection emits when it looks at every row."""
+    """Return the (row, view) pairs of the splats that projection makes of all rows."""
     rows = project(
         *(table[name] for name in PARAMETERS), viewmats, Ks, WIDTH, HEIGHT, near_plane=NEAR, far_plane=FAR
     )  # fmt: skip
@@ -181,7 +181,7 @@ def test_the_active_set_is_used_with_its_count_on_the_device(device, n, ahead):
         table[name].fill_(1e-3)
     table["last_step"].copy_(torch.arange(n) % 40)
     viewmats, Ks = make_views(device=device)
-    if not ahead:  # all looks away
+    if not ahead:  # no view sees the scene
         viewmats[:] = torch.eye(4, device=device)
         viewmats[:, 2, 3] = -1e5
     active = BlockIndex(table).active(table, viewmats, Ks, WIDTH, HEIGHT, NEAR, FAR)
@@ -214,17 +214,17 @@ def test_too_small_a_capacity_gives_empty_lists_and_the_needed_number_of_blocks(
             assert int(active.length) == 0
         else:
             assert all(torch.equal(a, b) for a, b in zip(active.listed(), exact.listed(), strict=True))
-        active.views[: needed // 2] = 0  # as gates do
+        active.views[: needed // 2] = 0  # as gates clear them
         assert int(active.considered()) == int((active.listed()[1] != 0).sum())
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_active_set_covers_thousands_of_pending_steps(device):
-    """Only what the set names is caught up and stepped; dense Adam decides what is really visible."""
+    """Only rows of the set are caught up and stepped; dense Adam decides which rows are visible."""
     steps, beta1, beta2, eps = 2000, 0.9, 0.999, 1e-15
     table = make_table(500, device)
     rates = torch.full((steps + 1, 6), 1e-3, device=device)
-    rates[:, 0] = 0.05  # means travel far
+    rates[:, 0] = 0.05  # means move far
     rates[:, 2] = 0.02
     schedule = schedule_table(rates, beta1, beta2)
     index = BlockIndex(table, schedule)
@@ -244,13 +244,14 @@ def test_the_active_set_covers_thousands_of_pending_steps(device):
             expected = {row for row, _ in seen(dense, viewmats, Ks)}
             assert expected <= set(ids.tolist())
             crossed += len({row for row, _ in seen(table, viewmats, Ks)} ^ expected)
-        ids = ids[torch.rand(len(ids), generator=generator).to(device) < 0.5]  # the rest turns out invisible
+        # The other rows are not visible.
+        ids = ids[torch.rand(len(ids), generator=generator).to(device) < 0.5]
         grads = [torch.randn((len(ids), *p.shape[1:]), generator=generator).to(device) for p in columns[0]]
         lazy_adam_step_(
             *columns, grads, ids, table["last_step"], table["moment_step"], rates, step, beta1, beta2, eps
         )
         index.update(table, ids)
-    assert crossed > 0  # pending drift really moved rows across the views' borders
+    assert crossed > 0  # pending steps moved rows across the borders of views
     assert int(table["last_step"].min()) < steps - 20
 
 
@@ -328,7 +329,7 @@ def test_opcheck(device):
     rows = [table["means"], table["scales"], *moments, table["last_step"], table["moment_step"], schedule]
     torch.library.opcheck(torch.ops.blitzgs.morton_keys, (table["means"],))
     torch.library.opcheck(torch.ops.blitzgs.update_block_bounds_, (bounds, None, rows))
-    # The rest of its lists is whatever was there, and opcheck's traced comparison looks at it.
+    # The lists are undefined past their length, and opcheck's traced comparison reads all of them.
     utilities = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(
         torch.ops.blitzgs.cull_blocks,

@@ -146,10 +146,11 @@ def test_images_are_those_of_the_gaussians_that_are_kept_with_blocks_and_without
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("smooth", [False, True])
 def test_training_behind_the_gate_is_dense_adams(device, smooth):
-    """Rows that wait behind the gate owe steps; a twin that pays every row at every step ends alike.
+    """Rows that the gate leaves out have pending steps; a training that applies all steps at once ends alike.
 
-    Adam turns a gradient of rounding size into a whole step, so two trainings that differ by rounding alone
-    come apart. A third one measures how far: dense as the twin, its means start a rounding error away.
+    Adam turns a gradient of rounding size into a whole step, so two trainings that differ only by rounding
+    diverge. A third training measures how far: it too applies all steps at once, but its means differ by a
+    rounding error at the start.
     """
     steps, tables = 120, []
     overrides = ("schedule.iterations=200", "optimiser.position=2e-3", "optimiser.position_final=1e-3")
@@ -161,7 +162,7 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
     samples = torch.full((2,), 3.0 * targets[0, ..., 0].numel(), device=device)
     K = torch.tensor([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]], device=device).repeat(2, 1, 1)
     trainings = []
-    for pays_at_once, nudge in ((False, 1.0), (True, 1.0), (True, 1.0 + 2.0**-22)):
+    for applies_at_once, nudge in ((False, 1.0), (True, 1.0), (True, 1.0 + 2.0**-22)):
         small = random_gaussians(300)
         small["means"] *= nudge
         sets = []
@@ -172,20 +173,20 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
         lod = LodGate(4.0, 2.0, 3, 2, smooth)
         gate = ViewGate(lod.reach(), 0b11)
         for step in range(1, steps + 1):
-            if pays_at_once:
+            if applies_at_once:
                 optimiser.catch_up(table, None, step - 1)
             viewmats = torch.eye(4).repeat(2, 1, 1)
             viewmats[:, 2, 3] = torch.tensor([2.0, 2.5]) + 0.8 * math.sin(step)
             views = Views(viewmats.to(device), K, WIDTH // 2, HEIGHT // 2)
             batch = Batch([0, 1], views, targets.to(device), None, samples, None)
-            # Sums in any order would drive two trainings apart by themselves.
+            # Sums in another order would make two trainings diverge.
             options = RenderOptions(0, 0.05, 100.0, deterministic=True, fade=lod.fade())
             frame, terms, _ = stepper.forward(step, options, batch, gate=gate)
             stepper.backward(step, frame, terms)
-            rows = frame.projected
-            pairs = zip(rows.gaussian_ids.tolist(), rows.camera_ids.tolist(), strict=True)
+            splats = frame.projected
+            pairs = zip(splats.gaussian_ids.tolist(), splats.camera_ids.tolist(), strict=True)
             sets.append(set(pairs))
-        assert int((table["moment_step"] < steps - 3).sum()) > 10  # these owe steps
+        assert int((table["moment_step"] < steps - 3).sum()) > 10  # these have pending steps
         optimiser.catch_up(table, None, steps)
         tables.append(table)
         trainings.append(sets)
@@ -210,7 +211,7 @@ def test_the_gated_active_set_covers_pending_steps(device):
     steps, beta1, beta2, eps = 400, 0.9, 0.999, 1e-15
     table = make_scene(1500, device)
     rates = torch.full((steps + 1, 6), 1e-3, device=device)
-    rates[:, 0] = 0.2  # means travel far
+    rates[:, 0] = 0.2  # means move far
     index = BlockIndex(table, schedule_table(rates, beta1, beta2))
     gate = ViewGate(GATE.reach(), 0b01, (3, 40))
     columns = [[table[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)]
@@ -243,13 +244,13 @@ def test_the_gated_active_set_covers_pending_steps(device):
             *columns, grads, ids, table["last_step"], table["moment_step"], rates, step, beta1, beta2, eps
         )
         index.update(table, ids)
-    assert crossed > 10  # pending drift carries rows over the borders of the gate
+    assert crossed > 10  # pending steps move rows across the borders of the gate
     assert listed < 0.5 * without
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_blocks_that_a_mask_leaves_out_are_dropped_unread(device):
-    """And blocks of which it leaves nothing out are taken whole, as without a mask."""
+    """Blocks from which the mask leaves nothing out are taken whole, as without a mask."""
     table = make_scene(30_000 + 100, device)
     viewmats, Ks = make_views(1, device)
     size, blocks = (WIDTH, HEIGHT, NEAR, FAR), -(-len(table) // 256)
@@ -273,7 +274,7 @@ def test_blocks_that_a_mask_leaves_out_are_dropped_unread(device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("columns", [(), COLUMNS])
 def test_the_gated_set_does_not_depend_on_the_order_of_the_rows(device, columns):
-    """And where no step is pending, it is what the exact test leaves of the set without a gate."""
+    """Without pending steps, the set is the part of the ungated set that the exact test keeps."""
     table = make_scene(60_000, device)
     viewmats, Ks = make_views(device=device)
     gate, sets, exact = ViewGate(GATE.reach(), 0b1011, columns), [], []

@@ -114,7 +114,7 @@ def test_the_blocks_that_are_needed_last_go_first():
     here = set((residence.rows_of(slots) // BLOCK_ROWS).tolist()) & set(range(78))  # the full blocks
     assert seen[1] | seen[2] <= here
     gone = seen[0] - here
-    # What went is not needed sooner than what stayed without being needed now.
+    # Blocks that were replaced are not needed sooner than idle blocks that stayed.
     next_use = {b: min((v for v in range(1, 8) if b in seen[v]), default=99) for b in range(78)}
     idle = here - seen[1] - seen[2]
     assert gone
@@ -240,7 +240,7 @@ def test_a_host_without_room_is_named(monkeypatch, tmp_path):
 
 
 class FakeRuntime:
-    """Stands for the CUDA runtime: knows which memory is pinned; it has to be there at every call."""
+    """Replaces the CUDA runtime: records which memory is pinned, and checks that it is mapped."""
 
     def __init__(self):
         self.pinned, self.calls = {}, 0
@@ -264,7 +264,7 @@ def is_mapped(address):
 
 
 def test_memory_is_unpinned_before_it_goes(monkeypatch):
-    gc.collect()  # tables of other tests are unpinned by the real runtime
+    gc.collect()  # the real runtime unpins the tables of other tests
     runtime, unraisable = FakeRuntime(), []
     monkeypatch.setattr(torch.cuda, "cudart", lambda: runtime)
     monkeypatch.setattr(sys, "unraisablehook", unraisable.append)
@@ -273,7 +273,7 @@ def test_memory_is_unpinned_before_it_goes(monkeypatch):
     columns = len(table.columns)
     assert runtime.calls == len(runtime.pinned) == columns
     kept = table.columns["sh"][5:9]
-    table.append({name: table[name].clone() for name in table})  # more than the memory holds
+    table.append({name: table[name].clone() for name in table})  # more rows than the memory has room for
     assert runtime.calls == 2 * columns and len(runtime.pinned) == columns + 1
     del kept
     assert len(runtime.pinned) == columns
@@ -295,7 +295,7 @@ def test_blocks_that_views_leave_out_are_not_seen():
     rows = torch.randint(-(2**31), 2**31 - 1, (blocks * BLOCK_ROWS, 3), generator=generator).int()
     shown = torch.rand(blocks, 96, generator=generator) < 0.5
     bits = (rows[:, :, None] >> torch.arange(32) & 1).bool().view(blocks, BLOCK_ROWS, 96) | ~shown[:, None]
-    # By block and column, as the kernels have it.
+    # In the layout of the kernels: by block and column.
     words = bits.view(blocks, 8, 32, 96).long() << torch.arange(32)[:, None]
     sectors = words.sum(2).mT.contiguous()
     culled = culled_blocks(torch.where(sectors < 1 << 31, sectors, sectors - (1 << 32)).int())

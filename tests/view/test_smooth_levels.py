@@ -23,9 +23,10 @@ FADED = replace(OPTIONS, fade=SMOOTH.fade())
 
 
 def weights_by_levels(distances, level, gate):
-    """From the level that a distance resolves: whole a quarter level before the cut, gone a quarter after."""
+    """Return the weight: 1 up to a quarter level before the cut, 0 from a quarter level after it."""
     resolved = (gate.reference_distance / distances).log() / math.log(gate.fork)
-    share = ((resolved - (level.double() - 0.75)) * 2).clamp(0, 1)  # 0 where it is gone, 1 where it is whole
+    # 0 where the Gaussian is gone, 1 where it is whole.
+    share = ((resolved - (level.double() - 0.75)) * 2).clamp(0, 1)
     # The squared distance, relative to that where it is whole, goes from 1 to f; the weight is linear in it.
     squared = gate.fork ** (1 - share)
     weight = (gate.fork - squared) / (gate.fork - 1)
@@ -85,7 +86,7 @@ def test_images_are_those_of_faded_opacities(device, antialiased):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_gate_before_the_projection_changes_nothing(device):
-    """All Gaussians that it leaves out have faded away."""
+    """All Gaussians that the gate leaves out have the weight 0."""
     table = faint_scene(6000, device)
     viewmats, Ks = make_views(device=device)
     views = Views(viewmats, Ks, WIDTH, HEIGHT)
