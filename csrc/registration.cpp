@@ -97,6 +97,14 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Writes a small tensor to pinned memory of the host, in stream order (CUDA).
   m.def("copy_to_host_(Tensor(a!) host, Tensor values) -> ()");
 
+  // Splats in the arrangement of `meta`: places are (order), or (images, gaussians) where the last two
+  // dimensions of `shape` are the views and the Gaussians. The last column has the values `under` where there
+  // is no splat, and the others have zeros.
+  m.def(
+      "arrange_splats(Tensor[] columns, Tensor[] places, int[] shape, Tensor? under=None) -> Tensor[] "
+      "arranged");
+  m.def("splats_of_arranged(Tensor[] arranged, Tensor[] places, int[] shape) -> Tensor[] columns");
+
   // Alpha compositing. composited: (transmittances, last_ids, packed_splats, tile_order) of the forward pass.
   m.def(
       "rasterize_fwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "

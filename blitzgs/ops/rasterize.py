@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs._library import without_autograd
+from blitzgs.ops.arrange_splats import Places
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import tile_counts
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
@@ -36,6 +37,18 @@ class RasterizeForward(NamedTuple):
     composited: list[Tensor]
 
 
+class Through(NamedTuple):
+    """Arranged geometry of splats through which the gradients of the splats pass.
+
+    Attributes:
+        places: the arrangement.
+        columns: means2d, conics and splat_opacities in it.
+    """
+
+    places: Places
+    columns: Sequence[Tensor]
+
+
 def rasterize(
     means2d: Tensor,
     conics: Tensor,
@@ -53,6 +66,7 @@ def rasterize(
     tile_end: int = -1,
     tell_absgrad: Callable[[Tensor], object] | None = None,
     composited: tuple[Tensor, ...] | None = None,
+    through: Through | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Composite the splats of each tile's list into images.
 
@@ -85,6 +99,8 @@ def rasterize(
             per axis, [P, 2], whichever gradients it computes.
         composited: the result of the op `rasterize_fwd` for these arguments, if it is already known; None:
             call the op.
+        through: the same means2d, conics and splat_opacities in an arrangement, which get the gradients in
+            their place; not under `torch.compile`.
 
     Returns:
         Renders [B, H, W, D] and alphas [B, H, W].
@@ -101,9 +117,13 @@ def rasterize(
         renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, grid, None, True, False, None)
         alphas = 1 - transmittances
     else:
+        geometry = splats[:3] if through is None else through.columns
+        places = None if through is None else through.places
+        differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in (*geometry, colors))
         # The inputs whose gradients stay packed, see `_gradients`.
-        packed = tell_absgrad is None and torch.is_grad_enabled() and any(x.requires_grad for x in splats[:4])
-        renders, alphas = _Rasterize.apply(*splats, grid, tell_absgrad, packed, composited)  # type: ignore[no-untyped-call]
+        packed = differentiable and tell_absgrad is None
+        call = _Call(splats, grid, tell_absgrad, places, packed, composited)
+        renders, alphas = _Rasterize.apply(*geometry, colors, backgrounds, call)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
         alphas = alphas * _owned_pixels(alphas, tile_size, tile_begin, tile_end)
     return renders, alphas
@@ -250,6 +270,17 @@ def _first_gradients(
     return (*v_splats, v_backgrounds, v_abs if absgrad else None)
 
 
+class _Call(NamedTuple):
+    """The arguments of `rasterize` that `_Rasterize` takes as one, because each argument takes host time."""
+
+    splats: tuple[Any, ...]  # the tensors that the op takes
+    grid: list[int]
+    tell_absgrad: Callable[[Tensor], object] | None
+    places: Places | None
+    backward_follows: bool
+    composited: tuple[Tensor, ...] | None
+
+
 class _Rasterize(torch.autograd.Function):
     """Renders and alphas for calls outside of `torch.compile`, with the gradient formula registered below.
 
@@ -258,11 +289,12 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *splats, grid, tell_absgrad, backward_follows, output = arguments
+        *_, call = arguments
+        output = call.composited
         if output is None:
-            output = rasterize_fwd(*splats, grid, None, True, backward_follows)
-        _save(ctx, splats, grid, output)
-        ctx.tell_absgrad = tell_absgrad
+            output = rasterize_fwd(*call.splats, call.grid, None, True, call.backward_follows)
+        _save(ctx, call.splats, call.grid, output)
+        ctx.tell_absgrad, ctx.places = call.tell_absgrad, call.places
         return output[0], _ONE - output[1]
 
     @staticmethod
@@ -272,7 +304,9 @@ class _Rasterize(torch.autograd.Function):
         *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, tell is not None, may_pack=True)
         if v_abs is not None:
             tell(v_abs.detach())
-        return (*splat_gradients, *(None,) * 6)
+        if ctx.places is not None and splat_gradients[0] is not None:
+            splat_gradients[:3] = ctx.places.arrange(splat_gradients[:3])
+        return (*splat_gradients, None)
 
 
 torch.library.register_autograd("blitzgs::rasterize_fwd", _backward, setup_context=_setup_context)

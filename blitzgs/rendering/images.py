@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions
-from blitzgs.ops.rasterize import rasterize
+from blitzgs.ops.rasterize import Through, rasterize
 from blitzgs.ops.render import Rendered, render_queued
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.finite import warn_of_non_finite
@@ -72,9 +72,15 @@ def render(
     splats = project_groups(groups, image.sparse_grad, None if ready is None else ready.splats)
     layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
     arranged = _arranged(layout, gaussians, project, image)
-    rendered = splats
+    rendered, through = splats, None
     if layout.places is not None:
-        rendered = splats._replace(**dict(zip(arranged, layout.gather(*arranged.values()), strict=True)))
+        if compiling or job is not None:
+            columns = layout.gather(*arranged.values())
+            rendered = splats._replace(**dict(zip(arranged, columns, strict=True)))
+        else:
+            through = Through(layout.places, [arranged[name] for name in ("means2d", "conics", "opacities")])
+            if image.render_mode != "RGB":
+                rendered = splats._replace(depths=layout.gather(arranged["depths"])[0])
     channels, lead = _channels(rendered, layout, gaussians, image.render_mode), gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
@@ -85,7 +91,7 @@ def render(
         composited_lists.splats, composited_lists.offsets, n_cameras=math.prod(lead), width=project.width,
         height=project.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
         tell_absgrad=_absgrad_teller(layout, arranged["means2d"]) if image.absgrad else None,
-        composited=None if ready is None else ready.composited,
+        composited=None if ready is None else ready.composited, through=through,
     )  # fmt: skip
     if not compiling:
         warn_of_non_finite(gaussians, layout, function)
@@ -131,11 +137,12 @@ def _arranged(
 ) -> dict[str, Tensor]:
     """Return the rendered columns of splats in the layout of `meta`."""
     splats = layout.splats
-    means2d, conics, opacities, depths = layout.arrange(
-        splats.means2d, splats.conics, splats.opacities, splats.depths
-    )
-    if not (image.packed or project.antialiased or image.sparse_grad):
-        opacities = layout.arrange_opacities(gaussians.opacities)
+    # As in gsplat, Gaussians without a splat have their own opacity.
+    over_all = not (image.packed or project.antialiased or image.sparse_grad)
+    means2d, conics, depths, opacities = layout.arrange(
+        splats.means2d, splats.conics, splats.depths, splats.opacities,
+        under=gaussians.opacities if over_all else None,
+    )  # fmt: skip
     return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
 
 

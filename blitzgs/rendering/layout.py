@@ -2,18 +2,18 @@
 """Arranges a call's splats for `meta`: one after the other, or as [..., C, N, ...] for all Gaussians.
 
 The ops order splats by Gaussian, then view; packed `meta` orders them by image, then Gaussian. As in gsplat,
-the image is rendered from the tensors in `meta`, so that these get gradients: splats are first arranged for
-`meta`, and the columns to render are gathered from there.
+the image depends on the tensors in `meta`, so that these get gradients. Its kernels nevertheless read the
+splats in the order in which they are, and only gradients pass through the arrangement.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from blitzgs.ops.arrange_splats import Places
 from blitzgs.ops.projection import ProjectedSplats
 
 
@@ -23,8 +23,7 @@ class Layout:
     Attributes:
         splats: the splats; camera_ids number all images of the call, gaussian_ids the Gaussians of a scene.
         packed: whether `meta` has only the visible splats, or else an entry for every Gaussian and view.
-        places: int64 [P], flat index of each splat in `meta`; None: the order is unchanged.
-        shape: leading dimensions in `meta`, before those of a splat's values.
+        places: where each splat is in `meta`; None: the order is unchanged.
     """
 
     def __init__(self, splats: ProjectedSplats, lead: tuple[int, ...], count: int, packed: bool) -> None:
@@ -39,15 +38,12 @@ class Layout:
         self.splats, self.packed = splats, packed
         self._images: Tensor | None = None
         self._gaussians: Tensor | None = None
-        self.places: Tensor | None = None
-        self.shape: tuple[int, ...] = tuple(splats.camera_ids.shape)
+        self.places: Places | None = None
         if not packed:
-            self.places = self.images * count + self.gaussians
-            self.shape = (*lead, count)
+            self.places = Places((splats.camera_ids, splats.gaussian_ids), (*lead, count))
         elif math.prod(lead) > 1:
-            order = torch.argsort(self.images, stable=True)
-            self.places = torch.empty_like(order)
-            self.places[order] = torch.arange(len(order), device=order.device)
+            order = torch.sort(splats.camera_ids, stable=True)[1]
+            self.places = Places((order,), tuple(order.shape))
 
     # Computed on first use. functools.cached_property takes a lock, which torch.compile cannot trace.
     @property
@@ -64,99 +60,10 @@ class Layout:
             self._gaussians = self.splats.gaussian_ids.long()
         return self._gaussians
 
-    def arrange(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """Arrange values of splats, [P, ...], as [*shape, ...]; entries without a splat are zero."""
-        if self.places is None:
-            return values
-        if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
-            return tuple(_arranged(self.places, self.shape, v) for v in values)
-        arranged: tuple[Tensor, ...] = _Arrange.apply(self.places, self.shape, *values)  # type: ignore[no-untyped-call]
-        return arranged
+    def arrange(self, *columns: Tensor, under: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Arrange columns of splats as `Places.arrange` does."""
+        return columns if self.places is None else self.places.arrange(columns, under)
 
     def gather(self, *arranged: Tensor) -> tuple[Tensor, ...]:
-        """Gather the values of splats, [P, ...], from [*shape, ...]; the inverse of `arrange`."""
-        if self.places is None:
-            return arranged
-        if torch.compiler.is_compiling():
-            return tuple(_gathered(self.places, self.shape, t) for t in arranged)
-        gathered: tuple[Tensor, ...] = _Gather.apply(self.places, self.shape, *arranged)  # type: ignore[no-untyped-call]
-        return gathered
-
-    def arrange_opacities(self, opacities: Tensor) -> Tensor:
-        """Arrange the splats' opacities as [..., C, N].
-
-        Entries without a splat have the given opacities, [..., N], as in gsplat.
-        """
-        assert self.places is not None  # the constructor computes them when all Gaussians are arranged
-        if torch.compiler.is_compiling():
-            return _arranged_over(self.places, self.shape, self.splats.opacities, opacities)
-        arranged: Tensor = _ArrangeOver.apply(self.places, self.shape, self.splats.opacities, opacities)  # type: ignore[no-untyped-call]
-        return arranged
-
-
-def _arranged(places: Tensor, shape: tuple[int, ...], values: Tensor) -> Tensor:
-    arranged = values.new_zeros(*shape, *values.shape[1:])
-    arranged.view(-1, *values.shape[1:]).index_copy_(0, places, values)
-    return arranged
-
-
-def _arranged_over(places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
-    arranged = under[..., None, :].expand(shape).clone(memory_format=torch.contiguous_format)
-    arranged.view(-1).index_copy_(0, places, values)
-    return arranged
-
-
-def _gathered(places: Tensor, shape: tuple[int, ...], arranged: Tensor) -> Tensor:
-    return arranged.reshape(-1, *arranged.shape[len(shape) :]).index_select(0, places)
-
-
-class _Arrange(torch.autograd.Function):
-    """`Layout.arrange`; no two splats have the same place, so the gradient is gathered from the places."""
-
-    @staticmethod
-    def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *values: Tensor) -> tuple[Tensor, ...]:
-        ctx.save_for_backward(places)
-        ctx.shape = shape
-        ctx.set_materialize_grads(False)
-        return tuple(_arranged(places, shape, v) for v in values)
-
-    @staticmethod
-    def backward(ctx: Any, *v_arranged: Tensor | None) -> Any:
-        (places,) = ctx.saved_tensors
-        return None, None, *(None if v is None else _gathered(places, ctx.shape, v) for v in v_arranged)
-
-
-class _ArrangeOver(torch.autograd.Function):
-    """`Layout.arrange_opacities`."""
-
-    @staticmethod
-    def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], values: Tensor, under: Tensor) -> Tensor:
-        ctx.save_for_backward(places)
-        ctx.shape = shape
-        return _arranged_over(places, shape, values, under)
-
-    @staticmethod
-    def backward(ctx: Any, v_arranged: Tensor) -> Any:
-        (places,) = ctx.saved_tensors
-        v_values, v_under = _gathered(places, ctx.shape, v_arranged), None
-        if ctx.needs_input_grad[3]:
-            covered = v_arranged.clone(memory_format=torch.contiguous_format)
-            covered.view(-1).index_fill_(0, places, 0)
-            v_under = covered.sum(dim=-2)
-        return None, None, v_values, v_under
-
-
-class _Gather(torch.autograd.Function):
-    """`Layout.gather`, the inverse of `_Arrange`."""
-
-    @staticmethod
-    def forward(ctx: Any, places: Tensor, shape: tuple[int, ...], *arranged: Tensor) -> tuple[Tensor, ...]:
-        ctx.save_for_backward(places)
-        ctx.shape = shape
-        ctx.set_materialize_grads(False)
-        return tuple(_gathered(places, shape, t) for t in arranged)
-
-    @staticmethod
-    def backward(ctx: Any, *v_gathered: Tensor | None) -> Any:
-        (places,) = ctx.saved_tensors
-        return None, None, *(None if v is None else _arranged(places, ctx.shape, v) for v in v_gathered)
+        """Gather the columns of the splats from arranged ones; the inverse of `arrange`."""
+        return arranged if self.places is None else self.places.gather(arranged)

@@ -78,7 +78,7 @@ def make_meta(
     def flatten_ids() -> Tensor:
         if layout.places is None or arrived is not None:
             return lists.listed()
-        return layout.places.index_select(0, lists.listed()).int()
+        return layout.places.flat().index_select(0, lists.listed()).int()
 
     entries: dict[str, Any] = {
         "batch_ids": Later(lambda: layout.arrange(layout.images // views)[0]) if packed else None,
