@@ -43,7 +43,7 @@ from blitzgs.model import PARAMETERS, GaussianTable, schema
 from blitzgs.ops.intersect import tile_counts
 from blitzgs.pipeline import Frame, RenderOptions, Views, forward
 
-IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # of the default setting
+IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # largest errors of the default setting
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,7 @@ class Option:
     tile_size: int = 16
     deterministic: bool = False
     views: int = 1
-    exchanged: bool = (
-        False  # through the exchange of a single rank, which includes all costs but the transfer
-    )
+    exchanged: bool = False  # splats pass through the exchange of one rank: all costs but the transfer
     half: bool = False
     dtype: torch.dtype = torch.float32
 

@@ -4,7 +4,7 @@
     python benchmarks/bm_lineage.py [--gaussians 2000000] [--candidates 0.02] [--json FILE]
 
 Every event clones or splits a share of the Gaussians and prunes about as many. Times are medians of wall time
-with the device idle before and after; "books" writes the rows of all events to disk and compares births less
+with the device idle before and after. "check" writes the rows of all events to disk and compares births less
 deaths with the population. A run has an event every 100 images and this check at each checkpoint.
 """
 
@@ -28,7 +28,7 @@ RULES = DensityRules(grad_threshold=0.5, clone_scale=1.0, min_opacity=0.005)
 
 
 def shake(table: GaussianTable, share: float, event: int) -> None:
-    """Give a share of the rows gradients above the threshold, and another opacities that are pruned."""
+    """Give a share of the rows large gradients, and an equal share opacities that are pruned."""
     generator = torch.Generator(table.device).manual_seed(event)
     draws = torch.rand(len(table), generator=generator, device=table.device)
     table["grad_count"].fill_(1)
@@ -50,7 +50,7 @@ def events(table: GaussianTable, share: float, count: int, lineage: Lineage | No
 
 
 def now(device: torch.device) -> float:
-    """Return the time when the device is idle."""
+    """Wait for the device and return the time in seconds."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
@@ -72,10 +72,10 @@ def main(arguments: list[str] | None = None) -> None:
         logged = events(table, options.candidates, options.events, lineage)
         begin = now(table.device)
         lineage.flush_and_check(table["id"], options.events)
-        books = now(table.device) - begin
+        check = now(table.device) - begin
         lineage.close()
         megabytes = sum(path.stat().st_size for path in Path(folder).iterdir()) / 1e6
-    times = {"event": plain, "event, logged": logged, "books": [books]}
+    times = {"event": plain, "event, logged": logged, "check": [check]}
     rows = [{"work": name, "ms": 1e3 * statistics.median(values)} for name, values in times.items()]
     title = (
         f"Lineage: {options.events} events on {scene.name}, {options.candidates:.0%} grow; {megabytes:.0f} MB"

@@ -49,7 +49,7 @@ REACH = 400.0  # metres from the middle to the outermost points that cameras loo
 
 @dataclass(frozen=True)
 class Camera:
-    """As training reads it."""
+    """A camera with the fields that training reads."""
 
     name: str
     width: int
@@ -71,7 +71,7 @@ def survey(scene: BenchmarkScene) -> list[Camera]:
 
 
 class FlightOrder(BatchSampler):
-    """Views in the order of the flight."""
+    """Chooses views in the order of the flight."""
 
     def batch(self, step: int) -> list[int]:
         """Return consecutive views."""
@@ -79,7 +79,7 @@ class FlightOrder(BatchSampler):
 
 
 class Survey:
-    """The parts that the steps of all arms share."""
+    """The parts that the steps of all arms use."""
 
     def __init__(self, scene: BenchmarkScene, batch_size: int, device: torch.device) -> None:
         cameras = survey(scene)

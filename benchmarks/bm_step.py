@@ -42,12 +42,12 @@ OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
 
 
 def make_scene(name: str, views: int, order: str) -> BenchmarkScene:
-    """Return a scene of `GAUSSIANS` or "garden", its rows in the order asked for."""
+    """Return a scene of `GAUSSIANS` or "garden", with its rows in the given order."""
     if name == "garden":
         scene = garden_like(device="cuda", views=views)
     else:
         scene = aerial(GAUSSIANS[name], "cuda", views=views)
-    if order == "random":  # as it was drawn
+    if order == "random":  # the generated order is random
         return scene
     rows = morton_order(scene.means)
     columns = ("means", "quats", "scales", "opacities", "sh")
@@ -55,7 +55,7 @@ def make_scene(name: str, views: int, order: str) -> BenchmarkScene:
 
 
 def random_photographs(scene: BenchmarkScene) -> Batch:
-    """Return what the views are compared with."""
+    """Return a batch of random photographs of the scene's views."""
     count = len(scene.viewmats)
     targets = torch.randint(0, 256, (count, scene.height, scene.width, 3), dtype=torch.uint8, device="cuda")
     samples = torch.full((count,), float(targets[0].numel()), device="cuda")
@@ -84,7 +84,7 @@ class Clock:
 
 
 def make_table(scene: BenchmarkScene) -> GaussianTable:
-    """Return the scene in the midst of a training: with moments, at step 0."""
+    """Return the scene as a table in the middle of a training: with moments, at step 0."""
     table = GaussianTable.create(scene.raw())
     # Gradients of this loss are around 1e-7; their sizes spread over some orders of magnitude.
     for first, second in zip(EXP_AVGS, EXP_AVG_SQS, strict=True):
@@ -109,7 +109,7 @@ class OurStep:
         self.stepper = Stepper(self.table, optimiser, owners, LOSS, 1.0)
 
     def prepare(self) -> None:
-        """Put every row behind, outside the timed stages."""
+        """Set pending steps for every row, outside the timed stages."""
         self.step += 1
         for name in ("last_step", "moment_step"):
             self.table[name].copy_(self.step - 1 - self.behind)

@@ -38,7 +38,7 @@ from blitzgs.training.run_log import RunLog
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
 
-LEAST_GAP = 3.0  # us; what lies between two kernels that were queued long before
+LEAST_GAP = 3.0  # us; the usual gap between two kernels that were queued long before
 
 
 class Times(NamedTuple):
@@ -49,14 +49,14 @@ class Times(NamedTuple):
 
 
 class StreamUse(NamedTuple):
-    """What the main stream and the host did in the profiled steps.
+    """How busy the main stream and the host were in the profiled steps.
 
     Attributes:
         busy: share of the time, from the first to the last kernel, in which the main stream works.
-        waiting: share of the same time that the thread which launches kernels waits for the GPU.
+        waiting: share of the same time in which the thread that launches kernels waits for the GPU.
         launches: kernels and copies on all streams.
         gaps: (before, after) -> the main stream's gaps between these, in us.
-        kernels: name -> how long each launch of it took, on all streams, in us.
+        kernels: name -> duration of each of its launches, on all streams, in us.
     """
 
     busy: float

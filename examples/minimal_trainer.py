@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trainer of 3D Gaussians in a hundred lines, from the public parts of BlitzGS: COLMAP in, PLY out.
+"""A trainer of 3D Gaussians in 150 lines, from the public parts of BlitzGS: reads COLMAP, writes PLY.
 
     python examples/minimal_trainer.py --data CAPTURE --out model.ply [--steps 7000] [--device cuda]
 
-As the original 3DGS (Kerbl et al. 2023): L1 + SSIM, Adam, clones and splits where the image gradient of a
-Gaussian is large, pruning of transparent ones. It runs on the CPU and on one GPU.
+It trains like the original 3DGS (Kerbl et al. 2023): with L1 + SSIM and Adam, it clones and splits Gaussians
+whose image gradient is large, and prunes transparent ones. It runs on the CPU and on one GPU.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from blitzgs.scene.capture import Capture, load_capture
 from blitzgs.scene.images import ImageStore
 
 RATES = {"quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
-MEANS_RATE, MEANS_DECAY = 1.6e-4, 0.01  # times the capture's extent; over the whole training
+MEANS_RATE, MEANS_DECAY = 1.6e-4, 0.01  # relative to the extent; factor at the end of the training
 SH_DEGREE, SH0 = 3, 0.28209479177387814
 
 
 class Model:
-    """Gaussians as they are learned, with their optimiser and the statistics that tell where to add some."""
+    """The trained Gaussians, their optimiser, and the statistics that decide which are cloned or split."""
 
     def __init__(self, capture: Capture, device: torch.device) -> None:
         points, colors = (torch.from_numpy(t).float().to(device) for t in (capture.points, capture.colors))
@@ -50,12 +50,12 @@ class Model:
         self.sort_by_place()
 
     def sort_by_place(self) -> None:
-        """Put neighbours in space next to each other, and begin new statistics."""
+        """Sort the rows so that neighbours in space are neighbours in memory, and clear the statistics."""
         self.params = self.optimizer.permute(blitzgs.morton_order(self.params["means"].detach()))
         self.gradients, self.seen = torch.zeros_like(self.params["means"].detach()[:, :2]).unbind(1)
 
     def render(self, view: dict[str, Tensor], degree: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return an image [1, H, W, 3] and what is known of the Gaussians in it."""
+        """Return an image [1, H, W, 3] and the renderer's `meta`."""
         height, width = view["image"].shape[1:3]
         image, _, meta = blitzgs.raw_rasterization(
             *self.params.values(), view["pose"], view["K"], width, height, sh_degree=degree,
@@ -79,7 +79,7 @@ class Model:
 
     @torch.no_grad()
     def densify(self, most: int, threshold: float = 2e-4, min_opacity: float = 0.005) -> None:
-        """Clone small Gaussians and split large ones where the image wants more; prune transparent ones."""
+        """Clone small and split large Gaussians whose gradient is large; prune transparent ones."""
         self.optimizer.catch_up()
         wanted = self.gradients / self.seen.clamp(min=1) > threshold
         if int(wanted.sum()) + len(wanted) > most:

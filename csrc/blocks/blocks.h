@@ -38,11 +38,7 @@
 
 namespace blitzgs {
 
-constexpr int kBlockRows = 256;
-static_assert(kBlockRows == kSectorRows);
 constexpr int kBlockBounds = 8;  // lowest corner, highest corner, largest sigma, whether all rows are finite
-
-BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
 
 BLITZGS_HD int rows_in_block(std::int64_t rows, std::int64_t block) {
   const std::int64_t rest = rows - block * kBlockRows;

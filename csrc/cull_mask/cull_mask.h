@@ -17,9 +17,10 @@
 
 namespace blitzgs {
 
-constexpr int kSectorRows = 256, kSectorWords = kSectorRows / 32;
+constexpr int kBlockRows = 256;                // rows of a block of the table
+constexpr int kSectorWords = kBlockRows / 32;  // words of a sector
 
-BLITZGS_HD std::int64_t sector_blocks(std::int64_t rows) { return (rows + kSectorRows - 1) / kSectorRows; }
+BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
 
 // The position of the sector of a block and a column, in a mask of n_columns columns.
 BLITZGS_HD std::int64_t sector_at(std::int64_t block, std::int64_t n_columns, std::int64_t column) {
@@ -28,8 +29,8 @@ BLITZGS_HD std::int64_t sector_at(std::int64_t block, std::int64_t n_columns, st
 
 BLITZGS_HD bool sector_bit(const std::int32_t* sectors, std::int64_t n_columns, std::int64_t column,
                            std::int64_t row) {
-  const int local = static_cast<int>(row % kSectorRows);
-  const std::int32_t word = sectors[sector_at(row / kSectorRows, n_columns, column) + local / 32];
+  const int local = static_cast<int>(row % kBlockRows);
+  const std::int32_t word = sectors[sector_at(row / kBlockRows, n_columns, column) + local / 32];
   return (static_cast<std::uint32_t>(word) >> local % 32 & 1u) != 0;
 }
 

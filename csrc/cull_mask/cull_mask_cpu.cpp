@@ -28,7 +28,7 @@ void transpose_bits(std::uint32_t* words) {
 // column.
 template <class F>
 void for_each_square(const CullMask& mask, const F& f) {
-  parallel_for(0, sector_blocks(mask.n) * kSectorWords, 64, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(0, blocks_of(mask.n) * kSectorWords, 64, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t group = begin; group < end; ++group) {
       const auto count = static_cast<int>(std::clamp<std::int64_t>(mask.n - 32 * group, 0, 32));
       for (std::int64_t word = 0; word < mask.words; ++word) {

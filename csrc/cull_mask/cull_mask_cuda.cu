@@ -20,9 +20,9 @@ __device__ std::uint32_t transpose_bits(std::uint32_t word, int lane) {
 // Converts a mask by rows to sectors or back (cull_mask.h). A CUDA block handles a block of 256 rows; each of
 // its warps handles 32 of these rows, which are one word of each sector.
 template <bool kToSectors>
-__global__ void __launch_bounds__(kSectorRows) transpose_kernel(const CullMask mask) {
+__global__ void __launch_bounds__(kBlockRows) transpose_kernel(const CullMask mask) {
   const int group = threadIdx.x / 32, lane = threadIdx.x % 32;
-  const std::int64_t block = blockIdx.x, row = block * kSectorRows + threadIdx.x;
+  const std::int64_t block = blockIdx.x, row = block * kBlockRows + threadIdx.x;
   const bool present = row < mask.n;
   for (std::int64_t word = 0; word < mask.words; ++word) {
     std::int32_t& row_word = mask.rows[(present ? row : 0) * mask.words + word];
@@ -40,8 +40,7 @@ __global__ void __launch_bounds__(kSectorRows) transpose_kernel(const CullMask m
 template <bool kToSectors>
 void transpose(const CullMask& mask, CudaStream stream) {
   if (mask.n == 0 || mask.words == 0) return;
-  transpose_kernel<kToSectors>
-      <<<static_cast<unsigned>(sector_blocks(mask.n)), kSectorRows, 0, stream>>>(mask);
+  transpose_kernel<kToSectors><<<static_cast<unsigned>(blocks_of(mask.n)), kBlockRows, 0, stream>>>(mask);
   check_launch("cull mask");
 }
 

@@ -11,7 +11,7 @@ Tensor sectors_of_rows(const Tensor& rows_in) {
   check_shape("sectors_of_rows", "rows", rows_in, {-1, -1});
   Tensor rows = as_contiguous(rows_in);
   const std::int64_t n = rows.size(0), words = rows.size(1);
-  Tensor sectors = make_empty(rows, {sector_blocks(n), 32 * words, kSectorWords});
+  Tensor sectors = make_empty(rows, {blocks_of(n), 32 * words, kSectorWords});
   DeviceScope scope(rows);
   backend::sectors_of_rows({mutable_data<std::int32_t>(rows), mutable_data<std::int32_t>(sectors), n, words},
                            scope.stream);
@@ -21,7 +21,7 @@ Tensor sectors_of_rows(const Tensor& rows_in) {
 Tensor rows_of_sectors(const Tensor& sectors_in, std::int64_t n) {
   constexpr const char* kOp = "rows_of_sectors";
   check_dtype(kOp, "sectors", sectors_in, ScalarType::Int);
-  check_shape(kOp, "sectors", sectors_in, {sector_blocks(n), -1, kSectorWords});
+  check_shape(kOp, "sectors", sectors_in, {blocks_of(n), -1, kSectorWords});
   STD_TORCH_CHECK(sectors_in.size(1) % 32 == 0, "blitzgs::", kOp,
                   ": sectors must be of a multiple of 32 columns, got ", sectors_in.size(1));
   Tensor sectors = as_contiguous(sectors_in);

@@ -34,7 +34,7 @@ struct GateTable {
 // The rules by which rows of a table are dropped from B views.
 struct GateRules {
   const std::uint8_t* level;  // [N]
-  const std::int32_t* cull;   // [sector_blocks(N), cull_columns, kSectorWords]; may be null
+  const std::int32_t* cull;   // [blocks_of(N), cull_columns, kSectorWords]; may be null
   std::int64_t n_rows, cull_columns;
   int n_views, n_levels;
   std::uint32_t lod_views;   // bits of the views that have an LOD gate

@@ -50,7 +50,7 @@ inline HeldRules hold_rules(const char* op, std::int64_t rows, int views, const 
   HeldRules held{as_contiguous(level), std::nullopt};
   if (cull) {
     check_dtype(op, "cull", *cull, ScalarType::Int);
-    check_shape(op, "cull", *cull, {sector_blocks(rows), -1, kSectorWords});
+    check_shape(op, "cull", *cull, {blocks_of(rows), -1, kSectorWords});
     held.cull = as_contiguous(*cull);
     held.rules.cull_columns = held.cull->size(1);
   }

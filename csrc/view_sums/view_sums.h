@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The sums of the importance sweep (paper: the score s, c_rad, c_vis and the cull matrix) for a batch of at
-// most kMostViews views. For each visible Gaussian g the op adds over its consecutive splats i (g in the view
+// most kMaxViews views. For each visible Gaussian g the op adds over its consecutive splats i (g in the view
 // v_i):
 //
 //   score[g]   += round(w / (a + eps)^p / unit)   w = weights[i] / 2^32, a = pixels[i]; p is 1, 1/2 or 0; in
@@ -23,8 +23,6 @@
 
 namespace blitzgs {
 
-inline constexpr int kMostViews = 32;
-
 enum class ScoreRule : int { kWeight = 0, kRoot = 1, kDensity = 2 };
 
 struct ViewSumsArgs {
@@ -42,7 +40,7 @@ struct ViewSumsArgs {
   std::uint32_t* cull;
   ScoreRule rule;
   double eps, unit;
-  std::int32_t columns[kMostViews];
+  std::int32_t columns[kMaxViews];
 };
 
 // The summand of a splat, in units of the score. `round` rounds to the nearest integer, ties to even; each

@@ -31,7 +31,7 @@ void view_sums_(const std::vector<Tensor>& sums, const std::vector<Tensor>& spla
   check_in_place(kOp, "weights", weights, ScalarType::Long, {count});
   check_in_place(kOp, "pixels", pixels, ScalarType::Int, {count});
   check_in_place(kOp, "counts", counts, ScalarType::Bool, {count});
-  STD_TORCH_CHECK(!columns.empty() && columns.size() <= kMostViews, "blitzgs::", kOp, ": 1 to ", kMostViews,
+  STD_TORCH_CHECK(!columns.empty() && columns.size() <= kMaxViews, "blitzgs::", kOp, ": 1 to ", kMaxViews,
                   " views at once, got ", columns.size());
   for (const std::int64_t column : columns) {
     STD_TORCH_CHECK(0 <= column && column < 32 * words, "blitzgs::", kOp, ": cull has ", 32 * words,
