@@ -28,7 +28,7 @@ from opponents.gsplat_training import GsplatOptions, GsplatTrainer
 from torch import Tensor
 
 import blitzgs
-from blitzgs.optim import LazyAdam
+from blitzgs.optim import LazyAdam, step_together
 from blitzgs.scene.capture import load_capture
 from blitzgs.scene.images import ImageStore
 
@@ -59,14 +59,18 @@ class OneImport(GsplatTrainer):
         )  # fmt: skip
         return image, info
 
+    def move(self) -> None:
+        """Take the optimisers' step."""
+        for optimiser in self._optimisers.values():
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+
     def _take_step(self) -> None:
         views, target, _ = self._batches[next(self._order)]
         image, info = self.render(views)
         self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
         self.loss(image, target).backward()
-        for optimiser in self._optimisers.values():
-            optimiser.step()
-            optimiser.zero_grad(set_to_none=True)
+        self.move()
         self._decay.step()
         self.change_population(info)
 
@@ -95,6 +99,10 @@ class FourSwaps(OneImport):
             views.width, views.height, sh_degree=self.sh_degree, optimizers=self._optimisers,
         )  # fmt: skip
         return image, info
+
+    def move(self) -> None:
+        """Take the optimisers' step in two launches."""
+        step_together(self._optimisers, set_to_none=True)
 
     def change_population(self, info: Any) -> None:
         """Bring all rows up to date before the strategy reads them, and sort them afterwards."""

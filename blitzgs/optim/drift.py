@@ -4,22 +4,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from blitzgs.ops.lazy_adam import explicit_steps, table_without_rates
 
-# csrc/lazy_adam/lazy_adam.h: a row has 4 orders of 6 groups, then powers and corrections. A parameter that
-# is stepped alone takes the place of SH, whose first three values have a group and the rest another.
-_ORDERS, _GROUPS, _OWN = 4, 6, (4, 5)
+# csrc/lazy_adam/lazy_adam.h: a row has 4 orders of 6 groups, then powers and corrections.
+_ORDERS, GROUPS = 4, 6
 # Number of steps that the tables hold. When they are full, all rows are brought up to date and the tables
 # begin again, so that they do not grow.
 CAPACITY = 4096
 
 
 class Drift:
-    """The tables of one parameter that the op takes, for the steps from `begin` to the latest one.
+    """The tables that the op takes, for the steps from `begin` to the latest one.
 
     A row without a gradient moves between step p and step s by a sum over the steps between them. Each new
     step therefore adds its term to the table rows of earlier steps; those before the last `reach` steps need
@@ -28,13 +30,19 @@ class Drift:
 
     Attributes:
         begin: the step at which the tables begin.
-        table: float64 [CAPACITY + 1, 30], see csrc/lazy_adam/lazy_adam.h.
-        lr_table: float32 [CAPACITY + 1, 6].
+        betas: decay rates of the moments.
+        tables: T of float64 [CAPACITY + 1, 30], see csrc/lazy_adam/lazy_adam.h.
+        lr_tables: T of float32 [CAPACITY + 1, 6].
         reach: number of steps for which a row without a gradient still moves.
     """
 
     def __init__(
-        self, betas: tuple[float, float], dtype: torch.dtype, device: torch.device, begin: int
+        self,
+        betas: tuple[float, float],
+        dtype: torch.dtype,
+        device: torch.device,
+        begin: int,
+        tables: int = 1,
     ) -> None:
         """Begin with empty tables.
 
@@ -43,49 +51,88 @@ class Drift:
             dtype: dtype of the parameter.
             device: device of the parameter.
             begin: number of steps taken before; all rows must be up to date with it.
+            tables: number of tables T; each has learning rates of its own.
 
         Raises:
             ValueError: decay rates outside their range.
         """
         self.betas = betas
         self.reach = explicit_steps(*betas, dtype)
-        self.lr_table = torch.zeros(CAPACITY + 1, _GROUPS, dtype=torch.float32, device=device)
+        lr_tables = torch.zeros(tables, CAPACITY + 1, GROUPS, dtype=torch.float32, device=device)
+        self._set_rates(lr_tables, torch.zeros(tables, 1, 1, GROUPS, dtype=torch.float64, device=device))
         ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
         distances = np.arange(self.reach, 0, -1)[:, None]
         decays = (ratio * root ** np.arange(_ORDERS)) ** distances
         self._decays = torch.from_numpy(decays).to(device)[:, :, None]
         self.restart(begin)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A pickled view would no longer be one.
+        views = ("lr_tables", "tables", "_rate_cells", "_tails")
+        return {name: value for name, value in self.__dict__.items() if name not in views}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._set_rates(self._lr_tables, self._rates)
+        self._set_tables(self._tables)
+
+    def _set_rates(self, lr_tables: Tensor, rates: Tensor) -> None:
+        """Take the learning rates of all steps, and those of the latest step, float64 [T, 1, 1, 6]."""
+        self._lr_tables, self.lr_tables = lr_tables, lr_tables.unbind()
+        self._rates, self._rate_cells = rates, rates.flatten().unbind()
+        self._known_rates: list[float] = rates.flatten().tolist()
+
+    def _set_tables(self, tables: Tensor) -> None:
+        """Take the tables, float64 [T, CAPACITY + 1, 30]."""
+        self._tables, self.tables = tables, tables.unbind()
+        self._tails = tables[:, :, : _ORDERS * GROUPS].unflatten(2, (_ORDERS, GROUPS))
+
     def restart(self, begin: int) -> None:
         """Empty the tables at step `begin`, with which all rows and their moments must be up to date."""
         self.begin = begin
-        table = table_without_rates(len(self.lr_table), *self.betas, begin)
+        table = table_without_rates(CAPACITY + 1, *self.betas, begin)
         first, second = table[:, 28], table[:, 29]
         # The terms that a step with learning rate 1 adds to the rows of earlier steps.
         shares = torch.stack([first * second ** (order - 1) for order in range(_ORDERS)], dim=1)
         shares[0] = 0
-        self._shares = shares.to(self.lr_table.device)[:, :, None]
-        self.table = table.to(self.lr_table.device)
-        self.lr_table.zero_()
+        device = self._lr_tables.device
+        self._shares = shares.to(device)[:, :, None]
+        self._set_tables(table.to(device).repeat(len(self._lr_tables), 1, 1))
+        self._lr_tables.zero_()
 
     def is_full(self, step: int) -> bool:
         """Tell whether the tables are full, so that no steps after `step` fit."""
-        return step - self.begin >= len(self.lr_table) - 1
+        return step - self.begin >= CAPACITY
 
-    def add(self, step: int, lr: float, lr_rest: float) -> None:
+    def add(self, step: int, rates: Sequence[float]) -> None:
         """Add a step to the tables; this queues a few small kernels and copies nothing to the device.
 
         Args:
             step: number of the step, from 1.
-            lr: learning rate of the first three values of a row.
-            lr_rest: learning rate of the other values.
+            rates: 6 T learning rates, in the order of the tables.
         """
+        for index, rate in enumerate(rates):
+            rate = float(np.float32(rate))  # as in lr_tables
+            if rate != self._known_rates[index]:
+                self._known_rates[index] = rate
+                self._rate_cells[index].fill_(rate)
         place = step - self.begin
         first = max(0, place - self.reach)
-        tails = self.table[first:place, : _ORDERS * _GROUPS].view(-1, _ORDERS, _GROUPS)
-        decays, shares = self._decays[first - place :], self._shares[place]
-        for groups, rate in [(_OWN, lr)] if lr == lr_rest else [(_OWN[:1], lr), (_OWN[1:], lr_rest)]:
-            owned = slice(groups[0], groups[-1] + 1)
-            rate = float(np.float32(rate))  # as in lr_table
-            tails[:, :, owned].addcmul_(decays, shares, value=rate)
-            self.lr_table[place, owned].fill_(rate)
+        terms = self._shares[place] * self._rates
+        self._tails[:, first:place].addcmul_(self._decays[first - place :], terms)
+        self._lr_tables[:, place] = self._rates[:, 0, 0]
+
+    def alone(self, table: int, group: int) -> Drift:
+        """Return a copy for a parameter alone, which had the learning rates of a group of a table.
+
+        A parameter that is stepped alone takes the place of SH: the first three values of its rows are in
+        group 4 and the others in group 5. Groups 4 and 5 are copied as they are, others to both.
+        """
+        copied = Drift.__new__(Drift)
+        copied.begin, copied.betas, copied.reach = self.begin, self.betas, self.reach
+        copied._decays, copied._shares = self._decays, self._shares
+        own = [*range(4), *((4, 5) if group >= 4 else (group, group))]
+        copied._set_rates(self._lr_tables[table][None, :, own], self._rates[table][None, :, :, own])
+        copied._set_tables(self._tables[table][None].clone())
+        copied._tails.copy_(self._tails[table][None, :, :, own])
+        return copied

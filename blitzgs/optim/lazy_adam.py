@@ -10,14 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from blitzgs.ops.lazy_adam import AdamState
 from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
-
-# Entries of a parameter's state: the step up to which each row's values, and its moments, are current,
-# counted from `Drift.begin`.
-_STEPS = ("last_step", "moment_step")
-_MOMENTS = ("exp_avg", "exp_avg_sq")
+from blitzgs.optim.joint import Joint, step_jointly
+from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of
 
 
 class LazyAdam(torch.optim.Optimizer):
@@ -47,7 +43,9 @@ class LazyAdam(torch.optim.Optimizer):
 
     Attributes:
         drifts: tables of the steps that rows missed, by the indices of a parameter's group and of the
-            parameter in it, because strategies replace the parameters and their state.
+            parameter in it, because strategies replace the parameters and their state. Parameters of
+            `joint` have none.
+        joint: the parameters that are stepped together, also those of other optimisers (`step_together`).
     """
 
     def __init__(
@@ -70,10 +68,12 @@ class LazyAdam(torch.optim.Optimizer):
             ValueError: an option is outside its range.
         """
         self.drifts: dict[tuple[int, int], Drift] = {}
+        self.joint: Joint | None = None
         super().__init__(params, {"lr": lr, "lr_rest": None, "betas": betas, "eps": eps})
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "drifts": self.drifts}
+        self.leave_joint()  # its other members do not belong to a copy
+        return {**super().__getstate__(), "drifts": self.drifts, "joint": None}
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add parameters with options of their own, see `__init__`."""
@@ -97,41 +97,36 @@ class LazyAdam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        if not step_jointly([self]):
+            self._step_alone()
+        return loss
+
+    def _step_alone(self) -> None:
+        """Take a step for each parameter by itself."""
+        self.leave_joint()
         for place, group, param in self._placed():
             if param.grad is None:
                 continue
-            state, drift = self._state_of(param), self._drift_of(place, group, param)
+            state, table = self._table_of(place, group, param)
+            drift = table.drift
             if drift.is_full(int(state["step"])):
-                self._update_one(group, param, state, drift)
+                table.restart(int(state["step"]))
                 drift.restart(int(state["step"]))
-                for name in _STEPS:
-                    state[name].zero_()
             state["step"] += 1
-            rest = group["lr"] if group["lr_rest"] is None else group["lr_rest"]
-            drift.add(int(state["step"]), float(group["lr"]), float(rest))
-            self._step_one(group, param, state, drift)
-        return loss
-
-    def _step_one(self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift) -> None:
-        assert param.grad is not None
-        if param.grad.is_sparse:
-            if param.grad.sparse_dim() != 1:
-                raise ValueError(
-                    "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
-                    f"{param.grad.sparse_dim()} of them"
-                )
-            rows, values = distinct_rows(param.grad)
-            ids = rows.int()
-        else:
-            ids = torch.arange(len(param), dtype=torch.int32, device=param.device)
-            values = param.grad
-        if param.numel() == 0 or len(ids) == 0:
-            return
-        gradients = [values.new_empty(len(values), 0)] * 4 + [values]
-        torch.ops.blitzgs.lazy_adam_step_(
-            _as_adam_state(param, state).tensors, [drift.table, drift.lr_table],
-            [int(state["step"]) - drift.begin, drift.reach, 0], [*drift.betas, group["eps"]], gradients, ids,
-        )  # fmt: skip
+            drift.add(int(state["step"]), (0.0,) * 4 + rates_of(group))
+            if param.grad.is_sparse:
+                if param.grad.sparse_dim() != 1:
+                    raise ValueError(
+                        "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
+                        f"{param.grad.sparse_dim()} of them"
+                    )
+                rows, values = distinct_rows(param.grad)
+                ids = rows.int()
+            else:
+                ids = torch.arange(len(param), dtype=torch.int32, device=param.device)
+                values = param.grad
+            if param.numel() > 0 and len(ids) > 0:
+                table.step(int(state["step"]), ids, [values])
 
     @torch.no_grad()
     def catch_up(self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None) -> None:
@@ -145,45 +140,36 @@ class LazyAdam(torch.optim.Optimizer):
             rows: int32 [A], the rows to update, each once; None: all.
         """
         chosen = None if params is None else {id(param) for param in params}
-        for place, group, param in self._placed():
-            if not self.state.get(param) or param.numel() == 0:
-                continue
-            if chosen is not None and id(param) not in chosen:
-                continue
-            self._catch_up_one(group, param, self._state_of(param), self._drift_of(place, group, param), rows)
-
-    def _catch_up_one(
-        self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift, rows: Tensor | None
-    ) -> None:
-        torch.ops.blitzgs.lazy_adam_catch_up_(
-            _as_adam_state(param, state).tensors, [drift.table, drift.lr_table],
-            [int(state["step"]) - drift.begin, drift.reach, 0], [*drift.betas, group["eps"]], rows,
-        )  # fmt: skip
+        wanted = [entry for entry in self._placed() if chosen is None or id(entry[2]) in chosen]
+        if self.joint is not None and self.joint.is_current():
+            self.joint.catch_up([param for _, _, param in wanted], rows)
+            return
+        self.leave_joint()
+        for place, group, param in wanted:
+            if self.state.get(param):
+                state, table = self._table_of(place, group, param)
+                table.catch_up(int(state["step"]), rows)
 
     @torch.no_grad()
     def bring_up_to_date(self) -> None:
         """Bring all rows and their moments up to date; afterwards the state is that of `torch.optim.Adam`."""
+        self.leave_joint()
         for place, group, param in self._placed():
             if self.state.get(param):
-                self._update_one(group, param, self._state_of(param), self._drift_of(place, group, param))
+                state, table = self._table_of(place, group, param)
+                table.bring_up_to_date(int(state["step"]))
 
-    def _update_one(self, group: dict[str, Any], param: Tensor, state: dict[str, Any], drift: Drift) -> None:
-        if param.numel() > 0:
-            self._catch_up_one(group, param, state, drift, None)
-        place = int(state["step"]) - drift.begin
-        behind = (place - state["moment_step"]).double()
-        behind = behind.view(-1, *(1,) * (param.dim() - 1))
-        for name, beta in zip(_MOMENTS, group["betas"], strict=True):
-            state[name] *= (beta**behind).to(param.dtype)
-        for name in _STEPS:
-            state[name].fill_(place)
+    def leave_joint(self) -> None:
+        """Step each parameter by itself again, see `step_together`."""
+        if self.joint is not None:
+            self.joint.dissolve()
 
     def state_dict(self) -> dict[str, Any]:
         """Bring all rows up to date and return the state of `torch.optim.Adam`: step, exp_avg, exp_avg_sq."""
         self.bring_up_to_date()
         packed = super().state_dict()
         packed["state"] = {
-            index: {name: value for name, value in state.items() if name not in _STEPS}
+            index: {name: value for name, value in state.items() if name not in STEPS}
             for index, state in packed["state"].items()
         }
         return packed
@@ -198,6 +184,7 @@ class LazyAdam(torch.optim.Optimizer):
         """
         for group in state_dict["param_groups"]:
             _check_group({"lr_rest": None, **group})
+        self.leave_joint()
         super().load_state_dict(state_dict)
         self.drifts.clear()
         for _, group, param in self._placed():
@@ -206,7 +193,7 @@ class LazyAdam(torch.optim.Optimizer):
             if state:
                 state["step"] = torch.tensor(float(state["step"]), dtype=torch.float32)
                 stand = torch.zeros(len(param), dtype=torch.int32, device=param.device)
-                state.update({name: stand.clone() for name in _STEPS})
+                state.update({name: stand.clone() for name in STEPS})
 
     def append(self, rows: Mapping[str, Tensor]) -> dict[str, Parameter]:
         """Add rows at the end of every parameter; their moments are zero.
@@ -269,6 +256,7 @@ class LazyAdam(torch.optim.Optimizer):
         of_param: Callable[[str, Tensor], Tensor],
         of_state: Callable[[Tensor], Tensor],
     ) -> dict[str, Parameter]:
+        self.leave_joint()
         self.catch_up()
         renewed = {}
         for name, group in named.items():
@@ -276,7 +264,7 @@ class LazyAdam(torch.optim.Optimizer):
             new = Parameter(of_param(name, old.detach()), requires_grad=old.requires_grad)
             state = self.state.pop(old, None)
             if state:
-                for key in (*_MOMENTS, *_STEPS):
+                for key in (*MOMENTS, *STEPS):
                     state[key] = of_state(state[key])
                 self.state[new] = state
             group["params"] = [new]
@@ -302,18 +290,20 @@ class LazyAdam(torch.optim.Optimizer):
             for p, param in enumerate(group["params"]):
                 yield (g, p), group, param
 
-    def _drift_of(self, place: tuple[int, int], group: dict[str, Any], param: Tensor) -> Drift:
-        """Return the `Drift` of the parameter at these indices; make it on first use."""
+    def _table_of(
+        self, place: tuple[int, int], group: dict[str, Any], param: Tensor
+    ) -> tuple[dict[str, Any], Table]:
+        """Return the state of a parameter, and the parameter as a table by itself."""
+        state = self.state_of(param)
         betas = tuple(group["betas"])
         drift = self.drifts.get(place)
         if drift is None:
-            taken = int(self.state[param]["step"])
-            drift = self.drifts[place] = Drift(betas, param.dtype, param.device, taken)
+            drift = self.drifts[place] = Drift(betas, param.dtype, param.device, int(state["step"]))
         if drift.betas != betas:
             raise ValueError(f"LazyAdam: betas cannot change from {drift.betas} to {betas} after a step")
-        return drift
+        return state, Table([param], [state], drift, 0, group["eps"])
 
-    def _state_of(self, param: Tensor) -> dict[str, Any]:
+    def state_of(self, param: Tensor) -> dict[str, Any]:
         """Return the state of a parameter; make it on first use, and correct a strategy's dtypes."""
         state: dict[str, Any] = self.state[param]
         if not param.is_contiguous():
@@ -322,14 +312,14 @@ class LazyAdam(torch.optim.Optimizer):
             )
         if not state:
             state["step"] = torch.tensor(0.0, dtype=torch.float32)
-            state.update({name: torch.zeros_like(param) for name in _MOMENTS})
+            state.update({name: torch.zeros_like(param) for name in MOMENTS})
             steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
-            state.update({name: steps.clone() for name in _STEPS})
-        for name in _STEPS:
+            state.update({name: steps.clone() for name in STEPS})
+        for name in STEPS:
             # gsplat's strategies append float zeros. The value is right for rows whose moments are zero.
             if state[name].dtype != torch.int32:
                 state[name] = state[name].int()
-        for name in (*_MOMENTS, *_STEPS):
+        for name in (*MOMENTS, *STEPS):
             if state[name].shape[0] != param.shape[0]:
                 raise ValueError(
                     f"LazyAdam: a parameter has {len(param)} rows and its {name} {len(state[name])}; change "
@@ -355,10 +345,30 @@ def _check_group(group: dict[str, Any]) -> None:
             raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
 
 
-def _as_adam_state(param: Tensor, state: dict[str, Any]) -> AdamState:
-    """Return a parameter and its state as the ops' SH column, with all their other columns empty."""
-    nothing = param.new_empty(len(param), 0)
-    params, exp_avgs, exp_avg_sqs = (
-        [*[nothing] * 4, values] for values in (param.detach(), *(state[name] for name in _MOMENTS))
-    )
-    return AdamState(params, exp_avgs, exp_avg_sqs, *(state[name] for name in _STEPS))
+@torch.no_grad()
+def step_together(optimizers: Iterable[LazyAdam] | Mapping[str, LazyAdam], set_to_none: bool = False) -> None:
+    """Take a step of several optimisers, in few launches if their parameters are those of gsplat's trainer.
+
+    The result is that of `step` of each. gsplat's strategies need an optimiser for each parameter, but the
+    parameters have the same rows. If their gradients are those of one call of
+    `raw_rasterization(..., optimizers=...)`, means, quats, scales, opacities and sh0 take one launch and shN
+    another. Otherwise each optimiser takes its step by itself. A single `LazyAdam` with a group for each
+    parameter does the same in its own `step`. Step hooks of the optimisers are not called.
+
+    Args:
+        optimizers: the optimisers, as a mapping or a sequence.
+        set_to_none: whether to remove the gradients afterwards, as `zero_grad(set_to_none=True)` does.
+
+    Raises:
+        ValueError: as `LazyAdam.step`.
+    """
+    chosen = list(optimizers.values() if isinstance(optimizers, Mapping) else optimizers)
+    if not step_jointly(chosen):
+        for optimizer in chosen:
+            optimizer.step()
+    for optimizer in chosen:
+        optimizer._opt_called = True  # torch's schedulers warn if they do not see a step
+        if set_to_none:
+            for group in optimizer.param_groups:
+                for param in group["params"]:
+                    param.grad = None

@@ -114,10 +114,9 @@ def raw_rasterization(
     for optimizer in lazy:
         optimizer.catch_up(harmonics, ids)
     shaded = "RGB" in render_mode
-    means, quats, scales, opacities, *parts = _Visible.apply(  # type: ignore[no-untyped-call]
+    means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
         ids, sparse_grad, *geometry, *(harmonics if shaded else ())
     )
-    sh = torch.cat(parts, dim=1) if len(parts) > 1 else parts[0] if parts else None
     gaussians = gaussians_of(means, quats, scales, opacities, sh, viewmats, Ks, sh_degree, shaded, raw=True)
     named = {**whole.named, **({"sh0": (sh0,), "shN": (shN,)} if shN is not None else {"sh0": (sh0,)})}
     background = background_rows(backgrounds, gaussians, render_mode)
@@ -131,10 +130,22 @@ def raw_rasterization(
 
 
 def _lazy(optimizers: Any) -> list[CatchesUp]:
-    if hasattr(optimizers, "catch_up"):
-        return [optimizers]
+    """Return the optimisers that may have pending steps; those that step together are one."""
     given = optimizers.values() if isinstance(optimizers, Mapping) else optimizers
-    return [optimizer for optimizer in given if hasattr(optimizer, "catch_up")]
+    if hasattr(optimizers, "catch_up"):
+        given = [optimizers]
+    found: list[CatchesUp] = []
+    joints: list[Any] = []
+    for optimizer in given:
+        joint = getattr(optimizer, "joint", None)
+        if joint is not None and any(joint is other for other in joints):
+            continue
+        if joint is not None and joint.is_current():
+            joints.append(joint)
+            found.append(joint)
+        elif hasattr(optimizer, "catch_up"):
+            found.append(optimizer)
+    return found
 
 
 def _check_harmonics(harmonics: list[Tensor], count: int) -> None:
@@ -160,20 +171,37 @@ def _visible(calls: list[ProjectionInputs]) -> tuple[Tensor, Sizes | None]:
 
 
 class _Visible(torch.autograd.Function):
-    """Gathers the rows `ids` of tables; the tables' gradients are sparse, or dense if `sparse` is False."""
+    """Gathers the rows `ids` of means, quats, scales and opacities, and of SH in any number of parts.
+
+    The result has the SH in one tensor, or None without parts. The gradients of the tables are sparse, or
+    dense if `sparse` is False.
+    """
 
     @staticmethod
-    def forward(ctx: Any, ids: Tensor, sparse: bool, *tables: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, ids: Tensor, sparse: bool, *tables: Tensor) -> tuple[Tensor | None, ...]:
         ctx.save_for_backward(ids)
         ctx.sparse, ctx.shapes = sparse, [table.shape for table in tables]
         ctx.set_materialize_grads(False)
-        return tuple(table.index_select(0, ids) for table in tables)
+        geometry, parts = tables[:4], tables[4:]
+        ctx.lengths = [part.shape[1] for part in parts]
+        rows = [table.index_select(0, ids) for table in geometry]
+        if not parts:
+            return (*rows, None)
+        sh = parts[0].new_empty(len(ids), sum(ctx.lengths), 3)
+        for part, here in zip(parts, sh.split(ctx.lengths, dim=1), strict=True):
+            torch.index_select(part, 0, ids, out=here)
+        return (*rows, sh)
 
     @staticmethod
     def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
         ids = ctx.saved_tensors[0].long()
-        gradients = (
+        *gradients, v_sh = v_rows
+        if ctx.lengths:
+            # Autograd would copy a gradient that is not contiguous, and its indices with it.
+            parts = [None] * len(ctx.lengths) if v_sh is None else v_sh.split(ctx.lengths, dim=1)
+            gradients += [None if part is None else part.contiguous() for part in parts]
+        found = (
             None if v is None else full_gradient(ids, v, shape, ctx.sparse)
-            for v, shape in zip(v_rows, ctx.shapes, strict=True)
+            for v, shape in zip(gradients, ctx.shapes, strict=True)
         )
-        return None, None, *gradients
+        return None, None, *found

@@ -269,7 +269,7 @@ def test_full_tables_restart_and_still_equal_dense_adam(backend, monkeypatch):
         if number == 100:  # in the middle of the tables
             pair.ours.load_state_dict(copy.deepcopy(pair.ours.state_dict()))
     pair.require_equal()
-    assert all(len(kept.table) == 41 and kept.begin > 100 for kept in pair.ours.drifts.values())
+    assert all(len(kept.tables[0]) == 41 and kept.begin > 100 for kept in pair.ours.drifts.values())
     pair.ours.bring_up_to_date()
     for name in SHAPES:
         ours, dense = pair.ours.state[pair.lazy[name]], pair.torchs.state[pair.dense[name]]
@@ -280,10 +280,10 @@ def test_full_tables_restart_and_still_equal_dense_adam(backend, monkeypatch):
 
 def test_tables_do_not_grow_over_a_hundred_thousand_steps():
     kept = Drift((0.9, 0.999), torch.float32, torch.device("cpu"), 0)
-    sizes = {len(kept.table), len(kept.lr_table)}
+    sizes = {len(kept.tables[0]), len(kept.lr_tables[0])}
     for step in range(1, 100_001):
         if kept.is_full(step - 1):
             kept.restart(step - 1)
-        kept.add(step, 1e-3, 1e-3)
-        sizes |= {len(kept.table), len(kept.lr_table)}
+        kept.add(step, [1e-3] * 6)
+        sizes |= {len(kept.tables[0]), len(kept.lr_tables[0])}
     assert sizes == {drift.CAPACITY + 1} and kept.begin > 90_000

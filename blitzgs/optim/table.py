@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the same rows that one call of the op moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import blitzgs.ops.lazy_adam  # noqa: F401  (registers the ops)
+from blitzgs.optim.drift import Drift
+
+# Entries of a parameter's state: the step up to which each row's values, and its moments, are current,
+# counted from `Drift.begin`.
+STEPS = ("last_step", "moment_step")
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class Table:
+    """Parameters that share the columns of steps: five of row widths 3, 4, 3, 1 and any, or one alone.
+
+    Attributes:
+        drift: has the table of the missed steps.
+    """
+
+    def __init__(
+        self,
+        params: Sequence[Tensor],
+        states: Sequence[dict[str, Any]],
+        drift: Drift,
+        index: int,
+        eps: float,
+    ) -> None:
+        """Take parameters as they are at present; a table is no longer valid once one is replaced.
+
+        Args:
+            params: the parameters.
+            states: their states: `MOMENTS`, and `STEPS`, which are the same tensors in all of them.
+            drift: as the attribute.
+            index: which of its tables belongs to these parameters.
+            eps: of the optimiser.
+        """
+        self.drift, self._index, self._eps = drift, index, eps
+        self._moments = [[state[name] for state in states] for name in MOMENTS]
+        self._steps = [states[0][name] for name in STEPS]
+        self._rows = len(params[0])
+        columns = [_columns(values) for values in (params, *self._moments)]
+        self._tensors = [*columns[0], *columns[1], *columns[2], *self._steps]  # as `AdamState.tensors`
+
+    def step(self, step: int, ids: Tensor, gradients: Sequence[Tensor]) -> None:
+        """Take step number `step` for the rows `ids`, int32 [A], from a gradient for each parameter."""
+        torch.ops.blitzgs.lazy_adam_step_(self._tensors, *self._schedule(step), _columns(gradients), ids)
+
+    def catch_up(self, step: int, rows: Tensor | None = None) -> None:
+        """Apply the steps that the rows, int32 [A] or None for all, have missed up to `step`."""
+        if self._rows > 0:
+            torch.ops.blitzgs.lazy_adam_catch_up_(self._tensors, *self._schedule(step), rows)
+
+    def bring_up_to_date(self, step: int) -> None:
+        """Apply all missed steps to all rows and their moments."""
+        self.catch_up(step)
+        place = step - self.drift.begin
+        behind = (place - self._steps[1]).double()
+        for moments, beta in zip(self._moments, self.drift.betas, strict=True):
+            for values in moments:
+                values *= (beta**behind).to(values.dtype).view(-1, *(1,) * (values.dim() - 1))
+        for steps in self._steps:
+            steps.fill_(place)
+
+    def restart(self, step: int) -> None:
+        """Bring all rows up to date and count steps from `step`, where the drift's tables begin again."""
+        self.bring_up_to_date(step)
+        for steps in self._steps:
+            steps.zero_()
+
+    def _schedule(self, step: int) -> tuple[list[Tensor], list[int], list[float]]:
+        drift = self.drift
+        return (
+            [drift.tables[self._index], drift.lr_tables[self._index]],
+            [step - drift.begin, drift.reach, 0],
+            [*drift.betas, self._eps],
+        )
+
+
+def _columns(values: Sequence[Tensor]) -> Sequence[Tensor]:
+    """Return the op's five columns; a parameter alone is its SH column, and the others are empty."""
+    return values if len(values) > 1 else [values[0].new_empty(len(values[0]), 0)] * 4 + [values[0]]
+
+
+def rates_of(group: dict[str, Any]) -> tuple[float, float]:
+    """Return the learning rates of a group for the first three values of a row and for the rest."""
+    rest = group["lr"] if group["lr_rest"] is None else group["lr_rest"]
+    return float(group["lr"]), float(rest)

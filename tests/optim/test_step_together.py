@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`step_together` and a `LazyAdam` of all parameters equal `torch.optim.Adam`, in few calls of the op."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+
+from blitzgs.ops.sparse_rows import sparse_rows
+from blitzgs.optim import LazyAdam, drift, step_together
+from blitzgs.optim.table import Table
+from tests.helpers import BACKENDS, relative_error
+
+SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+LR = 2.0**-7
+BOUND = {torch.float32: 3e-5, torch.float64: 1e-11}
+
+
+class Pair:
+    """The same parameters under dense Adam and under ours: one optimiser each, or one for all."""
+
+    def __init__(self, backend, in_one=False, rows=50):
+        self.device, self.dtype = backend
+        self.generator = torch.Generator().manual_seed(0)
+        start = {name: self.normal(rows, *shape) for name, shape in SHAPES.items()}
+        self.lazy, self.dense = ({k: v.clone().requires_grad_() for k, v in start.items()} for _ in range(2))
+        groups = self.groups(self.lazy)
+        self.ours = [LazyAdam(groups, eps=1e-15)]
+        if not in_one:
+            self.ours = [LazyAdam([group], eps=1e-15) for group in groups]
+        self.torchs = torch.optim.Adam(self.groups(self.dense), eps=1e-15)
+
+    def groups(self, params):
+        return [
+            {"params": [p], "lr": LR * (1 + i), "name": name} for i, (name, p) in enumerate(params.items())
+        ]
+
+    def normal(self, *shape):
+        return torch.randn(*shape, generator=self.generator, dtype=torch.float64).to(self.device, self.dtype)
+
+    def step(self, share=0.3, without=()):
+        count = len(self.dense["means"])
+        ids = (torch.rand(count, generator=self.generator) < share).nonzero()[:, 0].to(self.device)
+        for name, shape in SHAPES.items():
+            if name in without:
+                self.lazy[name].grad = self.dense[name].grad = None
+                continue
+            values = self.normal(len(ids), *shape)
+            self.dense[name].grad = torch.zeros_like(self.dense[name]).index_copy_(0, ids, values)
+            self.lazy[name].grad = sparse_rows(ids, values, self.lazy[name].shape)
+        step_together(self.ours, set_to_none=True)
+        assert all(param.grad is None for param in self.lazy.values())
+        self.torchs.step()
+
+    def require_equal(self):
+        for optimizer in self.ours:
+            optimizer.catch_up()
+        for name in SHAPES:
+            assert relative_error(self.lazy[name], self.dense[name]) < BOUND[self.dtype], name
+
+    @property
+    def joined(self):
+        joints = {id(optimizer.joint) for optimizer in self.ours}
+        return len(joints) == 1 and self.ours[0].joint is not None
+
+    @torch.no_grad()
+    def change_rows(self, change, ours=True):
+        """Change the rows of parameters and state as gsplat's strategies do, without a call of the optimiser.
+
+        Args:
+            change: called with a tensor and whether it belongs to the state; returns the new tensor.
+            ours: False: only those of dense Adam.
+        """
+        for optimizers, params in [([self.torchs], self.dense)] + [(self.ours, self.lazy)] * ours:
+            for optimizer in optimizers:
+                for group in optimizer.param_groups:
+                    old = group["params"][0]
+                    state = optimizer.state.pop(old)
+                    moved = {key: change(value, True) for key, value in state.items() if key != "step"}
+                    new = change(old.detach(), False).clone().requires_grad_()
+                    optimizer.state[new], group["params"] = {**state, **moved}, [new]
+                    params[group["name"]] = new
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """The number of parameters in each call of the op that takes steps."""
+    found = []
+    taken = Table.step
+
+    def step(table, number, ids, gradients):
+        found.append(len(gradients))
+        taken(table, number, ids, gradients)
+
+    monkeypatch.setattr(Table, "step", step)
+    return found
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("in_one", [True, False])
+def test_two_calls_take_the_step_of_all(backend, in_one, calls):
+    pair = Pair(backend, in_one)
+    for _ in range(12):
+        pair.step(0.2)
+    pair.require_equal()
+    for _ in range(12):
+        pair.step(0.2)
+    pair.require_equal()
+    assert pair.joined and calls == [5, 1] * 24
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rows_change_as_strategies_change_them(backend, calls):
+    pair = Pair(backend)
+    for number in range(24):
+        pair.step()
+        if number == 5:  # duplicate; gsplat appends float zeros to every entry of the state
+            for optimizer in pair.ours:
+                optimizer.catch_up()
+            pair.change_rows(
+                lambda t, of_state: torch.cat(
+                    [t, torch.zeros(9, *t.shape[1:]).to(t.device) if of_state else t[:9]]
+                )
+            )
+        if number == 11:  # prune
+            pair.change_rows(lambda t, _: t[5:])
+        if number == 17:
+            order = torch.randperm(len(pair.lazy["means"]), generator=pair.generator).to(pair.device)
+            for optimizer in pair.ours:
+                pair.lazy.update(optimizer.permute(order))
+            assert not pair.joined
+            pair.change_rows(lambda t, _, order=order: t[order], ours=False)
+    assert pair.joined and set(calls) == {5, 1} and len(calls) == 48
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_reset_of_one_parameter_keeps_the_others(backend):
+    pair = Pair(backend)
+    for number in range(12):
+        pair.step()
+        if number == 5:  # gsplat's reset_opa
+            for optimizer in pair.ours:
+                optimizer.catch_up()
+            for optimizer, params in ((pair.ours[3], pair.lazy), (pair.torchs, pair.dense)):
+                old = params["opacities"]
+                group = next(g for g in optimizer.param_groups if g["params"][0] is old)
+                state = optimizer.state.pop(old)
+                new = old.detach().clamp(max=-1.0).requires_grad_()
+                zeros = {key: torch.zeros_like(value) for key, value in state.items() if key != "step"}
+                optimizer.state[new], group["params"] = {**state, **zeros}, [new]
+                params["opacities"] = new
+    assert pair.joined
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_cannot_be_joined_is_stepped_by_itself(backend, calls):
+    pair = Pair(backend)
+    for number in range(15):
+        if number == 5:
+            pair.step(without=("shN", "quats"))
+            assert not pair.joined
+        elif number in (6, 10):
+            pair.step(without=("opacities",))
+            pair.step(share=0.0)
+        else:
+            pair.step()
+    assert not pair.joined and 1 in calls  # opacities have taken fewer steps than the others
+    pair.require_equal()
+
+
+def test_rates_follow_a_scheduler():
+    pair = Pair(("cpu", torch.float64))
+    decays = [torch.optim.lr_scheduler.ExponentialLR(pair.ours[index], 0.5) for index in (0, 5)]
+    for _ in range(12):
+        pair.step(0.2)
+        for decay in decays:
+            decay.step()
+        for index in (0, 5):
+            pair.torchs.param_groups[index]["lr"] *= 0.5
+    assert pair.joined
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies_and_saved_states_continue(copy_of):
+    pair = Pair(("cpu", torch.float64))
+    for _ in range(5):
+        pair.step()
+    pair.ours = [copy_of(optimizer) for optimizer in pair.ours]
+    pair.lazy = {o.param_groups[0]["name"]: o.param_groups[0]["params"][0] for o in pair.ours}
+    for _ in range(5):
+        pair.step()
+    assert pair.joined
+    pair.require_equal()
+    for optimizer in pair.ours:
+        optimizer.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+    for _ in range(5):
+        pair.step()
+    assert pair.joined
+    pair.require_equal()
+
+
+def test_catching_up_some_rows():
+    pair = Pair(("cpu", torch.float64))
+    pair.step(1.0)
+    for _ in range(5):
+        pair.step(0.0)
+    before = {name: param.detach().clone() for name, param in pair.lazy.items()}
+    rows = torch.tensor([3, 7], dtype=torch.int32)
+    pair.ours[5].catch_up(rows=rows)
+    moved = (pair.lazy["shN"].detach() != before["shN"]).flatten(1).any(dim=1)
+    assert moved.nonzero()[:, 0].tolist() == [3, 7]
+    assert torch.equal(pair.lazy["means"].detach(), before["means"])
+    pair.ours[0].catch_up()
+    assert not torch.equal(pair.lazy["opacities"].detach(), before["opacities"])
+    pair.require_equal()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_full_tables_restart(backend, monkeypatch):
+    monkeypatch.setattr(drift, "CAPACITY", 20)
+    pair = Pair(backend)
+    for _ in range(75):
+        pair.step()
+    assert pair.joined
+    pair.require_equal()
