@@ -2,6 +2,7 @@
 """Runs gsplat's training loop with gsplat's parts and with ours, and compares time and quality.
 
     python benchmarks/bm_drop_in.py CAPTURE [--steps 7000] [--arms gsplat import four] [--device cuda]
+        [--profile]
 
 The loop, learning rates and density strategy are those of gsplat's `simple_trainer.py` 1.5.3
 (`opponents/gsplat_training.py`), with photographs on the device. Arms:
@@ -12,19 +13,22 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 - four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order.
 
 Times are of the whole training, and of steps between two densifications at its end; PSNR is the mean over
-held-out views.
+held-out views. `--profile` then times the parts of a step of each arm, on the host and on the device, and
+prints the ops and kernels that take most time.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
 from harness import make_parser, report
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
+from step_parts import Parts, trace
 from torch import Tensor
 
 import blitzgs
@@ -34,8 +38,13 @@ from blitzgs.scene.images import ImageStore
 
 
 class OneImport(GsplatTrainer):
-    """gsplat's loop with another renderer."""
+    """gsplat's loop with another renderer.
 
+    Attributes:
+        part: `Parts`, where the parts of a step are timed.
+    """
+
+    part: Any = staticmethod(nullcontext)
     rasterization: Any = staticmethod(blitzgs.rasterization)
 
     def loss(self, renders: Tensor, target: Tensor) -> Tensor:
@@ -67,12 +76,19 @@ class OneImport(GsplatTrainer):
 
     def _take_step(self) -> None:
         views, target, _ = self._batches[next(self._order)]
-        image, info = self.render(views)
-        self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
-        self.loss(image, target).backward()
-        self.move()
-        self._decay.step()
-        self.change_population(info)
+        with self.part("render"):
+            image, info = self.render(views)
+        with self.part("strategy, before"):
+            self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
+        with self.part("loss"):
+            loss = self.loss(image, target)
+        with self.part("backward"):
+            loss.backward()
+        with self.part("optimisers"):
+            self.move()
+            self._decay.step()
+        with self.part("strategy, after"):
+            self.change_population(info)
 
 
 class FourSwaps(OneImport):
@@ -168,13 +184,30 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
     last = min(99, options.steps // 10)  # between two densifications
     first = seconds_of(trainer, options.steps - last)
     rest = seconds_of(trainer, options.steps)
-    return {
+    found = {
         "arm": name,
         "training, s": first + rest,
         "last steps, ms each": rest / last * 1e3,
         "Gaussians": len(trainer.params["means"]),
         "PSNR, dB": psnr(trainer, capture, images),
     }
+    if options.profile:
+        profile(name, trainer, options)
+    return found
+
+
+def profile(name: str, trainer: OneImport, options: argparse.Namespace) -> None:
+    """Continue the training by some steps and report the parts of a step."""
+    steps, trace_steps = 40, 20  # with 5 steps to warm up, these reach no densification
+    trainer.train_to(trainer.step + 5)
+    trainer.part = parts = Parts(trainer.device)
+    seconds = seconds_of(trainer, trainer.step + steps)
+    title = f"{name}: a step at {len(trainer.params['means'])} Gaussians, {seconds / steps * 1e3:.2f} ms"
+    report(title, parts.rows(steps), None, options.device)
+    trainer.part = nullcontext
+    counts, table = trace(lambda: trainer.train_to(trainer.step + trace_steps), trace_steps, trainer.device)
+    report(f"{name}: work of a step", [counts], None, options.device)
+    print(table)
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
@@ -184,6 +217,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--downscale", type=float, default=1)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
+    parser.add_argument("--profile", action="store_true", help="time the parts of a step of each arm")
     options = parser.parse_args(arguments)
     capture = load_capture(options.capture, downscale=options.downscale)
     images = ImageStore(capture)
