@@ -18,8 +18,11 @@ from blitzgs.ops.take_rows import take_rows
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 EXP_AVGS = tuple(f"exp_avg.{name}" for name in PARAMETERS)
 EXP_AVG_SQS = tuple(f"exp_avg_sq.{name}" for name in PARAMETERS)
-# Columns that new rows must have; every other column starts with zeros.
+# What new rows have in a column: values that the caller gives, or zeros. Columns that are added to
+# a table later are inherited: the caller gives the values of the parents (`inherited`). All columns
+# move with their rows.
 REQUIRED = (*PARAMETERS, "last_step", "id", "parent", "birth", "level")
+ZERO_AT_BIRTH = (*EXP_AVGS, *EXP_AVG_SQS, "moment_step", "grad_sum", "grad_count", "max_radii")
 NO_PARENT = -1
 # The cull matrix, from the first importance pass on: which views leave a row out.
 CULL = "cull"
@@ -230,11 +233,10 @@ class GaussianTable:
         """Add rows at the end.
 
         Args:
-            rows: name -> tensor [M, ...] with the columns of `REQUIRED`; other columns that are absent
-                (moments, statistics) are filled with zeros.
+            rows: name -> tensor [M, ...] of every column; those of `ZERO_AT_BIRTH` may be absent.
 
         Raises:
-            ValueError: a required column is missing, an unknown one is given, or shapes or dtypes differ.
+            ValueError: a column is missing, an unknown one is given, or shapes or dtypes differ.
         """
         count = self._check_new(rows)
         for name in self._to_change():
@@ -244,7 +246,7 @@ class GaussianTable:
 
     def _check_new(self, rows: Mapping[str, Tensor]) -> int:
         """Check rows that are to be added; return how many."""
-        if missing := [name for name in REQUIRED if name not in rows]:
+        if missing := [name for name in self if name not in rows and name not in ZERO_AT_BIRTH]:
             raise ValueError(f"GaussianTable: new rows lack the columns {missing}")
         if unknown := [name for name in rows if name not in self]:
             raise ValueError(f"GaussianTable: the table has no columns {unknown}")
@@ -258,6 +260,11 @@ class GaussianTable:
                     f"got {new.dtype} {list(new.shape)}"
                 )
         return count
+
+    def inherited(self, parents: Tensor) -> dict[str, Tensor]:
+        """Return the columns that new rows inherit from their parents, the rows `parents` (int64 [M])."""
+        added = [name for name in self if name not in REQUIRED and name not in ZERO_AT_BIRTH]
+        return {name: self[name].index_select(0, parents) for name in added}
 
     def keep(self, mask: Tensor) -> None:
         """Keep the rows where `mask` (bool [N]) is true, in their order."""

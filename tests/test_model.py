@@ -2,7 +2,7 @@
 import pytest
 import torch
 
-from blitzgs.model import NO_PARENT, PARAMETERS, GaussianTable, schema
+from blitzgs.model import NO_PARENT, PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, schema
 
 
 def filled_table(count: int, seed: int = 0) -> GaussianTable:
@@ -58,10 +58,10 @@ def test_renew_equals_append_keep_and_permute(count, added):
 
 def test_new_rows_start_with_zero_moments_and_statistics():
     source = filled_table(5)
-    required = ("means", "quats", "scales", "opacities", "sh", "last_step", "id", "parent", "birth", "level")
-    table = GaussianTable.create({name: source[name] for name in required})
+    table = GaussianTable.create({name: source[name] for name in REQUIRED})
+    assert sorted(table) == sorted(REQUIRED + ZERO_AT_BIRTH)
     for name in table:
-        if name in required:
+        if name in REQUIRED:
             assert torch.equal(table[name], source[name])
         else:
             assert table[name].shape == source[name].shape and not table[name].any(), name
@@ -74,6 +74,17 @@ def test_a_table_of_parameters_alone_holds_first_gaussians():
     assert not any(table[name].any() for name in ("last_step", "moment_step", "birth", "level"))
     with pytest.raises(ValueError, match=r"new rows lack the columns \['quats'\]"):
         GaussianTable.create({name: source[name] for name in PARAMETERS if name != "quats"})
+
+
+def test_new_rows_without_a_column_that_was_added_later_are_refused():
+    table, new = filled_table(5), filled_table(2, seed=2).columns
+    table["phi"] = torch.arange(5.0)
+    with pytest.raises(ValueError, match=r"new rows lack the columns \['phi'\]"):
+        table.append(new)
+    with pytest.raises(ValueError, match=r"new rows lack the columns \['phi'\]"):
+        table.renew(torch.arange(7), new)
+    table.append(new | table.inherited(torch.tensor([3, 1])))
+    assert table["phi"].tolist() == [0, 1, 2, 3, 4, 3, 1]
 
 
 def test_empty_table():

@@ -12,18 +12,14 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
-from blitzgs.model import CULL, PARAMETERS, GaussianTable
+from blitzgs.model import PARAMETERS, GaussianTable
 from blitzgs.ops.counter_random import hash_keys, normal
 from blitzgs.population.candidates import Candidates, Veto, spawn_features
-from blitzgs.population.importance import PHI
 from blitzgs.population.lineage import Births, Cause, Lineage
-from blitzgs.population.scale_floor import FLOOR
 from blitzgs.view.blocks import morton_order
 
 SPLIT_SHRINK = 1.6
 CHILDREN_OF_A_SPLIT = 2
-# Columns that children inherit from their parent, if the table has these columns.
-INHERITED = (PHI, CULL, FLOOR)
 # Columns with the statistics since the last density event.
 STATISTICS = ("grad_sum", "grad_count", "max_radii")
 _ID_MASK = (1 << 63) - 1
@@ -218,7 +214,7 @@ def _children(
         "birth": torch.full_like(table["birth"][rows], time),
         "level": torch.where(slots > 0, (level.int() + 1).clamp(max=level_count - 1), level).to(level.dtype),
     }
-    children |= {name: table[name].index_select(0, rows) for name in INHERITED if name in table}
+    children |= table.inherited(rows)
     _shrink({name: column[len(clones) :] for name, column in children.items()}, seed, time)
     return children
 

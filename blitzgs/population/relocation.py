@@ -15,7 +15,6 @@ from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.population.candidates import spawn_features
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
-    INHERITED,
     DensityReport,
     DensityRules,
     child_ids,
@@ -175,8 +174,8 @@ def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step:
     # Use slots after those of clones and splits, which may have the same parents in the same event.
     slots = torch.arange(len(rows), device=rows.device) - first.repeat_interleave(counts)
     slots += CHILDREN_OF_A_SPLIT + 1
-    inherited = [*PARAMETERS, "level", *(name for name in INHERITED if name in table)]
-    new = {name: table[name].index_select(0, rows) for name in inherited}
+    new = {name: table[name].index_select(0, rows) for name in (*PARAMETERS, "level")}
+    new |= table.inherited(rows)
     parents = table["id"][rows]
     return new | {
         "id": child_ids(parents, time, slots),
