@@ -48,7 +48,7 @@ class OneImport(GsplatTrainer):
     rasterization: Any = staticmethod(blitzgs.rasterization)
 
     def loss(self, renders: Tensor, target: Tensor) -> Tensor:
-        """L1 and SSIM, with the kernels that gsplat's trainer uses where they are installed."""
+        """Return L1 and SSIM, with the kernels that gsplat's trainer uses where they are installed."""
         try:
             from fused_ssim import fused_ssim
         except ImportError:
@@ -104,7 +104,7 @@ class FourSwaps(OneImport):
         return params, lazy
 
     def loss(self, renders: Tensor, target: Tensor) -> Tensor:
-        """L1 and SSIM in one kernel."""
+        """Return L1 and SSIM in one kernel."""
         return blitzgs.l1_ssim(renders, target, ssim_weight=self.options.ssim_lambda)
 
     def render(self, views: Any) -> tuple[Tensor, Any]:

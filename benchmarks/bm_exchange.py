@@ -88,7 +88,7 @@ class Clock:
             self.marks.append((stage, time.perf_counter()))
 
     def milliseconds(self) -> list[float]:
-        """The time of each of `STAGES`."""
+        """Return the time of each of `STAGES`."""
         if self.cuda:
             torch.cuda.synchronize()
         times = dict.fromkeys(STAGES, 0.0)

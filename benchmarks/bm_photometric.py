@@ -16,7 +16,7 @@ from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_sums
 
 
 def plain_loss(x: Tensor, targets: Tensor) -> Tensor:
-    """0.8 L1 + 0.2 (1 - SSIM) with separable convolutions of PyTorch."""
+    """Return 0.8 L1 + 0.2 (1 - SSIM) with separable convolutions of PyTorch."""
     y = targets.permute(0, 3, 1, 2).float() / 255
     x = x.permute(0, 3, 1, 2)
     line = torch.exp(-((torch.arange(11, device=x.device) - 5.0) ** 2) / 4.5)

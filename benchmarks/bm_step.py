@@ -135,7 +135,7 @@ class GsplatStep:
         self.optimiser = torch.optim.Adam(self.render.parameters, lr=RATE, eps=1e-15, fused=True)
 
     def prepare(self) -> None:
-        """Nothing to prepare."""
+        """Do nothing; there is nothing to prepare."""
 
     def take(self, mark: Callable[[str], None]) -> None:
         """Take one step."""

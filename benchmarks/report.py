@@ -89,7 +89,7 @@ def fastest_gsplat(result: Json) -> Json | None:
 
 
 def render_lines(render: Json) -> list[str]:
-    """Forward and backward pass, against gsplat's faster mode."""
+    """Tabulate the forward and backward pass, against gsplat's faster mode."""
 
     def cells(figures: Json) -> list[str]:
         parts = " / ".join(ms(figures[name]) for name in ("forward", "backward", "total"))
@@ -107,7 +107,7 @@ def render_lines(render: Json) -> list[str]:
 
 
 def stage_lines(render: Json) -> list[str]:
-    """Stages of the forward and backward pass."""
+    """Tabulate the stages of the forward and backward pass."""
     stages = list(render["results"][0]["stages"])
     rows = [
         [
@@ -122,7 +122,7 @@ def stage_lines(render: Json) -> list[str]:
 
 
 def call_lines(render: Json) -> list[str]:
-    """The same work through `blitzgs.rasterization` and autograd."""
+    """Tabulate the same work through `blitzgs.rasterization` and autograd."""
     columns = {
         "blitzgs": "the training step's ops",
         "rasterization": "the call, dense gradients",
@@ -140,7 +140,7 @@ def call_lines(render: Json) -> list[str]:
 
 
 def step_lines(*files: Json) -> list[str]:
-    """A whole training step, against gsplat with torch's fused Adam."""
+    """Tabulate A whole training step, against gsplat with torch's fused Adam."""
     results = [result for file in files for result in file["results"]]
 
     def cells(figures: Json | None) -> list[str]:
@@ -159,7 +159,7 @@ def step_lines(*files: Json) -> list[str]:
 
 
 def exchange_lines(exchange: Json) -> list[str]:
-    """A step on several GPUs, by stage."""
+    """Tabulate A step on several GPUs, by stage."""
     reports = exchange["results"]
     names = {"alone": "a step alone, behind a barrier", "step": "**steps in a row**"}
     rows = [[names.get(stage, stage), *(ms(report["ms"][stage]) for report in reports)]
@@ -174,21 +174,21 @@ def exchange_lines(exchange: Json) -> list[str]:
 
 
 def row_lines(file: Json) -> list[str]:
-    """The rows that a benchmark has written itself."""
+    """Tabulate the rows that a benchmark has written itself."""
     rows = file["rows"]
     cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
     return [f"{file['title']}.", "", *table(rows[0], cells)]
 
 
 def photometric_lines(photometric: Json) -> list[str]:
-    """L1 + SSIM against its byte floor and plain PyTorch."""
+    """Tabulate L1 + SSIM against its byte floor and plain PyTorch."""
     rows = [[r["work"], ms(r["ms"]), ms(r["floor_ms"])] for r in photometric["results"]]
     size = "{views} view(s) of {width} × {height}".format(**photometric)
     return table([size, "ms", "byte floor, ms"], rows)
 
 
 def accuracy_lines(accuracy: Json) -> list[str]:
-    """Error against time of each option."""
+    """Tabulate the error against time of each option."""
     rows = [
         [r["name"], ms(r["milliseconds"]), f"{r['image_error']:.1e}", f"{r['gradient_error']:.1e}",
          f"{r['cut_pixels']:.2%}"]
@@ -198,7 +198,7 @@ def accuracy_lines(accuracy: Json) -> list[str]:
 
 
 def quality_lines(quality: Json) -> list[str]:
-    """Held-out quality and training time at the end of each recipe, by capture."""
+    """Tabulate held-out quality and training time at the end of each recipe, by capture."""
     import quality_report  # needs the package, which the other tables do not
 
     rows = []
@@ -215,13 +215,13 @@ SUMMARY_HEAD = ["work", "BlitzGS", "compared with", "ratio", "command"]
 def summary_row(
     work: str, ours: float, theirs: float | None, unit: str, other: str, command: str
 ) -> list[str]:
-    """One line of the README's tables: a figure, the figure that it is compared with, and their ratio."""
+    """Return one line of the README's tables: a figure, the figure compared with it, and their ratio."""
     their_cells = [f"{other} {theirs:.2f} {unit}", f"{theirs / ours:.1f}"] if theirs else ["–", "–"]
     return [work, f"{ours:.2f} {unit}", *their_cells, f"`{command}`"]
 
 
 def summary_lines(render: Json, step_1: Json, step_4: Json) -> list[str]:
-    """The README's table for one GPU: one line for each kind of work."""
+    """Return the README's table for one GPU: one line for each kind of work."""
     rows = []
 
     def add(*cells: Any) -> None:
@@ -248,7 +248,7 @@ def summary_lines(render: Json, step_1: Json, step_4: Json) -> list[str]:
 
 
 def summary_ranks_lines(exchange: Json) -> list[str]:
-    """The README's table for several GPUs: their step against one GPU's."""
+    """Return the README's table for several GPUs: their step against one GPU's."""
     one = exchange["results"][0]
     rows = [
         summary_row(

@@ -235,7 +235,7 @@ def divide(cost: NDArray[Any], parts: int) -> tuple[int, ...]:
 
 
 def cost_balance(cost: NDArray[np.float64], bounds: Sequence[int]) -> float:
-    """Largest part's cost over the mean part's: 1 is perfect."""
+    """Return the ratio of the largest part's cost to the mean of the parts; 1 is best."""
     ends = np.concatenate(([0.0], np.cumsum(cost)))
     parts = np.diff(ends[list(bounds)])
     return float(parts.max() / parts.mean()) if ends[-1] > 0 else 1.0

@@ -26,7 +26,7 @@ _MANTISSA_BITS = 23
 
 
 def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor:
-    """Random keys whose k smallest are a sample without replacement with probability proportional to weight.
+    """Draw keys; the k smallest are a sample without replacement, with probability proportional to weight.
 
     key = -log(u) / weight with u uniform in (0, 1) from (seed, event, id) alone (exponential races,
     Efraimidis and Spirakis 2006).
@@ -252,7 +252,7 @@ def _mass_threshold(
 
 
 def _exponent(key: int) -> int:
-    """Exponent of the score with this key: the same for all scores that share the key's first digit."""
+    """Return the exponent of the score with this key, which follows from the key's first digit."""
     return max(((1 << 31) - 1 - key) >> _MANTISSA_BITS, 1)
 
 

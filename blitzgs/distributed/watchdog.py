@@ -122,7 +122,7 @@ class Watchdog:
 
     @staticmethod
     def period_for(timeout_seconds: float) -> float:
-        """Seconds between two looks at the clock."""
+        """Return the seconds between two checks of the clock."""
         return min(2.0, timeout_seconds / 5)
 
     @contextmanager

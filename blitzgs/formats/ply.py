@@ -178,7 +178,7 @@ def _moved(means: Tensor, offset: npt.NDArray[np.float64] | None) -> npt.NDArray
 
 
 def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
-    """Positions float64 [M, 3] and colours uint8 [M, 3] (grey when the file has none) of a point cloud.
+    """Read positions, float64 [M, 3], and colours, uint8 [M, 3] (grey if there are none), of a point cloud.
 
     Raises:
         ValueError: the file is damaged or has no x, y, z.

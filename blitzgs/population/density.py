@@ -201,7 +201,7 @@ def _within_cap(candidates: Tensor, gradient: Tensor, ids: Tensor, cap: int, ran
 def _children(
     table: GaussianTable, clones: Tensor, splits: Tensor, time: int, seed: int, level_count: int
 ) -> dict[str, Tensor]:
-    """New rows: copies of the rows `clones`, then each child of the rows `splits`; without `last_step`."""
+    """Return new rows: copies of the rows `clones`, then each child of `splits`; without `last_step`."""
     rows = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
     slots = torch.zeros_like(rows)
     for slot in range(1, CHILDREN_OF_A_SPLIT + 1):

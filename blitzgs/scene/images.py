@@ -279,7 +279,7 @@ class ImageStore:
         return pixels
 
     def _maps_of(self, plan: Rectification) -> _Maps:
-        """Only a few maps are kept, because those of a 12-megapixel image take 100 MB."""
+        """Return a camera's maps. Only a few are kept, because those of a 12-megapixel image take 100 MB."""
         with self._maps_lock:
             if plan not in self._maps:
                 columns, rows, seen = plan.maps()

@@ -105,7 +105,7 @@ class Lens:
 
 
 def _polynomial(r2: Array, coefficients: Sequence[float]) -> Array:
-    """1 + c0 r2 + c1 r2^2 + ..."""
+    """Return 1 + c0 r2 + c1 r2^2 + ..."""
     value = np.zeros_like(r2)
     for c in reversed(coefficients):
         value = (value + c) * r2

@@ -71,7 +71,7 @@ def save_config(config: Config, path: Path) -> None:
 
 
 def config_hash(config: Config) -> str:
-    """First 16 hex digits of the SHA-256 of the resolved configuration."""
+    """Return the first 16 hex digits of the SHA-256 of the resolved configuration."""
     return hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -97,7 +97,7 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
 
 
 def _rounding(means: Tensor, offset: np.ndarray) -> float:
-    """Half the distance between neighbouring float32 numbers at the largest coordinate."""
+    """Return half the distance between neighbouring float32 numbers at the largest coordinate."""
     if len(means) == 0:
         return 0.0
     largest = np.abs(means.numpy() + offset).max()

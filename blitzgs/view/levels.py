@@ -93,7 +93,7 @@ def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution
 
 
 def _quantile(values: Tensor, q: float) -> Tensor:
-    """Linearly interpolated quantile of values [M] near one of their ends, without sorting them all."""
+    """Return the linearly interpolated quantile of values [M] near one of their ends, without a full sort."""
     largest = q > 0.5
     position = (1.0 - q if largest else q) * (len(values) - 1)
     below = math.floor(position)

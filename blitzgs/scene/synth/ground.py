@@ -81,7 +81,7 @@ def _street(
     j: Ints,
     footprint: Floats,
 ) -> Floats:
-    """Asphalt with lane markings, crossings before junctions and worn wheel tracks."""
+    """Return asphalt with lane markings, crossings before junctions and worn wheel tracks."""
     color = _asphalt(noise, x, y, footprint)
     for across, along, edge_other, streets, index, own in (
         (dx, y, edge_y, plan.along_y, i, edge_x < 0),
@@ -118,7 +118,7 @@ def _markings(
 
 
 def _pavement(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats) -> Floats:
-    """Paving slabs behind a lighter kerb, with a dark gutter."""
+    """Return paving slabs behind a lighter kerb, with a dark gutter."""
     tone = noise.layers(x, y, footprint, (5.0, 0.06), (1.2, 0.06), (0.3, 0.04))
     slab = (cell_random(np.floor(x / 0.8), np.floor(y / 0.8), 5) - 0.5) * 0.2 * resolved(0.8, footprint)
     color = np.array([0.40, 0.385, 0.36], np.float32) * (1 + tone + slab)[:, None]
@@ -145,7 +145,7 @@ def _park(
     j: Ints,
     footprint: Floats,
 ) -> Floats:
-    """Mown lawn around a pond, with gravel paths: a ring and a cross."""
+    """Return mown lawn around a pond, with gravel paths: a ring and a cross."""
     a, b = plan.along_y.centres, plan.along_x.centres
     cx, cy = (a[i] + a[i + 1]) / 2, (b[j] + b[j + 1]) / 2
     reach = np.minimum(a[i + 1] - a[i], b[j + 1] - b[j])
@@ -169,7 +169,7 @@ def _park(
 
 
 def _garden(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats) -> Floats:
-    """Lawns with beds, terraces and drives."""
+    """Return lawns with beds, terraces and drives."""
     color = _grass(noise, x, y, footprint, 0.06)
     cell_x, cell_y = np.floor(x / 7.3), np.floor(y / 6.1)
     chance = cell_random(cell_x, cell_y, 17)
@@ -192,7 +192,7 @@ def _garden(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats)
 
 
 def _square(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
-    """A paved square: bands of light stone every 5 m and slabs laid in two tones."""
+    """Return A paved square: bands of light stone every 5 m and slabs laid in two tones."""
     slab = cell_random(np.floor(x / 1.25), np.floor(y / 1.25), 23)
     tone = noise.layers(x, y, footprint, (7.0, 0.06), (1.0, 0.05), (0.3, 0.05))
     shade = (slab - 0.5) * 0.3 * resolved(1.25, footprint)
@@ -204,7 +204,7 @@ def _square(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
 
 
 def _courtyard(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
-    """Yards between houses: concrete and cobbles with overgrown corners."""
+    """Return yards between houses: concrete and cobbles with overgrown corners."""
     tone = noise.layers(x, y, footprint, (4.0, 0.12), (1.0, 0.08), (0.3, 0.08))
     cobble = (cell_random(np.floor(x / 0.5), np.floor(y / 0.5), 29) - 0.5) * 0.35 * resolved(0.5, footprint)
     color = np.array([0.31, 0.29, 0.26], np.float32) * (1 + tone + cobble)[:, None]
@@ -221,7 +221,7 @@ def _car_park(
     j: Ints,
     footprint: Floats,
 ) -> Floats:
-    """Asphalt with rows of stalls, aligned with the cars that `city.py` parks there."""
+    """Return asphalt with rows of stalls, aligned with the cars that `city.py` parks there."""
     a, b = plan.along_y, plan.along_x
     u = x - (a.centres[i] + a.halves[i] + SIDEWALK)
     v = y - (b.centres[j] + b.halves[j] + SIDEWALK)
@@ -233,7 +233,7 @@ def _car_park(
 
 
 def _fields(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
-    """Farmland around the city: parcels of crop, meadow and soil, each with its own furrows."""
+    """Return farmland around the city: parcels of crop, meadow and soil, each with its own furrows."""
     c, s = np.float32(np.cos(0.35)), np.float32(np.sin(0.35))
     u, v = c * x - s * y, s * x + c * y
     row = np.floor(v / 62 + 0.15 * noise(u / 300, v / 300))

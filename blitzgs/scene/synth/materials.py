@@ -40,7 +40,7 @@ def mix(a: Floats, b: Floats | tuple[float, float, float], amount: Floats) -> Fl
 
 
 def facade(p: Points, noise: Noise) -> Floats:
-    """Plaster, brick or banded concrete with a grid of windows; with a shop front if the look has one."""
+    """Return plaster, brick or banded concrete with windows, and with a shop front if the look has one."""
     seed, style, pitch, shop = p.numbers.T
     stains = noise.layers(p.u + 7 * seed, p.v, p.footprint, (9.0, 0.05), (2.0, 0.04), (0.5, 0.035))
     streaks = noise((p.u + seed) / 0.7, p.v / 6) * resolved(0.7, p.footprint)
@@ -96,7 +96,7 @@ def _panes(p: Points, column: Floats, row: Floats, du: Floats, dv: Floats, shop:
 
 
 def curtain_wall(p: Points, noise: Noise) -> Floats:
-    """Glass panels between mullions and floor slabs; panels differ a little in tint."""
+    """Return glass panels between mullions and floor slabs; panels differ a little in tint."""
     seed, pitch = p.numbers[:, 0], p.numbers[:, 1]
     column, row = np.floor(p.u / pitch), np.floor(p.v / FLOOR)
     tint = 0.75 + 0.5 * cell_random(column, row, seed)
@@ -110,7 +110,7 @@ def curtain_wall(p: Points, noise: Noise) -> Floats:
 
 
 def gravel(p: Points, noise: Noise) -> Floats:
-    """Gravelled or felted roofs: stones, weathered patches, seams and the odd puddle stain."""
+    """Return gravelled or felted roofs: stones, weathered patches, seams and the odd puddle stain."""
     x, y = p.position[:, 0], p.position[:, 1]
     seed = p.numbers[:, 0]
     tone = noise.layers(x + seed, y, p.footprint, (6.0, 0.10), (1.7, 0.09), (0.45, 0.12), (0.2, 0.12))
@@ -123,7 +123,7 @@ def gravel(p: Points, noise: Noise) -> Floats:
 
 
 def tiles(p: Points, noise: Noise) -> Floats:
-    """Rows of roof tiles, each of its own shade, with moss, a ridge and perhaps skylights."""
+    """Return rows of roof tiles, each of its own shade, with moss, a ridge and perhaps skylights."""
     seed, skylights = p.numbers[:, 0], p.numbers[:, 1]
     course, across = 0.38, 0.34
     row = np.floor(p.v / course)
@@ -148,7 +148,7 @@ def tiles(p: Points, noise: Noise) -> Floats:
 
 
 def metal(p: Points, noise: Noise) -> Floats:
-    """Sheet metal with standing seams; machines (first number 1) have louvres and a fan grille."""
+    """Return sheet metal with standing seams; machines (first number 1) have louvres and a fan grille."""
     louvre = stripes(p.v, 0.3, 0.0, 0.35, p.footprint) * (p.numbers[:, 1] > 0)
     seam = stripes(p.u, 0.6, 0.0, 0.1, p.footprint) * (p.numbers[:, 1] == 0)
     centre = np.hypot(p.u - p.size[:, 0] / 2, p.v - p.size[:, 1] / 2)
@@ -160,7 +160,7 @@ def metal(p: Points, noise: Noise) -> Floats:
 
 
 def plain(p: Points, noise: Noise) -> Floats:
-    """Concrete, plaster, painted boards: the colour with weathering."""
+    """Return concrete, plaster, painted boards: the colour with weathering."""
     x = p.u + p.position[:, 0] + p.numbers[:, 0]
     tone = noise.layers(x, p.v + p.position[:, 1], p.footprint, (3.0, 0.07), (0.7, 0.07), (0.25, 0.05))
     weathered: Floats = p.color * (1 + tone)[:, None]
@@ -168,14 +168,14 @@ def plain(p: Points, noise: Noise) -> Floats:
 
 
 def solar(p: Points, noise: Noise) -> Floats:
-    """Dark panels of 1 m by 1.6 m with bright frames."""
+    """Return dark panels of 1 m by 1.6 m with bright frames."""
     frames = stripes(p.u, 1.0, 0.0, 0.06, p.footprint) + stripes(p.v, p.size[:, 1], 0.0, 0.05, p.footprint)
     tint = 0.8 + 0.4 * cell_random(np.floor(p.u), np.floor(p.v), p.numbers[:, 0])
     return mix(p.color * tint[:, None], (0.45, 0.46, 0.48), np.clip(frames, 0, 1))
 
 
 def leaves(p: Points, noise: Noise) -> Floats:
-    """Foliage: clumps of light and dark, lighter towards the top of the crown."""
+    """Return foliage: clumps of light and dark, lighter towards the top of the crown."""
     x, y, z = p.position.T
     tone = noise.layers(x + 0.7 * z, y + 0.9 * z, p.footprint, (1.3, 0.22), (0.5, 0.25), (0.22, 0.2))
     lift = 0.25 * p.normal[:, 2]
@@ -184,5 +184,5 @@ def leaves(p: Points, noise: Noise) -> Floats:
 
 
 def paint(p: Points, noise: Noise) -> Floats:
-    """Car paint: the colour, with the bright sky on surfaces that face up."""
+    """Return car paint: the colour, with the bright sky on surfaces that face up."""
     return mix(p.color, (0.6, 0.65, 0.7), (0.12 * np.clip(p.normal[:, 2], 0, 1)).astype(np.float32))
