@@ -213,11 +213,12 @@ def render(
         exchange = transport.start(inputs, assignment, attempt, mark)
         splats, n_splats, n_isects = exchange.arrived
         geometry = (splats.means2d, splats.conics, splats.opacities)
-        lists = torch.ops.blitzgs.intersect(
+        isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
             *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
         )
         mark("sort")
-        arguments, zeros = (*geometry, splats.colors, backgrounds, *lists, grid), exchange.gradient_table
+        arguments = (*geometry, splats.colors, backgrounds, isect_splats, tile_offsets, grid)
+        zeros = exchange.gradient_table
         if zeros is not None and backward_follows:
             composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, zeros, n_splats)
         else:
@@ -241,8 +242,8 @@ def render(
         visible=counts.visible,
         active=active,
         backgrounds=backgrounds,
-        isect_splats=lists[0],
-        tile_offsets=lists[1],
+        isect_splats=isect_splats,
+        tile_offsets=tile_offsets,
         renders=renders,
         transmittances=transmittances,
         last_ids=last_ids,

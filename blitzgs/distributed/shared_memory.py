@@ -141,8 +141,8 @@ class SharedMemory:
         first = count + place * MAX_VALUES * (count + 1) + count * (MAX_VALUES - numbers)
         host = self._host[place, : count * numbers].view(count, numbers)
         self._barrier(values, first, host)
-        brought = self._control[self.rank][first : first + (count + 1) * numbers].view(count + 1, numbers)
-        return Shared(brought[:count], brought[count], host)
+        gathered = self._control[self.rank][first : first + (count + 1) * numbers].view(count + 1, numbers)
+        return Shared(gathered[:count], gathered[count], host)
 
     def boards(self, words: int) -> list[Tensor]:
         """Return every rank's board, float32 [words], for the next barrier of the board. Collective.

@@ -117,7 +117,7 @@ def rasterize(
         renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, grid, None, True, False, None)
         alphas = 1 - transmittances
     else:
-        geometry = splats[:3] if through is None else through.columns
+        geometry = (means2d, conics, splat_opacities) if through is None else through.columns
         places = None if through is None else through.places
         differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in (*geometry, colors))
         # The inputs whose gradients stay packed, see `_gradients`.

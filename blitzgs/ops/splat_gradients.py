@@ -110,7 +110,8 @@ class SplatGradients(NamedTuple):
         widths = [math.prod(column.shape[1:]) for column in columns]
         sums = sum_splats(values, places, group_sizes, splats, widths)
         parts = [total.reshape(-1, *like.shape[1:]) for total, like in zip(sums, columns, strict=True)]
-        return SplatGradients(parts[:4], None, parts[4] if self.means2d_abs is not None else None)
+        absolute = parts.pop() if self.means2d_abs is not None else None
+        return SplatGradients(parts, None, absolute)
 
     def _columns(self) -> list[Tensor]:
         """Return the four columns, and `means2d_abs` if it is there."""

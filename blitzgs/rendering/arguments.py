@@ -208,7 +208,8 @@ def gaussians_of(
     colors = colors if with_colors else None
     whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
     scenes = _scenes(whole, batch)
-    named = dict(zip(Scene._fields[:7], zip(*scenes, strict=True), strict=False))
+    named = dict(zip(Scene._fields, zip(*scenes, strict=True), strict=True))
+    del named["covariances"]
     if colors is None:
         del named["colors"]
     degree = sh_degree if with_colors else None

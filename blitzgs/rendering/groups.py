@@ -42,7 +42,7 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
             views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
         sh = _sh_of_views(gaussians, scene, len(views))
         for part, (viewmats, Ks) in enumerate(views):
-            means, quats, scales, opacities = scene[:4]
+            means, quats, scales, opacities, *_ = scene
             inputs = ProjectionInputs(
                 gaussians_of(means, quats, scales, opacities, sh[part]), (viewmats, Ks), options
             )

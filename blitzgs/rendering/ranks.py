@@ -56,7 +56,8 @@ def gather_views(gaussians: Gaussians, same: Sequence[Any]) -> tuple[Gaussians, 
         return gaussians, None
     job = Job(dist.get_rank(), dist.get_world_size(), gaussians.views)
     scene, recorded = gaussians.scenes[0], torch.is_grad_enabled()
-    need = recorded and any(t is not None and t.requires_grad for t in scene[:6])
+    *inputs, _, _ = scene  # without Ks and covariances
+    need = recorded and any(t is not None and t.requires_grad for t in inputs)
     need_poses = recorded and scene.viewmats.requires_grad
     _require_same((gaussians.views, *same, need, need_poses), scene.viewmats.device)
     viewmats: Tensor = _GatherViews.apply(scene.viewmats, job)  # type: ignore[no-untyped-call]

@@ -55,7 +55,7 @@ class BlockVisibility:
         """
         self._batch_size = batch_size
         self.batches = len(cameras.viewmats) // batch_size
-        seen = seen_blocks(bounds, *cameras[:3], *cameras.limits)
+        seen = seen_blocks(bounds, cameras.viewmats, cameras.Ks, cameras.sizes, *cameras.limits)
         if culled is not None and cameras.columns is not None:
             seen &= ~_culling_views(culled, cameras.columns)
         self._event: torch.cuda.Event | None = None
