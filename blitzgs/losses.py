@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -59,15 +60,24 @@ class _L1Ssim(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, renders: Tensor, targets: Tensor, masks: Tensor | None, weight: float) -> Tensor:
-        counts = pixel_counts(renders, masks)
-        share = torch.full_like(counts, 1 / len(renders))
+        constant = masks is None and renders.numel() > 0
+        if constant:
+            views, height, width, _ = renders.shape
+            key = (views, 3 * height * width, float(weight), renders.dtype, renders.device)
+            l1_weights, ssim_weights, divisors, factors = _constants(*key)
+        else:
+            counts = pixel_counts(renders, masks)
+            divisors, share = counts.clamp_min(1), torch.full_like(counts, 1 / len(renders))
+            l1_weights, ssim_weights = (1 - weight) * share, -weight * share
         parts, v_renders, _ = photometric_fwd_bwd(
-            renders, targets, masks, (1 - weight) * share, -weight * share, samples=counts.clamp_min(1)
+            renders, targets, masks, l1_weights, ssim_weights, samples=divisors
         )
         ctx.save_for_backward(v_renders)
         ctx.renders = renders  # not saved, as its values are not needed and may change
+        if constant:
+            return ((parts * factors).sum() + weight).to(renders.dtype)
         l1, ssim = parts.sum(dim=1).unbind(dim=1)
-        per_view = ((1 - weight) * l1 + weight * (counts - ssim)) / counts.clamp_min(1)
+        per_view = ((1 - weight) * l1 + weight * (counts - ssim)) / divisors
         return per_view.mean().to(renders.dtype)
 
     @staticmethod
@@ -77,3 +87,25 @@ class _L1Ssim(torch.autograd.Function):
             gradient: Tensor | None = v_renders * v_loss
         (gradient,) = first_only("l1_ssim", [gradient], [ctx.renders, v_loss])
         return gradient, None, None, None
+
+
+@lru_cache(maxsize=16)
+def _constants(
+    views: int, count: int, weight: float, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return what the loss of views without a mask needs; each tensor would cost a launch in every step.
+
+    Args:
+        views: number of views B.
+        count: values that the mean of a view averages, at least 1.
+        weight: w of `l1_ssim`.
+        dtype: of the renders.
+        device: of the renders.
+
+    Returns:
+        The weights of the sums of L1 and SSIM and their divisors, [B] each, and the factors, float64 [2],
+        that turn these two sums into the loss less w.
+    """
+    factors = torch.tensor([1 - weight, -weight], dtype=torch.float64, device=device) / views
+    l1, ssim = factors.to(dtype)[:, None].repeat(1, views)
+    return l1, ssim, torch.full((views,), count, dtype=dtype, device=device), factors / count
