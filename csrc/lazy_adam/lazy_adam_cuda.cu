@@ -18,6 +18,9 @@ namespace {
 // these gets a thread.
 constexpr int kRows = 16;  // rows per block
 constexpr int kThreads = kRows * (12 + 8);
+// With three SH values a row (the first coefficient, stepped without the others) a block has threads for more
+// rows.
+constexpr int kFewPacks = 3, kMoreRows = kThreads / (kFewPacks + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
 constexpr int kPrepareLanes = 8, kPrepareThreads = 64, kListThreads = 256;
 static_assert(kPrepareLanes > kAdamGroups);
@@ -133,25 +136,26 @@ __global__ void __launch_bounds__(kListThreads)
   }
 }
 
-// Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every kRows rows.
+// Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every Rows rows.
 // ShPacks: the packs in an SH row; 0: sh_packs is their number.
-template <int ShWidth, int ShPacks, class F>
+template <int ShWidth, int ShPacks, int Rows, class F>
 __device__ __forceinline__ void for_each_pack(int sh_packs, const F& update) {
   const int packs = ShPacks ? ShPacks : sh_packs;
   // If the number of packs is known at compile time, a single round handles all of them.
-  constexpr int kRound = ShPacks ? kRows * (ShPacks + 8) : kThreads;
-  for (int item = threadIdx.x; item < kRows * (packs + 8); item += kRound) {
-    const int rest = item - kRows * packs;
+  constexpr int kRound = ShPacks ? Rows * (ShPacks + 8) : kThreads;
+  static_assert(kRound <= kThreads);
+  for (int item = threadIdx.x; item < Rows * (packs + 8); item += kRound) {
+    const int rest = item - Rows * packs;
     if (rest < 0) {
       update.template operator()<4, ShWidth>(item / packs, item % packs);
-    } else if (rest < 3 * kRows) {
+    } else if (rest < 3 * Rows) {
       update.template operator()<0, 1>(rest / 3, rest % 3);
-    } else if (rest < 6 * kRows) {
-      update.template operator()<2, 1>(rest / 3 - kRows, rest % 3);
-    } else if (rest < 7 * kRows) {
-      update.template operator()<1, 4>(rest - 6 * kRows, 0);
+    } else if (rest < 6 * Rows) {
+      update.template operator()<2, 1>(rest / 3 - Rows, rest % 3);
+    } else if (rest < 7 * Rows) {
+      update.template operator()<1, 4>(rest - 6 * Rows, 0);
     } else {
-      update.template operator()<3, 1>(rest - 7 * kRows, 0);
+      update.template operator()<3, 1>(rest - 7 * Rows, 0);
     }
   }
 }
@@ -178,8 +182,8 @@ __device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const
 }
 
 // The pending rows catch up: reads parameters and moments, writes parameters. A thread handles the same pack
-// of every (gridDim.x * kRows)-th listed row, and loads the next list entry while it updates the current row.
-template <int ShWidth, int ShPacks>
+// of every (gridDim.x * Rows)-th listed row, and loads the next list entry while it updates the current row.
+template <int ShWidth, int ShPacks, int Rows>
 __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
     catch_up_kernel(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
                     const PendingRow* pending_rows) {
@@ -187,8 +191,8 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
   if (!*prepared.any_pending) return;
   const std::int64_t n = listed(args);
   const auto catch_up_one = [&]<int Column, int Width>(int local, int pack) {
-    const std::int64_t stride = gridDim.x * std::int64_t{kRows};
-    std::int64_t i = blockIdx.x * std::int64_t{kRows} + local;
+    const std::int64_t stride = gridDim.x * std::int64_t{Rows};
+    std::int64_t i = blockIdx.x * std::int64_t{Rows} + local;
     PendingRow next{-1, 0, {}};
     if (i < n) next = pending_rows[i];
     while (i < n) {
@@ -198,7 +202,7 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
       if (row.id >= 0) catch_up_pack<Column, Width>(args, prepared, row, pack);
     }
   };
-  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, catch_up_one);
+  for_each_pack<ShWidth, ShPacks, Rows>(static_cast<int>(args.columns[4].width) / ShWidth, catch_up_one);
 }
 
 // One pack of a row takes the Adam step; the row has caught up.
@@ -212,22 +216,22 @@ __device__ __forceinline__ void step_pack(const AdamArgs<float>& args, const Ada
   own.finish(column, step, make_decay(args, args.sparse ? 0 : args.target() - args.moment_step[row]), g);
 }
 
-// The Adam step with gradients, for rows that have caught up. One thread per pack. A block handles kRows rows
+// The Adam step with gradients, for rows that have caught up. One thread per pack. A block handles Rows rows
 // of the list in all five columns, so no other block reads or writes their last_step and moment_step.
-template <int ShWidth, int ShPacks>
+template <int ShWidth, int ShPacks, int Rows>
 __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ AdamArgs<float> args) {
   __shared__ AdamStep<float> step;
   wait_for_earlier_kernels();
   if (threadIdx.x == 0) step = adam_step_scalars(args);
   __syncthreads();
-  const std::int64_t first = blockIdx.x * std::int64_t{kRows};
-  const int count = static_cast<int>(args.n - first < kRows ? args.n - first : kRows);
+  const std::int64_t first = blockIdx.x * std::int64_t{Rows};
+  const int count = static_cast<int>(args.n - first < Rows ? args.n - first : Rows);
   const auto take_step = [&]<int Column, int Width>(int local, int pack) {
     if (local >= count) return;
     const std::int64_t row = args.ids ? args.ids[first + local] : first + local;
     step_pack<Column, Width>(args, step, row, first + local, pack);
   };
-  for_each_pack<ShWidth, ShPacks>(static_cast<int>(args.columns[4].width) / ShWidth, take_step);
+  for_each_pack<ShWidth, ShPacks, Rows>(static_cast<int>(args.columns[4].width) / ShWidth, take_step);
   __syncthreads();
   if (threadIdx.x >= count) return;
   const std::int64_t i = first + threadIdx.x, row = args.ids ? args.ids[i] : i;
@@ -294,6 +298,17 @@ __global__ void __launch_bounds__(kListThreads)
 
 bool is_alone(const AdamArgs<float>& args) { return args.columns[0].width == 0; }
 
+// Selects a kernel by the number of SH values in a row: 48 (degree 3), 3 (degree 0) or another.
+template <class Kernel>
+Kernel* select(const AdamArgs<float>& args, Kernel* degree_3, Kernel* degree_0, Kernel* any) {
+  const std::int64_t width = args.columns[4].width;
+  return width == 48 ? degree_3 : width == kFewPacks ? degree_0 : any;
+}
+
+int rows_per_block(const AdamArgs<float>& args) {
+  return args.columns[4].width == kFewPacks ? kMoreRows : kRows;
+}
+
 // The number of blocks for `items` items, at most as many as the device runs at a time.
 unsigned filled_blocks(std::int64_t items, int items_per_block, int blocks_per_multiprocessor) {
   return std::min(blocks_for(items, items_per_block),
@@ -331,9 +346,11 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
                  pending_rows);
     return;
   }
-  const auto kernel = args.columns[4].width == 48 ? catch_up_kernel<4, 12> : catch_up_kernel<1, 0>;
-  launch_early("lazy_adam catch-up", kernel, {filled_blocks(args.n, kRows, kCatchUpBlocks), kThreads, stream},
-               args, prepared, pending_rows);
+  const auto kernel = select(args, catch_up_kernel<4, 12, kRows>, catch_up_kernel<1, kFewPacks, kMoreRows>,
+                             catch_up_kernel<1, 0, kRows>);
+  launch_early("lazy_adam catch-up", kernel,
+               {filled_blocks(args.n, rows_per_block(args), kCatchUpBlocks), kThreads, stream}, args,
+               prepared, pending_rows);
 }
 
 // Quaternions, and SH of degree 3, are moved 16 bytes at a time.
@@ -369,8 +386,9 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
                  {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args);
     return;
   }
-  const auto kernel = args.columns[4].width == 48 ? step_kernel<4, 12> : step_kernel<1, 0>;
-  launch_early("lazy_adam step", kernel, {blocks_for(args.n, kRows), kThreads, stream}, args);
+  const auto kernel =
+      select(args, step_kernel<4, 12, kRows>, step_kernel<1, kFewPacks, kMoreRows>, step_kernel<1, 0, kRows>);
+  launch_early("lazy_adam step", kernel, {blocks_for(args.n, rows_per_block(args)), kThreads, stream}, args);
 }
 
 template <class T>
