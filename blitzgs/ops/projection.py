@@ -216,13 +216,25 @@ class Projected(NamedTuple):
 
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
     """Project without gradients and wait for the number of splats; `project` with grouped arguments."""
+    return splats_of(*_projected(inputs))
+
+
+def visible_gaussians(inputs: ProjectionInputs) -> tuple[Tensor, Sizes]:
+    """Return the Gaussians that have a splat, int32 [U], ascending, and the sizes of their projection."""
+    splats, counts = _projected(inputs)
+    sizes = Sizes(*counts.tolist())
+    return splats.visible_ids[: sizes.visible], sizes
+
+
+def _projected(inputs: ProjectionInputs) -> tuple[ProjectedSplats, Tensor]:
+    """Return columns that may be longer than their valid part, and `ProjectedSplats.counts`."""
     with torch._C._AutoDispatchBelowAutograd():
         for attempt in capacity_for(inputs).attempts():
             projected = inputs.run(attempt.sizes)
             counts = HostCopy(projected.totals).read()[:3]
             needed = Sizes(*counts.tolist())
             attempt.end(needed, attempt.sizes is None or attempt.sizes.holds(needed[:2]))
-        return splats_of(projected.splats, counts)
+        return projected.splats, counts
 
 
 def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:

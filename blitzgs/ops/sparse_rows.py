@@ -53,7 +53,7 @@ def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
     """
     if not table.is_coalesced():
         here = table._indices().untyped_storage()._cdata
-        if any(known.cdata == here and not known.expired() for known in _distinct):
+        if any(known.cdata == here and not known.expired() for known in reversed(_distinct)):
             return table._indices()[0], table._values()
         table = table.coalesce()
     return table.indices()[0], table.values()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from blitzgs.lazy_dict import Later
 from blitzgs.ops.capacity import Sizes
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
+from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, visible_gaussians
 from blitzgs.ops.sparse_rows import full_gradient
 from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
 from blitzgs.rendering.groups import groups_of
@@ -164,10 +164,9 @@ def _visible(calls: list[ProjectionInputs]) -> tuple[Tensor, Sizes | None]:
     Returns:
         Ascending ids; and, with a single call, the numbers of Gaussians, splats and tile entries.
     """
-    parts = [project_splats(inputs) for inputs in calls]
-    if len(parts) > 1:
-        return torch.cat([splats.visible_ids for splats in parts]).unique(), None
-    return parts[0].visible_ids, Sizes(*parts[0].counts.tolist())
+    if len(calls) == 1:
+        return visible_gaussians(calls[0])
+    return torch.cat([visible_gaussians(inputs)[0] for inputs in calls]).unique(), None
 
 
 class _Visible(torch.autograd.Function):
