@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A dict that computes some of its values only when they are read."""
+"""Dicts that compute their values, or all of their contents, only when they are read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from torch.utils import _pytree as pytree
@@ -34,6 +34,12 @@ class LazyDict(dict[str, Any]):
     def __iter__(self) -> Iterator[str]:
         """Iterate over the keys; defined so that `dict(self)` and `**self` read values by `__getitem__`."""
         return super().__iter__()
+
+    def change(self, key: str, function: Callable[[Any], Any]) -> None:
+        """Replace a value by a function of it, without computing either before it is read."""
+        before = super().__getitem__(key)
+        compute = before.compute if isinstance(before, Later) else lambda: before
+        self[key] = Later(lambda: function(compute()))
 
     def get(self, key: str, default: Any = None) -> Any:
         """Return the value of a key, or `default`."""
@@ -89,9 +95,38 @@ class LazyDict(dict[str, Any]):
         return super()
 
 
-# Register the class, so that tree_map visits its values: an unregistered subclass of dict would be a leaf.
-pytree.register_pytree_node(
-    LazyDict,
-    lambda values: (list(values.values()), list(values)),
-    lambda values, keys: dict(zip(keys, values, strict=True)),
-)
+class LateMapping(Mapping[str, Any]):
+    """A mapping whose keys and values are computed when it is first looked into; copies are plain dicts."""
+
+    def __init__(self, compute: Callable[[], Mapping[str, Any]]) -> None:
+        self._compute = compute
+        self._contents: Mapping[str, Any] | None = None
+
+    def _whole(self) -> Mapping[str, Any]:
+        if self._contents is None:
+            self._contents = self._compute()
+        return self._contents
+
+    def __getitem__(self, key: str) -> Any:
+        return self._whole()[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._whole())
+
+    def __len__(self) -> int:
+        return len(self._whole())
+
+    def __repr__(self) -> str:
+        return repr(dict(self))
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        return dict, (dict(self),)
+
+
+# Register the classes, so that tree_map visits their values: unregistered, they would be leaves.
+for _class in (LazyDict, LateMapping):
+    pytree.register_pytree_node(
+        _class,
+        lambda values: (list(values.values()), list(values)),
+        lambda values, keys: dict(zip(keys, values, strict=True)),
+    )

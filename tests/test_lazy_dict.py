@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A `LazyDict` reads like a dict and computes each value once, when it is read."""
+"""Lazy dicts read like dicts and compute their values or contents once, when they are read."""
 
 import copy
 import json
 import pickle
 
 import pytest
+from torch.utils._pytree import tree_map
 
-from blitzgs.lazy_dict import Later, LazyDict
+from blitzgs.lazy_dict import LateMapping, Later, LazyDict
 
 PLAIN = {"image": 1, "ids": [2, 3], "mask": None}
 READERS = {
@@ -81,3 +82,36 @@ def test_values_may_be_replaced_and_deleted():
     assert values.pop("mask", None) is None and values.setdefault("mask", 6) == 6
     with pytest.raises(KeyError):
         values["radii"]
+
+
+def test_a_changed_value_is_computed_when_it_is_read():
+    values, computed = lazy()
+    values.change("ids", lambda ids: [*ids, 4])
+    values.change("image", lambda image: image + 1)
+    assert computed == []
+    assert values["ids"] == [2, 3, 4] and values["image"] == 2 and computed == ["ids"]
+
+
+LATE_READERS = (
+    "dict",
+    "unpacked",
+    "keyword arguments",
+    "update",
+    "shallow copy",
+    "deep copy",
+    "pickle",
+    "repr",
+)
+
+
+@pytest.mark.parametrize("reader", [READERS[name] for name in (*LATE_READERS, "items", "values")])
+def test_a_mapping_is_computed_once_and_only_when_it_is_looked_into(reader):
+    computed, plain = [], dict(PLAIN)
+    late = LateMapping(lambda: computed.append(0) or PLAIN)
+    whole = LazyDict(found=late)
+    assert list(whole.values())[0] is late and computed == []
+    result = reader(late)
+    assert type(result) is dict and list(result.items()) == list(PLAIN.items())
+    assert len(late) == 3 and "ids" in late and late == PLAIN and plain == late and late != {}
+    assert tree_map(lambda value: value, whole) == {"found": PLAIN}
+    assert computed == [0]

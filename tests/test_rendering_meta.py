@@ -244,6 +244,17 @@ def test_large_finite_values_are_not_named(per_view):
     assert rasterize_scene(scene)[2]["non_finite"] == {}
 
 
+def test_reading_all_of_meta_reads_no_parameter(monkeypatch):
+    def fail(gaussians):
+        raise AssertionError("non_finite was not looked into")
+
+    monkeypatch.setattr("blitzgs.rendering.meta.non_finite", fail)
+    _, _, meta = rasterize_scene(random_scene(n=30))
+    assert len(list(meta.values())) == len(meta)
+    with pytest.raises(AssertionError, match="looked into"):
+        len(meta["non_finite"])
+
+
 def test_finite_input_is_not_warned_of(recwarn):
     _, _, meta = rasterize_scene(random_scene(n=30))
     assert meta["non_finite"] == {}

@@ -108,9 +108,10 @@ def rasterization(
         width, height, tile_size, n_batches, n_cameras. The image depends on means2d, conics, opacities and,
         where depth is rendered, depths, so `retain_grad()` works on them. Splats whose alpha is below 1/255
         at all pixels of the image are left out, though gsplat counts some of them as visible (0.1 % more).
-        `meta["non_finite"]` is a dict from the names of arguments to the indices of Gaussians or views that
-        were not rendered because they are NaN or infinite. Meta is a `LazyDict`: entries that the image does
-        not need are computed when they are first read.
+        `meta["non_finite"]` is a mapping from the names of arguments to the indices of Gaussians or views
+        that were not rendered because they are NaN or infinite; they are looked for when the mapping is first
+        looked into. Meta is a `LazyDict`: entries that the image does not need are computed when they are
+        first read.
 
     Warns:
         RuntimeWarning: an argument has values that are NaN or infinite (on CUDA, every 32nd call checks

@@ -10,14 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.lazy_dict import Later, LazyDict
+from blitzgs.lazy_dict import LateMapping, Later, LazyDict
 from blitzgs.ops.projection import ProjectedSplats
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.finite import non_finite
 from blitzgs.rendering.layout import Layout
 
 
-@dataclass(frozen=True)
+@dataclass
 class Lists:
     """The splats that each tile of all images composites.
 
@@ -34,6 +34,7 @@ class Lists:
     width: int
     height: int
     tile_size: int
+    _listed: Tensor | None = None
 
     @property
     def tiles_x(self) -> int:
@@ -49,7 +50,9 @@ class Lists:
         """Return `splats` without the undefined entries, which exist if splats are hidden."""
         if torch.compiler.is_compiling():  # they were counted
             return self.splats
-        return self.splats[: int(self.offsets[-1])]
+        if self._listed is None:  # once, because it waits for the device
+            self._listed = self.splats[: int(self.offsets[-1])]
+        return self._listed
 
 
 def make_meta(
@@ -80,9 +83,18 @@ def make_meta(
             return lists.listed()
         return layout.places.flat().index_select(0, lists.listed()).int()
 
+    def batch_ids() -> Tensor:
+        if len(gaussians.scenes) == 1:
+            return torch.zeros_like(splats.camera_ids, dtype=torch.int64)
+        return layout.arrange(layout.images // views)[0]
+
+    def camera_ids() -> Tensor:
+        ids = splats.camera_ids.long()
+        return layout.arrange(ids if len(gaussians.scenes) == 1 else ids % views)[0]
+
     entries: dict[str, Any] = {
-        "batch_ids": Later(lambda: layout.arrange(layout.images // views)[0]) if packed else None,
-        "camera_ids": Later(lambda: layout.arrange(layout.images % views)[0]) if packed else None,
+        "batch_ids": Later(batch_ids) if packed else None,
+        "camera_ids": Later(camera_ids) if packed else None,
         "gaussian_ids": Later(lambda: layout.arrange(layout.gaussians)[0]) if packed else None,
         "radii": Later(lambda: layout.arrange(splats.radii)[0]),
         **arranged,
@@ -100,8 +112,8 @@ def make_meta(
     }
     if torch.compiler.is_compiling():
         return {key: value.compute() if isinstance(value, Later) else value for key, value in entries.items()}
-    entries["non_finite"] = Later(lambda: non_finite(gaussians))
-    return LazyDict(**entries)
+    entries["non_finite"] = LateMapping(lambda: non_finite(gaussians))
+    return LazyDict(entries)
 
 
 def _isect_ids(depths: Tensor, lists: Lists, images: int) -> Tensor:

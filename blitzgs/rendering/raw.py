@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.lazy_dict import Later
+from blitzgs.lazy_dict import LazyDict
 from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, visible_gaussians
 from blitzgs.ops.sparse_rows import full_gradient
@@ -124,8 +124,8 @@ def raw_rasterization(
     renders, alphas, meta = render(
         "raw_rasterization", replace(gaussians, named=named), project, image, sizes
     )
-    index_in_visible = meta["gaussian_ids"]
-    meta["gaussian_ids"] = Later(lambda: ids.long()[index_in_visible])
+    assert isinstance(meta, LazyDict)
+    meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
     return renders, alphas, meta
 
 
