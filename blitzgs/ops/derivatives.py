@@ -4,10 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
+
+_NOTHING: AbstractContextManager[object] = nullcontext()
+
+
+def unrecorded() -> AbstractContextManager[object]:
+    """Return a context in which autograd records nothing; usually nothing has to be done."""
+    return torch.no_grad() if torch.is_grad_enabled() else _NOTHING
 
 
 def first_only(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.ops.derivatives import first_only
+from blitzgs.ops.derivatives import first_only, unrecorded
 from blitzgs.ops.projection import (
     VIEW_TOTALS,
     ProjectedSplats,
@@ -122,7 +122,10 @@ def differentiable_splats(
         columns = _Project.apply(  # type: ignore[no-untyped-call]
             means, quats, scales, opacities, sh[0] if sh else None, viewmats, inputs, sparse_grad, splats
         )
-        return splats._replace(**_Differentiable._make(columns)._asdict())
+        means2d, conics, depths, opacities, colors = columns
+        return splats._replace(
+            means2d=means2d, conics=conics, depths=depths, opacities=opacities, colors=colors
+        )
     if sparse_grad:
         raise ValueError("sparse_grad is not supported under torch.compile")
     *columns, _, totals = torch.ops.blitzgs.project_fwd(
@@ -257,7 +260,7 @@ def _gradients(
         v: gradients of the splats; None: zero.
     """
     saved = _Saved.of(ctx)
-    with torch.no_grad():
+    with unrecorded():
         gradients = _first_gradients(ctx.options, saved, needed, need_viewmats, sparse, v)
     return first_only("project", gradients, (*saved.gaussians, saved.cameras[0], *v))
 

@@ -47,12 +47,12 @@ def splats_of(allocated: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
         allocated: a `ProjectedSplats`; its `counts` are not read.
         counts: `counts` of the result.
     """
-    visible, splats = counts[:2].tolist()
+    visible, splats, *_ = counts.tolist()
     lengths = (splats, splats, visible, visible + 1, *(splats,) * 8)
     # Hide from autograd that these are views: a Function may return views, but its caller could not change
     # them in place.
     with torch._C._AutoDispatchBelowADInplaceOrView():
-        columns = (column[:n] for column, n in zip(allocated, lengths, strict=False))
+        columns = [column[:n] for column, n in zip(allocated, lengths, strict=False)]
         return ProjectedSplats._make((*columns, counts))
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from blitzgs._library import without_autograd
 from blitzgs.ops.arrange_splats import Places
-from blitzgs.ops.derivatives import first_only
+from blitzgs.ops.derivatives import first_only, unrecorded
 from blitzgs.ops.intersect import tile_counts
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
 
@@ -238,7 +238,7 @@ def _gradients(
     if v_renders is None and v_alphas is None:
         return (None,) * 6
     saved = _saved(ctx)
-    with torch.no_grad():
+    with unrecorded():
         gradients = _first_gradients(ctx, saved, v_renders, v_alphas, absgrad, may_pack)
     return first_only("rasterize", gradients, (*saved.splats, saved.backgrounds, v_renders, v_alphas))
 

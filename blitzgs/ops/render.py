@@ -47,7 +47,7 @@ def render_queued(
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
 
     estimate = capacity_for(inputs) if sizes is None else CapacityEstimate(sizes)
-    with torch.no_grad(), torch._C._AutoDispatchBelowAutograd():
+    with torch._C._AutoDispatchBelowAutograd():
         for attempt in estimate.attempts():
             projected, capacity = inputs.run(attempt.sizes), attempt.sizes
             splats, n_splats = projected.splats, None if capacity is None else projected.n_splats

@@ -75,7 +75,7 @@ class Gaussians:
         per_view: whether every view has its own colours.
         lead: the batch dimensions, and C.
         raw: whether scales and opacities are before their activation.
-        named: the arguments of the call that have to be finite, a tensor for each scene.
+        given: the arguments that `named` returns, if they are not the tensors of the scenes.
     """
 
     scenes: tuple[Scene, ...]
@@ -85,7 +85,15 @@ class Gaussians:
     per_view: bool
     lead: tuple[int, ...]
     raw: bool
-    named: Mapping[str, tuple[Tensor, ...]]
+    given: Mapping[str, tuple[Tensor, ...]] | None = None
+
+    @property
+    def named(self) -> Mapping[str, tuple[Tensor, ...]]:
+        """The arguments of the call that have to be finite, a tensor for each scene."""
+        if self.given is not None:
+            return self.given
+        columns = zip(Scene._fields, zip(*self.scenes, strict=True), strict=True)
+        return {name: own for name, own in columns if name != "covariances" and own[0] is not None}
 
     @property
     def views(self) -> int:
@@ -207,13 +215,8 @@ def gaussians_of(
     per_view = colors is not None and _per_view(colors, batch, C, N, sh_degree)
     colors = colors if with_colors else None
     whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
-    scenes = _scenes(whole, batch)
-    named = dict(zip(Scene._fields, zip(*scenes, strict=True), strict=True))
-    del named["covariances"]
-    if colors is None:
-        del named["colors"]
     degree = sh_degree if with_colors else None
-    return Gaussians(scenes, colors, opacities, degree, per_view, (*batch, C), raw, named)
+    return Gaussians(_scenes(whole, batch), colors, opacities, degree, per_view, (*batch, C), raw)
 
 
 def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:
@@ -248,7 +251,7 @@ def with_covariances(gaussians: Gaussians, covars: Tensor) -> Gaussians:
         scenes.append(scene._replace(quats=found.quats, scales=found.scales, covariances=found))
     named = {name: given for name, given in gaussians.named.items() if name not in ("quats", "scales")}
     named["covars"] = tuple(uppers)
-    return replace(gaussians, scenes=tuple(scenes), named=named)
+    return replace(gaussians, scenes=tuple(scenes), given=named)
 
 
 def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree: int | None) -> bool:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,8 +15,7 @@ from blitzgs.rendering.arguments import Gaussians, Scene
 from blitzgs.rendering.covariances import Decomposed, shaped_by
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Views of one scene that are projected together.
 
     Attributes:

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,8 +25,7 @@ from blitzgs.rendering.ranks import Job, send_splats
 CUDA_TILE_SIZE = 16
 
 
-@dataclass(frozen=True)
-class ImageOptions:
+class ImageOptions(NamedTuple):
     """The options of compositing and of `meta`; see `blitzgs.rasterization`.
 
     Attributes:

@@ -63,7 +63,8 @@ def gather_views(gaussians: Gaussians, same: Sequence[Any]) -> tuple[Gaussians, 
     viewmats: Tensor = _GatherViews.apply(scene.viewmats, job)  # type: ignore[no-untyped-call]
     Ks = _gathered(scene.Ks.detach(), job)
     scene = scene._replace(viewmats=viewmats, Ks=Ks)
-    return replace(gaussians, scenes=(scene,), lead=(job.size * job.views,)), job
+    gathered = replace(gaussians, scenes=(scene,), lead=(job.size * job.views,), given=gaussians.named)
+    return gathered, job
 
 
 def _require_same(given: tuple[Any, ...], device: torch.device) -> None:

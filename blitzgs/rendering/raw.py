@@ -122,7 +122,7 @@ def raw_rasterization(
     background = background_rows(backgrounds, gaussians, render_mode)
     image = ImageOptions(render_mode, background, True, False, absgrad)
     renders, alphas, meta = render(
-        "raw_rasterization", replace(gaussians, named=named), project, image, sizes
+        "raw_rasterization", replace(gaussians, given=named), project, image, sizes
     )
     assert isinstance(meta, LazyDict)
     meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])

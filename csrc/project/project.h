@@ -235,6 +235,15 @@ struct ProjectGradients {
   bool dense = false;
 };
 
+// Arrays that are set to zero together; on CUDA by one launch, because each launch takes the host
+// microseconds.
+template <class T>
+struct ZeroedArrays {
+  static constexpr int kCount = 5;
+  T* begin[kCount];
+  std::int64_t length[kCount];
+};
+
 // The terms of the training loss that do not depend on pixels, as weights per view, [B] each, or null (zero).
 // For each Gaussian that has a splat in view b, the loss has scale[b] times the smallest axis of the Gaussian
 // (the paper's L_scale), opacity[b] times its opacity and size[b] times the mean of its three axes as
@@ -257,6 +266,8 @@ void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::in
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
+template <class T>
+void zero_arrays(const ZeroedArrays<T>&, CudaStream);
 }  // namespace cpu
 namespace cuda {
 // If there are more splats than the capacity, the totals are still correct, and the columns hold the first
@@ -267,6 +278,8 @@ void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::in
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
+template <class T>
+void zero_arrays(const ZeroedArrays<T>&, CudaStream);
 }  // namespace cuda
 
 // project_bwd_step is the projection's backward pass and the optimiser's step of the visible Gaussians in one

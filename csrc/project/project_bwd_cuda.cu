@@ -115,7 +115,37 @@ __global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks
   v_viewmats[16 * view + i] = static_cast<float>(sum);
 }
 
+constexpr int kZeroThreads = 256;
+
+// The arrays begin at multiples of 16 bytes, so a thread writes four floats at a time.
+__global__ void __launch_bounds__(kZeroThreads) zero_arrays_kernel(const ZeroedArrays<float> arrays) {
+  wait_for_earlier_kernels();
+  const std::int64_t first = blockIdx.x * std::int64_t{kZeroThreads} + threadIdx.x;
+  const std::int64_t step = gridDim.x * std::int64_t{kZeroThreads};
+#pragma unroll
+  for (int a = 0; a < ZeroedArrays<float>::kCount; ++a) {
+    float* const begin = arrays.begin[a];
+    const std::int64_t fours = arrays.length[a] / 4;
+    for (std::int64_t i = first; i < fours; i += step) {
+      reinterpret_cast<float4*>(begin)[i] = make_float4(0.f, 0.f, 0.f, 0.f);
+    }
+    const std::int64_t rest = 4 * fours + first;
+    if (rest < arrays.length[a]) begin[rest] = 0.f;
+  }
+}
+
 }  // namespace
+
+template <>
+void zero_arrays<float>(const ZeroedArrays<float>& arrays, CudaStream stream) {
+  std::int64_t most = 0;
+  for (const std::int64_t length : arrays.length) most = length > most ? length : most;
+  if (most == 0) return;
+  const unsigned at_a_time = 8u * static_cast<unsigned>(multiprocessors());
+  const std::int64_t needed = (most + 4 * kZeroThreads - 1) / (4 * kZeroThreads);
+  const unsigned blocks = needed < at_a_time ? static_cast<unsigned>(needed) : at_a_time;
+  launch_early("project_bwd", zero_arrays_kernel, {blocks, kZeroThreads, stream}, arrays);
+}
 
 template <>
 void project_bwd<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,

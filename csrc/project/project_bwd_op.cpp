@@ -181,18 +181,20 @@ BackwardTensors project_bwd(const TensorList& gaussians, const OptionalTensorLis
   const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
                              std::nullopt);
   const std::int64_t length = dense ? p.count : b.visible();
-  const auto make_gradient = [&](const std::vector<std::int64_t>& shape) {
-    Tensor gradient = make_empty(p.means, shape);
-    if (dense) TORCH_ERROR_CODE_CHECK(aoti_torch_zero_(gradient.get()));
-    return gradient;
-  };
-  Tensor v_means = make_gradient({length, 3}), v_quats = make_gradient({length, 4}),
-         v_scales = make_gradient({length, 3}), v_opacities = make_gradient({length}),
-         v_sh = make_gradient({length, p.sh_stride, 3}),
+  Tensor v_means = make_empty(p.means, {length, 3}), v_quats = make_empty(p.means, {length, 4}),
+         v_scales = make_empty(p.means, {length, 3}), v_opacities = make_empty(p.means, {length}),
+         v_sh = make_empty(p.means, {length, p.sh_stride, 3}),
          v_viewmats = make_empty(p.means, {need_viewmats ? p.n_views : 0, 4, 4});
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&](auto zero) {
     using T = decltype(zero);
+    if (dense) {
+      backend::zero_arrays(
+          ZeroedArrays<T>{{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),
+                           mutable_data<T>(v_opacities), mutable_data<T>(v_sh)},
+                          {3 * length, 4 * length, 3 * length, length, 3 * p.sh_stride * length}},
+          scope.stream);
+    }
     backend::project_bwd(
         p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
         ProjectGradients<T>{mutable_data<T>(v_means), mutable_data<T>(v_quats), mutable_data<T>(v_scales),

@@ -252,11 +252,21 @@ void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const Spl
   if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                             \
-  template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,      \
-                           Workspace&, CudaStream);                                                        \
-  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&, \
-                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
+template <class T>
+void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
+  for (int a = 0; a < ZeroedArrays<T>::kCount; ++a) {
+    parallel_for(0, arrays.length[a], 1 << 16, [&](std::int64_t begin, std::int64_t end) {
+      std::fill(arrays.begin[a] + begin, arrays.begin[a] + end, T(0));
+    });
+  }
+}
+
+#define BLITZGS_INSTANTIATE(T)                                                                              \
+  template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,       \
+                           Workspace&, CudaStream);                                                         \
+  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,  \
+                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream); \
+  template void zero_arrays<T>(const ZeroedArrays<T>&, CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)
 #undef BLITZGS_INSTANTIATE

@@ -297,3 +297,10 @@ TEST_CASE("no Gaussians, no views, and Gaussians of NaN give no splats") {
   REQUIRE(hidden < p.sizes.splats);
   REQUIRE((p.opacities[hidden] == 0 && p.colors[3 * hidden] == 0 && p.tiles[hidden] == 0));
 }
+
+TEST_CASE("arrays are zeroed to their ends") {
+  std::vector<float> values(20, 7.f);
+  float* const v = values.data();
+  cpu::zero_arrays(ZeroedArrays<float>{{v, v + 6, v + 8, nullptr, v + 12}, {5, 1, 3, 0, 7}}, nullptr);
+  REQUIRE(values == std::vector<float>{0, 0, 0, 0, 0, 7, 0, 7, 0, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0, 7});
+}

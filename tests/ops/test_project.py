@@ -179,7 +179,7 @@ def test_gradients_are_repeatable_and_sum_over_views():
 @pytest.mark.parametrize("degree, coefficients", [(3, 16), (1, 16), (2, 9), (0, 1), (None, 0)])
 def test_dense_gradients_equal_scattered_compact_ones(backend, degree, coefficients):
     device, dtype = backend
-    scene = random_scene(n=700, cameras=2, width=20, height=16, dtype=dtype, device=device)
+    scene = random_scene(n=701, cameras=2, width=20, height=16, dtype=dtype, device=device)
     scene.means[::2] *= 20.0  # seen by no view
     sh = None if degree is None else scene.colors[:, :coefficients].contiguous()
     splats = project_scene(scene, sh=sh, sh_degree=degree or 0)
@@ -198,11 +198,13 @@ def test_dense_gradients_equal_scattered_compact_ones(backend, degree, coefficie
         options.ints, options.floats, v_splats, depths[:, 0], True,
     )  # fmt: skip
     compact = torch.ops.blitzgs.project_bwd(*arguments)
+    # The memory that is freed here, and probably used for the gradients, is not zero.
+    del [part.new_full((701, *part.shape[1:]), torch.nan) for part in compact][:]
     dense = torch.ops.blitzgs.project_bwd(*arguments, dense=True)
     ids = splats.visible_ids.long()
     assert 10 < len(ids) < 600
     for part, whole in zip(compact[:5], dense[:5], strict=True):
-        expected = part.new_zeros(700, *part.shape[1:]).index_copy(0, ids, part)
+        expected = part.new_zeros(701, *part.shape[1:]).index_copy(0, ids, part)
         assert torch.equal(whole, expected)
     assert torch.equal(compact[5], dense[5])
     torch.library.opcheck(torch.ops.blitzgs.project_bwd, arguments, {"dense": True})
