@@ -66,7 +66,7 @@ def render(
     hidden = _without_non_finite(gaussians) if by_value else gaussians
     groups = groups_of(hidden, project)
     ready = None
-    if len(groups) == 1 and groups[0].covariances is None and not by_value and job is None and not compiling:
+    if len(groups) == 1 and groups[0].covariances is None and job is None and not compiling:
         ready = _queued(groups[0], gaussians, project, image, sizes)
     splats = project_groups(groups, image.sparse_grad, None if ready is None else ready.splats)
     layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
@@ -80,7 +80,7 @@ def render(
             through = Through(layout.places, [arranged[name] for name in ("means2d", "conics", "opacities")])
             if image.render_mode != "RGB":
                 rendered = splats._replace(depths=layout.gather(arranged["depths"])[0])
-    channels, lead = _channels(rendered, layout, gaussians, image.render_mode), gaussians.lead
+    channels, lead = _channels(rendered, gaussians, image.render_mode), gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
     count = -1 if compiling or job is not None or ready is not None else int(splats.counts[2])
@@ -118,13 +118,14 @@ def _queued(
         not means.is_cuda
         or project.tile_size != CUDA_TILE_SIZE
         or torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
+        or gaussians.count == 0
     ):
         return None
     inputs = [*group.inputs.gaussians, *group.inputs.cameras, gaussians.colors]
     differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     return render_queued(
         group.inputs,
-        lambda splats: _channels_of_splats(splats, gaussians, image.render_mode),
+        lambda splats: _channels(splats, gaussians, image.render_mode, with_spare=True),
         image.backgrounds,
         differentiable and not image.absgrad,
         sizes,
@@ -172,31 +173,36 @@ def _without_non_finite(gaussians: Gaussians) -> Gaussians:
     scenes = []
     for scene in gaussians.scenes:
         assert scene.colors is not None
-        finite = scene.colors.detach().isfinite().all(dim=-1)
-        if finite.dim() == 2:
-            finite = finite.all(dim=0)
-        opacities = torch.where(finite, scene.opacities, torch.zeros_like(scene.opacities))
+        # Zero times a number is zero unless the number is NaN or infinite.
+        zeros = (scene.colors.detach() * 0).sum(dim=-1 if scene.colors.dim() == 2 else (0, 2))
+        opacities = scene.opacities.masked_fill(zeros != 0, 0)
         scenes.append(scene._replace(opacities=opacities))
     return replace(gaussians, scenes=tuple(scenes))
 
 
-def _channels(splats: ProjectedSplats, layout: Layout, gaussians: Gaussians, render_mode: str) -> Tensor:
-    """Return the channels to composite, [P, D]."""
-    if gaussians.colors is None or gaussians.sh_degree is not None:
-        return _channels_of_splats(splats, gaussians, render_mode)
-    N = gaussians.count
-    scenes = layout.images if gaussians.per_view else layout.images // gaussians.views
-    of_all = len(gaussians.scenes) > 1 or gaussians.per_view
-    places = scenes * N + layout.gaussians if of_all else layout.gaussians
-    values = gaussians.colors.reshape(-1, gaussians.colors.shape[-1]).index_select(0, places)
-    return _with_depth(values, splats, render_mode)
+def _channels(
+    splats: ProjectedSplats, gaussians: Gaussians, render_mode: str, with_spare: bool = False
+) -> Tensor:
+    """Return the channels to composite, [P, D].
 
-
-def _channels_of_splats(splats: ProjectedSplats, gaussians: Gaussians, render_mode: str) -> Tensor:
-    """Return the channels to composite if the splats have them all: depths, or colours from SH."""
+    Args:
+        splats: the P splats.
+        gaussians: the Gaussians, with colours.
+        render_mode: which channels are rendered.
+        with_spare: whether the last splats may be spare capacity, whose ids are undefined.
+    """
     if gaussians.colors is None:
         return splats.depths[:, None]
-    return _with_depth(splats.colors, splats, render_mode)
+    if gaussians.sh_degree is not None:
+        return _with_depth(splats.colors, splats, render_mode)
+    values = gaussians.colors.reshape(-1, gaussians.colors.shape[-1])
+    rows = splats.gaussian_ids
+    if len(gaussians.scenes) > 1 or gaussians.per_view:
+        images = splats.camera_ids.long()
+        rows = (images if gaussians.per_view else images // gaussians.views) * gaussians.count + rows
+    if with_spare:
+        rows = rows.clamp(0, len(values) - 1)
+    return _with_depth(values.index_select(0, rows), splats, render_mode)
 
 
 def _with_depth(values: Tensor, splats: ProjectedSplats, render_mode: str) -> Tensor:
