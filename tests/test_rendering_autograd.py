@@ -25,6 +25,12 @@ def second_derivative_of_a_linear_loss(scene):
     torch.autograd.grad(gradient.sum(), scene.means)
 
 
+def second_derivative_through_arranged_splats(scene):
+    image, _, meta = rasterize_scene(scene, packed=False)
+    (gradient,) = torch.autograd.grad(image.square().sum(), meta["means2d"], create_graph=True)
+    gradient.sum().backward()
+
+
 def hessian(scene):
     def loss(means):
         return rasterize_scene(replace(scene, means=means))[0].sum()
@@ -45,6 +51,7 @@ def second_derivative_of_the_loss_function(scene):
     [
         second_derivative_of_a_gradient,
         second_derivative_of_a_linear_loss,
+        second_derivative_through_arranged_splats,
         hessian,
         second_derivative_of_the_loss_function,
     ],
