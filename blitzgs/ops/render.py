@@ -41,18 +41,23 @@ def render_queued(
             splats, and `counts` of these splats is None.
         backgrounds: [B, D] or None.
         backward_follows: see the op `rasterize_fwd`.
-        sizes: the needed sizes, if they are known; None: estimate them from earlier calls of this size.
+        sizes: the needed sizes, if an earlier projection of these Gaussians and views has returned them;
+            None: estimate them from earlier calls of this size. Splats whose colour is not finite, which
+            touch no tile, need fewer list entries than that projection counted; the others at the end of
+            `isect_splats` are then undefined.
     """
     options = inputs.options
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
 
+    known = None if sizes is None else torch.tensor(sizes, device="cpu")
     estimate = capacity_for(inputs) if sizes is None else CapacityEstimate(sizes)
     with torch._C._AutoDispatchBelowAutograd():
         for attempt in estimate.attempts():
             projected, capacity = inputs.run(attempt.sizes), attempt.sizes
             splats, n_splats = projected.splats, None if capacity is None else projected.n_splats
-            copy = HostCopy(projected.totals)
-            n_isects = int(copy.read()[2]) if capacity is None else capacity.isects
+            # Known sizes spare the host a wait.
+            read = HostCopy(projected.totals).read if known is None else known.clone
+            n_isects = int(read()[2]) if capacity is None else capacity.isects
             geometry = splats.means2d, splats.conics, splats.opacities
             isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
                 *geometry, splats.depths, splats.camera_ids, None, grid, n_isects, n_splats, True
@@ -61,7 +66,7 @@ def render_queued(
                 *geometry, channels(splats), backgrounds, isect_splats, tile_offsets, grid, None, True,
                 backward_follows, n_splats,
             )  # fmt: skip
-            counts = copy.read()[:3]
+            counts = read()[:3]
             needed = counts.tolist()
             attempt.end(needed, capacity is None or capacity.holds(needed))
         listed = isect_splats[: needed[2]]
