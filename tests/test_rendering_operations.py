@@ -40,13 +40,13 @@ def operations(cameras, sh, read_meta, **options):
 @pytest.mark.parametrize(
     ("cameras", "options", "forward", "backward"),
     [
-        (1, {}, 33, 2),
-        (1, {"sparse_grad": True}, 33, 13),
-        (1, {"packed": False}, 34, 8),
-        (2, {}, 35, 4),
-        (2, {"packed": False}, 34, 8),
-        (1, {"sh": False}, 40, 6),
-        (1, {"read_meta": True}, 50, 2),
+        (1, {}, 31, 2),
+        (1, {"sparse_grad": True}, 31, 13),
+        (1, {"packed": False}, 32, 8),
+        (2, {}, 33, 4),
+        (2, {"packed": False}, 32, 8),
+        (1, {"sh": False}, 38, 6),
+        (1, {"read_meta": True}, 48, 2),
     ],
     ids=str,
 )
