@@ -117,7 +117,7 @@ class FourSwaps(OneImport):
         return image, info
 
     def move(self) -> None:
-        """Take the optimisers' step in two launches."""
+        """Take the optimisers' step in two calls of the op."""
         step_together(self._optimisers, set_to_none=True)
 
     def change_population(self, info: Any) -> None:

@@ -347,11 +347,11 @@ def _check_group(group: dict[str, Any]) -> None:
 
 @torch.no_grad()
 def step_together(optimizers: Iterable[LazyAdam] | Mapping[str, LazyAdam], set_to_none: bool = False) -> None:
-    """Take a step of several optimisers, in few launches if their parameters are those of gsplat's trainer.
+    """Take a step of several optimisers, in few calls if their parameters are those of gsplat's trainer.
 
     The result is that of `step` of each. gsplat's strategies need an optimiser for each parameter, but the
     parameters have the same rows. If their gradients are those of one call of
-    `raw_rasterization(..., optimizers=...)`, means, quats, scales, opacities and sh0 take one launch and shN
+    `raw_rasterization(..., optimizers=...)`, means, quats, scales, opacities and sh0 take one call and shN
     another. Otherwise each optimiser takes its step by itself. A single `LazyAdam` with a group for each
     parameter does the same in its own `step`. Step hooks of the optimisers are not called.
 
