@@ -60,12 +60,15 @@ def test_a_table_s_mask_moves_with_its_rows(n, device):
     assert torch.equal(table.release()[CULL], kept) and not table.columns
 
 
-def test_new_rows_without_a_mask_have_zeros():
+def test_new_rows_need_a_mask_and_may_inherit_it():
     table = random_gaussians(100)
     table[CULL] = random_rows(100, 1)
     more = random_gaussians(5)
-    table.append({name: more[name] for name in more})
-    assert not table[CULL][100:].any() and table[CULL][:100].any()
+    with pytest.raises(ValueError, match=r"new rows lack the columns \['cull'\]"):
+        table.append({name: more[name] for name in more})
+    parents = torch.tensor([7, 7, 0, 99, 3])
+    table.append({name: more[name] for name in more} | table.inherited(parents))
+    assert torch.equal(table[CULL][100:], table[CULL][parents])
     with pytest.raises(ValueError, match=r"column 'cull' of new rows must be torch.int32 \[5, 1\]"):
         table.append({name: more[name] for name in more} | {CULL: random_rows(5, 2)})
     del table[CULL]
