@@ -2,11 +2,12 @@
 """Keeps the images of a capture compressed in memory within a budget; threads decode them ahead.
 
 There are two bounded caches, for compressed and for decoded images; both drop the entries that were used
-longest ago. The compressed form is the file itself if the file needs no processing. An image that must be
-undistorted or downscaled is processed once and kept as QOI, which is lossless. For an image of 1.9
-megapixels, decoding the QOI takes 16 ms at full size and 1 ms at a quarter; decoding, undistorting and
-averaging the JPEG again takes 22 and 16 ms, and PNG 46 and 3 ms. Nothing is written to disk. The images do
-not depend on budgets, threads or the order of calls.
+longest ago. Decoded images take the memory that compressed ones leave. The compressed form is the file
+itself if the file needs no processing. An image that must be undistorted or downscaled is processed once
+and kept as QOI, which is lossless. For an image of 1.9 megapixels, decoding the QOI takes 16 ms at full
+size and 1 ms at a quarter; decoding, undistorting and averaging the JPEG again takes 22 and 16 ms, and
+PNG 46 and 3 ms. Nothing is written to disk. The images do not depend on budgets, threads or the order of
+calls.
 """
 
 from __future__ import annotations
@@ -76,6 +77,13 @@ class BoundedCache(Generic[K, V]):
             self.bytes += size
             self.most_bytes = max(self.most_bytes, self.bytes)
 
+    def resize(self, budget: int) -> None:
+        """Change the budget, dropping the oldest entries until the others fit."""
+        with self._lock:
+            self.budget = budget
+            while self.bytes > budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
+
 
 @dataclass(frozen=True)
 class ImageMemory:
@@ -134,19 +142,20 @@ class ImageStore:
             capture: the capture that has the images.
             budget_bytes: limit of the compressed images in memory.
             threads: number of threads that decode ahead.
-            decoded_bytes: limit of the decoded images in memory; None: a quarter of `budget_bytes`.
+            decoded_bytes: limit of the decoded images in memory; None: a quarter of `budget_bytes`, and
+                what the compressed images leave of `budget_bytes`.
             background: RGB in [0, 1] that images with an alpha channel are composited over.
         """
         self.capture = capture
         self._background = background if capture.has_alpha else None
         self.compressed: BoundedCache[Path | int, bytes] = BoundedCache(budget_bytes)
-        self.decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(
-            budget_bytes // 4 if decoded_bytes is None else decoded_bytes
-        )
+        self._decoded_bytes = decoded_bytes
+        self.decoded: BoundedCache[tuple[str, int], UInt8] = BoundedCache(self._decoded_budget())
         self._maps: OrderedDict[Rectification, _Maps] = OrderedDict()
         self._maps_lock = threading.Lock()
         self._pending: dict[tuple[str, int], Future[UInt8]] = {}
         self._pending_lock = threading.Lock()
+        self._budget_lock = threading.Lock()
         self._times_decoded = 0
         self._pool = ThreadPoolExecutor(max(1, threads), thread_name_prefix="blitzgs-images")
 
@@ -164,20 +173,23 @@ class ImageStore:
 
         A pixel that mixes counted and excluded pixels of the file is excluded.
         """
-        camera = self.capture.cameras[index]
-        if camera.mask_path is None and not camera.rectification.has_invalid:
-            return None
-        return torch.from_numpy(self._result("mask", index))
+        return torch.from_numpy(self._result("mask", index)) if self._has_mask(index) else None
 
-    def prefetch(self, indices: Iterable[int]) -> None:
-        """Start to decode the images that are needed next, in order, as many as the decoded budget holds."""
+    def prefetch(self, indices: Iterable[int], masks: Iterable[int] = ()) -> None:
+        """Start to decode what is needed next, in order, as much as the decoded budget holds.
+
+        Args:
+            indices: cameras whose images are needed.
+            masks: cameras whose masks are needed, if they have one.
+        """
+        wanted = [("mask", index, 1) for index in masks if self._has_mask(index)]
         planned = 0
-        for index in indices:
+        for kind, index, channels in [*wanted, *(("image", index, 3) for index in indices)]:
             camera = self.capture.cameras[index]
-            planned += 3 * camera.width * camera.height
+            planned += channels * camera.width * camera.height
             if planned > self.decoded.budget:
                 return
-            self._submit("image", index)
+            self._submit(kind, index)
 
     def memory(self) -> ImageMemory:
         """Return the memory that images have taken so far."""
@@ -189,6 +201,17 @@ class ImageStore:
     def close(self) -> None:
         """Stop the threads; images whose decoding has not begun are not decoded."""
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _has_mask(self, index: int) -> bool:
+        camera = self.capture.cameras[index]
+        return camera.mask_path is not None or camera.rectification.has_invalid
+
+    def _decoded_budget(self) -> int:
+        """Return how many bytes the decoded images may take now."""
+        if self._decoded_bytes is not None:
+            return self._decoded_bytes
+        budget = self.compressed.budget
+        return budget // 4 + budget - self.compressed.bytes
 
     def _result(self, kind: str, index: int) -> UInt8:
         found = self._submit(kind, index)
@@ -212,6 +235,8 @@ class ImageStore:
         try:
             make = self._make_image if kind == "image" else self._make_mask
             pixels = make(index)
+            with self._budget_lock:  # so that no thread restores a budget of before another one's image
+                self.decoded.resize(self._decoded_budget())
             self.decoded.put((kind, index), pixels, pixels.nbytes)
             return pixels
         finally:

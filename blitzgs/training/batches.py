@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -19,6 +21,10 @@ from blitzgs.scene.images import ImageMemory
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.views import VIEW_NUMBERS, ViewSet, unpack_views
 
+# For every batch that is prepared ahead, the photographs of this number of later batches are decoded, too.
+# Decoding one takes as long as several steps on a fast GPU.
+_DECODED = 4
+
 
 class PhotographError(RuntimeError):
     """A photograph cannot be read; the message names the file."""
@@ -33,8 +39,8 @@ class Images(Protocol):
     def mask(self, index: int) -> Tensor | None:
         """Return the image's mask, uint8 [H, W] with 0 = excluded, or None."""
 
-    def prefetch(self, indices: list[int]) -> None:
-        """Decode images in the background."""
+    def prefetch(self, indices: Sequence[int], masks: Sequence[int] = ()) -> None:
+        """Decode images and masks in the background."""
 
     def memory(self) -> ImageMemory:
         """Return how much host memory the images have taken."""
@@ -60,6 +66,14 @@ class Batch:
     masks: Tensor | None
     samples: Tensor
     ranges: TileRanges | None
+
+
+class _Plan(NamedTuple):
+    """What is known about a batch before its photographs are decoded."""
+
+    indices: list[int]
+    ranges: TileRanges | None
+    rows: list[tuple[int, int]]  # the pixel rows [y0, y1) of each view that this rank needs
 
 
 class _Photograph(NamedTuple):
@@ -162,6 +176,7 @@ class BatchLoader:
         lost: on several ranks, why this rank could not read a photograph (the first one, if there are
             several). The rank cannot stop alone in the middle of a step, so it continues and treats all
             pixels of such photographs as masked. None: it has read all photographs.
+        waited: seconds that the caller has waited for batches so far.
     """
 
     def __init__(
@@ -182,8 +197,8 @@ class BatchLoader:
             train: for each of the sampler's views, its camera in the capture.
             sampler: chooses the views of each step.
             device: device of the batches.
-            ahead: number of batches to prepare beyond the requested one; 0: the calling thread prepares each
-                batch when it is requested.
+            ahead: number of batches to prepare beyond the requested one; 0: each batch is prepared when it is
+                requested. The photographs of further batches are decoded.
             owners: divides the tiles of each batch; this rank then decodes and uploads only the pixel rows
                 that its tiles' loss reads. None: whole photographs.
         """
@@ -192,11 +207,13 @@ class BatchLoader:
         self._owners = owners
         self._counts: dict[int, float] = {}
         self.lost: str | None = None
+        self.waited = 0.0
         self._train = train
         self._sampler = sampler
         self._device = device
         self._ahead = ahead
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._plans: dict[int, _Plan] = {}
         self._pending: dict[int, Future[tuple[Batch, _Slot]]] = {}
         # One slot is in use; the others hold batches that are ready or being prepared.
         self._free = deque(_Slot(device) for _ in range(ahead + 2))
@@ -213,18 +230,19 @@ class BatchLoader:
             self._used = None  # in case the next batch cannot be loaded
         if self._owners is not None:
             self._owners.forget_before(step)
-        for ahead in range(step, max(step + 1, min(step + self._ahead + 1, last))):
-            if ahead not in self._pending:
-                indices = [self._train[view] for view in self._sampler.batch(ahead)]
-                # Divide the tiles in this thread and not in the other one: at this point all ranks know the
-                # same costs.
-                ranges = self._divide(ahead, indices)
-                rows = self._rows(indices, ranges)
-                self._images.prefetch(
-                    [index for index, (y0, y1) in zip(indices, rows, strict=True) if y0 < y1]
-                )
-                self._pending[ahead] = self._worker.submit(self._load, indices, ranges, rows)
+        for later in range(step, max(step + 1, min(step + (1 + _DECODED) * self._ahead + 1, last))):
+            is_near = later <= step + self._ahead
+            if later not in self._plans:
+                self._plans[later] = self._plan(later)
+                if not is_near and self._has_room(later - step, self._plans[later]):
+                    self._prefetch(self._plans[later])
+            if is_near and later not in self._pending:
+                self._prefetch(self._plans[later])  # those that there was no room for before
+                self._pending[later] = self._worker.submit(self._load, *self._plans[later])
+        begin = time.perf_counter()
         batch, slot = self._pending.pop(step).result()
+        self.waited += time.perf_counter() - begin
+        del self._plans[step]
         if stream is not None:
             stream.wait_event(slot.uploaded)
         self._used = slot
@@ -238,6 +256,25 @@ class BatchLoader:
         """Make the loader's stream the current stream of its thread."""
         if self._stream is not None:
             torch.cuda.set_stream(self._stream)
+
+    def _plan(self, step: int) -> _Plan:
+        """Choose the views of a step and divide their tiles."""
+        indices = [self._train[view] for view in self._sampler.batch(step)]
+        # This is done in the caller's thread and not in the other one, and always as many steps ahead: at
+        # this point all ranks know the same costs.
+        ranges = self._divide(step, indices)
+        return _Plan(indices, ranges, self._rows(indices, ranges))
+
+    def _prefetch(self, plan: _Plan) -> None:
+        """Start to decode the photographs and masks of a batch."""
+        needed = [index for index, (y0, y1) in zip(plan.indices, plan.rows, strict=True) if y0 < y1]
+        self._images.prefetch(needed, plan.indices)
+
+    def _has_room(self, batches: int, plan: _Plan) -> bool:
+        """Tell whether this number of batches takes at most half of the memory for decoded images."""
+        width, height = self._views.size(plan.indices)
+        size = 4 * width * height * len(plan.indices)  # images and masks
+        return 2 * batches * size <= self._images.memory().decoded_budget
 
     def _divide(self, step: int, indices: list[int]) -> TileRanges | None:
         if self._owners is None:

@@ -27,10 +27,10 @@ class DataConfig:
         exif: "auto" turns an image by its EXIF tag if only the turned image fits its camera; "apply" always
             turns it, "ignore" never.
         allow_missing: drop views whose image is missing instead of failing.
-        cache_bytes: memory for compressed images, of all ranks of a host together; decoded images take up to
-            a quarter of it in addition.
+        cache_bytes: memory for compressed images, of all ranks of a host together, at most half of the host's
+            memory; decoded images take what these leave, and up to a quarter of it in addition.
         threads: decoder threads.
-        prefetch: number of batches to decode and upload ahead.
+        prefetch: number of batches to upload ahead; photographs are decoded for more batches ahead.
     """
 
     path: str = ""

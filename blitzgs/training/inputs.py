@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from blitzgs.training.views import Space
 
 # Fields that may differ between the hosts of a job.
 HOST_FIELDS = ("data.path", "data.cache_bytes", "data.threads")
+# The largest memory of a container in bytes, or "max" (Linux, control groups 2).
+_CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 def open_capture(
@@ -24,7 +27,7 @@ def open_capture(
 ) -> tuple[Capture, ImageStore]:
     """Load the capture that a configuration names, and open its images.
 
-    The processes of one host share the budget for images in memory.
+    The processes of one host share the budget for images in memory, which is at most half of its memory.
 
     Args:
         config: configuration of the run.
@@ -52,8 +55,18 @@ def open_capture(
         )
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
-    budget = data.cache_bytes // ranks.local_world_size
+    budget = min(data.cache_bytes, _host_memory() // 2) // ranks.local_world_size
     return capture, ImageStore(capture, budget, data.threads, background=config.model.background)
+
+
+def _host_memory() -> int:
+    """Return the bytes of memory that this host has, or that its container may use."""
+    size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        limit = _CONTAINER_LIMIT.read_text().strip()
+    except OSError:
+        return size
+    return min(size, int(limit)) if limit.isdigit() else size
 
 
 def check_capture(space: Space, capture: Capture, folder: Path) -> None:

@@ -86,6 +86,31 @@ def test_prefetch_decodes_ahead_as_far_as_the_budget_goes(capture):
         store.get(5)
 
 
+@pytest.mark.parametrize("spare", [0.5, 3.5, 20])
+def test_decoded_images_take_what_compressed_ones_leave(capture, spare):
+    files = sum(camera.image_path.stat().st_size for camera in capture.cameras)
+    budget = files + int(spare * IMAGE_BYTES)
+    store = ImageStore(capture, budget_bytes=budget)
+    for i in range(12):
+        store.get(i)
+        assert store.decoded.bytes <= store.decoded.budget == budget // 4 + budget - store.compressed.bytes
+    assert store.compressed.bytes == files
+    kept = min(12, int((budget // 4 + budget - files) / IMAGE_BYTES))
+    assert store.decoded.bytes == kept * IMAGE_BYTES
+    for i in range(12 - kept, 12):
+        store.get(i)
+    assert store.memory().decoded == 12  # those used last were kept
+
+
+def test_masks_and_images_are_decoded_ahead_together(tmp_path):
+    write_capture(tmp_path, NAMES[:3], model="SIMPLE_RADIAL", params=[60.0, 32.0, 24.0, -0.1])
+    capture = load_capture(tmp_path, undistort="mask")
+    store = ImageStore(capture)
+    store.prefetch([0, 2], masks=[0, 1, 2])
+    wanted = [store.get(0), store.get(2), store.mask(0), store.mask(1), store.mask(2)]
+    assert all(tensor is not None for tensor in wanted) and store.memory().decoded == 5
+
+
 def test_two_thousand_images_stay_within_small_budgets(tmp_path):
     """Two rounds over a capture of 2,000 images in a shuffled order, decoded ahead as training does."""
     names = [f"v{i:04d}.jpg" for i in range(2000)]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.scene.images import ImageMemory
 from blitzgs.training.batches import BatchLoader
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.views import Space, ViewSet
@@ -62,6 +63,29 @@ def test_each_step_gets_its_own_views(capture, device, ahead):
             assert torch.equal(masks.cpu(), torch.stack(counted).byte())
         else:
             assert masks is None
+
+
+@pytest.mark.parametrize(("batches", "first"), [(100, 11), (16, 9), (0, 3)])
+def test_photographs_are_decoded_before_their_batches_are_assembled(capture, batches, first, monkeypatch):
+    """Up to half of the memory for decoded images, and always those of the batches that are assembled."""
+    cameras, images = capture
+    device = torch.device("cpu")
+    views = ViewSet(cameras[:5], Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
+    sampler, wanted = BatchSampler(SIZES[:5], 2, seed=3), []
+    budget = batches * 2 * 4 * 48 * 32  # images and masks of batches of two views
+    monkeypatch.setattr(images, "memory", lambda: ImageMemory(0, 0, 0, budget, 0))
+    monkeypatch.setattr(images, "prefetch", lambda indices, masks: wanted.append((indices, masks)))
+    loader = BatchLoader(images, views, list(range(5)), sampler, device, ahead=2)
+    try:
+        loader.get(0, STEPS)
+        assert [indices for indices, _ in wanted] == [sampler.batch(step) for step in range(first)]
+        assert all(indices == masks for indices, masks in wanted)
+        for step in range(1, STEPS):
+            loader.get(step, STEPS)
+        assert {tuple(indices) for indices, _ in wanted} == {tuple(sampler.batch(s)) for s in range(STEPS)}
+        assert loader.waited > 0
+    finally:
+        loader.close()
 
 
 @pytest.mark.parametrize("device", DEVICES)

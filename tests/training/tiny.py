@@ -66,7 +66,7 @@ class Images:
     def mask(self, index):
         return None if self.masks is None else self.masks[index]
 
-    def prefetch(self, indices):
+    def prefetch(self, indices, masks=()):
         pass
 
     def memory(self):
