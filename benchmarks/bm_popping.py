@@ -48,7 +48,6 @@ FRAMES_PER_SECOND = 30.0
 FARTHEST, NEAREST = 4.0, 0.5
 
 
-@torch.no_grad()
 def popping(
     run: Path,
     out: Path | None = None,
@@ -76,11 +75,25 @@ def popping(
         ValueError: there are fewer than 2 frames, no view of that name, or nothing in front of the camera.
         OSError: the clip cannot be written.
     """
-    if frames < 2:
-        raise ValueError(f"a flight has at least 2 frames, got {frames}")
     ranks = Ranks(device=torch.device(device))
     model = run_folder.open_model(run, ranks)
-    viewmats, K, size = _flight(model, load_cameras(run).cameras, frames, width, camera)
+    return popping_of(model, load_cameras(run).cameras, ranks, out, frames, width, camera)
+
+
+@torch.no_grad()
+def popping_of(
+    model: TrainedModel,
+    cameras: Any,
+    ranks: Ranks,
+    out: Path | None = None,
+    frames: int = 240,
+    width: int = 640,
+    camera: str | None = None,
+) -> dict[str, Any]:
+    """Measure the popping of a model in memory: as `popping`, with the cameras of its capture."""
+    if frames < 2:
+        raise ValueError(f"a flight has at least 2 frames, got {frames}")
+    viewmats, K, size = _flight(model, cameras, frames, width, camera)
     gates: dict[str, SceneGate | None] = {"full": None}
     gates |= {mode: _gate(model, mode == "smooth", ranks) for mode in MODES[1:]}
     clip = None if out is None else _Clip(out / "popping.mp4", 3 * size[0], size[1])

@@ -71,7 +71,13 @@ class Job:
 
 
 class Pool:
-    """Runs trainings side by side, one in each slot."""
+    """Runs trainings side by side, one in each slot.
+
+    Attributes:
+        worker: program beside this file that does one run; it takes the paths of the run's SPEC and RESULT.
+    """
+
+    worker = "quality_run.py"
 
     def __init__(self, out: Path, gpus: int, per_gpu: int, ranks: int = 1) -> None:
         """Make `per_gpu` slots for each group of `ranks` GPUs; without a GPU, `per_gpu` slots for the CPU."""
@@ -87,7 +93,7 @@ class Pool:
         spec_path = self.out / "specs" / f"{spec.name}.json"
         spec_path.write_text(json.dumps(dataclasses.asdict(spec)))
         log = (self.out / "logs" / f"{spec.name}.txt").open("w")
-        worker = Path(__file__).with_name("quality_run.py")
+        worker = Path(__file__).with_name(self.worker)
         root = str(worker.parents[1])
         cores = max(1, (os.cpu_count() or 1) // (max(self.gpus, 1) * self.per_gpu))
         environment = os.environ | {

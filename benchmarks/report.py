@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the tables of docs/performance.md and README.md from the results in benchmarks/results.
+"""Write the tables of docs/performance.md, docs/city.md and README.md from the results in benchmarks/results.
 
     python benchmarks/report.py           # writes the tables
     python benchmarks/report.py --check   # fails when a page differs from the results
@@ -7,7 +7,7 @@
 Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` names the file and the command. A
 page has a pair of comments around each table, `<!-- table: NAME -->` and `<!-- end: NAME -->`; the text
 between them is replaced. All files must come from one commit, because figures of different code do not
-compare. In place of a table whose file is absent the page names the command that makes it.
+compare; only those of the city (`APART`), which have a page of their own, may be of others. In place of a table whose file is absent the page names the command that makes it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import city_report
+
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PAGES = (ROOT / "docs" / "performance.md", ROOT / "README.md")
+PAGES = (ROOT / "docs" / "performance.md", ROOT / "docs" / "city.md", ROOT / "README.md")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
 
 Json = dict[str, Any]
@@ -66,6 +68,14 @@ COMMANDS = {
         "--recipe aerial=configs/aerial.yaml --recipe gsplat=gsplat-default-reset --seeds 0 1 2"
     ),
 }
+COMMANDS |= {
+    "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --popping",
+    "city_exchange": (
+        "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"
+    ),
+}
+# Files that are not compared with the others' commit.
+APART = ("city", "city_exchange")
 # bm_quality.py takes no --json: it collects all of its runs in one file.
 COPIED = {"quality": "cp runs/quality/quality.json benchmarks/results/"}
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -180,6 +190,16 @@ def row_lines(file: Json) -> list[str]:
     return [f"{file['title']}.", "", *table(rows[0], cells)]
 
 
+def city_lines(rows_of: Callable[[Json], city_report.Rows]) -> Callable[[Json], list[str]]:
+    """Return the function that makes a table of the city's file."""
+
+    def lines(city: Json) -> list[str]:
+        rows = rows_of(city)
+        return table(rows[0], (row.values() for row in rows)) if rows else ["No run got so far."]
+
+    return lines
+
+
 def photometric_lines(photometric: Json) -> list[str]:
     """Tabulate L1 + SSIM against its byte floor and plain PyTorch."""
     rows = [[r["work"], ms(r["ms"]), ms(r["floor_ms"])] for r in photometric["results"]]
@@ -280,7 +300,9 @@ SECTIONS = {
     "quality": Section(("quality",), quality_lines),
     "summary": Section(("render", "step_1", "step_4"), summary_lines),
     "summary_ranks": Section(("exchange",), summary_ranks_lines),
+    "city_exchange": Section(("city_exchange",), exchange_lines),
 }
+SECTIONS |= {name: Section(("city",), city_lines(rows_of)) for name, rows_of in city_report.TABLES.items()}
 
 
 def with_origin(name: str, file: Json) -> Json:
@@ -313,7 +335,9 @@ def load_results(folder: Path = RESULTS) -> Results:
                 f"{path}: its commit is {commit}; measure a clean checkout, or a copy of one "
                 "with its commit in BLITZGS_COMMIT"
             )
-        first, expected = next((name, file["commit"]) for name, file in results.items())
+        if path.stem in APART:
+            continue
+        first, expected = next((n, file["commit"]) for n, file in results.items() if n not in APART)
         if commit != expected:
             raise ReportError(
                 f"{path} is of commit {commit}, {first}.json of {expected}: measure both on one"

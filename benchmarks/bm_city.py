@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Trains a synthetic city with and without the view level: quality, speed by phase, memory, popping, ranks.
+
+    blitzgs synth CITY --preset city --views 2048 --width 1024 --height 684 | tee generation.txt
+    python benchmarks/bm_city.py CITY --out RESULTS --generation-log generation.txt \
+        --gpus 2 --ranks 1 2 --popping --json benchmarks/results/city.json
+
+The arms are `configs/city.yaml` with the LOD gate and the cull mask (full), without the one (no_lod), the other
+(no_mask), or both (all_off). Every run is a process on one GPU; each GPU has one at a time. The numbers of
+ranks above 1 follow when these are over: the first of --arms, under torchrun, with the machine to itself.
+
+A run writes its figures into RESULTS/runs after its set-up, training, evaluation and popping. Some seconds
+before --seconds-per-run are over, its training stops where it is and is evaluated there ("finished": false).
+The tables and --json are written when a run ends, and when this program is ended by SIGTERM. The same
+command then skips the runs that are done; --collect trains nothing, and writes tables and JSON of what there
+is in RESULTS. A run that is done is not repeated for its popping alone. Other fields of the configuration may follow as --section.field=value. In a copy without a
+repository, BLITZGS_COMMIT names the commit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import quality_report
+import torch
+from bm_quality import Pool, positive
+from city_report import TABLES
+from city_run import RESERVE, CityRun
+from harness import ROOT, command_line, make_parser, markdown_table, write_json
+from quality_plan import runs_of
+
+CONFIG = ROOT / "configs" / "city.yaml"
+ON = "--population.importance=true"
+ARMS = {
+    "full": f"{ON} --view.lod=true --view.cull=true",
+    "no_lod": f"{ON} --view.lod=false --view.cull=true",
+    "no_mask": f"{ON} --view.lod=true --view.cull=false",
+    "all_off": "--population.importance=false --view.lod=false --view.cull=false",
+}
+Json = dict[str, Any]
+
+
+class CityPool(Pool):
+    """Runs the trainings of the city."""
+
+    worker = "city_run.py"
+
+
+def held_out(city: Path, count: int, path: Path) -> None:
+    """Write the names of `count` views, evenly over the flight, into a file for `data.split`."""
+    names = sorted(file.name for file in (city / "images").iterdir())
+    total = len(names)
+    chosen = [name for i, name in enumerate(names) if i * count // total != (i + 1) * count // total]
+    path.write_text("".join(f"{name}\n" for name in chosen))
+
+
+def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
+    """Return the runs: all arms on one rank, then the first arm on each further number of ranks.
+
+    Raises:
+        ValueError: an argument cannot be used.
+    """
+    split = args.out / "held_out.txt"
+    held_out(args.city, args.held_out, split)
+    capture = {"city": f"'{args.city}' --data.split={json.dumps(str(split.resolve()))}"}
+    common = " ".join([f"--schedule.scale={args.scale}", "--log.every=200", *overrides])
+    recipes = {arm: f"'{CONFIG}' {ARMS[arm]} {common}" for arm in args.arms}
+    runs = []
+    for ranks in args.ranks:
+        chosen = recipes if ranks == 1 else {args.arms[0]: recipes[args.arms[0]]}
+        device = "cuda" if args.gpus else "cpu"
+        for spec in runs_of(capture, chosen, [0], [], None, device, ranks):
+            frames = args.popping if ranks == 1 and spec.recipe == args.arms[0] else 0
+            runs.append(
+                CityRun(
+                    **dataclasses.asdict(spec),
+                    limit=args.seconds_per_run,
+                    popping=frames,
+                    shown=str((args.out / "popping").resolve()),
+                    command=command_line(),
+                )
+            )
+    return runs
+
+
+def about_city(city: Path, log: Path | None) -> Json:
+    """Return what `blitzgs synth` noted about the city, its images and bytes, and the seconds that it took.
+
+    Raises:
+        ValueError: the city is not finished.
+    """
+    manifest = city / "city.json"
+    if not manifest.exists():
+        raise ValueError(
+            f"{city}: there is no city.json: wait until blitzgs synth has ended, or run it again"
+        )
+    sizes = [file.stat().st_size for file in (city / "images").iterdir()]
+    found: Json = json.loads(manifest.read_text())
+    found |= {"images": len(sizes), "image_bytes": sum(sizes)}
+    if log is not None and (seconds := re.findall(r", ([\d.]+) s$", log.read_text(), re.MULTILINE)):
+        found["seconds"] = float(seconds[-1])
+    return found
+
+
+def collect(args: Any) -> str:
+    """Write city.md into the results, and the JSON; return the Markdown."""
+    order = list(ARMS)
+    runs = quality_report.read_runs(args.out / quality_report.RUNS)
+    runs.sort(key=lambda run: (run["ranks"], order.index(run["recipe"])))
+    saved = args.out / "city.json"
+    file = {"city": json.loads(saved.read_text()), "results": runs}
+    if not runs:
+        return "no run has any results yet"
+    known = [run for run in runs if "command" in run]  # a process that ended early may have written none
+    about = {
+        "command": "; ".join(sorted({run["command"] for run in known})),
+        "commit": " and ".join(sorted({run["commit"] for run in runs})),
+        "environment": known[0]["environment"] if known else {},
+    }
+    if args.json is not None:
+        write_json(args.json, "cpu", **about, **file)
+    lines = [f"# The city\n\n`{about['command']}`, commit {about['commit']}"]
+    for name, rows_of in TABLES.items():
+        if rows := rows_of(file):
+            lines.append(f"## {name}\n\n{markdown_table(rows)}")
+    for run in runs:
+        if run["status"] != "done":
+            lines.append(
+                f"Not done: {run['name']}: {run.get('error', 'it was stopped or ended from outside')}"
+            )
+    text = "\n\n".join(lines) + "\n"
+    (args.out / "city.md").write_text(text)
+    return text
+
+
+def work(runs: Sequence[CityRun], pool: Pool, args: Any) -> None:
+    """Do the runs that are not done, and write the tables whenever one ends."""
+    left = [run for run in runs if not quality_report.is_done(pool.out, run.name)]
+    begin = time.monotonic()
+    try:
+        while left or pool.jobs:
+            while left and pool.slots:
+                pool.result_path(left[0]).unlink(missing_ok=True)
+                pool.start(left.pop(0))
+            for job in pool.ended():
+                result = json.loads(pool.result_path(job.spec).read_text())
+                shown = {key: result.get(key) for key in ("status", "finished", "psnr", "images_per_second")}
+                print(f"[{time.monotonic() - begin:.0f} s] {job.spec.name}: {shown}", flush=True)
+                collect(args)
+            time.sleep(0.1)
+    finally:
+        pool.stop()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark; returns the exit status: 1 when a planned run is not done."""
+    parser = make_parser(__doc__, device=None)
+    parser.add_argument("city", type=Path, help="folder that blitzgs synth has made")
+    parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="(all)")
+    gpus = torch.cuda.device_count()
+    parser.add_argument("--gpus", type=int, default=gpus, help="to use; 0: the CPU (%(default)s)")
+    parser.add_argument("--ranks", type=positive, nargs="+", default=[1], help="(%(default)s)")
+    parser.add_argument(
+        "--popping", type=int, nargs="?", const=240, default=0, metavar="FRAMES",
+        help="measure popping on the first arm's model (240 frames)",
+    )  # fmt: skip
+    parser.add_argument("--seconds-per-run", type=float, default=100.0, help="(%(default)s)")
+    parser.add_argument("--held-out", type=positive, default=64, help="views to measure (%(default)s)")
+    parser.add_argument("--scale", type=float, default=0.9, help="of the schedule (%(default)s)")
+    parser.add_argument("--generation-log", type=Path, help="what blitzgs synth printed, for its seconds")
+    parser.add_argument("--collect", action="store_true", help="train nothing; write tables and JSON")
+    args, overrides = parser.parse_known_args(arguments)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    if args.collect:
+        print(collect(args))
+        return 0
+    try:
+        if args.seconds_per_run <= RESERVE:
+            raise ValueError(f"--seconds-per-run must be above {RESERVE:g}, got {args.seconds_per_run:g}")
+        if args.gpus and max(args.ranks) > args.gpus:
+            raise ValueError(f"--ranks {max(args.ranks)} needs as many --gpus, got {args.gpus}")
+        about = about_city(args.city, args.generation_log)
+        (args.out / quality_report.RUNS).mkdir(parents=True, exist_ok=True)
+        (args.out / "city.json").write_text(json.dumps(about))
+        runs = plan(args, overrides)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
+    try:
+        for ranks in dict.fromkeys(args.ranks):
+            group = [run for run in runs if run.ranks == ranks]
+            work(group, CityPool(args.out, args.gpus, 1, ranks), args)
+    finally:
+        print(collect(args))
+    return int(not all(quality_report.is_done(args.out, run.name) for run in runs))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

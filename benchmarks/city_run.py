@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trains one run of `bm_city.py` in a separate process: python benchmarks/city_run.py SPEC RESULT.
+
+SPEC is a JSON file of a `CityRun`. RESULT is written anew whenever more is known: after the set-up, the
+training, the evaluation, and the popping. Its "status" is "done" at the end, "stopped" if a signal from outside
+has stopped the training, and else "running" or "failed".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import resource
+import signal
+import statistics
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bm_popping
+import torch
+from harness import environment
+from quality_plan import RunSpec
+from quality_run import describe, means_of, synchronize, write
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training.config import Config
+from blitzgs.training.events.evaluate import measure
+from blitzgs.training.inputs import open_capture
+from blitzgs.training.population_report import population_report
+from blitzgs.training.run import TrainedModel
+from blitzgs.training.run_log import LOG
+from blitzgs.training.state import never
+from blitzgs.training.trainer import Trainer
+
+# A training stops so long before its process ends itself, in seconds; it is then evaluated.
+RESERVE = 16.0
+EVENTS = ("lod_gate", "pass_1", "pass_2", "clear_cull")
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class CityRun(RunSpec):
+    """A run with its limits.
+
+    Attributes:
+        limit: seconds after which the process ends itself, whatever it does.
+        popping: number of frames of the flight after the evaluation, 0: none.
+        shown: folder for the chart and the clip of the popping.
+        command: command of the benchmark that started the run.
+    """
+
+    limit: float = 100.0
+    popping: int = 0
+    shown: str = ""
+    command: str = ""
+
+
+class CityTrainer(Trainer):
+    """A trainer that neither evaluates nor saves at its end, which its caller does or leaves out."""
+
+    def finish(self) -> Record:
+        """Do nothing."""
+        return {}
+
+    def _stop(self, text: str) -> None:
+        """Write no checkpoint of a stopped run: it takes longer than the time that is left."""
+
+
+def phases_of(config: Config, records: Sequence[Record], images: int, seconds: float) -> list[Record]:
+    """Divide a run by what its schedule has on, from the records of its log.
+
+    Args:
+        config: of the run.
+        records: of the log.
+        images: that the run has seen.
+        seconds: of training until then.
+
+    Returns:
+        For each phase "from" and "to" in images, "on" (growth, LOD, mask), "seconds", "images_per_second" with
+        all that happened in it, "median_images_per_second" between two records, "active" and "visible" (shares
+        of the Gaussians, means over the logged steps), and "gaussians" at its end.
+    """
+    schedule, view = config.schedule, config.view
+    begins = schedule.t1 or schedule.t2
+    cleared = (schedule.t2 + schedule.iterations) / 2
+    marks = sorted({0, begins, schedule.densify_until, schedule.t2, cleared, schedule.iterations})
+    steps = [record for record in records if "loss" in record]
+    clock = [(0.0, 0.0)] + [(record["t"], record["t"] / record["images_per_second"]) for record in steps]
+    if images > clock[-1][0]:
+        clock.append((images, seconds))
+    pairs = list(zip(clock, clock[1:], strict=False))
+
+    def seconds_at(t: float) -> float:
+        for (a, seconds_a), (b, seconds_b) in pairs:
+            if t <= b:
+                return seconds_a + (seconds_b - seconds_a) * (t - a) / max(1, b - a)
+        return clock[-1][1]
+
+    phases = []
+    for begin, end in zip(marks, marks[1:], strict=False):
+        first, last = begin * schedule.scale, min(end * schedule.scale, clock[-1][0])
+        if first >= clock[-1][0]:
+            break
+        inside = [record for record in steps if first < record["t"] <= last]
+        rates = [
+            (b - a) / max(seconds_b - seconds_a, 1e-9)
+            for (a, seconds_a), (b, seconds_b) in pairs
+            if a >= first and b <= last
+        ]
+        parts = {
+            "growth": begin < schedule.densify_until,
+            "LOD": view.lod and begin >= schedule.densify_until,
+            "mask": view.cull and config.population.importance and begins <= begin < cleared,
+        }
+        spent = seconds_at(last) - seconds_at(first)
+        phases.append(
+            {
+                "from": first,
+                "to": last,
+                "on": " + ".join(name for name, is_on in parts.items() if is_on) or "–",
+                "seconds": spent,
+                "images_per_second": (last - first) / max(spent, 1e-9),
+                "median_images_per_second": statistics.median(rates) if rates else None,
+                "active": _mean_share(inside, "active"),
+                "visible": _mean_share(inside, "visible"),
+                "gaussians": inside[-1]["gaussians"] if inside else None,
+            }
+        )
+    return phases
+
+
+def _mean_share(records: Sequence[Record], name: str) -> float | None:
+    return statistics.fmean(r[name] / r["gaussians"] for r in records) if records else None
+
+
+def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float) -> None:
+    """Train, evaluate and, if planned, measure popping; add to the result, and write it after each part.
+
+    Args:
+        spec: the run.
+        result: gets the figures.
+        path: of the result's file, which rank 0 writes.
+        folder: for the run's log.
+        since: when the process began, by `time.monotonic`.
+    """
+    config = spec.config()
+    with Ranks.from_environment(spec.device, config.ranks.timeout_seconds, config.ranks.transport) as ranks:
+        folder = Path(ranks.broadcast_object(str(folder)))  # all ranks are on one host
+        wall: dict[str, float] = result.setdefault("wall", {})
+
+        def note(part: str) -> None:
+            """Note when a part was over, and write what is known."""
+            wall[part] = round(time.monotonic() - since, 2)
+            if ranks.rank == 0:
+                write(path, result)
+
+        capture, images = open_capture(config, ranks)
+        trainer = CityTrainer(config, capture, images, folder, ranks)
+        state = trainer.state
+        result["views"] = {"train": len(capture.train), "test": len(capture.test)}
+        result["points"] = len(capture.points)
+        result["levels"] = state.progress.level_count
+        note("set_up")
+        deadline = threading.Event()
+
+        def stop() -> None:
+            """Stop the training as a signal from outside does: the ranks agree on what one of them got."""
+            deadline.set()
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        timer = threading.Timer(max(1.0, spec.limit - RESERVE - (time.monotonic() - since)), stop)
+        timer.daemon = True
+        if ranks.rank == 0:
+            timer.start()
+        result["finished"] = trainer.train() is not None
+        timer.cancel()
+        is_done = result["finished"] or deadline.is_set()
+        synchronize(ranks.device)
+        state.stops = never
+        images_seen, seconds = state.images_seen, state.progress.seconds
+        host_peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        result |= {
+            "images": images_seen,
+            "planned_images": state.schedule.iterations,
+            "batch_size": config.schedule.batch_size,
+            "seconds": seconds,
+            "images_per_second": images_seen / max(seconds, 1e-9),
+            "gaussians": state.population(),
+            "population": population_report(state, trainer.memory),
+            "image_memory": dataclasses.asdict(images.memory()),
+            "host_peak_bytes": ranks.all_gather_object(host_peak),
+        }
+        if ranks.rank == 0:
+            records = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
+            result["phases"] = phases_of(state.config, records, images_seen, seconds)
+            result["events"] = [record for record in records if record.get("event") in EVENTS]
+        note("trained")
+        with torch.no_grad():
+            result |= means_of(measure(state, capture.test, None))
+        note("evaluated")
+        if spec.popping and ranks.world_size == 1:
+            state.catch_up()
+            model = TrainedModel(state.config, state.progress, state.space, state.table)
+            result["popping"] = popping(spec, model, capture.cameras, ranks)
+            note("popped")
+    result["status"] = "done" if is_done else "stopped"
+
+
+def popping(spec: CityRun, model: TrainedModel, cameras: Any, ranks: Ranks) -> Record:
+    """Measure popping; where OpenCV cannot write a clip, without clip and chart."""
+    try:
+        return bm_popping.popping_of(model, cameras, ranks, Path(spec.shown), spec.popping)
+    except OSError as error:
+        print(f"no clip and no chart: {error}", flush=True)
+        return bm_popping.popping_of(model, cameras, ranks, None, spec.popping)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do one run; returns the exit status."""
+    since = time.monotonic()
+    spec_path, result_path = map(Path, arguments)
+    spec = CityRun(**json.loads(spec_path.read_text()))
+    # On every rank: no rank outlives its parent, and a run that hangs ends, too.
+    watchdog = threading.Timer(spec.limit, os._exit, (1,))
+    watchdog.daemon = True
+    watchdog.start()
+    result = describe(spec) | {"status": "running", "finished": False, "command": spec.command}
+    result["environment"] = environment(spec.device)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            train(spec, result, result_path, Path(folder), since)
+        except Exception as error:
+            traceback.print_exc()
+            result |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
+    if os.environ.get("RANK", "0") == "0":
+        write(result_path, result)
+    return 0 if result["status"] in ("done", "stopped") else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
