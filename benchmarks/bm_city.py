@@ -5,16 +5,16 @@ r"""Trains a synthetic city with and without the view level: quality, speed by p
     python benchmarks/bm_city.py CITY --out RESULTS --generation-log generation.txt \
         --gpus 2 --ranks 1 2 --popping --json benchmarks/results/city.json
 
-The arms are `configs/city.yaml` with the LOD gate and the cull mask (full), without the one (no_lod), the other
-(no_mask), or both (all_off). Every run is a process on one GPU; each GPU has one at a time. The numbers of
+The arms are `configs/city.yaml` with the LOD gate and the cull mask (full), without the one (no_lod), the
+other (no_mask), or both (all_off). Every run is a process on one GPU; each GPU has one at a time. The numbers of
 ranks above 1 follow when these are over: the first of --arms, under torchrun, with the machine to itself.
 
 A run writes its figures into RESULTS/runs after its set-up, training, evaluation and popping. Some seconds
 before --seconds-per-run are over, its training stops where it is and is evaluated there ("finished": false).
 The tables and --json are written when a run ends, and when this program is ended by SIGTERM. The same
-command then skips the runs that are done; --collect trains nothing, and writes tables and JSON of what there
-is in RESULTS. A run that is done is not repeated for its popping alone. Other fields of the configuration may follow as --section.field=value. In a copy without a
-repository, BLITZGS_COMMIT names the commit.
+command then skips the runs that are done; it does not repeat one for its popping alone. --collect trains
+nothing, and writes tables and JSON of what there is in RESULTS. Other fields of the configuration may follow
+as --section.field=value. In a copy without a repository, BLITZGS_COMMIT names the commit.
 """
 
 from __future__ import annotations

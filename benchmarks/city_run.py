@@ -2,8 +2,8 @@
 """Trains one run of `bm_city.py` in a separate process: python benchmarks/city_run.py SPEC RESULT.
 
 SPEC is a JSON file of a `CityRun`. RESULT is written anew whenever more is known: after the set-up, the
-training, the evaluation, and the popping. Its "status" is "done" at the end, "stopped" if a signal from outside
-has stopped the training, and else "running" or "failed".
+training, the evaluation, and the popping. Its "status" is "done" at the end, "stopped" if a signal from
+outside has stopped the training, and else "running" or "failed".
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ def phases_of(config: Config, records: Sequence[Record], images: int, seconds: f
         seconds: of training until then.
 
     Returns:
-        For each phase "from" and "to" in images, "on" (growth, LOD, mask), "seconds", "images_per_second" with
-        all that happened in it, "median_images_per_second" between two records, "active" and "visible" (shares
-        of the Gaussians, means over the logged steps), and "gaussians" at its end.
+        For each phase "from" and "to" in images, "on" (growth, LOD, mask), "seconds", "images_per_second" of
+        the whole phase, "median_images_per_second" between two records, "active" and "visible" (shares of the
+        Gaussians, means over the logged steps), and "gaussians" at its end.
     """
     schedule, view = config.schedule, config.view
     begins = schedule.t1 or schedule.t2

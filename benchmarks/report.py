@@ -7,7 +7,8 @@
 Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` names the file and the command. A
 page has a pair of comments around each table, `<!-- table: NAME -->` and `<!-- end: NAME -->`; the text
 between them is replaced. All files must come from one commit, because figures of different code do not
-compare; only those of the city (`APART`), which have a page of their own, may be of others. In place of a table whose file is absent the page names the command that makes it.
+compare; only those of the city (`APART`), which have a page of their own, may be of others. In place of a
+table whose file is absent the page names the command that makes it.
 """
 
 from __future__ import annotations
