@@ -6,8 +6,9 @@ r"""Trains a synthetic city with and without the view level: quality, speed by p
         --gpus 2 --ranks 1 2 --popping --json benchmarks/results/city.json
 
 The arms are `configs/city.yaml` with the LOD gate and the cull mask (full), without the one (no_lod), the
-other (no_mask), or both (all_off). Every run is a process on one GPU; each GPU has one at a time. The numbers of
-ranks above 1 follow when these are over: the first of --arms, under torchrun, with the machine to itself.
+other (no_mask), or both (all_off). Every run is a process on one GPU; each GPU has one at a time. The
+numbers of ranks above 1 follow when these are over: the first of --arms, under torchrun, with the machine to
+itself.
 
 A run writes its figures into RESULTS/runs after its set-up, training, evaluation and popping. Some seconds
 before --seconds-per-run are over, its training stops where it is and is evaluated there ("finished": false).
