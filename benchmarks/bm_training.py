@@ -6,12 +6,16 @@
 
 First the benchmark trains the capture with `--images` images, as `blitzgs train` does, with loading and
 logging of batches but without checkpoints and evaluations. Then it measures `--steps` further steps with the
-density events that fall among them, by the host's clock; the GPU is idle before and after.
+density events that fall among them, by the host's clock; the GPU is idle before and after. Of these steps it
+also reports how many images and masks were decoded, and in which share of the time the host waited for
+photographs, and for other ranks or the GPU in each `Watchdog.waiting`. With several ranks the host waits
+nowhere else.
 
 On CUDA, `--profiled` more steps, without density events, run under torch's profiler. Reported are: how long
-kernels and copies keep the busiest stream occupied, how long the host waits for the GPU, which kernels take
-the time, and the longest gaps on the busiest stream with the kernels before and after each. The figures are
-those of rank 0; the ranks wait for each other in every step.
+kernels and copies keep the busiest stream occupied, which part of this are barriers and collectives, in which
+it waits for other ranks, how long the host waits for the GPU, which kernels take the time, and the longest
+gaps on the busiest stream with the kernels before and after each. The figures are those of rank 0; the ranks
+wait for each other in every step.
 """
 
 from __future__ import annotations
@@ -21,7 +25,8 @@ import re
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -31,6 +36,8 @@ from harness import make_parser, markdown_table, report
 from torch.profiler import ProfilerActivity, profile
 
 from blitzgs.distributed.group import Ranks, Transport
+from blitzgs.distributed.watchdog import NoWatchdog, Watchdog
+from blitzgs.training.agreement import Agreement, StopRequest
 from blitzgs.training.config_io import load_config
 from blitzgs.training.events import densify
 from blitzgs.training.inputs import open_capture
@@ -41,11 +48,25 @@ from blitzgs.training.trainer import Trainer
 LEAST_GAP = 3.0  # us; the usual gap between two kernels that were queued long before
 
 
+# How the names of the kernels begin in which a stream waits for other ranks: `short_name` of blitzgs' barrier
+# and of NCCL's collectives.
+WAITING_KERNELS = ("barrier_kernel", "ncclDevKernel")
+
+
 class Times(NamedTuple):
-    """Seconds of some steps in a row, and of each density event among them."""
+    """Seconds of some steps in a row, and of each density event among them.
+
+    Attributes:
+        steps: seconds of the steps.
+        events: seconds of each density event.
+        waits: share of the steps' time in which the host waited, by what it waited for.
+        decoded: decodings of images and masks.
+    """
 
     steps: float
     events: list[float]
+    waits: dict[str, float]
+    decoded: int
 
 
 class StreamUse(NamedTuple):
@@ -53,6 +74,7 @@ class StreamUse(NamedTuple):
 
     Attributes:
         busy: share of the time, from the first to the last kernel, in which the main stream works.
+        exchanging: share of the same time in which barriers or collectives run on the main stream.
         waiting: share of the same time in which the thread that launches kernels waits for the GPU.
         launches: kernels and copies on all streams.
         gaps: (before, after) -> the main stream's gaps between these, in us.
@@ -60,19 +82,53 @@ class StreamUse(NamedTuple):
     """
 
     busy: float
+    exchanging: float
     waiting: float
     launches: int
     gaps: dict[tuple[str, str], list[float]]
     kernels: dict[str, list[float]]
 
 
+class MeasuredWatchdog(NoWatchdog):
+    """Measures how long the process waits in each context of another watchdog.
+
+    Attributes:
+        seconds: by the name of the context.
+    """
+
+    def __init__(self, watchdog: Watchdog | NoWatchdog) -> None:
+        self._watchdog = watchdog
+        self.seconds: dict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def waiting(self, name: str) -> Iterator[None]:
+        """See `Watchdog.waiting`."""
+        begin = time.perf_counter()
+        with self._watchdog.waiting(name):
+            yield
+        self.seconds[name] += time.perf_counter() - begin
+
+    def working(self, what: str) -> AbstractContextManager[None]:
+        """See `Watchdog.working`."""
+        return self._watchdog.working(what)
+
+    def report_failure(self, message: str) -> None:
+        """See `Watchdog.report_failure`."""
+        self._watchdog.report_failure(message)
+
+    def stop(self) -> None:
+        """See `Watchdog.stop`."""
+        self._watchdog.stop()
+
+
 class MeasuredTrainer(Trainer):
-    """A trainer that stops on the way to measure."""
+    """A trainer that stops on the way to measure; the watchdog of its ranks is a `MeasuredWatchdog`."""
 
     @torch.no_grad()
     def begin(self, steps: int) -> None:
         """Train the first steps, with their density events."""
         self.state.start_clock()
+        self._agreement = Agreement(self.state.ranks, StopRequest(), self.state.save_clock)
         folder = self.state.folder if self.state.ranks.rank == 0 else None
         self.state.log = RunLog(folder, self.state.schedule.iterations, done=0, tensorboard=False)
         self.timed(steps)
@@ -82,17 +138,30 @@ class MeasuredTrainer(Trainer):
         """Train further steps with their density events, and measure both."""
         size, first = self.state.schedule.batch_size, self.state.progress.step + 1
         spent, events = 0.0, []
+        waited, decoded = self._waited(), self.state.images.memory().decoded
         begin = self._now()
         for step in range(first, first + steps):
             self.step(step)
+            self._agreement.after(step)
             for event in self.state.schedule.events((step - 1) * size, step * size):
                 if event.kind == "densify":
-                    stopped = self._now()
+                    stopped, before = self._now(), self._waited()
                     densify.run(self.state, event)
                     spent += stopped - begin
                     begin = self._now()
                     events.append(begin - stopped)
-        return Times(spent + self._now() - begin, events)
+                    for name, seconds in self._waited().items():  # do not count those of the event
+                        waited[name] = waited.get(name, 0.0) + seconds - before.get(name, 0.0)
+        spent += self._now() - begin
+        shares = {name: (end - waited.get(name, 0.0)) / spent for name, end in self._waited().items()}
+        waits = {name: share for name, share in shares.items() if share >= 0.0005}
+        return Times(spent, events, waits, self.state.images.memory().decoded - decoded)
+
+    def _waited(self) -> dict[str, float]:
+        """Return the seconds that the host has waited so far, by what it waited for."""
+        watchdog = cast(MeasuredWatchdog, self.state.ranks.watchdog)
+        in_contexts = {f"other ranks or the GPU, {name}": t for name, t in watchdog.seconds.items()}
+        return {"photographs": self.loader.waited} | in_contexts
 
     @torch.no_grad()
     def profiled(self, steps: int) -> list[dict[str, Any]]:
@@ -127,8 +196,13 @@ def stream_use(trace: Sequence[dict[str, Any]]) -> StreamUse:
             work[event["args"]["stream"]].append((event["ts"], end, short_name(event["name"])))
         elif kind in ("cuda_runtime", "cuda_driver"):
             calls[event["tid"]].append((event["name"], event["dur"]))
-    main = sorted(max(work.values(), key=lambda items: sum(end - begin for begin, end, _ in items)))
+
+    def working(items: list[tuple[float, float, str]]) -> float:
+        return sum(end - begin for begin, end, name in items if not name.startswith(WAITING_KERNELS))
+
+    main = sorted(max(work.values(), key=working))
     span = main[-1][1] - main[0][0]
+    exchanging = sum(end - begin for begin, end, _ in main) - working(main)
     busy, last, before = 0.0, main[0][0], ""
     gaps: dict[tuple[str, str], list[float]] = defaultdict(list)
     for begin, end, name in main:
@@ -142,7 +216,8 @@ def stream_use(trace: Sequence[dict[str, Any]]) -> StreamUse:
     kernels: dict[str, list[float]] = defaultdict(list)
     for begin, end, name in chain.from_iterable(work.values()):
         kernels[name].append(end - begin)
-    return StreamUse(busy / span, waits / span, sum(map(len, work.values())), dict(gaps), dict(kernels))
+    launches = sum(map(len, work.values()))
+    return StreamUse(busy / span, exchanging / span, waits / span, launches, dict(gaps), dict(kernels))
 
 
 def short_name(name: str) -> str:
@@ -160,9 +235,12 @@ def figures(times: Times, steps: int, use: StreamUse | None, profiled: int) -> l
             (f"with them, one in {every:.3g} steps, ms", 1e3 * (times.steps + sum(times.events)) / steps),
             ("a density event, ms", 1e3 * sum(times.events) / len(times.events)),
         ]
+    rows.append(("images and masks decoded a step", times.decoded / steps))
+    rows += [(f"the host waits for {name}", f"{share:.1%}") for name, share in times.waits.items()]
     if use is not None:
         rows += [
             ("the main stream is busy", f"{use.busy:.0%}"),
+            ("of this in barriers and collectives", f"{use.exchanging:.0%}"),
             ("the host waits for the GPU", f"{use.waiting:.0%}"),
             ("kernels and copies a step", use.launches / profiled),
         ]
@@ -207,8 +285,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ) as ranks,
         tempfile.TemporaryDirectory() as folder,
     ):
+        shared = ranks.broadcast_object(folder)  # the ranks write to one folder
+        ranks.watchdog = MeasuredWatchdog(ranks.watchdog)
         capture, images = open_capture(config, ranks)
-        trainer = MeasuredTrainer(config, capture, images, Path(folder), ranks)
+        trainer = MeasuredTrainer(config, capture, images, Path(shared), ranks)
         trainer.begin(before)
         times, use = trainer.timed(args.steps), None
         if ranks.device.type == "cuda":

@@ -41,15 +41,21 @@ class _ViewCost(NamedTuple):
     @classmethod
     def of(cls, key: Hashable, cost: NDArray[np.float32]) -> _ViewCost:
         """Store the costs of a view's tiles."""
-        grain, last = _grain(len(cost)), np.finfo(np.float16).max
-        begins = np.arange(0, len(cost), grain)
-        sums = np.add.reduceat(cost, begins, dtype=np.float32)
-        means = sums / np.minimum(grain, len(cost) - begins)
-        return cls(key, len(cost), np.minimum(means, last).astype(np.float16))
+        grain, means = _grain(len(cost)), cost
+        if grain > 1:
+            begins = np.arange(0, len(cost), grain)
+            sums = np.add.reduceat(cost, begins, dtype=np.float32)
+            means = (sums / np.minimum(grain, len(cost) - begins)).astype(np.float32)
+        # Torch converts to and from float16 with the processor's instructions, numpy without. This runs in
+        # every step while the GPU waits for its next work.
+        halves = torch.from_numpy(means).clamp(max=torch.finfo(torch.float16).max).half()
+        return cls(key, len(cost), halves.numpy())
 
     def of_tiles(self) -> NDArray[np.float32]:
         """Return the cost of each tile."""
-        return self.pieces.astype(np.float32).repeat(_grain(self.tiles))[: self.tiles]
+        grain = _grain(self.tiles)
+        costs: NDArray[np.float32] = torch.from_numpy(self.pieces).float().numpy()
+        return costs if grain == 1 else costs.repeat(grain)[: self.tiles]
 
 
 def _grain(tiles: int) -> int:

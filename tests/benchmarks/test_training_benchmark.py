@@ -11,6 +11,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 import bm_training  # noqa: E402
 
+from tests.distributed.rank_harness import run_ranks  # noqa: E402
 from tests.helpers import DEVICES  # noqa: E402
 from tests.training.tiny import OVERRIDES, write_tiny_capture  # noqa: E402
 
@@ -33,6 +34,22 @@ def test_a_training_is_measured(tmp_path, capsys, device):
         bm_training.main([*flags, "--images", "90", "--steps", "20", *settings])
 
 
+def _measure(rank, arguments):
+    bm_training.main(arguments)
+
+
+def test_the_waits_of_two_ranks_are_measured(tmp_path):
+    write_tiny_capture(tmp_path / "capture")
+    path = tmp_path / "figures.json"
+    settings = [f"--{text}" for text in OVERRIDES]
+    flags = ["--data", str(tmp_path / "capture"), "--device", "cpu", "--json", str(path), *settings]
+    run_ranks(_measure, 2, [*flags, "--images", "20", "--steps", "30", "--profiled", "0"], join=False)
+    rows = {row["figure"]: row["value"] for row in json.loads(path.read_text())["rows"]}
+    waits = {name: float(text[:-1]) for name, text in rows.items() if name.startswith("the host waits for")}
+    assert {"the host waits for other ranks or the GPU, all_to_all"} <= set(waits)
+    assert all(share > 0 for share in waits.values()) and sum(waits.values()) < 100
+
+
 def test_figures_read_from_a_profiler_trace():
     def work(begin, end, name, stream=7):
         return {"cat": "kernel", "ts": begin, "dur": end - begin, "name": name, "args": {"stream": stream}}
@@ -45,13 +62,14 @@ def test_figures_read_from_a_profiler_trace():
         work(0, 40, "void blitzgs::cuda::(anonymous namespace)::splats_kernel<3, (bool)1>(float const*)"),
         work(60, 80, "Memcpy DtoH (Device -> Pinned)"),
         work(70, 75, "beneath"),
-        work(81, 100, "void at::native::fill_kernel<int>(int)"),
+        work(81, 100, "void blitzgs::cuda::(anonymous namespace)::barrier_kernel(ControlWords, long)"),
         work(30, 70, "elsewhere", stream=9),
         call("cudaLaunchKernel", 5, 1),
         call("cudaEventSynchronize", 25, 1),
         call("cudaStreamSynchronize", 90, 2),
     ]
     use = bm_training.stream_use(trace)
+    assert use.exchanging == pytest.approx(0.19)
     assert use.busy == pytest.approx(0.79) and use.waiting == pytest.approx(0.25) and use.launches == 5
     assert use.gaps == {("splats_kernel", "Memcpy DtoH"): [20]}
     (gap,) = bm_training.longest_gaps(use, 2)
