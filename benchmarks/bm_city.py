@@ -120,7 +120,7 @@ def collect(args: Any) -> str:
     file = {"city": json.loads(saved.read_text()), "results": runs}
     if not runs:
         return "no run has any results yet"
-    known = [run for run in runs if "command" in run]  # a process that ended early may have written none
+    known = [run for run in runs if "environment" in run]  # those that got as far as their training
     about = {
         "command": "; ".join(sorted({run["command"] for run in known})),
         "commit": " and ".join(sorted({run["commit"] for run in runs})),

@@ -169,6 +169,7 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         result["views"] = {"train": len(capture.train), "test": len(capture.test)}
         result["points"] = len(capture.points)
         result["levels"] = state.progress.level_count
+        result["environment"] = environment(ranks.device)
         note("set_up")
         deadline = threading.Event()
 
@@ -234,7 +235,6 @@ def main(arguments: Sequence[str]) -> int:
     watchdog.daemon = True
     watchdog.start()
     result = describe(spec) | {"status": "running", "finished": False, "command": spec.command}
-    result["environment"] = environment(spec.device)
     with tempfile.TemporaryDirectory() as folder:
         try:
             train(spec, result, result_path, Path(folder), since)
