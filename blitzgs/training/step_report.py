@@ -30,13 +30,13 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> Tensor:
     if loss.size > 0:
         size = size_term(frame, state.stepper.table, extent).mean()
     assert frame.active is not None  # as in every step of a training
-    counts = [
-        state.ranks.all_reduce(torch.full((), float(count), dtype=torch.float64, device=scale.device))
-        for count in (len(frame.projected.visible_ids), len(state.table))
-    ]
-    counts.insert(0, state.ranks.all_reduce(frame.active.considered().double()))
-    terms = [term.double() for term in (scale, opacity, size, batch_psnr(frame, batch))]
-    return torch.stack([*terms, *counts])
+    active = frame.active.considered().double()
+    visible, population = (
+        active.new_full((), float(count)) for count in (len(frame.projected.visible_ids), len(state.table))
+    )
+    counts = state.ranks.all_reduce(torch.stack([active, visible, population]))
+    terms = torch.stack([scale, opacity, size, batch_psnr(frame, batch)]).double()
+    return torch.cat([terms, counts])
 
 
 def log_step(
