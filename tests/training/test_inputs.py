@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run opens its capture with the memory for images that the configuration and the host allow."""
+
+import pytest
+
+from blitzgs.distributed.group import Ranks
+from blitzgs.training import inputs
+from tests.training.tiny import tiny_config, write_tiny_capture
+
+
+@pytest.mark.parametrize(
+    ("limit", "cache_bytes", "budget"),
+    [("1000000\n", 800_000, 250_000), ("1000000\n", 300_000, 150_000), ("max\n", 300_000, 150_000)],
+)
+def test_ranks_share_at_most_half_of_the_memory_of_a_container(
+    tmp_path, monkeypatch, limit, cache_bytes, budget
+):
+    write_tiny_capture(tmp_path / "capture")
+    (tmp_path / "memory.max").write_text(limit)
+    monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "memory.max")
+    config = tiny_config(f"data.path={tmp_path / 'capture'}", f"data.cache_bytes={cache_bytes}")
+    _, images = inputs.open_capture(config, Ranks(local_world_size=2))
+    assert images.compressed.budget == budget and images.decoded.budget == budget // 4 + budget
+
+
+def test_without_a_container_the_memory_of_the_host_counts(tmp_path, monkeypatch):
+    write_tiny_capture(tmp_path / "capture")
+    monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "missing")
+    monkeypatch.setattr(inputs.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}[name])
+    _, images = inputs.open_capture(tiny_config(f"data.path={tmp_path / 'capture'}"), Ranks())
+    assert images.compressed.budget == 4096 * 50
