@@ -62,8 +62,12 @@ class CollectiveExchange:
         # The host may have to wait for the collectives of other ranks that are queued before the projection.
         with ranks.watchdog.waiting("project"):
             projected = inputs.run(sizes, tiles)
+        everyone = projected.totals.repeat(ranks.world_size, 1)
+        # Newer versions of torch have this function under another name and warn about the old one.
+        gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
         with ranks.watchdog.waiting("share_counts"):
-            everyone = _gather(projected.totals, ranks.world_size)
+            if ranks.world_size > 1:
+                gather(everyone.view(-1), projected.totals)
             visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
             totals = to_host(everyone).tolist()
         traffic = Traffic.of(totals, n_views, ranks.rank)
@@ -96,17 +100,6 @@ class CollectiveExchange:
     def finish(self) -> HostCounts | None:
         """See `Exchange.finish`; the host has known all numbers since the splats were sent."""
         return self._counts
-
-
-def _gather(totals: Tensor, world_size: int) -> Tensor:
-    """Gather the totals of all ranks, [M, T]."""
-    if world_size == 1:
-        return totals[None]
-    everyone = totals.new_empty(world_size, len(totals))
-    # Newer versions of torch have this function under another name and warn about the old one.
-    gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
-    gather(everyone.view(-1), totals)
-    return everyone
 
 
 class HalfCodec:
