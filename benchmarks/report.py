@@ -52,12 +52,14 @@ class Section:
 
 # File in benchmarks/results (without .json) -> the command that writes it.
 EXCHANGE = "python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda --batch 4 --batches 4"
+TRAINING = "benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000"
 COMMANDS = {
     "render": "python benchmarks/bm_render.py",
     "step_1": "python benchmarks/bm_step.py --views 1",
     "step_4": "python benchmarks/bm_step.py --views 4",
-    "exchange": f"{EXCHANGE} --ranks 1 2 4",
-    "training": "python benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000",
+    "exchange": f"{EXCHANGE} --ranks 1 2",
+    "training": f"python {TRAINING}",
+    "training_2": f"torchrun --nproc-per-node=2 {TRAINING}",
     "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
     "importance": "python benchmarks/bm_importance.py",
     "gate": "python benchmarks/bm_gate.py",
@@ -66,7 +68,7 @@ COMMANDS = {
     "accuracy": "python benchmarks/bm_accuracy.py",
     "quality": (
         "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
-        "--recipe aerial=configs/aerial.yaml --recipe gsplat=gsplat-default-reset --seeds 0 1 2"
+        "--recipe aerial=configs/aerial.yaml --seeds 0 1 2"
     ),
 }
 COMMANDS |= {
@@ -292,6 +294,7 @@ SECTIONS = {
     "step": Section(("step_1", "step_4"), step_lines),
     "exchange": Section(("exchange",), exchange_lines),
     "training": Section(("training",), row_lines),
+    "training_2": Section(("training_2",), row_lines),
     "drop_in": Section(("drop_in",), row_lines),
     "importance": Section(("importance",), row_lines),
     "gate": Section(("gate",), row_lines),
