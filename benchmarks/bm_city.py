@@ -69,6 +69,9 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     Raises:
         ValueError: an argument cannot be used.
     """
+    views = sum(1 for _ in (args.city / "images").iterdir())
+    if args.held_out >= views:
+        raise ValueError(f"--held-out must be below the number of views, {views}, got {args.held_out}")
     split = args.out / "held_out.txt"
     held_out(args.city, args.held_out, split)
     capture = {"city": f"'{args.city}' --data.split={json.dumps(str(split.resolve()))}"}
@@ -112,7 +115,11 @@ def about_city(city: Path, log: Path | None) -> Json:
 
 
 def collect(args: Any) -> str:
-    """Write city.md into the results, and the JSON; return the Markdown."""
+    """Write city.md into the results, and the JSON; return the Markdown.
+
+    Raises:
+        OSError: the folder has no results.
+    """
     order = list(ARMS)
     runs = quality_report.read_runs(args.out / quality_report.RUNS)
     runs.sort(key=lambda run: (run["ranks"], order.index(run["recipe"])))
@@ -181,10 +188,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--collect", action="store_true", help="train nothing; write tables and JSON")
     args, overrides = parser.parse_known_args(arguments)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    if args.collect:
-        print(collect(args))
-        return 0
     try:
+        if args.collect:
+            print(collect(args))
+            return 0
         if args.seconds_per_run <= RESERVE:
             raise ValueError(f"--seconds-per-run must be above {RESERVE:g}, got {args.seconds_per_run:g}")
         if args.gpus and max(args.ranks) > args.gpus:

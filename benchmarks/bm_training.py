@@ -290,10 +290,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         capture, images = open_capture(config, ranks)
         trainer = MeasuredTrainer(config, capture, images, Path(shared), ranks)
         trainer.begin(before)
+        count = trainer.state.population()
         times, use = trainer.timed(args.steps), None
         if ranks.device.type == "cuda":
             use = stream_use(trainer.profiled(args.profiled))
-        count = int(ranks.all_reduce(torch.tensor([len(trainer.state.table)], device=ranks.device)))
         trainer.close()
         if ranks.rank == 0:
             title = (

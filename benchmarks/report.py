@@ -153,7 +153,7 @@ def call_lines(render: Json) -> list[str]:
 
 
 def step_lines(*files: Json) -> list[str]:
-    """Tabulate A whole training step, against gsplat with torch's fused Adam."""
+    """Tabulate a whole training step, against gsplat with torch's fused Adam."""
     results = [result for file in files for result in file["results"]]
 
     def cells(figures: Json | None) -> list[str]:
@@ -172,7 +172,7 @@ def step_lines(*files: Json) -> list[str]:
 
 
 def exchange_lines(exchange: Json) -> list[str]:
-    """Tabulate A step on several GPUs, by stage."""
+    """Tabulate a step on several GPUs, by stage."""
     reports = exchange["results"]
     names = {"alone": "a step alone, behind a barrier", "step": "**steps in a row**"}
     rows = [[names.get(stage, stage), *(ms(report["ms"][stage]) for report in reports)]

@@ -60,7 +60,8 @@ class _L1Ssim(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, renders: Tensor, targets: Tensor, masks: Tensor | None, weight: float) -> Tensor:
-        constant = masks is None and renders.numel() > 0
+        # Constants of a fake tensor (FakeTensorMode) would be stored and break later calls.
+        constant = masks is None and renders.numel() > 0 and type(renders) is Tensor
         if constant:
             views, height, width, _ = renders.shape
             key = (views, 3 * height * width, float(weight), renders.dtype, renders.device)

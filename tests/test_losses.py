@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """`blitzgs.l1_ssim` is the mean of `photometric_loss`, which has tests of its own."""
 
+import contextlib
+
 import pytest
 import torch
+from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTensorMode
 
 import blitzgs
 from blitzgs.ops.photometric import photometric_loss
@@ -61,6 +64,15 @@ def test_a_second_derivative_is_refused():
     (gradient,) = torch.autograd.grad(blitzgs.l1_ssim(x, targets), x, create_graph=True)
     with pytest.raises(RuntimeError, match="l1_ssim has first derivatives only"):
         gradient.sum().backward()
+
+
+def test_a_call_with_fake_tensors_leaves_later_calls_intact():
+    shape = (1, 13, 17, 3)
+    with FakeTensorMode(), contextlib.suppress(DynamicOutputShapeException):  # the op has no fake result
+        blitzgs.l1_ssim(torch.rand(shape, requires_grad=True), torch.rand(shape))
+    renders = torch.rand(shape, requires_grad=True)
+    loss = blitzgs.l1_ssim(renders, renders.detach())
+    assert type(loss) is torch.Tensor and loss.item() == pytest.approx(0, abs=1e-6)
 
 
 def test_it_compiles():

@@ -360,9 +360,16 @@ def step_together(optimizers: Iterable[LazyAdam] | Mapping[str, LazyAdam], set_t
         set_to_none: whether to remove the gradients afterwards, as `zero_grad(set_to_none=True)` does.
 
     Raises:
+        TypeError: an optimiser is not a `LazyAdam`.
         ValueError: as `LazyAdam.step`.
     """
     chosen = list(optimizers.values() if isinstance(optimizers, Mapping) else optimizers)
+    for optimizer in chosen:
+        if not isinstance(optimizer, LazyAdam):
+            raise TypeError(
+                f"step_together: every optimiser must be a LazyAdam, got {type(optimizer).__name__}; call "
+                "the step of the others separately"
+            )
     if not step_jointly(chosen):
         for optimizer in chosen:
             optimizer.step()

@@ -93,7 +93,7 @@ class ImageMemory:
         compressed_bytes: bytes of compressed images.
         compressed_budget: limit of these bytes.
         decoded_bytes: bytes of decoded images and masks, without those that a caller holds.
-        decoded_budget: limit of these bytes.
+        decoded_budget: limit of these bytes at present; it may have been larger before (`ImageStore`).
         decoded: number of decodings of images and masks.
     """
 
@@ -107,7 +107,7 @@ class ImageMemory:
         """Return the figures as text, in gigabytes."""
         return (
             f"host memory of images: at most {self.compressed_bytes / 1e9:.2f} GB compressed (budget "
-            f"{self.compressed_budget / 1e9:.2f}) and {self.decoded_bytes / 1e9:.2f} GB decoded (budget "
+            f"{self.compressed_budget / 1e9:.2f}) and {self.decoded_bytes / 1e9:.2f} GB decoded (budget now "
             f"{self.decoded_budget / 1e9:.2f}); decoded {self.decoded:,} times"
         )
 

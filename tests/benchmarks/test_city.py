@@ -102,6 +102,15 @@ def test_a_city_that_is_not_finished_is_refused(city, capsys):
     assert "wait until blitzgs synth has ended" in capsys.readouterr().err
 
 
+def test_wrong_arguments_are_refused(city, capsys):
+    with pytest.raises(SystemExit):
+        call(city, "--held-out", "8")
+    assert "--held-out must be below the number of views, 8, got 8" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        bm_city.main([str(city), "--out", str(city.parent / "empty"), "--collect"])
+    assert "empty" in capsys.readouterr().err
+
+
 def test_phases_divide_the_time_between_records():
     config = load_config(None, ["schedule.iterations=1000", "schedule.densify_until=400", "schedule.t1=0",
                                 "schedule.t2=400", "view.lod=true"])  # fmt: skip

@@ -227,3 +227,9 @@ def test_full_tables_restart(backend, monkeypatch):
         pair.step()
     assert pair.joined
     pair.require_equal()
+
+
+def test_other_optimisers_are_refused():
+    pair = Pair(("cpu", torch.float64))
+    with pytest.raises(TypeError, match="every optimiser must be a LazyAdam, got Adam"):
+        step_together([*pair.ours, pair.torchs])
