@@ -15,7 +15,7 @@ On CUDA, `--profiled` more steps, without density events, run under torch's prof
 kernels and copies keep the busiest stream occupied, which part of this are barriers and collectives, in which
 it waits for other ranks, how long the host waits for the GPU, which kernels take the time, and the longest
 gaps on the busiest stream with the kernels before and after each. The figures are those of rank 0; the ranks
-wait for each other in every step.
+wait for each other in every step. The title has the Gaussians of all ranks before the measured steps.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class MeasuredWatchdog(NoWatchdog):
 
 
 class MeasuredTrainer(Trainer):
-    """A trainer that stops on the way to measure; the watchdog of its ranks is a `MeasuredWatchdog`."""
+    """A trainer that takes steps in timed parts; the watchdog of its ranks is a `MeasuredWatchdog`."""
 
     @torch.no_grad()
     def begin(self, steps: int) -> None:
