@@ -95,6 +95,10 @@ class LodConfig:
 # The most that `schedule.images_per_view` makes a run longer.
 MOST_STRETCH = 4.0
 
+# The least and the most that `loss.opacity_total` makes of `loss.opacity`: about the range that was measured
+# (docs/decisions/recipe.md).
+LEAST_OPACITY, MOST_OPACITY = 0.005, 0.05
+
 
 @dataclass(frozen=True)
 class ScheduleConfig:
@@ -197,6 +201,11 @@ class LossConfig:
         ssim: weight of the SSIM term.
         opacity: weight of the mean opacity of the visible Gaussians (3DGS-MCMC takes the mean of all
             Gaussians; here the term does not act on Gaussians that a step does not see).
+        opacity_total: weight of the same mean against the sum of the losses of all training views. A new run
+            sets `opacity` to this divided by the number of training views, from `LEAST_OPACITY` to
+            `MOST_OPACITY`: the more photographs speak for a Gaussian, the less the term should speak against
+            it. The run's own configuration holds the result in `opacity`, and 0 here. 0: `opacity` is the
+            weight.
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.
         size: weight of the mean of all three axes of the visible Gaussians, in units of the extent; the other
@@ -205,6 +214,7 @@ class LossConfig:
 
     ssim: float = 0.2
     opacity: float = 0.0
+    opacity_total: float = 0.0
     scale: float = 10.0
     scale_reference: float = 10.0
     size: float = 0.0

@@ -97,6 +97,7 @@ RANGES: Mapping[str, Range] = {
     "optimiser.eps": Range(1e-30, 1),
     "loss.ssim": Range(0, 1),
     "loss.opacity": Range(0, 1e6),
+    "loss.opacity_total": Range(0, 1e6),
     "loss.scale": Range(0, 1e6),
     "loss.scale_reference": Range(1e-6, 1e6),
     "loss.size": Range(0, 1e6),
@@ -154,10 +155,15 @@ def problems(config: Config) -> Iterator[str]:
         yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
     yield from _problems_of_length(schedule)
     yield from _problems_of_places(schedule)
-    if not population.min_opacity < population.reset_opacity:
+    if schedule.reset_every > 0 and not population.min_opacity < population.reset_opacity:
         yield (
             f"population.reset_opacity: must be above population.min_opacity ({population.min_opacity}), or "
             f"all Gaussians are pruned; got {population.reset_opacity}"
+        )
+    if config.loss.opacity > 0 and config.loss.opacity_total > 0:
+        yield (
+            f"loss.opacity: loss.opacity_total ({config.loss.opacity_total:g}) sets it by the number of "
+            f"views; for {config.loss.opacity:g}, add --loss.opacity_total=0"
         )
     if population.strategy == "relocation" and population.gate is not None:
         yield "population.gate: withholds candidates of population.strategy=density; relocation has none"

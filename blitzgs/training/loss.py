@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.pipeline import Frame
 from blitzgs.training.batches import Batch
-from blitzgs.training.config import LossConfig
+from blitzgs.training.config import LEAST_OPACITY, MOST_OPACITY, LossConfig
 
 
 class LossTerms(NamedTuple):
@@ -37,6 +38,19 @@ class LossTerms(NamedTuple):
     scale_reg: Tensor | None
     opacity_reg: Tensor | None
     size_reg: Tensor | None
+
+
+def weighted(config: LossConfig, views: int) -> LossConfig:
+    """Return weights whose `opacity` contains what `opacity_total` asks for, which is 0 in them.
+
+    Args:
+        config: of a new run, or of a run that already has its weight.
+        views: number of training views.
+    """
+    if config.opacity_total == 0:
+        return config
+    opacity = min(max(config.opacity_total / max(views, 1), LEAST_OPACITY), MOST_OPACITY)
+    return replace(config, opacity=opacity, opacity_total=0.0)
 
 
 def loss_terms(frame: Frame, batch: Batch, config: LossConfig, extent: float) -> LossTerms:

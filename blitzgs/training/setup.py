@@ -26,6 +26,7 @@ from blitzgs.training.evaluation import load_lpips
 from blitzgs.training.folder_checks import check_room, check_writable
 from blitzgs.training.gate import lineage_subject, open_gate
 from blitzgs.training.inputs import check_alike, check_capture, train_views_fingerprint
+from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
@@ -73,7 +74,7 @@ def set_up(
         )
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = run.restore(folder, ranks, home) if resume else None
-    config = _with_length(config, capture, restored)
+    config = _for_views(config, capture, restored)
     config = run.with_pace_of(config, None if restored is None else restored.config)
     schedule = Schedule(config.schedule)
     if restored is None:
@@ -130,18 +131,23 @@ def set_up(
     )
 
 
-def _with_length(config: Config, capture: Capture, restored: run.Restored | None) -> Config:
-    """Return `config` with the length of the run that `schedule.images_per_view` asks for.
+def _for_views(config: Config, capture: Capture, restored: run.Restored | None) -> Config:
+    """Return `config` with the values that depend on the number of training views.
 
-    A run that is resumed with fewer or more photographs (`data.allow_missing`) keeps the length that it began
+    They are the length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A
+    run that is resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began
     with.
     """
-    schedule = config.schedule
-    if restored is not None and schedule.images_per_view > 0:
-        known = restored.progress.train_views
+    schedule, loss = config.schedule, config.loss
+    if restored is not None:
+        known, own = restored.progress.train_views, restored.config
         if known not in ("", train_views_fingerprint(capture)):
-            schedule = replace(schedule, scale=restored.config.schedule.scale, images_per_view=0.0)
-    return replace(config, schedule=stretched(schedule, len(capture.train)))
+            if schedule.images_per_view > 0:
+                schedule = replace(schedule, scale=own.schedule.scale, images_per_view=0.0)
+            if loss.opacity_total > 0:
+                loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
+    views = len(capture.train)
+    return replace(config, schedule=stretched(schedule, views), loss=weighted(loss, views))
 
 
 def _stepper(

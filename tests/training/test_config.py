@@ -12,7 +12,8 @@ from blitzgs.training.config_io import ConfigError, config_hash, from_dict, load
 from blitzgs.training.config_ranges import CHOICES, RANGES, flat_fields, problems
 from blitzgs.training.schedule import Schedule
 
-CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+FOLDER = Path(__file__).parents[2] / "configs"
+CONFIGS, AERIAL = sorted(FOLDER.glob("*.yaml")), FOLDER / "aerial.yaml"
 
 
 def test_file_then_overrides(tmp_path):
@@ -85,6 +86,20 @@ def test_relocation_has_no_candidates_for_a_gate():
     assert load_config(None, ["population.strategy=relocation"]).population.growth == 0.05
     with pytest.raises(ConfigError, match=r"population.gate: .* relocation has none"):
         load_config(None, ["population.strategy=relocation", "population.gate=gate.json"])
+
+
+def test_two_weights_of_the_opacity_term_are_refused():
+    with pytest.raises(ConfigError, match=r"loss.opacity: .* for 0.03, add --loss.opacity_total=0"):
+        load_config(AERIAL, ["loss.opacity=0.03"])
+    config = load_config(AERIAL, ["loss.opacity=0.03", "loss.opacity_total=0"])
+    assert config.loss.opacity == 0.03
+
+
+def test_opacities_are_capped_above_the_limit_of_pruning_only_where_they_are_reset():
+    flags = ["population.min_opacity=0.02", "population.reset_opacity=0.01"]
+    assert load_config(None, flags).population.min_opacity == 0.02
+    with pytest.raises(ConfigError, match="population.reset_opacity: must be above population.min_opacity"):
+        load_config(None, [*flags, "schedule.reset_every=3000"])
 
 
 def test_every_number_has_a_range_and_every_default_lies_in_it():

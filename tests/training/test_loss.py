@@ -11,7 +11,7 @@ from blitzgs.model import GaussianTable
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig
-from blitzgs.training.loss import loss_terms, opacity_term, scale_term, size_term
+from blitzgs.training.loss import loss_terms, opacity_term, scale_term, size_term, weighted
 from blitzgs.training.trainer import Trainer
 from tests.helpers import DEVICES, parameter_gradients
 from tests.training.tiny import look_at_origin, random_gaussians, tiny_config, tiny_scene
@@ -68,3 +68,13 @@ def test_the_logged_loss_has_all_terms(tmp_path):
         ("loss.scale=5", 5 * axis),
     ):
         assert first[override]["loss"] - plain["loss"] == pytest.approx(term, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("views", "opacity"), [(1, 0.05), (22, 0.05), (50, 0.022), (110, 0.01), (5_000, 0.005)]
+)
+def test_the_opacity_term_follows_the_number_of_views_within_what_was_measured(views, opacity):
+    found = weighted(LossConfig(opacity_total=1.1, size=0.7), views)
+    assert found.opacity == pytest.approx(opacity) and found.opacity_total == 0 and found.size == 0.7
+    assert weighted(found, views + 1) == found  # a resumed run keeps its weight
+    assert weighted(CONFIG, views) == CONFIG

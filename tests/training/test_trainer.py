@@ -85,6 +85,24 @@ def test_a_run_that_views_made_longer_is_resumed_with_either_configuration(tmp_p
     assert summary is not None and second.state.schedule.iterations == 20 * views
 
 
+def test_a_run_whose_opacity_term_follows_the_views_is_resumed_with_either_configuration(
+    tmp_path, monkeypatch
+):
+    asked = ["loss.opacity_total=0.2"]
+    stop_at(monkeypatch, 50)
+    first, summary = train(tmp_path, *asked)
+    weight = 0.2 / len(first.state.capture.train)
+    assert summary is None and first.state.config.loss.opacity == weight
+    monkeypatch.undo()
+    own = run.load_config(tmp_path / "config.yaml")
+    assert own.loss.opacity_total == 0 and own.loss.opacity == weight
+    with pytest.raises(ConfigError, match="loss.opacity: the checkpoint was trained with"):
+        train(tmp_path, "loss.opacity_total=0.3", resume=True)
+    Trainer(own, *tiny_scene(), tmp_path, Ranks(), resume=True).close()
+    _, summary = train(tmp_path, *asked, resume=True)
+    assert summary is not None
+
+
 def test_a_checkpoint_has_all_events_of_its_step(tmp_path):
     """In a batch, a checkpoint may be due an image before a density event of the same step."""
     times = ("schedule.densify_from=22", "schedule.checkpoint_every=20")

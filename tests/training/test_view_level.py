@@ -218,9 +218,9 @@ def test_masks_stay_with_their_views_when_a_photograph_is_lost(tmp_path, monkeyp
     assert summary is not None and len(again.state.progress.gated_views) == 7
 
 
-def test_a_photograph_that_is_lost_does_not_change_how_long_a_run_is(tmp_path, monkeypatch):
-    """This also holds if the number of views made the run longer and the configuration is unchanged."""
-    longer = ("schedule.images_per_view=20",)
+def test_a_photograph_that_is_lost_changes_neither_length_nor_opacity_term_of_a_run(tmp_path, monkeypatch):
+    """This also holds if the number of views decided on both and the configuration is unchanged."""
+    longer = ("schedule.images_per_view=20", "loss.opacity_total=0.2")
     stop_at(monkeypatch, 75)
     before, _ = train(tmp_path, *longer)
     monkeypatch.undo()
@@ -233,6 +233,7 @@ def test_a_photograph_that_is_lost_does_not_change_how_long_a_run_is(tmp_path, m
     fewer.close()
     assert fewer.state.progress.step == 75
     assert fewer.state.schedule.iterations == before.state.schedule.iterations > 6 * 20
+    assert fewer.state.config.loss == before.state.config.loss
 
 
 def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path, monkeypatch):
