@@ -4,11 +4,11 @@
     python benchmarks/report.py           # writes the tables
     python benchmarks/report.py --check   # fails when a page differs from the results
 
-Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` names the file and the command. A
-page has a pair of comments around each table, `<!-- table: NAME -->` and `<!-- end: NAME -->`; the text
-between them is replaced. All files must come from one commit, because figures of different code do not
-compare; only those of the city (`APART`), which have a page of their own, may be of others. In place of a
-table whose file is absent the page names the command that makes it.
+Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` of report_tables.py names the file
+and the command. A page has a pair of comments around each table, `<!-- table: NAME -->` and
+`<!-- end: NAME -->`; the text between them is replaced. The files must come from one commit, because figures
+of different code do not compare; those of each of `GROUPS` may come from another. In place of a table whose
+file is absent the page names the command that makes it.
 """
 
 from __future__ import annotations
@@ -17,296 +17,20 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import city_report
+from report_tables import COMMANDS, COPIED, GROUPS, SECTIONS, Json
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 PAGES = (ROOT / "docs" / "performance.md", ROOT / "docs" / "city.md", ROOT / "README.md")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
 
-Json = dict[str, Any]
 Results = dict[str, Json]
 
 
 class ReportError(Exception):
     """The results cannot be reported; the message says why."""
-
-
-@dataclass(frozen=True)
-class Section:
-    """One table: the files that it needs, and the function that makes its lines.
-
-    Attributes:
-        files: names in `COMMANDS`.
-        lines: takes the content of each file, in the order of `files`.
-    """
-
-    files: tuple[str, ...]
-    lines: Callable[..., list[str]]
-
-
-# File in benchmarks/results (without .json) -> the command that writes it.
-EXCHANGE = "python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda --batch 4 --batches 4"
-TRAINING = "benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000"
-COMMANDS = {
-    "render": "python benchmarks/bm_render.py",
-    "step_1": "python benchmarks/bm_step.py --views 1",
-    "step_4": "python benchmarks/bm_step.py --views 4",
-    "exchange": f"{EXCHANGE} --ranks 1 2",
-    "training": f"python {TRAINING}",
-    "training_2": f"torchrun --nproc-per-node=2 {TRAINING}",
-    "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
-    "importance": "python benchmarks/bm_importance.py",
-    "gate": "python benchmarks/bm_gate.py",
-    "scratch": "python benchmarks/bm_scratch.py",
-    "photometric": "python benchmarks/bm_photometric.py",
-    "accuracy": "python benchmarks/bm_accuracy.py",
-    "quality": (
-        "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
-        "--recipe aerial=configs/aerial.yaml --seeds 0 1 2"
-    ),
-}
-COMMANDS |= {
-    "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --popping",
-    "city_exchange": (
-        "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"
-    ),
-}
-# Files that are not compared with the others' commit.
-APART = ("city", "city_exchange")
-# bm_quality.py takes no --json: it collects all of its runs in one file.
-COPIED = {"quality": "cp runs/quality/quality.json benchmarks/results/"}
-QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """Return the lines of a Markdown table."""
-    names = list(head)
-    return [f"| {' | '.join(line)} |" for line in (names, ["---"] * len(names), *rows)]
-
-
-def ms(value: float) -> str:
-    """Return milliseconds with two decimals, three below a tenth."""
-    return f"{value:.2f}" if value >= 0.1 else f"{value:.3f}"
-
-
-def fastest_gsplat(result: Json) -> Json | None:
-    """Return the figures of gsplat's faster mode, or None if gsplat was not installed."""
-    modes = [result[name] for name in ("gsplat", "gsplat packed") if name in result]
-    return min(modes, key=lambda mode: mode["total"]) if modes else None
-
-
-def render_lines(render: Json) -> list[str]:
-    """Tabulate the forward and backward pass, against gsplat's faster mode."""
-
-    def cells(figures: Json) -> list[str]:
-        parts = " / ".join(ms(figures[name]) for name in ("forward", "backward", "total"))
-        return [parts, f"{figures['peak_gb']:.2f}"]
-
-    rows = []
-    for result in render["results"]:
-        ours, theirs = result["blitzgs"], fastest_gsplat(result)
-        row = [result["scene"], f"{result['visible'] / 1e6:.2f} M", *cells(ours)]
-        row += [*cells(theirs), f"**{theirs['total'] / ours['total']:.2f}**"] if theirs else ["–"] * 3
-        rows.append(row)
-    head = ["scene", "visible", "BlitzGS forward / backward / total, ms", "peak GB",
-            "gsplat forward / backward / total, ms", "peak GB", "ratio"]  # fmt: skip
-    return table(head, rows)
-
-
-def stage_lines(render: Json) -> list[str]:
-    """Tabulate the stages of the forward and backward pass."""
-    stages = list(render["results"][0]["stages"])
-    rows = [
-        [
-            result["scene"],
-            f"{result['rows'] / 1e6:.2f} M",
-            f"{result['intersections'] / 1e6:.2f} M",
-            *(ms(result["stages"][stage]) for stage in stages),
-        ]
-        for result in render["results"]
-    ]
-    return table(["scene", "splats", "tile entries", *(s.replace("_", " ") for s in stages)], rows)
-
-
-def call_lines(render: Json) -> list[str]:
-    """Tabulate the same work through `blitzgs.rasterization` and autograd."""
-    columns = {
-        "blitzgs": "the training step's ops",
-        "rasterization": "the call, dense gradients",
-        "sparse": "sparse gradients",
-        "sparse, 1 thread": "sparse, autograd in one thread",
-        "sparse, meta": "sparse, all of meta read",
-        "gsplat": "gsplat",
-        "gsplat, 1 thread": "gsplat, autograd in one thread",
-    }
-    rows = [
-        [result["scene"], *(ms(result[name]["total"]) if name in result else "–" for name in columns)]
-        for result in render["results"]
-    ]
-    return table(["scene", *columns.values()], rows)
-
-
-def step_lines(*files: Json) -> list[str]:
-    """Tabulate a whole training step, against gsplat with torch's fused Adam."""
-    results = [result for file in files for result in file["results"]]
-
-    def cells(figures: Json | None) -> list[str]:
-        if figures is None:
-            return ["–", "–"]
-        parts = ", ".join(f"{name} {ms(value)}" for name, value in figures["ms"].items() if name != "total")
-        return [parts, f"**{ms(figures['ms']['total'])}**"]
-
-    rows = []
-    for result in results:
-        ours, theirs = result["blitzgs"], result.get("gsplat + fused Adam")
-        ratio = f"**{theirs['ms']['total'] / ours['ms']['total']:.2f}**" if theirs else "–"
-        rows.append([result["scene"], str(result["views"]), *cells(ours), *cells(theirs), ratio])
-    head = ["scene", "views", "BlitzGS by stage, ms", "total", "gsplat by stage, ms", "total", "ratio"]
-    return table(head, rows)
-
-
-def exchange_lines(exchange: Json) -> list[str]:
-    """Tabulate a step on several GPUs, by stage."""
-    reports = exchange["results"]
-    names = {"alone": "a step alone, behind a barrier", "step": "**steps in a row**"}
-    rows = [[names.get(stage, stage), *(ms(report["ms"][stage]) for report in reports)]
-            for stage in reports[0]["ms"]]  # fmt: skip
-    first = reports[0]["ms"]["step"] * reports[0]["ranks"]
-    rows += [
-        ["speed-up of steps in a row", *(f"{first / report['ms']['step']:.2f}" for report in reports)],
-        ["largest cost over the mean", *(f"{report['balance']['measured']:.3f}" for report in reports)],
-        ["MB between ranks", *(f"{sum(r['bytes per step'].values()) / 1e6:.0f}" for r in reports)],
-    ]
-    return table(["ms", *(f"{report['ranks']} GPU" for report in reports)], rows)
-
-
-def row_lines(file: Json) -> list[str]:
-    """Tabulate the rows that a benchmark has written itself."""
-    rows = file["rows"]
-    cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
-    return [f"{file['title']}.", "", *table(rows[0], cells)]
-
-
-def city_lines(rows_of: Callable[[Json], city_report.Rows]) -> Callable[[Json], list[str]]:
-    """Return the function that makes a table of the city's file."""
-
-    def lines(city: Json) -> list[str]:
-        rows = rows_of(city)
-        return table(rows[0], (row.values() for row in rows)) if rows else ["No run got so far."]
-
-    return lines
-
-
-def photometric_lines(photometric: Json) -> list[str]:
-    """Tabulate L1 + SSIM against its byte floor and plain PyTorch."""
-    rows = [[r["work"], ms(r["ms"]), ms(r["floor_ms"])] for r in photometric["results"]]
-    size = "{views} view(s) of {width} × {height}".format(**photometric)
-    return table([size, "ms", "byte floor, ms"], rows)
-
-
-def accuracy_lines(accuracy: Json) -> list[str]:
-    """Tabulate the error against time of each option."""
-    rows = [
-        [r["name"], ms(r["milliseconds"]), f"{r['image_error']:.1e}", f"{r['gradient_error']:.1e}",
-         f"{r['cut_pixels']:.2%}"]
-        for r in accuracy["rows"]
-    ]  # fmt: skip
-    return table(["option", "ms a view", "image error", "gradient error", "cut pixels"], rows)
-
-
-def quality_lines(quality: Json) -> list[str]:
-    """Tabulate held-out quality and training time at the end of each recipe, by capture."""
-    import quality_report  # needs the package, which the other tables do not
-
-    rows = []
-    done = [run for run in quality["runs"] if run["status"] == "done"]
-    for (capture, label), group in quality_report.grouped(done).items():
-        last = quality_report.table_rows(label, group)[-1]
-        rows.append([capture, *(last[column] for column in QUALITY_COLUMNS)])
-    return table(["capture", *QUALITY_COLUMNS], rows)
-
-
-SUMMARY_HEAD = ["work", "BlitzGS", "compared with", "ratio", "command"]
-
-
-def summary_row(
-    work: str, ours: float, theirs: float | None, unit: str, other: str, command: str
-) -> list[str]:
-    """Return one line of the README's tables: a figure, the figure compared with it, and their ratio."""
-    their_cells = [f"{other} {theirs:.2f} {unit}", f"{theirs / ours:.1f}"] if theirs else ["–", "–"]
-    return [work, f"{ours:.2f} {unit}", *their_cells, f"`{command}`"]
-
-
-def summary_lines(render: Json, step_1: Json, step_4: Json) -> list[str]:
-    """Return the README's table for one GPU: one line for each kind of work."""
-    rows = []
-
-    def add(*cells: Any) -> None:
-        rows.append(summary_row(*cells))
-
-    for result in render["results"]:
-        ours, theirs = result["blitzgs"], fastest_gsplat(result)
-        total = theirs["total"] if theirs else None
-        add(f"render forward + backward, {result['scene']}", ours["total"], total, "ms", "gsplat",
-            COMMANDS["render"])  # fmt: skip
-    last = render["results"][-1]
-    for result in render["results"]:
-        last = result if result["blitzgs"]["peak_gb"] > last["blitzgs"]["peak_gb"] else last
-    theirs = fastest_gsplat(last)
-    add(f"memory above the parameters, {last['scene']}", last["blitzgs"]["peak_gb"],
-        theirs["peak_gb"] if theirs else None, "GB", "gsplat", COMMANDS["render"])  # fmt: skip
-    for name, file in (("step_1", step_1), ("step_4", step_4)):
-        for result in file["results"]:
-            their = result.get("gsplat + fused Adam")
-            add(f"whole training step, {result['scene']}, {result['views']} view(s)",
-                result["blitzgs"]["ms"]["total"], their["ms"]["total"] if their else None, "ms",
-                "gsplat + fused Adam", COMMANDS[name])  # fmt: skip
-    return table(SUMMARY_HEAD, rows)
-
-
-def summary_ranks_lines(exchange: Json) -> list[str]:
-    """Return the README's table for several GPUs: their step against one GPU's."""
-    one = exchange["results"][0]
-    rows = [
-        summary_row(
-            f"step of 4 views, {report['gaussians'] / 1e6:.0f} M Gaussians, on {report['ranks']} GPUs",
-            report["ms"]["step"],
-            one["ms"]["step"],
-            "ms",
-            f"{one['ranks']} GPU",
-            COMMANDS["exchange"],
-        )  # fmt: skip
-        for report in exchange["results"][1:]
-    ]
-    return table(SUMMARY_HEAD, rows)
-
-
-SECTIONS = {
-    "render": Section(("render",), render_lines),
-    "stages": Section(("render",), stage_lines),
-    "call": Section(("render",), call_lines),
-    "step": Section(("step_1", "step_4"), step_lines),
-    "exchange": Section(("exchange",), exchange_lines),
-    "training": Section(("training",), row_lines),
-    "training_2": Section(("training_2",), row_lines),
-    "drop_in": Section(("drop_in",), row_lines),
-    "importance": Section(("importance",), row_lines),
-    "gate": Section(("gate",), row_lines),
-    "scratch": Section(("scratch",), row_lines),
-    "photometric": Section(("photometric",), photometric_lines),
-    "accuracy": Section(("accuracy",), accuracy_lines),
-    "quality": Section(("quality",), quality_lines),
-    "summary": Section(("render", "step_1", "step_4"), summary_lines),
-    "summary_ranks": Section(("exchange",), summary_ranks_lines),
-    "city_exchange": Section(("city_exchange",), exchange_lines),
-}
-SECTIONS |= {name: Section(("city",), city_lines(rows_of)) for name, rows_of in city_report.TABLES.items()}
 
 
 def with_origin(name: str, file: Json) -> Json:
@@ -322,11 +46,16 @@ def with_origin(name: str, file: Json) -> Json:
     return about | file
 
 
+def group_of(name: str) -> tuple[str, ...]:
+    """Return the files that must be of the same commit as a file; () for those that are in no group."""
+    return next((group for group in GROUPS if name in group), ())
+
+
 def load_results(folder: Path = RESULTS) -> Results:
     """Read every result.
 
     Raises:
-        ReportError: a file has no known name, does not name its commit, or is of another commit.
+        ReportError: a file has no known name, does not name its commit, or is of several or another one.
     """
     results: Results = {}
     for path in sorted(folder.glob("*.json")):
@@ -339,9 +68,10 @@ def load_results(folder: Path = RESULTS) -> Results:
                 f"{path}: its commit is {commit}; measure a clean checkout, or a copy of one "
                 "with its commit in BLITZGS_COMMIT"
             )
-        if path.stem in APART:
-            continue
-        first, expected = next((n, file["commit"]) for n, file in results.items() if n not in APART)
+        if " and " in commit:
+            raise ReportError(f"{path} is of commit {commit}: measure all of its runs on one")
+        group = group_of(path.stem)
+        first, expected = next((n, file["commit"]) for n, file in results.items() if group_of(n) == group)
         if commit != expected:
             raise ReportError(
                 f"{path} is of commit {commit}, {first}.json of {expected}: measure both on one"

@@ -156,6 +156,16 @@ def test_results_that_do_not_belong_together_are_refused(results, name, change, 
         report.load_results(results)
 
 
+def test_trainings_may_be_of_another_commit_than_the_ops(results):
+    rows = {"title": "steps", "rows": [{"arm": "four"}], "commit": "def", "command": "c", "environment": {}}
+    (results / "quality.json").unlink(missing_ok=True)
+    (results / "drop_in.json").write_text(json.dumps(rows))
+    assert report.load_results(results)["drop_in"]["commit"] == "def"
+    (results / "quality.json").write_text(json.dumps({"runs": [quality_run(0, 28.0)]}))
+    with pytest.raises(report.ReportError, match="quality.json is of commit abc, drop_in.json of def"):
+        report.load_results(results)
+
+
 def test_a_table_that_nothing_makes_is_refused(results):
     with pytest.raises(report.ReportError, match="no table is called speed"):
         made(results, "speed")
