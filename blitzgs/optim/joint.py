@@ -16,9 +16,12 @@ from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of
 # Values in a row of the op's first four columns, and of the parameter that takes the place of SH beside them.
 _WIDTHS = (3, 4, 3, 1, 3)
 _SH = len(_WIDTHS) - 1
+# Entries of a parameter's state.
+_ENTRIES = ("step", *MOMENTS, *STEPS)
 
-# An optimiser with the indices of one of its groups and of a parameter in the group.
-Member = tuple[Any, int, int]
+# An optimiser, one of its groups, and the index of a parameter in the group. The group stands for itself,
+# because its index changes if a group before it is removed.
+Member = tuple[Any, dict[str, Any], int]
 # The table that a parameter belongs to, and its column there.
 Slot = tuple[int, int]
 
@@ -42,10 +45,9 @@ class Joint:
             optimizer.bring_up_to_date()
             optimizer.drifts.clear()
             optimizer.joint = self
-        params = self._params()
-        states = [self._state(index) for index in range(len(members))]
-        self._options = [self._options_of(index) for index in range(len(members))]
-        betas, eps = self._options[0]
+        params = [group["params"][place] for _, group, place in members]
+        states = [member[0].state[param] for member, param in zip(members, params, strict=True)]
+        betas, eps = _options_of(members[0][1])
         self._step, self._step_tensor = int(states[0]["step"]), states[0]["step"]
         like, count = params[0], 1 + max(table for table, _ in slots)
         self.drift = Drift(betas, like.dtype, like.device, self._step, count)
@@ -63,13 +65,34 @@ class Joint:
             self.tables.append(Table(*own, self.drift, number, eps))
         # The step up to which all rows of each table are known to be current.
         self._current = [self._step] * count
-        self._known = self._tensors()
+        self._known = [
+            (param, state, [state[name] for name in _ENTRIES])
+            for param, state in zip(params, states, strict=True)
+        ]
+        self._options = [_options_of(group) for _, group, _ in members]
 
     def is_current(self) -> bool:
         """Tell whether the members still have the parameters, state and options that were joined."""
-        now = self._tensors()
-        same = len(now) == len(self._known) and all(a is b for a, b in zip(now, self._known, strict=True))
-        return same and all(self._options_of(i) == own for i, own in enumerate(self._options))
+        # Each training step asks this several times, so it is one loop without calls.
+        for (optimizer, group, place), (param, state, entries), options in zip(
+            self.members, self._known, self._options, strict=True
+        ):
+            params = group["params"]
+            if place >= len(params) or params[place] is not param or optimizer.state.get(param) is not state:
+                return False
+            for name, entry in zip(_ENTRIES, entries, strict=True):
+                if state.get(name) is not entry:
+                    return False
+            if (group["betas"], group["eps"]) != options and _options_of(group) != options:
+                return False
+        return True
+
+    def has_members(self, members: Sequence[Member]) -> bool:
+        """Tell whether these are the members, in the same order."""
+        return len(members) == len(self.members) and all(
+            optimizer is known[0] and group is known[1] and place == known[2]
+            for (optimizer, group, place), known in zip(members, self.members, strict=True)
+        )
 
     def step(self, rows: Tensor, gradients: Sequence[Tensor]) -> None:
         """Take a step for some rows.
@@ -85,8 +108,8 @@ class Joint:
         self._step += 1
         self._step_tensor += 1
         rates = [0.0] * (GROUPS * len(self.tables))
-        for (optimizer, group, _), (number, column) in zip(self.members, self._slots, strict=True):
-            first, rest = rates_of(optimizer.param_groups[group])
+        for (_, group, _), (number, column) in zip(self.members, self._slots, strict=True):
+            first, rest = rates_of(group)
             rates[GROUPS * number + column] = first
             if column == _SH:
                 rates[GROUPS * number + column + 1] = rest
@@ -101,43 +124,34 @@ class Joint:
     def catch_up(self, params: Collection[Tensor], rows: Tensor | None = None) -> None:
         """Apply the steps that rows, int32 [A] or None for all, of the tables of some parameters missed."""
         wanted = {id(param) for param in params}
-        now = self._params()
         for number, (table, inside) in enumerate(zip(self.tables, self._inside, strict=True)):
-            if self._current[number] == self._step or not any(id(now[index]) in wanted for index in inside):
+            if self._current[number] == self._step:
+                continue
+            if not any(id(self._known[index][0]) in wanted for index in inside):
                 continue
             table.catch_up(self._step, rows)
             if rows is None:
                 self._current[number] = self._step
 
     def dissolve(self) -> None:
-        """Give each member columns and tables of its own, so that its optimiser steps it alone."""
-        for index, ((optimizer, group, place), (table, column)) in enumerate(
-            zip(self.members, self._slots, strict=True)
-        ):
+        """Give each member columns and tables of its own, so that its optimiser steps it alone.
+
+        A member whose group or parameter was removed from its optimiser gets nothing.
+        """
+        for (optimizer, group, place), (table, column) in zip(self.members, self._slots, strict=True):
             optimizer.joint = None
-            optimizer.drifts[group, place] = self.drift.alone(table, column)
-            state = self._state(index)
+            index = optimizer.index_of(group)
+            if index is None or place >= len(group["params"]):
+                continue
+            optimizer.drifts[index, place] = self.drift.alone(table, column)
+            state = optimizer.state.get(group["params"][place])
             if state:
                 state["step"] = self._step_tensor.clone()
                 state.update({name: state[name].clone() for name in STEPS})
 
-    def _params(self) -> list[Tensor]:
-        return [optimizer.param_groups[group]["params"][place] for optimizer, group, place in self.members]
 
-    def _state(self, index: int) -> dict[str, Any]:
-        optimizer, group, place = self.members[index]
-        found: dict[str, Any] = optimizer.state.get(optimizer.param_groups[group]["params"][place], {})
-        return found
-
-    def _options_of(self, index: int) -> tuple[Any, Any]:
-        optimizer, group, _ = self.members[index]
-        options = optimizer.param_groups[group]
-        return tuple(options["betas"]), options["eps"]
-
-    def _tensors(self) -> list[Any]:
-        states = (self._state(index) for index in range(len(self.members)))
-        entries = [state.get(name) for state in states for name in ("step", *MOMENTS, *STEPS)]
-        return [*self._params(), *entries]
+def _options_of(group: dict[str, Any]) -> tuple[Any, Any]:
+    return tuple(group["betas"]), group["eps"]
 
 
 def step_jointly(optimizers: Sequence[Any]) -> bool:
@@ -147,10 +161,10 @@ def step_jointly(optimizers: Sequence[Any]) -> bool:
     indices tensor, as `raw_rasterization` returns them, and if options and numbers of steps are equal.
     """
     members = [
-        (optimizer, g, p)
+        (optimizer, group, place)
         for optimizer in optimizers
-        for g, group in enumerate(optimizer.param_groups)
-        for p in range(len(group["params"]))
+        for group in optimizer.param_groups
+        for place in range(len(group["params"]))
     ]
     if len(members) < len(_WIDTHS):
         return False
@@ -158,7 +172,7 @@ def step_jointly(optimizers: Sequence[Any]) -> bool:
     if gradients is None:
         return False
     joint: Joint | None = optimizers[0].joint
-    if joint is None or joint.members != members or not joint.is_current():
+    if joint is None or not joint.has_members(members) or not joint.is_current():
         for optimizer in optimizers:
             optimizer.leave_joint()
         slots = _slots_of(members)
@@ -171,17 +185,18 @@ def step_jointly(optimizers: Sequence[Any]) -> bool:
 
 def _common_gradients(members: Sequence[Member]) -> tuple[Tensor, list[Tensor]] | None:
     """Return the rows that all gradients have and their values; None if the rows differ."""
-    found = [optimizer.param_groups[g]["params"][p].grad for optimizer, g, p in members]
+    found = [group["params"][place].grad for _, group, place in members]
     if any(gradient is None or not gradient.is_sparse for gradient in found):
         return None
-    if any(gradient.sparse_dim() != 1 for gradient in found):
+    if found[0].sparse_dim() != 1:
         return None
-    rows, _ = distinct_rows(found[0])
-    address, count = rows.data_ptr(), len(rows)
-    values = []
-    for gradient in found:
+    rows, first = distinct_rows(found[0])
+    # The indices of a gradient with several sparse dimensions have another shape.
+    address, shape = rows.data_ptr(), (1, len(rows))
+    values = [first]
+    for gradient in found[1:]:
         indices = gradient._indices()
-        if indices.data_ptr() != address or indices.shape[1] != count:
+        if indices.data_ptr() != address or indices.shape != shape:
             return None
         values.append(gradient._values())
     return rows, values
@@ -192,9 +207,8 @@ def _slots_of(members: Sequence[Member]) -> list[Slot] | None:
     slots: list[Slot] = []
     free, alone = list(range(len(_WIDTHS))), 0
     first_state, first_like = None, None
-    for optimizer, g, p in members:
-        group = optimizer.param_groups[g]
-        param = group["params"][p]
+    for optimizer, group, place in members:
+        param = group["params"][place]
         if param.numel() == 0:
             return None
         state = optimizer.state_of(param)

@@ -69,11 +69,14 @@ class LazyAdam(torch.optim.Optimizer):
         """
         self.drifts: dict[tuple[int, int], Drift] = {}
         self.joint: Joint | None = None
+        self._drift_groups: list[dict[str, Any]] = []
         super().__init__(params, {"lr": lr, "lr_rest": None, "betas": betas, "eps": eps})
 
     def __getstate__(self) -> dict[str, Any]:
         self.leave_joint()  # its other members do not belong to a copy
-        return {**super().__getstate__(), "drifts": self.drifts, "joint": None}
+        self._follow_groups()
+        own = {"drifts": self.drifts, "joint": None, "_drift_groups": self._drift_groups}
+        return {**super().__getstate__(), **own}
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add parameters with options of their own, see `__init__`."""
@@ -271,6 +274,24 @@ class LazyAdam(torch.optim.Optimizer):
             renewed[name] = new
         return renewed
 
+    def index_of(self, group: dict[str, Any]) -> int | None:
+        """Return the present index of a group; None: it was removed."""
+        self._follow_groups()
+        return next((index for index, own in enumerate(self.param_groups) if own is group), None)
+
+    def _follow_groups(self) -> None:
+        """Move `drifts` to the present indices of their groups, because groups may have been removed."""
+        known, now = self._drift_groups, self.param_groups
+        if len(known) == len(now) and all(a is b for a, b in zip(known, now, strict=True)):
+            return
+        places = {id(group): index for index, group in enumerate(now)}
+        self.drifts = {
+            (places[id(known[g])], p): drift
+            for (g, p), drift in self.drifts.items()
+            if id(known[g]) in places
+        }
+        self._drift_groups = list(now)
+
     def _named(self) -> dict[str, dict[str, Any]]:
         """Return the groups by name.
 
@@ -286,6 +307,7 @@ class LazyAdam(torch.optim.Optimizer):
 
     def _placed(self) -> Iterator[tuple[tuple[int, int], dict[str, Any], Tensor]]:
         """Iterate over all parameters with their indices (group, parameter) and their groups."""
+        self._follow_groups()
         for g, group in enumerate(self.param_groups):
             for p, param in enumerate(group["params"]):
                 yield (g, p), group, param

@@ -50,7 +50,8 @@ class Pair:
             self.dense[name].grad = torch.zeros_like(self.dense[name]).index_copy_(0, ids, values)
             self.lazy[name].grad = sparse_rows(ids, values, self.lazy[name].shape)
         step_together(self.ours, set_to_none=True)
-        assert all(param.grad is None for param in self.lazy.values())
+        groups = [group for optimizer in self.ours for group in optimizer.param_groups]
+        assert all(param.grad is None for group in groups for param in group["params"])
         self.torchs.step()
 
     def require_equal(self):
@@ -233,3 +234,23 @@ def test_other_optimisers_are_refused():
     pair = Pair(("cpu", torch.float64))
     with pytest.raises(TypeError, match="every optimiser must be a LazyAdam, got Adam"):
         step_together([*pair.ours, pair.torchs])
+
+
+@pytest.mark.parametrize("in_one", [True, False])
+@pytest.mark.parametrize("joined", [True, False])
+def test_a_removed_group_leaves_the_others_as_they_were(in_one, joined):
+    pair = Pair(("cpu", torch.float64), in_one)
+    for _ in range(6):
+        pair.step(without=() if joined else ("shN",))
+    assert pair.joined == joined
+    index = list(SHAPES).index("scales")
+    optimizer, group = (pair.ours[0], index) if in_one else (pair.ours[index], 0)
+    del optimizer.param_groups[group]
+    removed = pair.lazy["scales"].detach().clone()
+    for _ in range(6):
+        pair.step()
+    for optimizer in pair.ours:
+        optimizer.catch_up()
+    assert torch.equal(pair.lazy["scales"].detach(), removed) and not pair.joined
+    for name in SHAPES.keys() - {"scales"}:
+        assert relative_error(pair.lazy[name], pair.dense[name]) < BOUND[pair.dtype], name
