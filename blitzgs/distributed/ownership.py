@@ -38,25 +38,6 @@ class _ViewCost(NamedTuple):
     tiles: int
     pieces: NDArray[np.float16]
 
-    @classmethod
-    def of(cls, key: Hashable, cost: NDArray[np.float32]) -> _ViewCost:
-        """Store the costs of a view's tiles."""
-        grain, means = _grain(len(cost)), cost
-        if grain > 1:
-            begins = np.arange(0, len(cost), grain)
-            sums = np.add.reduceat(cost, begins, dtype=np.float32)
-            means = (sums / np.minimum(grain, len(cost) - begins)).astype(np.float32)
-        # Torch converts to and from float16 with the processor's instructions, numpy without. This runs in
-        # every step while the GPU waits for its next work.
-        halves = torch.from_numpy(means).clamp(max=torch.finfo(torch.float16).max).half()
-        return cls(key, len(cost), halves.numpy())
-
-    def of_tiles(self) -> NDArray[np.float32]:
-        """Return the cost of each tile."""
-        grain = _grain(self.tiles)
-        costs: NDArray[np.float32] = torch.from_numpy(self.pieces).float().numpy()
-        return costs if grain == 1 else costs.repeat(grain)[: self.tiles]
-
 
 def _grain(tiles: int) -> int:
     """Return over how many tiles of a view one stored cost averages."""
@@ -65,8 +46,24 @@ def _grain(tiles: int) -> int:
 
 def _measured(sums: HostSum, keys: Sequence[Hashable], tiles: int, first: int) -> list[_ViewCost]:
     """Read the costs of the views of a batch; in the sums, those of the first view begin at `first`."""
-    values = sums.read().numpy()[first:]
-    return [_ViewCost.of(key, values[tiles * view :][:tiles]) for view, key in enumerate(keys)]
+    means, grain = sums.read().numpy()[first:].reshape(len(keys), tiles), _grain(tiles)
+    if grain > 1:
+        begins = np.arange(0, tiles, grain)
+        totals = np.add.reduceat(means, begins, axis=1, dtype=np.float32)
+        means = (totals / np.minimum(grain, tiles - begins)).astype(np.float32)
+    # Torch converts to and from float16 with the processor's instructions, numpy without. This runs in
+    # every step while the GPU waits for its next work, so all views of a batch are converted together.
+    halves = torch.from_numpy(means).clamp(max=torch.finfo(torch.float16).max).half().numpy()
+    # Each view has its own memory, because the views of a batch are not visited again together.
+    return [_ViewCost(key, tiles, pieces.copy()) for key, pieces in zip(keys, halves, strict=True)]
+
+
+def _of_tiles(costs: Sequence[_ViewCost], tiles: int) -> NDArray[np.float32]:
+    """Return the cost of each tile, [V, tiles], of V >= 1 views that have this number of tiles."""
+    halves = torch.from_numpy(np.concatenate([cost.pieces for cost in costs]))
+    table: NDArray[np.float32] = halves.float().numpy().reshape(len(costs), -1)
+    grain = _grain(tiles)
+    return table if grain == 1 else table.repeat(grain, axis=1)[:, :tiles]
 
 
 class TileOwners:
@@ -162,7 +159,7 @@ class TileOwners:
             Ranges whose costs differ from equal shares by at most the cost of one tile.
         """
         unit = TileRanges((0,), len(keys), width, height, tile_size)
-        cost = np.concatenate([self._cost(key, unit.tiles_per_view) for key in keys])
+        cost = self._expected(keys, unit.tiles_per_view)
         cost += TILE_COST
         bounds = divide(cost, self.ranks.world_size)
         return TileRanges(bounds, len(keys), width, height, tile_size, halo)
@@ -201,16 +198,27 @@ class TileOwners:
             self._costs[cost.key] = cost
         self._typical.clear()
 
-    def _cost(self, key: Hashable, tiles: int) -> NDArray[np.float32]:
-        """Return the costs of a view's tiles: those of its last visit, or the mean of other views."""
-        known = self._costs.get(key)
-        if known is not None and known.tiles == tiles:
-            return known.of_tiles()
+    def _expected(self, keys: Sequence[Hashable], tiles: int) -> NDArray[np.float32]:
+        """Return the costs of the tiles of B views, [B * tiles]; the caller may change the result.
+
+        They are those of a view's last visit, or the mean of other views.
+        """
+        found = (self._costs.get(key) for key in keys)
+        known = [cost if cost is not None and cost.tiles == tiles else None for cost in found]
+        visited = [cost for cost in known if cost is not None]
+        if len(visited) == len(keys):
+            return _of_tiles(visited, tiles).ravel()
+        rows = iter(_of_tiles(visited, tiles) if visited else ())
+        return np.concatenate([self._typical_cost(tiles) if cost is None else next(rows) for cost in known])
+
+    def _typical_cost(self, tiles: int) -> NDArray[np.float32]:
+        """Return the costs that a view without a visit is expected to have, [tiles]."""
         if tiles not in self._typical:
             # Views have costs in common: in oblique views the far (upper) tiles cost more than the near ones.
             alike = (cost for cost in reversed(self._costs.values()) if cost.tiles == tiles)
-            latest = [cost.of_tiles() for cost in islice(alike, _SIMILAR)] or [np.zeros(tiles, np.float32)]
-            self._typical[tiles] = np.mean(latest, 0)
+            latest = list(islice(alike, _SIMILAR))
+            mean = _of_tiles(latest, tiles).mean(0) if latest else np.zeros(tiles, np.float32)
+            self._typical[tiles] = mean
         return self._typical[tiles]
 
 
