@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -39,12 +40,12 @@ class TileRanges:
     tile_size: int = 16
     halo: int = 0
 
-    @property
+    @cached_property
     def tiles_x(self) -> int:
         """Tiles in a row."""
         return -(-self.width // self.tile_size)
 
-    @property
+    @cached_property
     def tiles_per_view(self) -> int:
         """Tiles of one view, T."""
         return self.tiles_x * -(-self.height // self.tile_size)

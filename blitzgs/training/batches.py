@@ -214,6 +214,7 @@ class BatchLoader:
         self._ahead = ahead
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._plans: dict[int, _Plan] = {}
+        self._prefetched: set[int] = set()  # the steps whose photographs are being decoded
         self._pending: dict[int, Future[tuple[Batch, _Slot]]] = {}
         # One slot is in use; the others hold batches that are ready or being prepared.
         self._free = deque(_Slot(device) for _ in range(ahead + 2))
@@ -235,14 +236,16 @@ class BatchLoader:
             if later not in self._plans:
                 self._plans[later] = self._plan(later)
                 if not is_near and self._has_room(later - step, self._plans[later]):
-                    self._prefetch(self._plans[later])
+                    self._prefetch(later)
             if is_near and later not in self._pending:
-                self._prefetch(self._plans[later])  # those that there was no room for before
+                if later not in self._prefetched:  # there was no room for its photographs before
+                    self._prefetch(later)
                 self._pending[later] = self._worker.submit(self._load, *self._plans[later])
         begin = time.perf_counter()
         batch, slot = self._pending.pop(step).result()
         self.waited += time.perf_counter() - begin
         del self._plans[step]
+        self._prefetched.discard(step)
         if stream is not None:
             stream.wait_event(slot.uploaded)
         self._used = slot
@@ -265,8 +268,10 @@ class BatchLoader:
         ranges = self._divide(step, indices)
         return _Plan(indices, ranges, self._rows(indices, ranges))
 
-    def _prefetch(self, plan: _Plan) -> None:
-        """Start to decode the photographs and masks of a batch."""
+    def _prefetch(self, step: int) -> None:
+        """Start to decode the photographs and masks of a planned batch."""
+        plan = self._plans[step]
+        self._prefetched.add(step)
         needed = [index for index, (y0, y1) in zip(plan.indices, plan.rows, strict=True) if y0 < y1]
         self._images.prefetch(needed, plan.indices)
 

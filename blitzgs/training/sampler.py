@@ -42,14 +42,17 @@ class BatchSampler:
         self._groups = [torch.tensor(views) for views in groups.values()]
         self.batch_size = batch_size
         self._seed = seed
-        # Consecutive steps use the same rounds, so it suffices to cache the latest two.
-        self._round = lru_cache(maxsize=2)(self._make_round)
+        # The latest round: its first step and its batches. Most steps use the same round as the one before.
+        self._round: tuple[int, list[tuple[int, int]]] = (0, [])
         self._epoch = lru_cache(maxsize=2 * len(groups))(self._make_epoch)
 
     def batch(self, step: int) -> list[int]:
         """Return the B views of a step (0-based); a view repeats only where its group's epochs meet."""
-        index = self._round_of(step)
-        group, batch = self._round(index)[step - self._batches_before(index)]
+        first, batches = self._round
+        if not first <= step < first + len(batches):
+            index = self._round_of(step)
+            first, batches = self._round = self._batches_before(index), self._make_round(index)
+        group, batch = batches[step - first]
         begin = batch * self.batch_size
         return [self._view(group, position) for position in range(begin, begin + self.batch_size)]
 

@@ -20,6 +20,8 @@ EventKind = Literal[
 PLACED = ("t1", "densify_until", "t2")
 # No time is placed later than this share of the run, unless the fixed schedule has it later.
 _LAST_PLACE = 0.95
+# The events of this number of images are searched at once.
+_SEARCHED = 1024
 # The columns of the learning-rate table.
 RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
@@ -84,6 +86,7 @@ class Schedule:
         self.batch_size = config.batch_size
         self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))
         self.iterations = self.steps * self.batch_size
+        self._found: tuple[int, int, list[Event]] = (0, 0, [])  # the events of [first, last) images
 
     def _scaled(self, time: float) -> int:
         # The small term keeps 0.1 * 30 from being rounded down to 2.
@@ -91,6 +94,16 @@ class Schedule:
 
     def events(self, begin: int, end: int) -> list[Event]:
         """Return the events with begin <= time < end, in the order in which they happen."""
+        # Training asks after every step, and most steps have no event.
+        first, last, found = self._found
+        if begin < first or end > last:
+            first, last = begin, max(end, begin + _SEARCHED)
+            found = self._search(first, last)
+            self._found = first, last, found
+        return [event for event in found if begin <= event.time < end]
+
+    def _search(self, begin: int, end: int) -> list[Event]:
+        """See `events`."""
         config = self._config
         series: list[tuple[EventKind, float, float, float]] = [
             ("densify", config.densify_from, config.densify_until, config.densify_every),
