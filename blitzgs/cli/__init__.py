@@ -23,6 +23,15 @@ from blitzgs.training.guard import ModelLostError, NonFiniteError
 from blitzgs.view.host_table import HostMemoryError
 from blitzgs.view.residence import ResidenceError
 
+HELP = """\
+Train 3D Gaussian Splatting models of photographs with known cameras, from a desk to a city. From a capture (a
+COLMAP model and its photographs) to a file for viewers:
+
+  blitzgs train --config configs/aerial.yaml --data CAPTURE --out RUN
+  blitzgs render RUN --out PICTURES
+  blitzgs export RUN --ply MODEL.ply
+"""
+
 # Errors that a user can cause and correct: they are reported as a message. Any other error is a fault of the
 # program and keeps its traceback.
 USER_ERRORS = (
@@ -47,9 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     parser = _parser()
     args, rest = parser.parse_known_args(arguments)
-    if rest and not (args.command == "train" and all(text.startswith("--") and "=" in text for text in rest)):
-        hint = " (configuration fields are written --section.field=value)" if args.command == "train" else ""
-        args.parser.error(f"unrecognized arguments: {' '.join(rest)}{hint}")
+    trains = args.command == "train"
+    unknown = [text for text in rest if not (trains and text.startswith("--") and "=" in text)]
+    if unknown:
+        hint = " (configuration fields are written --section.field=value)" if trains else ""
+        args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     args.overrides = rest
     # Our warnings are about the user's data, so they are shown without the line of code that raised them.
     warnings.formatwarning = lambda message, *_, **__: f"blitzgs {args.command}: warning: {message}\n"
@@ -76,11 +87,15 @@ def _message(error: Exception) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="blitzgs", description="City-scale 3D Gaussian Splatting.")
+    parser = argparse.ArgumentParser(
+        prog="blitzgs", description=HELP, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--version", action="version", version=f"blitzgs {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in (train, evaluate, render, export, gate):
         command.add_to(commands)
-    city = add_command(commands, "synth", synth.run, "generate a synthetic city to train on")
+    city = add_command(
+        commands, "synth", synth.run, "make a synthetic city: photographs, cameras and points to train on"
+    )
     synth.add_arguments(city)
     return parser

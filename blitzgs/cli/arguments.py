@@ -37,12 +37,16 @@ def named_path(text: str) -> Path:
 
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Add the argument RUN, the folder of a run."""
-    parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument(
+        "folder", type=Path, metavar="RUN", help="folder that blitzgs train wrote (its --out)"
+    )
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
     """Add the flag --data, the present folder of a run's capture."""
-    parser.add_argument("--data", metavar="DIR", help="where the capture is now (default: where it was)")
+    parser.add_argument(
+        "--data", metavar="DIR", help="folder of the capture, if it has moved since the training"
+    )
 
 
 def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> None:

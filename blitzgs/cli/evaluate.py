@@ -21,16 +21,24 @@ from blitzgs.training.views import ViewSet, render_options
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add the command."""
-    parser = add_command(commands, "eval", run, "measure the held-out views of a run")
+    parser = add_command(commands, "eval", run, "measure PSNR and SSIM of a run's held-out views")
     add_run(parser)
     add_capture(parser)
     add_device(parser, shares_gpus=True)
-    parser.add_argument("--split", choices=("test", "train"), default="test", help="views (%(default)s)")
-    parser.add_argument("--out", type=named_path, metavar="DIR", help="default: RUN/evaluation/SPLIT")
     parser.add_argument(
-        "--pictures", type=int, default=8, metavar="N", help="side-by-side pictures (%(default)s)"
+        "--split", choices=("test", "train"), default="test", help="which views (%(default)s)"
     )
-    parser.add_argument("--lpips", metavar="FILE", help="TorchScript module of LPIPS with its weights")
+    parser.add_argument(
+        "--out", type=named_path, metavar="DIR", help="folder for the results (default: RUN/evaluation/SPLIT)"
+    )
+    parser.add_argument(
+        "--pictures",
+        type=int,
+        default=8,
+        metavar="N",
+        help="number of pictures: render, photograph, error (%(default)s)",
+    )
+    parser.add_argument("--lpips", metavar="FILE", help="also measure LPIPS, with this TorchScript module")
     parser.add_argument(
         "--allow-missing", action="store_true", help="leave out views whose photograph is missing"
     )

@@ -24,13 +24,14 @@ property, `level`, is their octree level. The line
 the distance D * F^(1/2 - l), no level above L, and level 0 at any distance.
 
 A model trained with model.antialiased is marked `comment SplatRenderMode: mip`. For a viewer that does not
-know the mark, --classic bakes the compensation into the opacities as far as that is possible.
+know the mark, --classic writes opacities with the compensation that they have at the distance of the training
+views; nearer and farther it is only nearly right.
 """
 
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add the command."""
-    summary = "write the model of a run to a file other programs read"
+    summary = "write the model of a run as a PLY file for viewers"
     parser = add_command(commands, "export", run, summary, HELP)
     add_run(parser)
     add_device(parser)
@@ -39,11 +40,13 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "--coordinates",
         choices=COORDINATES,
         default="auto",
-        help="the capture's coordinates, or centred ones around the model's origin; auto: the capture's if "
-        "float32 can hold them (%(default)s)",
+        help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
+        "capture's if float32 can hold them (%(default)s)",
     )
     parser.add_argument(
-        "--classic", action="store_true", help="for viewers without antialiasing: bake what can be baked"
+        "--classic",
+        action="store_true",
+        help="for viewers without antialiasing: write opacities that make up for it",
     )
 
 

@@ -20,13 +20,14 @@ from blitzgs.training.inputs import open_capture
 from blitzgs.training.schedule import Schedule
 
 HELP = """\
-The spawn gate: a predictor, fitted on the lineage of finished runs, that withholds densification candidates
-whose children would probably not survive.
+A spawn gate is a predictor that withholds candidates of densification whose children would probably be pruned
+later. It is fitted on the lineage of finished runs: the log of
+all births and deaths of Gaussians. docs/guide/fewer-gaussians.md has an example.
 
   blitzgs train ... --population.lineage=true       log births and deaths (for each scene)
   blitzgs gate fit RUN RUN RUN --out gate.json      fit on them; prints figures for scenes left out
   blitzgs gate sample RUN --out NAME.parquet        a run's lineage in one small file, to fit elsewhere
-  blitzgs gate evaluate gate.json RUN --out DIR     judge it on a scene that it has not seen
+  blitzgs gate evaluate gate.json RUN --out DIR     measure it on a scene that it has not seen
   blitzgs gate replay gate.json RUN --out DIR       compare it with an oracle and with chance
   blitzgs train ... --population.gate=gate.json     use it
 """
@@ -34,28 +35,43 @@ whose children would probably not survive.
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add the command."""
-    parser = add_command(commands, "gate", lambda _: 2, "fit and judge spawn gates", HELP)
+    parser = add_command(
+        commands, "gate", lambda _: 2, "fit and evaluate spawn gates, which make smaller models", HELP
+    )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
     fit.add_argument(
         "runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage, or a sample"
     )
-    fit.add_argument("--out", type=Path, required=True, metavar="FILE", help="model, .json or .ubj")
+    fit.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="file for the gate, .json or .ubj"
+    )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     sample.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
-    sample.add_argument("--out", type=Path, required=True, metavar="FILE", help="sample, .parquet")
     sample.add_argument(
-        "--rows", type=int, default=spawn_samples.MOST_ROWS, help="spawns, about (%(default)s)"
+        "--out", type=Path, required=True, metavar="FILE", help="file for the sample, .parquet"
     )
-    judge = add_command(actions, "evaluate", run_evaluate, "judge a gate on the lineage of runs")
-    judge.add_argument("gate", type=gate_file, metavar="GATE", help="model file, or default")
+    sample.add_argument(
+        "--rows", type=int, default=spawn_samples.MOST_ROWS, help="about so many births (%(default)s)"
+    )
+    judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
+    judge.add_argument("gate", type=gate_file, metavar="GATE", help="file of the gate, or: default")
     judge.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage")
-    judge.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets figures and pictures")
-    again = add_command(actions, "replay", run_replay, "train from one checkpoint with several vetoes")
-    again.add_argument("gate", type=gate_file, metavar="GATE", help="model file, or default")
+    judge.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for figures and maps")
+    again = add_command(
+        actions,
+        "replay",
+        run_replay,
+        "train from one checkpoint without a gate, with it, with an oracle and at random",
+    )
+    again.add_argument("gate", type=gate_file, metavar="GATE", help="file of the gate, or: default")
     again.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
-    again.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a run for each veto")
-    again.add_argument("--rate", type=float, default=0.6, help="share to veto (%(default)s)")
+    again.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for one run for each of these"
+    )
+    again.add_argument(
+        "--rate", type=float, default=0.6, help="share of the candidates to withhold (%(default)s)"
+    )
     add_capture(again)
     add_device(again)
 

@@ -26,14 +26,12 @@ from blitzgs.training.views import CameraLike, ViewSet, render_options
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add the command."""
-    parser = add_command(
-        commands, "render", run, "render the views of a run to files; photographs are not needed"
-    )
+    parser = add_command(commands, "render", run, "render the views of a run to files, without photographs")
     add_run(parser)
     parser.add_argument("--data", metavar="DIR", help="take the cameras from this capture, not from the run")
     add_device(parser, shares_gpus=True)
     parser.add_argument(
-        "--split", choices=("test", "train", "all"), default="test", help="views (%(default)s)"
+        "--split", choices=("test", "train", "all"), default="test", help="which views (%(default)s)"
     )
     parser.add_argument("--out", type=named_path, required=True, metavar="DIR", help="folder for the images")
     parser.add_argument(

@@ -23,12 +23,19 @@ from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 
 HELP = """\
-Train a model of a capture: a COLMAP model (DIR/sparse/0 and DIR/images) or a transforms.json.
+Train a model of a capture, which is a folder DIR with photographs and their cameras: a COLMAP model
+(DIR/sparse/0 and DIR/images) or a transforms.json. At the end the held-out views (every 8th) are measured.
 
-Every field of the configuration is a flag, e.g.
-  blitzgs train --config configs/aerial.yaml --data DIR --out RUN --data.downscale=2 --schedule.scale=0.5
-Times are counted in images; schedule.scale stretches the whole schedule. `blitzgs train --show-config` prints
-the resolved configuration and stops. With --minutes=M the run measures its speed and chooses the scale.
+  blitzgs train --config configs/aerial.yaml --data DIR --out RUN
+
+Choose a configuration of the repository's folder configs/: aerial.yaml (GPU), aerial_cpu.yaml (CPU) or
+smoke.yaml (a first model in minutes). Without one, the fields have the defaults of
+blitzgs/training/config.py, which describes them all. Every field is also a flag, for example
+--data.downscale=2 --population.max_gaussians=2000000. --show-config prints the resulting configuration and
+stops.
+
+Times in the configuration count the images that were trained on. --schedule.scale=0.5 makes the whole
+schedule half as long; with --minutes=M the run measures its speed and chooses this factor itself.
 
 RUN gets config.yaml, cameras.json, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. A
 checkpoint is written every 10 minutes (log.checkpoint_seconds) and when the run is interrupted (Ctrl-C,
@@ -42,12 +49,15 @@ Several processes share the work with torchrun --nproc-per-node=M train.py (the 
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add the command."""
-    parser = add_command(commands, "train", run, "train a model of a capture", HELP)
+    parser = add_command(commands, "train", run, "train a model of photographs with known cameras", HELP)
     parser.add_argument(
-        "--config", type=Path, metavar="YAML", help="configuration file (default: the defaults)"
+        "--config",
+        type=Path,
+        metavar="YAML",
+        help="configuration file (default: see above)",
     )
-    parser.add_argument("--data", metavar="DIR", help="the capture (or --data.path=DIR)")
-    parser.add_argument("--out", type=named_path, metavar="RUN", help="folder of the run")
+    parser.add_argument("--data", metavar="DIR", help="folder of the capture")
+    parser.add_argument("--out", type=named_path, metavar="RUN", help="folder for the results")
     parser.add_argument(
         "--resume", action="store_true", help="continue from the newest checkpoint in RUN, if any"
     )
@@ -55,10 +65,10 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "--minutes",
         type=float,
         metavar="M",
-        help="fit the schedule into so much wall time of training (or --schedule.minutes=M)",
+        help="end after M minutes of training, with the whole schedule fitted into them",
     )
     parser.add_argument(
-        "--show-config", action="store_true", help="print the resolved configuration and stop"
+        "--show-config", action="store_true", help="print the resulting configuration and stop"
     )
     add_device(parser)
 

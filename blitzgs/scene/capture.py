@@ -29,6 +29,7 @@ from blitzgs.scene.undistort import Rectification, rectify
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
 _SAMPLED_POINTS = 2000
+_PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
@@ -61,7 +62,7 @@ class Capture:
 
 
 class MissingImagesError(FileNotFoundError):
-    """Images that a capture names are not on disk."""
+    """Some of the images that a capture names are not on disk."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +129,8 @@ def load_capture(
         if value not in allowed:
             raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
     views, points = _read_views(root, images, downscale)
+    if not views:
+        raise ValueError(f"{root}: its COLMAP model or transforms.json lists no images")
     views = sorted(_with_finite_poses(views), key=lambda view: view.name)
     # Use all views, so that a photograph that is lost later changes neither the origin nor the split.
     centers = camera_centers(np.stack([view.world_to_camera for view in views]))
@@ -200,10 +203,13 @@ def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View],
         return _read_colmap(
             root, incomplete, images, downscale
         )  # raises an error that names the missing file
-    raise FileNotFoundError(
+    message = (
         f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
         ".bin or .txt), or transforms.json"
     )
+    if any(path.suffix.lower() in _PHOTOGRAPH_SUFFIXES for path in [*root.glob("*"), *root.glob("*/*")]):
+        message += "; it has images but not their cameras: run COLMAP on them (docs/guide/first-model.md)"
+    raise FileNotFoundError(message)
 
 
 def _model_in(root: Path) -> Path:
@@ -271,10 +277,12 @@ def _existing(views: list[_View], root: Path, images: str, allow_missing: bool) 
         return found
     shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
     message = f"{len(missing)} of {len(views)} images are not in {root / images}: {shown}"
-    if not allow_missing or len(missing) == len(views):
-        raise MissingImagesError(
-            f"{message}; check the images folder, or leave those views out with allow_missing"
+    if not found:
+        raise FileNotFoundError(
+            f"{message}; name their folder, relative to the capture, with --data.images=FOLDER"
         )
+    if not allow_missing:
+        raise MissingImagesError(f"{message}; put them back, or leave those views out with allow_missing")
     warnings.warn(f"{message}; dropped", stacklevel=3)
     return found
 

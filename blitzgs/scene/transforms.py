@@ -124,6 +124,8 @@ def _read_pose(matrix: object) -> Float64:
 def _read_lens(fields: Mapping[str, Any], path: Path) -> Lens:
     if "w" in fields and "h" in fields:
         width, height = int(fields["w"]), int(fields["h"])
+    elif not path.is_file():
+        raise ValueError(f"the image {path} does not exist, and its size is not given by w and h")
     else:
         header = read_header(path)
         width, height = header.width, header.height

@@ -20,8 +20,9 @@ class DataConfig:
         downscale: integer factor by which images are reduced (1: original size).
         masks: mask folder inside the capture; null uses `masks/` where there is one, true requires it, false
             uses none.
-        split: which views are held out: a number n (every n-th), "val" (Mega-NeRF's `val/` layout), a text
-            file with one image name a line, or "auto": `val/` where there is one, else every 8th.
+        split: which views are held out: a number n (every n-th; 0: none), "val" (Mega-NeRF's `val/` layout),
+            a text file with one image name a line, or "auto": the capture's own split if it has one, else
+            every 8th.
         undistort: what happens to the part of a pinhole image that the distorted image does not cover: "crop"
             cuts it off, "mask" masks it.
         exif: "auto" turns an image by its EXIF tag if only the turned image fits its camera; "apply" always

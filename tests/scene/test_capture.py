@@ -9,7 +9,7 @@ import pytest
 
 from blitzgs.scene import colmap
 from blitzgs.scene.cameras import camera_centers
-from blitzgs.scene.capture import load_capture
+from blitzgs.scene.capture import MissingImagesError, load_capture
 from blitzgs.scene.files import find_mask
 from blitzgs.scene.image_files import apply_orientation, read_header
 from blitzgs.scene.images import ImageStore
@@ -236,11 +236,27 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
         load_capture(tmp_path)
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         load_capture(tmp_path / "nowhere")
+    (tmp_path / "photographs").mkdir()
+    (tmp_path / "photographs" / "DJI_0001.JPG").touch()
+    with pytest.raises(FileNotFoundError, match="has images but not their cameras: run COLMAP"):
+        load_capture(tmp_path)
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    with pytest.raises(ValueError, match=f"{tmp_path}: its COLMAP model or transforms.json lists no images"):
+        load_capture(tmp_path)
+    pose = np.eye(4).tolist()
+    frame = {"file_path": "gone.png", "camera_angle_x": 1.0, "transform_matrix": pose}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    with pytest.raises(ValueError, match=r"transforms.json: frame 0: the image .*gone.png does not exist"):
+        load_capture(tmp_path)
+    (tmp_path / "transforms.json").unlink()
     write_capture(tmp_path, NAMES[:2])
     with pytest.raises(ValueError, match="downscale must be at least 1, got 0.5"):
         load_capture(tmp_path, downscale=0.5)
     with pytest.raises(ValueError, match="undistort must be one of crop, mask, got 'none'"):
         load_capture(tmp_path, undistort="none")
+    with pytest.raises(FileNotFoundError, match="2 of 2 images .* with --data.images=FOLDER") as caught:
+        load_capture(tmp_path, images="elsewhere", allow_missing=True)
+    assert not isinstance(caught.value, MissingImagesError)  # leaving out all views is no remedy
     edit_model(tmp_path, lambda m: m.images.camera_ids.fill(7))
     with pytest.raises(ValueError, match=f"the cameras of 2 images .first: {NAMES[0]}. are not there"):
         load_capture(tmp_path)

@@ -18,19 +18,25 @@ _HELP = {
     "views": "number of images",
     "width": "image width, pixels",
     "height": "image height, pixels",
-    "points_per_view": "feature points looked for per image",
+    "points_per_view": "feature points searched for in each image",
     "oblique": "fraction of oblique views, 0 to 1",
-    "seed": "of everything random",
+    "seed": "seed of everything random",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `blitzgs synth` to a parser."""
     parser.add_argument(
-        "out", type=Path, metavar="DIR", help="folder to create; kept if it holds the same city"
+        "out",
+        type=Path,
+        metavar="DIR",
+        help="folder to create; one that has a part of the same city is completed",
     )
     parser.add_argument(
-        "--preset", choices=PRESETS, default="demo", help="base the other flags change (%(default)s)"
+        "--preset",
+        choices=PRESETS,
+        default="demo",
+        help="values of the flags that are not given (%(default)s)",
     )
     for field in fields(CityOptions):
         parser.add_argument(
@@ -39,9 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="N" if isinstance(field.default, int) else "X",
             help=_HELP[field.name],
         )
-    parser.add_argument("--processes", type=int, metavar="N", help="to render with (one a core)")
     parser.add_argument(
-        "--overwrite", action="store_true", help="replace a generated city with other parameters"
+        "--processes", type=int, metavar="N", help="number of processes (default: one for each core)"
+    )
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace another generated city in this folder"
     )
 
 
