@@ -17,7 +17,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import Shared
 from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.transport import PeerTransport
-from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
+from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT, room_for
 from blitzgs.distributed.transport.way_back import PeerWayBack
 from blitzgs.model import GaussianTable
 from blitzgs.ops.capacity import CapacityEstimate, Sizes
@@ -204,6 +204,16 @@ def test_all_ranks_repeat_a_frame_that_did_not_fit(sizes, frames, backward_follo
     )
     assert len(results[2][0]) == 0 and expected.any()
     torch.testing.assert_close(found[keys.argsort(), :9], expected[order], rtol=1e-4, atol=1e-4)
+
+
+def test_buffers_grow_rarely_while_a_model_grows():
+    words, lengths = room_for(100, 0), []
+    for splats in range(100, 10_000):
+        assert (grown := room_for(splats, words)) >= max(words, splats * WORDS_PER_SPLAT)
+        if grown > words:
+            lengths.append(words := grown)
+    assert len(lengths) <= 20 and room_for(100, words) == words
+    assert room_for(10**6, words) < (10**6 + 32) * WORDS_PER_SPLAT  # a single large request is not exceeded
 
 
 def test_ranks_survey_together():

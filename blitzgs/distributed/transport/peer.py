@@ -70,6 +70,17 @@ WORDS_PER_SPLAT = _SPLAT_WORDS + SPLAT_GRADIENT
 _ALIGNMENT = 32
 
 
+def room_for(splats: int, words: int) -> int:
+    """Return the words that each buffer needs for a number of splats; `words` is its present length.
+
+    All ranks stop and map their memory anew when the buffers grow. A buffer that is too small therefore grows
+    by at least a quarter: in a growing model, each record of the number of splats is a little higher than the
+    one before.
+    """
+    needed = -(-splats // _ALIGNMENT) * _ALIGNMENT * WORDS_PER_SPLAT
+    return words if needed <= words else max(needed, words * 5 // 4)
+
+
 class PeerBuffers:
     """The parts of the buffers of all ranks.
 
@@ -118,10 +129,11 @@ class PeerTransport:
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
         if attempt.sizes is not None:
-            splats = -(-attempt.sizes.splats // _ALIGNMENT) * _ALIGNMENT
-            if len(self._memory.buffers[0]) < splats * WORDS_PER_SPLAT:
+            present = self._memory.buffers[0].shape[0]
+            words = room_for(attempt.sizes.splats, present)
+            if words > present:
                 with self._ranks.watchdog.waiting("reserve"):
-                    self._memory.reserve(splats * WORDS_PER_SPLAT)
+                    self._memory.reserve(words)
         if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
             self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
         return PeerExchange(self._ranks, self._memory, self._buffers, inputs, assignment, attempt, mark)
