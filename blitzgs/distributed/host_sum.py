@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.ops.host import current_stream
 from blitzgs.ops.report import report_
 
 
@@ -37,36 +38,53 @@ class HostSum:
             tiles: the tiles of this rank, [first, one past last).
         """
         self._ranks = ranks
-        self._sums = 0 if parts is None else 2 * len(parts)
+        self._sums = 0 if parts is None else 2 * parts.shape[0]
         self._copied: torch.cuda.Event | None = None
-        words = ranks.world_size * self._sums + (0 if tile_work is None else len(tile_work))
+        words = ranks.world_size * self._sums + (0 if tile_work is None else tile_work.shape[0])
         self._total: Tensor | None = None
-        stream = _side_stream(ranks.device)
-        if stream is None:
+        main, stream = current_stream(ranks.device), _side_stream(ranks.device)
+        if main is None or stream is None:
             self._value = torch.zeros(words)
             report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [self._value])
             ranks.all_reduce(self._value)
             return
-        stream.wait_stream(torch.cuda.current_stream(ranks.device))
-        with torch.cuda.stream(stream):
-            if ranks.memory is not None:
-                with ranks.watchdog.waiting("boards"):
-                    boards = ranks.memory.boards(words)
-                report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, boards)
-                ranks.memory.side_barrier()
-                total = boards[ranks.rank]
-            else:
-                new = torch.empty if ranks.world_size == 1 else torch.zeros
-                total = new(words, device=ranks.device)
-                report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [total])
-                ranks.all_reduce(total)
-            self._value = torch.empty(words, pin_memory=True)
-            self._value.copy_(total, non_blocking=True)
-            self._copied = torch.cuda.Event()
-            self._copied.record(stream)
+        stream.wait_stream(main)
+        # The context manager of a stream takes longer: it asks for the current device and stream again.
+        torch.cuda.set_stream(stream)
+        try:
+            self._copied = self._queue(parts, tile_work, tiles, words, stream)
+        finally:
+            torch.cuda.set_stream(main)
         for tensor in (parts, tile_work):
             if tensor is not None:
                 tensor.record_stream(stream)
+
+    def _queue(
+        self,
+        parts: Tensor | None,
+        tile_work: Tensor | None,
+        tiles: tuple[int, int],
+        words: int,
+        stream: torch.cuda.Stream,
+    ) -> torch.cuda.Event:
+        """Queue the sums, of `words` words, and their copy to the host on `stream`, the current one."""
+        ranks = self._ranks
+        if ranks.memory is not None:
+            with ranks.watchdog.waiting("boards"):
+                boards = ranks.memory.boards(words)
+            report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, boards)
+            ranks.memory.side_barrier()
+            total = boards[ranks.rank]
+        else:
+            new = torch.empty if ranks.world_size == 1 else torch.zeros
+            total = new(words, device=ranks.device)
+            report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [total])
+            ranks.all_reduce(total)
+        self._value = torch.empty(words, pin_memory=True)
+        self._value.copy_(total, non_blocking=True)
+        copied = torch.cuda.Event()
+        copied.record(stream)
+        return copied
 
     def read(self) -> Tensor:
         """Return the sums, float32 on the CPU, the same bits on every rank. The first call waits for them.

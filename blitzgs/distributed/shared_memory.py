@@ -107,6 +107,7 @@ class SharedMemory:
         )
         self._boards: list[Tensor] = []
         self._places: dict[tuple[int, int], list[Tensor]] = {}  # parts of the boards, by length and half
+        self._gathered: dict[tuple[int, int], Shared] = {}  # by number of values and place
 
     def map_symmetric(self, name: str, mine: Tensor) -> list[Tensor]:
         """Map every rank's counterpart of a symmetric tensor; collective."""
@@ -136,13 +137,16 @@ class SharedMemory:
         # Use the other place: a rank may have left the last barrier without having read its numbers yet.
         place = self._shared % 2
         self._shared += 1
-        count, numbers = self.world_size, len(values)
+        count, numbers = self.world_size, values.shape[0]
         # The sums are stored behind the numbers, always in the same words, where no other rank writes.
         first = count + place * MAX_VALUES * (count + 1) + count * (MAX_VALUES - numbers)
-        host = self._host[place, : count * numbers].view(count, numbers)
-        self._barrier(values, first, host)
-        gathered = self._control[self.rank][first : first + (count + 1) * numbers].view(count + 1, numbers)
-        return Shared(gathered[:count], gathered[count], host)
+        if (numbers, place) not in self._gathered:
+            words = self._control[self.rank][first : first + (count + 1) * numbers].view(count + 1, numbers)
+            host = self._host[place, : count * numbers].view(count, numbers)
+            self._gathered[numbers, place] = Shared(words[:count], words[count], host)
+        shared = self._gathered[numbers, place]
+        self._barrier(values, first, shared.host)
+        return shared
 
     def boards(self, words: int) -> list[Tensor]:
         """Return every rank's board, float32 [words], for the next barrier of the board. Collective.

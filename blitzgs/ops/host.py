@@ -25,7 +25,7 @@ class HostCopy:
             self._host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
             torch.ops.blitzgs.copy_to_host_(self._host, values)
             self._written = torch.cuda.Event()
-            self._written.record(torch.cuda.current_stream(values.device))
+            self._written.record(current_stream(values.device))
 
     def read(self) -> Tensor:
         """Wait for the copy and return the numbers as a CPU tensor."""
@@ -41,6 +41,15 @@ class HostCopy:
 @torch.library.register_fake("blitzgs::copy_to_host_")
 def _(*_args: object) -> None:
     return None
+
+
+def current_stream(device: torch.device) -> torch.cuda.Stream | None:
+    """Return the current stream of a CUDA device; None on the CPU.
+
+    By the number of the device: torch looks up other forms in Python, which takes longer than the rest of the
+    call, and a step asks several times.
+    """
+    return torch.cuda.current_stream(device.index) if device.type == "cuda" else None
 
 
 def to_host(tensor: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.tiles import LOSS_HALO, TileRanges
+from blitzgs.ops.host import current_stream
 from blitzgs.pipeline import Views
 from blitzgs.scene.images import ImageMemory
 from blitzgs.training.sampler import BatchSampler
@@ -223,7 +224,7 @@ class BatchLoader:
 
     def get(self, step: int, last: int) -> Batch:
         """Return the batch of a step (0-based) and start to prepare the next ones, up to step `last` - 1."""
-        stream = None if self._stream is None else torch.cuda.current_stream(self._device)
+        stream = current_stream(self._device)
         if self._used is not None:
             if stream is not None:
                 self._used.read.record(stream)

@@ -82,7 +82,7 @@ class LoneMemory:
 class IdleEvent:
     """Replaces `torch.cuda.Event` on a CPU, where nothing is pending."""
 
-    def record(self) -> None:
+    def record(self, stream: object = None) -> None:
         """Return at once."""
 
     def synchronize(self) -> None:

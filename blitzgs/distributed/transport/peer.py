@@ -49,6 +49,7 @@ from blitzgs.distributed.tiles import TileAssignment
 from blitzgs.distributed.transport.protocol import Arrived, HostCounts, Mark, Traffic, unmarked
 from blitzgs.distributed.transport.way_back import PeerWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
+from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection import VIEW_TOTALS, ProjectionInputs, Splats, splats_of
 from blitzgs.ops.scatter import runs_of
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
@@ -161,7 +162,7 @@ class PeerExchange:
         self._own = projected.splats
         self._shared = memory.share(projected.totals)  # barrier A
         self._counted = torch.cuda.Event()
-        self._counted.record()
+        self._counted.record(current_stream(ranks.device))
         self._places, plan = torch.ops.blitzgs.send_splats_(
             list(projected.composited), projected.splats.rank_masks, self._shared.everyone, ranks.rank,
             buffers.buffers, buffers.length,
