@@ -42,12 +42,13 @@ class HostSum:
         self._copied: torch.cuda.Event | None = None
         words = ranks.world_size * self._sums + (0 if tile_work is None else tile_work.shape[0])
         self._total: Tensor | None = None
-        main, stream = current_stream(ranks.device), _side_stream(ranks.device)
-        if main is None or stream is None:
+        stream = _side_stream(ranks.device)
+        if stream is None:
             self._value = torch.zeros(words)
             report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [self._value])
             ranks.all_reduce(self._value)
             return
+        main = current_stream(ranks.device)
         stream.wait_stream(main)
         # The context manager of a stream takes longer: it asks for the current device and stream again.
         torch.cuda.set_stream(stream)

@@ -43,13 +43,13 @@ def _(*_args: object) -> None:
     return None
 
 
-def current_stream(device: torch.device) -> torch.cuda.Stream | None:
-    """Return the current stream of a CUDA device; None on the CPU.
+def current_stream(device: torch.device) -> torch.cuda.Stream:
+    """Return the current stream of a CUDA device.
 
     By the number of the device: torch looks up other forms in Python, which takes longer than the rest of the
     call, and a step asks several times.
     """
-    return torch.cuda.current_stream(device.index) if device.type == "cuda" else None
+    return torch.cuda.current_stream(device.index)
 
 
 def to_host(tensor: Tensor) -> Tensor:

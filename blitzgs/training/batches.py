@@ -224,7 +224,7 @@ class BatchLoader:
 
     def get(self, step: int, last: int) -> Batch:
         """Return the batch of a step (0-based) and start to prepare the next ones, up to step `last` - 1."""
-        stream = current_stream(self._device)
+        stream = None if self._stream is None else current_stream(self._device)
         if self._used is not None:
             if stream is not None:
                 self._used.read.record(stream)

@@ -114,6 +114,7 @@ def without_gpu(monkeypatch):
     monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
     monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: None)
     returned = PeerWayBack.return_gradients
 
     def from_columns(self, gradients):

@@ -187,6 +187,7 @@ def alone(monkeypatch):
     monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", send)
 
     monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: None)
     monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_packed_", rasterize_into)
     return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
 
