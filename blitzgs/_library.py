@@ -36,10 +36,10 @@ def load_libraries() -> None:
 
 def _load(path: Path) -> None:
     if not path.exists():
-        raise ImportError(
-            f"{path} is missing: the kernels are not built. Run `pip install .` (or `make build` in a "
-            "checkout); the CUDA library needs nvcc on the PATH while building."
-        )
+        remedy = "Run `pip install .` (or `make build` in a checkout)"
+        if path == LIBRARY_DIR / "libblitzgs_cuda.so":
+            remedy += " with nvcc (CUDA toolkit) on the PATH, or hide the GPUs (CUDA_VISIBLE_DEVICES=)"
+        raise ImportError(f"{path} is missing: the kernels are not built. {remedy}.")
     torch.ops.load_library(str(path))
     if REGISTRATION.exists() and schema_digest(path) != source_digest(REGISTRATION):
         raise ImportError(

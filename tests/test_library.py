@@ -51,3 +51,12 @@ def test_a_library_that_is_missing_is_named(tmp_path):
     )
     assert done.returncode != 0
     assert f"{tmp_path}/libblitzgs_cpu.so is missing: the kernels are not built" in done.stderr
+
+
+def test_missing_cuda_kernels_name_both_remedies(tmp_path, monkeypatch):
+    monkeypatch.setattr(_library, "LIBRARY_DIR", tmp_path)
+    with pytest.raises(ImportError, match=r"with nvcc .* or hide the GPUs \(CUDA_VISIBLE_DEVICES=\)"):
+        _library._load(tmp_path / "libblitzgs_cuda.so")
+    with pytest.raises(ImportError) as caught:
+        _library._load(tmp_path / "libblitzgs_cpu.so")
+    assert "nvcc" not in str(caught.value)
