@@ -47,8 +47,10 @@ def l1_ssim(
             raise ValueError(f"{name} is on {tensor.device} and renders on {renders.device}; move one")
     if not 0 <= ssim_weight <= 1:
         raise ValueError(f"ssim_weight must be in [0, 1], got {ssim_weight}")
-    x, y = renders.reshape(-1, *renders.shape[-3:]), targets.reshape(-1, *targets.shape[-3:])
-    masks = None if masks is None else masks.reshape(-1, *masks.shape[-2:])
+    x, y = renders, targets
+    if renders.dim() != 4:  # else leave the images as they are: a view would be a node of autograd's graph
+        x, y = renders.reshape(-1, *renders.shape[-3:]), targets.reshape(-1, *targets.shape[-3:])
+        masks = None if masks is None else masks.reshape(-1, *masks.shape[-2:])
     if torch.compiler.is_compiling() or not (torch.is_grad_enabled() and renders.requires_grad):
         return photometric_loss(x, y, masks, ssim_weight).mean()
     loss: Tensor = _L1Ssim.apply(x, y, masks, ssim_weight)  # type: ignore[no-untyped-call]
@@ -65,7 +67,7 @@ class _L1Ssim(torch.autograd.Function):
         if constant:
             views, height, width, _ = renders.shape
             key = (views, 3 * height * width, float(weight), renders.dtype, renders.device)
-            l1_weights, ssim_weights, divisors, factors = _constants(*key)
+            l1_weights, ssim_weights, divisors = _constants(*key)
         else:
             counts = pixel_counts(renders, masks)
             divisors, share = counts.clamp_min(1), torch.full_like(counts, 1 / len(renders))
@@ -76,7 +78,11 @@ class _L1Ssim(torch.autograd.Function):
         ctx.save_for_backward(v_renders)
         ctx.renders = renders  # not saved, as its values are not needed and may change
         if constant:
-            return ((parts * factors).sum() + weight).to(renders.dtype)
+            samples = views * 3 * height * width
+            loss: Tensor = torch.ops.blitzgs.loss_of_sums(
+                parts, renders, (1 - weight) / samples, -weight / samples, weight
+            )
+            return loss
         l1, ssim = parts.sum(dim=1).unbind(dim=1)
         per_view = ((1 - weight) * l1 + weight * (counts - ssim)) / divisors
         return per_view.mean().to(renders.dtype)
@@ -93,7 +99,7 @@ class _L1Ssim(torch.autograd.Function):
 @lru_cache(maxsize=16)
 def _constants(
     views: int, count: int, weight: float, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return what the loss of views without a mask needs; each tensor would cost a launch in every step.
 
     Args:
@@ -104,9 +110,8 @@ def _constants(
         device: of the renders.
 
     Returns:
-        The weights of the sums of L1 and SSIM and their divisors, [B] each, and the factors, float64 [2],
-        that turn these two sums into the loss less w.
+        The weights of the sums of L1 and SSIM and their divisors, [B] each.
     """
-    factors = torch.tensor([1 - weight, -weight], dtype=torch.float64, device=device) / views
-    l1, ssim = factors.to(dtype)[:, None].repeat(1, views)
-    return l1, ssim, torch.full((views,), count, dtype=dtype, device=device), factors / count
+    values = ((1 - weight) / views, -weight / views, count)
+    l1, ssim, divisors = (torch.full((views,), value, dtype=dtype, device=device) for value in values)
+    return l1, ssim, divisors

@@ -162,6 +162,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "report_(Tensor? parts, Tensor? tile_work, int tile_begin, int tile_end, int rank, int n_ranks, "
       "Tensor(a!)[] targets) -> ()");
+  // A scalar of the dtype of `like`: the weighted total of `parts` and an offset.
+  m.def(
+      "loss_of_sums(Tensor parts, Tensor like, float l1_weight, float ssim_weight, float offset) -> Tensor");
 
   // The optimiser: dense Adam over a list of rows, with the groups of arguments of project_bwd_step_; and the
   // statistics of density control.
@@ -174,6 +177,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The rules of the total drift of a row, by the step of its parameters; `like` has the dtype of the
   // parameters.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
+  // Adds a step to the tables of T schedules; rates: 6 T learning rates.
+  m.def(
+      "add_drift_step_(Tensor(a!) tables, Tensor(b!) lr_tables, Tensor decays, Tensor shares, int step, "
+      "float[] rates) -> ()");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "
@@ -193,6 +200,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
 
   // Rows of a table, old and new, in another order.
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
+  // The same rows of several columns, and then those of `joined`, side by side along the second dimension.
+  m.def("gather_rows(Tensor[] columns, Tensor[] joined, Tensor ids) -> Tensor[]");
 
   // For a table in the memory of the host with a pool of blocks on the device: the blocks that views may see,
   // and the exchange of blocks between table and pool. The first n_written columns are written back.

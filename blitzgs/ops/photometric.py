@@ -175,6 +175,11 @@ def _(
     )
 
 
+@torch.library.register_fake("blitzgs::loss_of_sums")
+def _(parts: Tensor, like: Tensor, l1_weight: float, ssim_weight: float, offset: float) -> Tensor:
+    return like.new_empty(())
+
+
 def _save_inputs(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     renders, targets, masks, *tiles = inputs
     ctx.save_for_backward(renders, targets, masks)

@@ -17,7 +17,7 @@ from blitzgs.ops.projection import (
     ProjectionOptions,
     project_splats,
 )
-from blitzgs.ops.sparse_rows import full_gradient
+from blitzgs.ops.sparse_rows import full_gradients
 from blitzgs.ops.splat_gradients import packed_table
 
 
@@ -282,12 +282,9 @@ def _first_gradients(
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if not dense:
         _, visible_ids, _ = saved.splats
-        ids = visible_ids.long()
-        columns = zip(saved.gaussians, gradients, sparse, needed, strict=False)
-        found = [
-            full_gradient(ids, gradient, parameter.shape, is_sparse) if wanted else None
-            for parameter, gradient, is_sparse, wanted in columns
-        ]
+        shapes = [parameter.shape for parameter in saved.gaussians]
+        kept = [v if wanted else None for v, wanted in zip(found, needed, strict=True)]
+        found = full_gradients(visible_ids, kept, shapes, sparse[: len(kept)])
     return (*found, *[None] * (5 - len(found)), v_viewmats if need_viewmats else None)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -23,26 +24,46 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
         values: the rows, [U, ...].
         shape: shape of the table.
     """
-    indices = ids.long()[None]
-    storage = indices.untyped_storage()
-    # The gradients of one backward pass share their indices.
-    if not _distinct or _distinct[-1].cdata != storage._cdata:
-        _distinct.append(StorageWeakRef(storage))
+    return _sparse_table(_indices_of(ids.long()), values, shape)
+
+
+def _indices_of(ids: Tensor) -> Tensor:
+    """Return the indices of sparse gradients, int64 [1, U], and remember that each is there once."""
+    indices = ids[None]
+    _distinct.append(StorageWeakRef(indices.untyped_storage()))
+    return indices
+
+
+def _sparse_table(indices: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
     return torch.sparse_coo_tensor(indices, values, shape, is_coalesced=True, check_invariants=False)
 
 
-def full_gradient(ids: Tensor, gradient: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """Return the gradient of a whole parameter from that of its rows `ids`, as a sparse or a dense tensor.
+def full_gradients(
+    ids: Tensor,
+    gradients: Sequence[Tensor | None],
+    shapes: Sequence[torch.Size],
+    sparse: Sequence[bool],
+) -> list[Tensor | None]:
+    """Return the gradients of whole parameters from those of their rows `ids`, as sparse or dense tensors.
 
     Args:
-        ids: int64 [U], without duplicates.
-        gradient: [U, ...].
-        shape: [N, ...], of the parameter.
-        sparse: return a sparse tensor.
+        ids: int32 or int64 [U], ascending, each once.
+        gradients: [U, ...] of each parameter; None: it needs none.
+        shapes: [N, ...], of each parameter.
+        sparse: which of the results are sparse.
     """
-    if sparse:
-        return sparse_rows(ids, gradient, shape)
-    return gradient.new_zeros(shape).index_copy_(0, ids, gradient)
+    ids = ids.long()
+    # All gradients share their indices, by which an optimiser sees that their rows are the same.
+    indices = _indices_of(ids) if any(sparse) else ids
+    found: list[Tensor | None] = []
+    for gradient, shape, is_sparse in zip(gradients, shapes, sparse, strict=True):
+        if gradient is None:
+            found.append(None)
+        elif is_sparse:
+            found.append(_sparse_table(indices, gradient, shape))
+        else:
+            found.append(gradient.new_zeros(shape).index_copy_(0, ids, gradient))
+    return found
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:

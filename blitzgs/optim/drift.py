@@ -59,33 +59,30 @@ class Drift:
         self.betas = betas
         self.reach = explicit_steps(*betas, dtype)
         lr_tables = torch.zeros(tables, CAPACITY + 1, GROUPS, dtype=torch.float32, device=device)
-        self._set_rates(lr_tables, torch.zeros(tables, 1, 1, GROUPS, dtype=torch.float64, device=device))
+        self._set_rates(lr_tables)
         ratio, root = betas[0] / math.sqrt(betas[1]), math.sqrt(betas[1])
         distances = np.arange(self.reach, 0, -1)[:, None]
         decays = (ratio * root ** np.arange(_ORDERS)) ** distances
-        self._decays = torch.from_numpy(decays).to(device)[:, :, None]
+        self._decays = torch.from_numpy(decays).to(device)
         self.restart(begin)
 
     def __getstate__(self) -> dict[str, Any]:
         # A pickled view would no longer be one.
-        views = ("lr_tables", "tables", "_rate_cells", "_tails")
+        views = ("lr_tables", "tables")
         return {name: value for name, value in self.__dict__.items() if name not in views}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._set_rates(self._lr_tables, self._rates)
+        self._set_rates(self._lr_tables)
         self._set_tables(self._tables)
 
-    def _set_rates(self, lr_tables: Tensor, rates: Tensor) -> None:
-        """Take the learning rates of all steps, and those of the latest step, float64 [T, 1, 1, 6]."""
+    def _set_rates(self, lr_tables: Tensor) -> None:
+        """Take the learning rates of all steps, float32 [T, CAPACITY + 1, 6]."""
         self._lr_tables, self.lr_tables = lr_tables, lr_tables.unbind()
-        self._rates, self._rate_cells = rates, rates.flatten().unbind()
-        self._known_rates: list[float] = rates.flatten().tolist()
 
     def _set_tables(self, tables: Tensor) -> None:
         """Take the tables, float64 [T, CAPACITY + 1, 30]."""
         self._tables, self.tables = tables, tables.unbind()
-        self._tails = tables[:, :, : _ORDERS * GROUPS].unflatten(2, (_ORDERS, GROUPS))
 
     def restart(self, begin: int) -> None:
         """Empty the tables at step `begin`, with which all rows and their moments must be up to date."""
@@ -96,7 +93,7 @@ class Drift:
         shares = torch.stack([first * second ** (order - 1) for order in range(_ORDERS)], dim=1)
         shares[0] = 0
         device = self._lr_tables.device
-        self._shares = shares.to(device)[:, :, None]
+        self._shares = shares.to(device)
         self._set_tables(table.to(device).repeat(len(self._lr_tables), 1, 1))
         self._lr_tables.zero_()
 
@@ -105,22 +102,18 @@ class Drift:
         return step - self.begin >= CAPACITY
 
     def add(self, step: int, rates: Sequence[float]) -> None:
-        """Add a step to the tables; this queues a few small kernels and copies nothing to the device.
+        """Add a step to the tables, in one launch that copies nothing to the device.
 
         Args:
             step: number of the step, from 1.
             rates: 6 T learning rates, in the order of the tables.
         """
-        for index, rate in enumerate(rates):
-            rate = float(np.float32(rate))  # as in lr_tables
-            if rate != self._known_rates[index]:
-                self._known_rates[index] = rate
-                self._rate_cells[index].fill_(rate)
+        # As in lr_tables.
+        rounded = np.asarray(rates, np.float32).tolist()
         place = step - self.begin
-        first = max(0, place - self.reach)
-        terms = self._shares[place] * self._rates
-        self._tails[:, first:place].addcmul_(self._decays[first - place :], terms)
-        self._lr_tables[:, place] = self._rates[:, 0, 0]
+        torch.ops.blitzgs.add_drift_step_(
+            self._tables, self._lr_tables, self._decays, self._shares, place, rounded
+        )
 
     def alone(self, table: int, group: int) -> Drift:
         """Return a copy for a parameter alone, which had the learning rates of a group of a table.
@@ -132,7 +125,14 @@ class Drift:
         copied.begin, copied.betas, copied.reach = self.begin, self.betas, self.reach
         copied._decays, copied._shares = self._decays, self._shares
         own = [*range(4), *((4, 5) if group >= 4 else (group, group))]
-        copied._set_rates(self._lr_tables[table][None, :, own], self._rates[table][None, :, :, own])
-        copied._set_tables(self._tables[table][None].clone())
-        copied._tails.copy_(self._tails[table][None, :, :, own])
+        copied._set_rates(self._lr_tables[table][None, :, own])
+        tables = self._tables[table][None].clone()
+        tails = tables[:, :, : _ORDERS * GROUPS].unflatten(2, (_ORDERS, GROUPS))
+        tails.copy_(tails[:, :, :, own])
+        copied._set_tables(tables)
         return copied
+
+
+@torch.library.register_fake("blitzgs::add_drift_step_")
+def _(*_args: Any) -> None:
+    return None

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from blitzgs.lazy_dict import LazyDict
 from blitzgs.ops.capacity import Sizes
+from blitzgs.ops.gather_rows import gather_rows
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, visible_gaussians
-from blitzgs.ops.sparse_rows import full_gradient
+from blitzgs.ops.sparse_rows import full_gradients
 from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
 from blitzgs.rendering.groups import groups_of
 from blitzgs.rendering.images import ImageOptions, render
@@ -181,26 +182,19 @@ class _Visible(torch.autograd.Function):
         ctx.save_for_backward(ids)
         ctx.sparse, ctx.shapes = sparse, [table.shape for table in tables]
         ctx.set_materialize_grads(False)
-        geometry, parts = tables[:4], tables[4:]
+        parts = tables[4:]
         ctx.lengths = [part.shape[1] for part in parts]
-        rows = [table.index_select(0, ids) for table in geometry]
-        if not parts:
-            return (*rows, None)
-        sh = parts[0].new_empty(len(ids), sum(ctx.lengths), 3)
-        for part, here in zip(parts, sh.split(ctx.lengths, dim=1), strict=True):
-            torch.index_select(part, 0, ids, out=here)
-        return (*rows, sh)
+        rows = gather_rows(tables[:4], parts, ids)
+        return (*rows, *([] if parts else [None]))
 
     @staticmethod
     def backward(ctx: Any, *v_rows: Tensor | None) -> Any:
-        ids = ctx.saved_tensors[0].long()
+        (ids,) = ctx.saved_tensors
         *gradients, v_sh = v_rows
-        if ctx.lengths:
+        if len(ctx.lengths) == 1 or v_sh is None:
+            gradients += [v_sh] * len(ctx.lengths)
+        else:
             # Autograd would copy a gradient that is not contiguous, and its indices with it.
-            parts = [None] * len(ctx.lengths) if v_sh is None else v_sh.split(ctx.lengths, dim=1)
-            gradients += [None if part is None else part.contiguous() for part in parts]
-        found = (
-            None if v is None else full_gradient(ids, v, shape, ctx.sparse)
-            for v, shape in zip(gradients, ctx.shapes, strict=True)
-        )
-        return None, None, *found
+            gradients += [part.contiguous() for part in v_sh.split(ctx.lengths, dim=1)]
+        sparse = [ctx.sparse] * len(gradients)
+        return None, None, *full_gradients(ids, gradients, ctx.shapes, sparse)

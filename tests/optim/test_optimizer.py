@@ -287,3 +287,24 @@ def test_tables_do_not_grow_over_a_hundred_thousand_steps():
         kept.add(step, [1e-3] * 6)
         sizes |= {len(kept.tables[0]), len(kept.lr_tables[0])}
     assert sizes == {drift.CAPACITY + 1} and kept.begin > 90_000
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_many_tables_equal_single_ones(device):
+    """One launch takes up to 16 tables."""
+    rates = torch.rand(18, 6, generator=torch.Generator().manual_seed(0)).tolist()
+    options = (0.9, 0.999), torch.float64, torch.device(device), 0
+    together, single = Drift(*options, 18), [Drift(*options) for _ in rates]
+    for step in range(1, 400):
+        together.add(step, [rate / step for row in rates for rate in row])
+        for one, row in zip(single, rates, strict=True):
+            one.add(step, [rate / step for rate in row])
+    assert together.reach < 399
+    for index, one in enumerate(single):
+        assert torch.equal(together.tables[index], one.tables[0]) and together.tables[index].any()
+        assert torch.equal(together.lr_tables[index], one.lr_tables[0])
+    decays = 0.9 / 0.999**0.5 * 0.999 ** (0.5 * torch.arange(4, dtype=torch.float64))
+    table, shares = together.tables[17].cpu(), together._shares.cpu()
+    lr = together.lr_tables[17].double().cpu()
+    expected = sum(decays[:, None] ** (t - 395) * shares[t][:, None] * lr[t] for t in range(396, 400))
+    torch.testing.assert_close(table[395, :24].view(4, 6), expected, rtol=1e-12, atol=0)

@@ -1,0 +1,36 @@
+// SPDX-License-Identifier: Apache-2.0
+// Gathers the same rows of several columns in one launch. A row of a column has `width` words of 4 bytes:
+//   column.to[i stride + k] = column.from[ids[i] width + k],  0 <= i < n,  0 <= k < width.
+// With a stride above the width, several columns are gathered side by side into one. ids int32 [n], rows of
+// the columns; not checked.
+#pragma once
+#include <cstdint>
+
+#include "common/kernel.h"
+
+namespace blitzgs {
+
+constexpr int kMostGatheredColumns = 8;
+
+struct GatheredColumn {
+  const std::uint32_t* from;
+  std::uint32_t* to;
+  std::int64_t stride;
+  std::uint32_t width;
+};
+
+struct GatherRows {
+  const std::int32_t* ids;
+  std::int64_t n;
+  int n_columns;
+  GatheredColumn columns[kMostGatheredColumns];
+};
+
+namespace cpu {
+void gather_rows(const GatherRows&, Workspace&, CudaStream);
+}
+namespace cuda {
+void gather_rows(const GatherRows&, Workspace&, CudaStream);
+}
+
+}  // namespace blitzgs
