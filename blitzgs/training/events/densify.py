@@ -67,8 +67,8 @@ def run(state: TrainingState, event: Event) -> None:
         record |= {"limit": limit.count, "limited_by": limit.reason}
         if held_back and not state.growth_was_limited:
             text = (
-                f"{limit.reason} limits the model to {limit.count:,} Gaussians: "
-                f"{held_back:,} weaker candidates wait"
+                f"{limit.reason} limits the model to {limit.count:,} Gaussians; this event would have added "
+                f"{held_back:,} more"
             )
             state.growth_was_limited = True
     state.log.event(event.time, "densify", record, text)
