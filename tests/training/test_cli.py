@@ -29,6 +29,20 @@ def test_train_leaves_a_summary(trained):
     assert summary["images"] == 40 and summary["psnr"] > 15
 
 
+@pytest.mark.parametrize("strategy", ["density", "relocation"])
+def test_the_log_names_the_limit_of_the_population(trained, tmp_path, capsys, strategy):
+    flags = [f"--{text}" for text in (*OVERRIDES, "schedule.iterations=22", "population.growth=0.5")]
+    flags += [f"--population.strategy={strategy}", "--population.max_gaussians=420", "--log.pictures=0"]
+    assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "r"), *flags]) == 0
+    lines = (tmp_path / "r" / "log.jsonl").read_text().splitlines()
+    event = next(record for record in map(json.loads, lines) if record.get("event") == "densify")
+    held_back = event["held_back"]
+    assert held_back > 0 and event["gaussians"] <= 420
+    limit = "population.max_gaussians limits the model to 420 Gaussians"
+    text = f"{limit}; this event would have added {held_back:,} more"
+    assert text in " ".join(capsys.readouterr().out.split())
+
+
 def test_eval_repeats_the_metrics_of_training(trained, tmp_path, capsys):
     summary = json.loads((trained[1] / "summary.json").read_text())
     assert main(["eval", str(trained[1]), "--out", str(tmp_path), "--pictures", "1", "--share-gpus"]) == 0
