@@ -52,6 +52,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
+  // The colours of splats that were projected without sh, [P, 3]. gaussian_ids: the rows of `gaussians`;
+  // shown (opacities, radii, tiles_touched): set to 0 for splats whose colour is not finite.
+  m.def(
+      "color_splats_(Tensor[] gaussians, Tensor[] cameras, Tensor gaussian_ids, Tensor camera_ids, "
+      "Tensor(a!)[] shown, int[] ints, float[] floats) -> Tensor colors");
   // views: cameras and, of each view, weights of the Gaussians' smallest axes, opacities and mean axes:
   // (viewmats, Ks[, scale_reg[, opacity_reg[, size_reg]]]). v_splats: (v_means2d, v_conics, v_opacities[,
   // v_colors]) or, on CUDA, one table of splat gradients.

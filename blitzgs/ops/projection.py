@@ -48,6 +48,8 @@ def splats_of(allocated: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
         counts: `counts` of the result.
     """
     visible, splats, *_ = counts.tolist()
+    if (visible, splats) == (allocated[2].shape[0], allocated[0].shape[0]):
+        return ProjectedSplats._make((*allocated[:-1], counts))
     lengths = (splats, splats, visible, visible + 1, *(splats,) * 8)
     # Hide from autograd that these are views: a Function may return views, but its caller could not change
     # them in place.
@@ -219,11 +221,38 @@ def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
     return splats_of(*_projected(inputs))
 
 
-def visible_gaussians(inputs: ProjectionInputs) -> tuple[Tensor, Sizes]:
-    """Return the Gaussians that have a splat, int32 [U], ascending, and the sizes of their projection."""
-    splats, counts = _projected(inputs)
-    sizes = Sizes(*counts.tolist())
-    return splats.visible_ids[: sizes.visible], sizes
+@torch.no_grad()
+def colored_rows(splats: ProjectedSplats, rows: ProjectionInputs) -> ProjectedSplats:
+    """Return the splats of gathered Gaussians from those of the whole table, without another projection.
+
+    Args:
+        splats: `project_splats` of the whole table without SH. Splats whose colour is not finite are hidden
+            in place.
+        rows: the inputs of that projection with the Gaussians `splats.visible_ids` alone, and SH or none.
+
+    Returns:
+        What `project_splats` returns for `rows`; only `counts` are those of `splats`, which count hidden
+        splats.
+    """
+    visible_ids = torch.arange(len(splats.visible_ids), dtype=torch.int32, device=splats.visible_ids.device)
+    of_splats = visible_ids  # of a single view, each visible Gaussian has one splat
+    if rows.n_views > 1:
+        per_row = splats.splat_offsets.diff()
+        of_splats = visible_ids.repeat_interleave(per_row, output_size=len(splats.gaussian_ids))
+    colors = splats.colors
+    if len(rows.gaussians) > 4:
+        colors = torch.ops.blitzgs.color_splats_(
+            list(rows.gaussians), list(rows.cameras), of_splats, splats.camera_ids,
+            [splats.opacities, splats.radii, splats.tiles_touched], rows.options.ints, rows.options.floats,
+        )  # fmt: skip
+    return splats._replace(gaussian_ids=of_splats, visible_ids=visible_ids, colors=colors)
+
+
+@torch.library.register_fake("blitzgs::color_splats_")
+def _(
+    gaussians: Sequence[Tensor], cameras: Sequence[Tensor], gaussian_ids: Tensor, *_others: object
+) -> Tensor:
+    return gaussians[0].new_empty(len(gaussian_ids), 3)
 
 
 def _projected(inputs: ProjectionInputs) -> tuple[ProjectedSplats, Tensor]:

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.ops.capacity import Sizes
 from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
 from blitzgs.ops.render import Rendered, render_queued
@@ -48,7 +47,7 @@ def render(
     gaussians: Gaussians,
     project: ProjectionOptions,
     image: ImageOptions,
-    sizes: Sizes | None = None,
+    projected: ProjectedSplats | None = None,
     job: Job | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`.
@@ -58,7 +57,7 @@ def render(
         gaussians: the Gaussians and views.
         project: options of the projection.
         image: options of compositing.
-        sizes: the numbers of splats and list entries, if they are known.
+        projected: the splats of the only group, if they have been computed already.
         job: the ranks among which the Gaussians and views are divided; None: this process has all of them.
     """
     compiling = torch.compiler.is_compiling()
@@ -67,8 +66,8 @@ def render(
     groups = groups_of(hidden, project)
     ready = None
     if len(groups) == 1 and groups[0].covariances is None and job is None and not compiling:
-        ready = _queued(groups[0], gaussians, project, image, sizes)
-    splats = project_groups(groups, image.sparse_grad, None if ready is None else ready.splats)
+        ready = _queued(groups[0], gaussians, project, image, projected)
+    splats = project_groups(groups, image.sparse_grad, projected if ready is None else ready.splats)
     layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
     arranged = _arranged(layout, gaussians, project, image)
     rendered, through = splats, None
@@ -109,7 +108,7 @@ def _queued(
     gaussians: Gaussians,
     project: ProjectionOptions,
     image: ImageOptions,
-    sizes: Sizes | None,
+    projected: ProjectedSplats | None,
 ) -> Rendered | None:
     """Queue all work on CUDA before the host knows the number of splats; None if that is not possible."""
     means = group.inputs.gaussians[0]
@@ -128,7 +127,7 @@ def _queued(
         lambda splats: _channels(splats, gaussians, image.render_mode, with_spare=True),
         image.backgrounds,
         differentiable and not image.absgrad,
-        sizes,
+        projected,
     )
 
 

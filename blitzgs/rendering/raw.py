@@ -11,13 +11,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.lazy_dict import LazyDict
-from blitzgs.ops.capacity import Sizes
+from blitzgs.lazy_dict import Later, LazyDict
 from blitzgs.ops.gather_rows import gather_rows
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, visible_gaussians
+from blitzgs.ops.projection import ProjectionOptions, colored_rows, project_splats
 from blitzgs.ops.sparse_rows import full_gradients
-from blitzgs.rendering.arguments import background_rows, check_options, check_tensors, gaussians_of
-from blitzgs.rendering.groups import groups_of
+from blitzgs.rendering.arguments import Scene, background_rows, check_options, check_tensors, gaussians_of
+from blitzgs.rendering.groups import Group, groups_of
 from blitzgs.rendering.images import ImageOptions, render
 
 
@@ -99,9 +98,7 @@ def raw_rasterization(
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     harmonics = [sh0] if shN is None else [sh0, shN]
-    _check_harmonics(harmonics, len(means))
-    if sh_degree is None:
-        sh_degree = math.isqrt(sum(part.shape[1] for part in harmonics)) - 1
+    sh_degree = _checked_degree(harmonics, len(means), sh_degree, "RGB" in render_mode)
     antialiased = rasterize_mode == "antialiased"
     project = ProjectionOptions(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
@@ -111,22 +108,35 @@ def raw_rasterization(
     lazy = _lazy(optimizers)
     for optimizer in lazy:
         optimizer.catch_up(geometry)
-    ids, sizes = _visible([group.inputs for group in groups_of(whole, project)])
+    groups = groups_of(whole, project)
+    # One projection of a single group finds its visible Gaussians and computes their splats but for colours.
+    splats = project_splats(groups[0].inputs) if len(groups) == 1 else None
+    ids = _visible(groups) if splats is None else splats.visible_ids
     for optimizer in lazy:
         optimizer.catch_up(harmonics, ids)
     shaded = "RGB" in render_mode
     means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
         ids, sparse_grad, *geometry, *(harmonics if shaded else ())
     )
-    gaussians = gaussians_of(means, quats, scales, opacities, sh, viewmats, Ks, sh_degree, shaded, raw=True)
-    named = {**whole.named, **({"sh0": (sh0,), "shN": (shN,)} if shN is not None else {"sh0": (sh0,)})}
-    background = background_rows(backgrounds, gaussians, render_mode)
-    image = ImageOptions(render_mode, background, True, False, absgrad)
-    renders, alphas, meta = render(
-        "raw_rasterization", replace(gaussians, given=named), project, image, sizes
+    named = {**whole.named, "sh0": (sh0,), **({} if shN is None else {"shN": (shN,)})}
+    gaussians = replace(
+        whole,
+        scenes=(Scene(means, quats, scales, opacities, sh, viewmats, Ks),),
+        colors=sh,
+        opacities=opacities,
+        sh_degree=sh_degree if shaded else None,
+        given=named,
     )
+    background = background_rows(backgrounds, gaussians, render_mode)
+    if splats is not None:
+        splats = colored_rows(splats, groups_of(gaussians, project)[0].inputs)
+    image = ImageOptions(render_mode, background, True, False, absgrad)
+    renders, alphas, meta = render("raw_rasterization", gaussians, project, image, splats)
     assert isinstance(meta, LazyDict)
-    meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
+    if splats is not None and len(viewmats) == 1:
+        meta["gaussian_ids"] = Later(ids.long)
+    else:
+        meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
     return renders, alphas, meta
 
 
@@ -149,25 +159,22 @@ def _lazy(optimizers: Any) -> list[CatchesUp]:
     return found
 
 
-def _check_harmonics(harmonics: list[Tensor], count: int) -> None:
+def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, shaded: bool) -> int:
+    """Check the SH and return the degree to evaluate."""
     for name, part in zip(("sh0", "shN"), harmonics, strict=False):
         if part.dim() != 3 or part.shape[0] != count or part.shape[2] != 3:
             raise ValueError(f"{name} must be [N, K, 3] with N = {count}, got {list(part.shape)}")
+    given = sum(part.shape[1] for part in harmonics)
+    if degree is None:
+        return math.isqrt(given) - 1
+    if shaded and (degree + 1) ** 2 > given:
+        raise ValueError(f"sh_degree {degree} needs {(degree + 1) ** 2} SH coefficients, got {given}")
+    return degree
 
 
-@torch.no_grad()
-def _visible(calls: list[ProjectionInputs]) -> tuple[Tensor, Sizes | None]:
-    """Return the Gaussians that at least one view sees, int32 [U], and the sizes of their rendering.
-
-    Args:
-        calls: inputs of the projections, with at most 32 views each.
-
-    Returns:
-        Ascending ids; and, with a single call, the numbers of Gaussians, splats and tile entries.
-    """
-    if len(calls) == 1:
-        return visible_gaussians(calls[0])
-    return torch.cat([visible_gaussians(inputs)[0] for inputs in calls]).unique(), None
+def _visible(groups: list[Group]) -> Tensor:
+    """Return the Gaussians that at least one view of any group sees, int32 [U], ascending."""
+    return torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
 
 
 class _Visible(torch.autograd.Function):

@@ -259,10 +259,17 @@ struct SplatIndex {
   std::int64_t n_visible;
 };
 
+// color_splats computes the colours of n_splats splats that project() wrote without `sh`, and hides those
+// whose colour is not finite. It reads the means, the SH and the cameras of its inputs, whose rows
+// `gaussian_ids` counts, and writes colors, opacities, radii and tiles_touched; other columns may be null.
+
 namespace cpu {
 template <class T>
 void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
+template <class T>
+void color_splats(const ProjectInputs<T>&, std::int64_t n_splats, const ProjectColumns<T>&, Workspace&,
+                  CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
@@ -275,6 +282,9 @@ namespace cuda {
 template <class T>
 void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
+template <class T>
+void color_splats(const ProjectInputs<T>&, std::int64_t n_splats, const ProjectColumns<T>&, Workspace&,
+                  CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);

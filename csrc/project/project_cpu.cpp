@@ -233,6 +233,24 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemor
 }
 
 template <class T>
+void color_splats(const ProjectInputs<T>& in, std::int64_t n_splats, const ProjectColumns<T>& columns,
+                  Workspace&, CudaStream) {
+  const std::vector<Camera<T>> cameras = make_cameras(in);
+  const ProjectOutputs<T>& out = columns.values;
+  parallel_for(0, n_splats, 1 << 10, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      const std::int64_t id = columns.ids.gaussian_ids[i];
+      if (splat_color(cameras[columns.ids.camera_ids[i]], load3(in.means + 3 * id),
+                      in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree, out.colors + 3 * i)) {
+        continue;
+      }
+      out.opacities[i] = T(0);
+      out.radii[2 * i] = out.radii[2 * i + 1] = out.tiles_touched[i] = 0;
+    }
+  });
+}
+
+template <class T>
 void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const SplatGradientColumns<T>& v,
                  const Regularisers<T>& regularisers, const ProjectGradients<T>& out, Workspace&,
                  CudaStream) {
@@ -261,11 +279,13 @@ void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
   }
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                              \
-  template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,       \
-                           Workspace&, CudaStream);                                                         \
-  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,  \
-                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream); \
+#define BLITZGS_INSTANTIATE(T)                                                                               \
+  template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,        \
+                           Workspace&, CudaStream);                                                          \
+  template void color_splats<T>(const ProjectInputs<T>&, std::int64_t, const ProjectColumns<T>&, Workspace&, \
+                                CudaStream);                                                                 \
+  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,   \
+                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);  \
   template void zero_arrays<T>(const ZeroedArrays<T>&, CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)

@@ -235,4 +235,10 @@ void project<float>(const Inputs& in, const RankTiles& rank_tiles, SplatMemory<f
   write_colors(in, {sizes, nullptr}, columns, stream);
 }
 
+template <>
+void color_splats<float>(const Inputs& in, std::int64_t n_splats, const ProjectColumns<float>& columns,
+                         Workspace&, CudaStream stream) {
+  write_colors(in, {{0, n_splats}, nullptr}, columns, stream);
+}
+
 }  // namespace blitzgs::cuda
