@@ -120,7 +120,9 @@ def shared(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, T
     depth = softplus(logits) / n
     opacity = -torch.expm1(-depth)
     term, total = torch.full_like(n, -1.0), torch.zeros_like(n)
-    for k in range(1, MOST_COPIES + 1):
+    # Terms with k > N are zero. Few rows have many copies, so reading the largest N saves most of the terms.
+    most = int(copies.max()) if copies.shape[0] > 0 else 0
+    for k in range(1, most + 1):
         term = term * (n - (k - 1)) / k * -opacity
         total += term / math.sqrt(k)
     factor = torch.nn.functional.logsigmoid(logits) - total.log()

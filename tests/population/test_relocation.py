@@ -44,6 +44,17 @@ def test_the_closed_form_is_the_paper_s_double_sum(copies):
         assert torch.allclose(logarithms[i], scales[i] + math.log(factor), atol=1e-8)
 
 
+def test_the_copies_of_other_rows_change_no_bit():
+    copies = torch.arange(1, MOST_COPIES + 1)
+    opacities, scales = torch.linspace(-6, 9, MOST_COPIES), torch.zeros(MOST_COPIES, 3)
+    together = shared(opacities, scales, copies)
+    for i, count in enumerate(copies.tolist()):
+        alone = shared(opacities, scales, torch.full_like(copies, count))
+        assert all(torch.equal(x[i], y[i]) for x, y in zip(together, alone, strict=True))
+    none = shared(opacities[:0], scales[:0], copies[:0])
+    assert [tuple(part.shape) for part in none] == [(0,), (0, 3)]
+
+
 @pytest.mark.parametrize("copies", [2, 5, 30])
 def test_copies_together_look_like_the_original(copies):
     """The opacity agrees at the centre, and integrated along a line through the centre."""
