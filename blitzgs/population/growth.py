@@ -78,9 +78,11 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
             return None
         available, scratch = free // ranks.local_world_size + len(table) * row_bytes, 0
     else:
-        allocated = torch.cuda.memory_allocated(ranks.device)
-        available = torch.cuda.mem_get_info(ranks.device)[0] + torch.cuda.memory_reserved(ranks.device)
-        scratch = torch.cuda.max_memory_allocated(ranks.device) - allocated
+        # One query; `torch.cuda.memory_allocated` and the like each collect and flatten all statistics.
+        statistics = torch.cuda.memory_stats_as_nested_dict(ranks.device)
+        allocated, reserved = (statistics[name]["all"] for name in ("allocated_bytes", "reserved_bytes"))
+        available = torch.cuda.mem_get_info(ranks.device)[0] + reserved["current"]
+        scratch = allocated["peak"] - allocated["current"]
     count = rows_that_fit(len(table), row_bytes, widest, available, scratch)
     # The ranks' shards stay equal to within `ranks.max_imbalance`, so the fullest GPU decides for all.
     fewest = ranks.all_reduce(torch.tensor([-count], device=ranks.device), "max")
