@@ -36,7 +36,7 @@ class PendingSteps(NamedTuple):
 
 
 class GateRules(NamedTuple):
-    """Which rows B views leave out before projection: LOD gate (BlitzGS Eq. 1 and 2) and cull mask (Eq. 5).
+    """Which rows B views leave out before projection: LOD gate (BlitzGS Eq. 1 and 2) and cull mask (Eq. 3).
 
     A view with an LOD gate leaves out each row of octree level l that is farther than `reach[l]` from the
     camera centre. A view with a column of the cull matrix leaves out the rows whose bit in that column is

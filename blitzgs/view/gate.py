@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leaves Gaussians out of views before projection: LOD gate (BlitzGS Eq. 1 and 2) and cull mask (Eq. 5).
+"""Leaves Gaussians out of views before projection: LOD gate (BlitzGS Eq. 1 and 2) and cull mask (Eq. 3).
 
 The gate is part of the model: it depends only on distances, so training, evaluation and rendering all apply
 it. The mask exists only for training views.

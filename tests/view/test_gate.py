@@ -46,7 +46,7 @@ def make_scene(n=3000, device="cpu", seed=0):
 
 
 def kept_by_definition(table, viewmats, gate=GATE, lod_views=range(32), columns=()):
-    """Bool [N, B]: Eq. 2 and Eq. 5 in float64; and bool [N, B]: pairs that rounding may decide."""
+    """Bool [N, B]: Eq. 2 and Eq. 3 in float64; and bool [N, B]: pairs that rounding may decide."""
     distances = torch.cdist(table["means"].double(), centres_of(viewmats))
     resolved = (gate.reference_distance / distances).log() / math.log(gate.fork)
     finest = resolved.round().clamp(0, gate.finest)
