@@ -8,7 +8,9 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import torch
 
+import blitzgs
 from blitzgs import cli
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import load_config, to_dict
@@ -218,3 +220,29 @@ def test_the_python_example_of_the_readme_runs(tmp_path, monkeypatch):
     exec(compile(example, "README.md", "exec"), names)
     assert names["image"].shape == (600, 800, 3)
     assert (tmp_path / "from_above.png").stat().st_size > 1000
+
+
+def test_the_example_of_the_single_ops_renders_the_image_of_the_one_call():
+    blocks = code_blocks(ROOT / "docs/guide/own-trainer.md", ["python"])
+    example = next(block for block in blocks if "import intersect" in block)
+    rng = torch.Generator().manual_seed(1)
+    means, scales = torch.randn(30, 3, generator=rng), torch.rand(30, 3, generator=rng) * 0.2
+    quats, opacities = torch.randn(30, 4, generator=rng), torch.rand(30, generator=rng) * 0.8 + 0.1
+    sh = torch.randn(30, 16, 3, generator=rng) * 0.2
+    viewmats, width, height = torch.eye(4).repeat(2, 1, 1), 50, 40
+    viewmats[:, 2, 3] = torch.tensor([5.0, 8.0])
+    Ks = torch.tensor([[40.0, 0, 25], [0, 40, 20], [0, 0, 1]]).repeat(2, 1, 1)
+    names = {
+        "means": means,
+        "quats": quats,
+        "log_scales": scales.log(),
+        "logits": opacities.logit(),
+        "sh": sh,
+    }
+    names |= {"viewmats": viewmats, "Ks": Ks, "width": width, "height": height}
+    exec(compile(example, "own-trainer.md", "exec"), names)
+    views = (viewmats, Ks, width, height)
+    renders, alphas, _ = blitzgs.rasterization(means, quats, scales, opacities, sh, *views, sh_degree=3)
+    assert renders.amax() > 0.1
+    torch.testing.assert_close(names["renders"], renders)
+    torch.testing.assert_close(names["alphas"][..., None], alphas)
