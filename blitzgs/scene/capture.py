@@ -203,13 +203,23 @@ def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View],
         return _read_colmap(
             root, incomplete, images, downscale
         )  # raises an error that names the missing file
-    message = (
+    raise FileNotFoundError(
         f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
-        ".bin or .txt), or transforms.json"
+        f".bin or .txt), or transforms.json{_hint(root)}"
     )
+
+
+def _hint(root: Path) -> str:
+    """Return what a folder without a capture has instead, and what to do."""
+    models = [path.parent for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/cameras.*")]
+    if models:
+        return (
+            f"; there is a COLMAP model in {min(models)}: name the folder above its sparse/0 with --data, or "
+            f"move the model to {root / 'sparse' / '0'}"
+        )
     if any(path.suffix.lower() in _PHOTOGRAPH_SUFFIXES for path in [*root.glob("*"), *root.glob("*/*")]):
-        message += "; it has images but not their cameras: run COLMAP on them (docs/guide/first-model.md)"
-    raise FileNotFoundError(message)
+        return "; it has images but not their cameras: run COLMAP on them (docs/guide/first-model.md)"
+    return ""
 
 
 def _model_in(root: Path) -> Path:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
+import shutil
 import struct
 import warnings
 
@@ -240,6 +241,11 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
     (tmp_path / "photographs" / "DJI_0001.JPG").touch()
     with pytest.raises(FileNotFoundError, match="has images but not their cameras: run COLMAP"):
         load_capture(tmp_path)
+    (tmp_path / "sparse" / "1").mkdir(parents=True)
+    (tmp_path / "sparse" / "1" / "cameras.bin").touch()
+    with pytest.raises(FileNotFoundError, match="there is a COLMAP model in .*sparse/1: .* to .*sparse/0"):
+        load_capture(tmp_path)
+    shutil.rmtree(tmp_path / "sparse")
     (tmp_path / "transforms.json").write_text('{"frames": []}')
     with pytest.raises(ValueError, match=f"{tmp_path}: its COLMAP model or transforms.json lists no images"):
         load_capture(tmp_path)
