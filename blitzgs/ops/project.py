@@ -273,18 +273,26 @@ def _first_gradients(
     sparse: Sequence[bool],
     v: _Differentiable,
 ) -> tuple[Tensor | None, ...]:
+    _, visible_ids, _ = saved.splats
+    # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass, the
+    # number of rows is unknown, and tensors are of another type.
+    complete = (
+        not any(sparse)
+        and type(visible_ids) is Tensor
+        and visible_ids.shape[0] == saved.gaussians[0].shape[0]
+    )
     # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
-    dense = not any(sparse) and all(needed)
+    dense = not complete and not any(sparse) and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         list(saved.gaussians), list(saved.cameras), list(saved.splats), options.ints, options.floats,
         _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if not dense:
-        _, visible_ids, _ = saved.splats
+        found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
+    if not dense and not complete:
         shapes = [parameter.shape for parameter in saved.gaussians]
-        kept = [v if wanted else None for v, wanted in zip(found, needed, strict=True)]
-        found = full_gradients(visible_ids, kept, shapes, sparse[: len(kept)])
+        found = full_gradients(visible_ids, found, shapes, sparse[: len(found)])
     return (*found, *[None] * (5 - len(found)), v_viewmats if need_viewmats else None)
 
 

@@ -48,13 +48,14 @@ def splats_of(allocated: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
         counts: `counts` of the result.
     """
     visible, splats, *_ = counts.tolist()
-    if (visible, splats) == (allocated[2].shape[0], allocated[0].shape[0]):
-        return ProjectedSplats._make((*allocated[:-1], counts))
     lengths = (splats, splats, visible, visible + 1, *(splats,) * 8)
     # Hide from autograd that these are views: a Function may return views, but its caller could not change
     # them in place.
     with torch._C._AutoDispatchBelowADInplaceOrView():
-        columns = [column[:n] for column, n in zip(allocated, lengths, strict=False)]
+        columns = [
+            column[:n] if column.shape[0] > n else column
+            for column, n in zip(allocated, lengths, strict=False)
+        ]
         return ProjectedSplats._make((*columns, counts))
 
 
