@@ -188,7 +188,9 @@ def _warn_of_blind_views(cameras: list[Camera], points: Float64) -> None:
 
 def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View], _Points]:
     if not root.is_dir():
-        raise FileNotFoundError(f"{root} is not a folder: --data needs a capture (images and a COLMAP model)")
+        raise FileNotFoundError(
+            f"{root} is not a folder: name the folder of the capture (images and a COLMAP model) with --data"
+        )
     folder = colmap.find_model(root)
     parts = [part for part in ("train", "val") if colmap.find_model(root / part)]
     if transforms.find_transforms(root) and (folder is None or "colmap" in folder.relative_to(root).parts):

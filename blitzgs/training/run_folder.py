@@ -126,13 +126,25 @@ class Model:
         Args:
             K: intrinsics in pixels, [3, 3].
             world_to_camera: rigid pose, [4, 4].
-            width: pixels.
-            height: pixels.
+            width: pixels, an integer of at least 1.
+            height: pixels, an integer of at least 1.
             name: name of the view.
+
+        Raises:
+            ValueError: an argument has another shape or value; the message names it.
         """
-        pose = np.array(world_to_camera, dtype=np.float64)
-        pose[:3, 3] += pose[:3, :3] @ np.array(self.space.offset)
-        return RunCamera(name, width, height, np.array(K, dtype=np.float64), pose)
+        intrinsics, pose = np.array(K, dtype=np.float64), np.array(world_to_camera, dtype=np.float64)
+        for argument, matrix, shape in (("K", intrinsics, (3, 3)), ("world_to_camera", pose, (4, 4))):
+            if matrix.shape != shape or not np.isfinite(matrix).all():
+                raise ValueError(f"{argument} must be a finite matrix {shape}, got {matrix.tolist()}")
+        rotation = pose[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+            raise ValueError(f"world_to_camera[:3, :3] must be a rotation, got {rotation.tolist()}")
+        for argument, size in (("width", width), ("height", height)):
+            if size < 1 or size != int(size):
+                raise ValueError(f"{argument} must be an integer of at least 1, got {size}")
+        pose[:3, 3] += rotation @ np.array(self.space.offset)
+        return RunCamera(name, int(width), int(height), intrinsics, pose)
 
 
 class RunFolder:

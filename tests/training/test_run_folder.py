@@ -72,6 +72,29 @@ def test_what_a_run_folder_holds(trained, tmp_path):
         blitzgs.open_run(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"K": np.eye(2)}, r"K must be a finite matrix \(3, 3\)"),
+        ({"K": np.full((3, 3), np.nan)}, r"K must be a finite matrix"),
+        ({"world_to_camera": np.eye(4)[:3]}, r"world_to_camera must be a finite matrix \(4, 4\)"),
+        ({"world_to_camera": 2 * np.eye(4)}, r"\[:3, :3\] must be a rotation"),
+        (
+            {"world_to_camera": np.diag([1.0, 1.0, -1.0, 1.0])},
+            r"world_to_camera\[:3, :3\] must be a rotation",
+        ),
+        ({"width": 0}, "width must be an integer of at least 1, got 0"),
+        ({"height": 32.5}, "height must be an integer of at least 1, got 32.5"),
+    ],
+)
+def test_a_camera_that_cannot_be_rendered_is_refused(trained, change, message):
+    model = blitzgs.open_run(trained[1]).model()
+    fields = {"K": np.eye(3), "world_to_camera": np.eye(4), "width": 48, "height": 32}
+    assert model.camera(**fields).width == 48
+    with pytest.raises(ValueError, match=message):
+        model.camera(**fields | change)
+
+
 def test_render_and_export_need_no_photographs(copy, tmp_path):
     data, folder = copy
     shutil.rmtree(data)
