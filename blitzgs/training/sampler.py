@@ -40,6 +40,7 @@ class BatchSampler:
         for view, size in enumerate(sizes):
             groups.setdefault(size, []).append(view)
         self._groups = [torch.tensor(views) for views in groups.values()]
+        self._counts = [len(views) for views in groups.values()]
         self.batch_size = batch_size
         self._seed = seed
         # The latest round: its first step and its batches. Most steps use the same round as the one before.
@@ -60,7 +61,7 @@ class BatchSampler:
         return rounds * size // self.batch_size
 
     def _batches_before(self, rounds: int) -> int:
-        return sum(self._group_batches(len(views), rounds) for views in self._groups)
+        return sum(self._group_batches(count, rounds) for count in self._counts)
 
     def _round_of(self, step: int) -> int:
         """Find the last round that starts at or before `step` and is not empty."""
@@ -76,8 +77,8 @@ class BatchSampler:
         """List the batches of a round in their order: group, and number within the group."""
         slots = [
             (g, k)
-            for g, views in enumerate(self._groups)
-            for k in range(self._group_batches(len(views), index), self._group_batches(len(views), index + 1))
+            for g, count in enumerate(self._counts)
+            for k in range(self._group_batches(count, index), self._group_batches(count, index + 1))
         ]
         order = hash_keys(torch.arange(len(slots)), self._seed, index, 1).argsort()
         return [slots[position] for position in order.tolist()]
@@ -89,5 +90,5 @@ class BatchSampler:
         return order
 
     def _view(self, group: int, position: int) -> int:
-        epoch, slot = divmod(position, len(self._groups[group]))
+        epoch, slot = divmod(position, self._counts[group])
         return self._epoch(group, epoch)[slot]
