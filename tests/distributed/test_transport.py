@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splats reach the ranks that composite them, once each, and their gradients return."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -9,6 +11,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.tiles import LOSS_HALO, TileAssignment, TileRanges
 from blitzgs.distributed.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport
 from blitzgs.distributed.transport.peer import WORDS_PER_SPLAT
+from blitzgs.distributed.transport.way_back import CollectiveWayBack
 from blitzgs.ops.capacity import Attempt, CapacityEstimate, Sizes
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
@@ -277,3 +280,23 @@ def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
     with pytest.raises(RuntimeError, match="4 attempts have each needed more .* needs \\("):
         pipeline.forward(table, views, OPTIONS, transport=transport)
     assert transport.too_small == 6
+
+
+@pytest.mark.parametrize("splats", [0, 1, 31, 32, 33, 5000])
+@pytest.mark.parametrize("world_size", [2, 4])
+def test_sums_return_to_the_splats_that_were_sent(splats, world_size):
+    g = torch.Generator().manual_seed(splats)
+    masks = torch.randint(0, 1 << world_size, (splats,), generator=g)
+    if world_size == 4:
+        masks &= 0b1011  # rank 2 composites nothing
+    sent = [(masks >> rank & 1).nonzero().squeeze(1) for rank in range(world_size)]
+    counts = [len(which) for which in sent]
+    _, places = scatter_splats([torch.zeros(splats)], masks, counts)
+    returned = torch.randint(-(2**40), 2**40, (sum(counts), 2), generator=g)
+    expected = torch.zeros(splats, 2, dtype=torch.int64)
+    for which, group in zip(sent, returned.split(counts), strict=True):
+        expected.index_add_(0, which, group)
+    ranks = SimpleNamespace(all_to_all=lambda *_: returned)
+    traffic = SimpleNamespace(sent=counts, received=counts, counts=torch.tensor([0, splats, 0]))
+    way_back = CollectiveWayBack(ranks, traffic, places, half=False)
+    assert torch.equal(way_back.return_sums(returned), expected)

@@ -116,10 +116,14 @@ def _return_sums(sums: Tensor, places: Tensor, traffic: Traffic, ranks: Ranks) -
     total = sums.new_zeros(int(traffic.counts[1]), sums.shape[1])
     lanes = torch.arange(RUN, device=sums.device)
     for group, runs in zip(returned.split(traffic.sent), places.unbind(1), strict=True):
+        if group.shape[0] == 0:
+            continue
         # The splats of a run are consecutive. `runs` has the position of the first one, and bits that tell
         # which splats of the run were sent (csrc/scatter).
         here = runs[:, None] >> (32 + lanes) & 1
         at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
-        which = here.flatten().nonzero().squeeze(1)
-        total.index_add_(0, which, group[at.flatten()[which]])
+        # Splats that were not sent take any row, times zero: leaving them out would need their number, for
+        # which the host would wait.
+        rows = group[at.flatten()[: total.shape[0]].clamp(max=group.shape[0] - 1)]
+        total += rows * here.flatten()[: total.shape[0], None]
     return total
