@@ -306,6 +306,12 @@ def resolve_device(
     shared = share_gpus and local_world_size > (count if place.index is None else 1)
     if place.index is None:
         place = torch.device("cuda", local_rank % max(count, 1) if shared else local_rank)
+    if count == 0:
+        built = "sees no GPU" if torch.version.cuda else f"({torch.__version__}) is built for CPUs alone"
+        raise ValueError(
+            f"device {device}: this torch {built}; install one with CUDA and check `nvidia-smi`, or use "
+            "--device cpu"
+        )
     if place.index >= count:
         raise ValueError(
             f"local rank {local_rank} needs {place}, but this host has {count} CUDA devices; start fewer "

@@ -64,7 +64,8 @@ def test_one_process_needs_no_group():
         assert not torch.distributed.is_initialized()
 
 
-def test_missing_gpu_is_named():
+def test_missing_gpu_is_named(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(ValueError, match="local rank 0 needs cuda:99"):
         Ranks.from_environment("cuda:99")
 
@@ -91,7 +92,13 @@ def test_ranks_share_gpus_only_when_told(monkeypatch):
     with pytest.raises(ValueError, match=r"local rank 2 needs cuda:2, but .* 2 CUDA.*ranks\.share_gpus=true"):
         places("cuda", 3, False)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
-    with pytest.raises(ValueError, match="local rank 0 needs cuda:0, but this host has 0 CUDA devices"):
+    monkeypatch.setattr(torch.version, "cuda", None)
+    with pytest.raises(
+        ValueError, match=r"device cuda: this torch \(.*\) is built for CPUs alone; install one"
+    ):
+        places("cuda", 2, True)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    with pytest.raises(ValueError, match="device cuda: this torch sees no GPU; install one with CUDA"):
         places("cuda", 2, True)
 
 
