@@ -13,7 +13,6 @@
 namespace blitzgs {
 
 constexpr int kMostDriftTables = 16;  // tables of one launch
-constexpr int kTailsOfRow = kAdamOrders * kAdamGroups;
 
 // tables double [n_tables, steps, kAdamTable] and lr_tables float [n_tables, steps, kAdamGroups]; decays
 // [reach, kAdamOrders]; shares [steps, kAdamOrders]; 0 < step < steps.
@@ -30,21 +29,14 @@ BLITZGS_HD std::int64_t drift_rows(const DriftStep& drift) {
   return drift.step < drift.reach ? drift.step : drift.reach;
 }
 
-// The number of values to change, of which `add_drift` changes one.
-BLITZGS_HD std::int64_t drift_values(const DriftStep& drift) {
-  return drift.n_tables * drift_rows(drift) * kTailsOfRow;
-}
-
-BLITZGS_HD void add_drift(const DriftStep& drift, std::int64_t i) {
-  const std::int64_t rows = drift_rows(drift), back = i / kTailsOfRow % rows + 1;
-  const auto table = static_cast<int>(i / kTailsOfRow / rows), tail = static_cast<int>(i % kTailsOfRow),
-             order = tail / kAdamGroups, group = tail % kAdamGroups;
+// Adds the term of one order and group to the row `back` steps before the step, 1 <= back <= drift_rows().
+BLITZGS_HD void add_drift(const DriftStep& drift, int table, std::int64_t back, int order, int group) {
   const double rate = drift.rates[table][group];
   const double term = drift.shares[drift.step * kAdamOrders + order] * rate;
-  const std::int64_t first = table * drift.steps + drift.step;  // the row of the step itself
-  drift.tables[(first - back) * kAdamTable + kTails + tail] +=
+  const std::int64_t row = table * drift.steps + drift.step;  // of the step itself
+  drift.tables[(row - back) * kAdamTable + kTails + order * kAdamGroups + group] +=
       drift.decays[(drift.reach - back) * kAdamOrders + order] * term;
-  if (back == 1 && order == 0) drift.lr_tables[first * kAdamGroups + group] = static_cast<float>(rate);
+  if (back == 1 && order == 0) drift.lr_tables[row * kAdamGroups + group] = static_cast<float>(rate);
 }
 
 namespace cpu {

@@ -4,8 +4,13 @@
 namespace blitzgs::cpu {
 
 void add_drift_step(const DriftStep& drift, Workspace&, CudaStream) {
-  const std::int64_t values = drift_values(drift);
-  for (std::int64_t i = 0; i < values; ++i) add_drift(drift, i);
+  for (int table = 0; table < drift.n_tables; ++table) {
+    for (std::int64_t back = 1; back <= drift_rows(drift); ++back) {
+      for (int order = 0; order < kAdamOrders; ++order) {
+        for (int group = 0; group < kAdamGroups; ++group) add_drift(drift, table, back, order, group);
+      }
+    }
+  }
 }
 
 }  // namespace blitzgs::cpu

@@ -6,20 +6,23 @@ namespace blitzgs::cuda {
 
 namespace {
 
-constexpr int kThreads = 256;
+constexpr int kThreads = 256, kTailsOfRow = kAdamOrders * kAdamGroups;
 
-// One thread per value (drift.h).
+// One thread per order and group of a row (drift.h); blockIdx.y is the table.
 __global__ void __launch_bounds__(kThreads) add_drift_kernel(const __grid_constant__ DriftStep drift) {
-  const std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
-  if (i < drift_values(drift)) add_drift(drift, i);
+  const std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x, back = i / kTailsOfRow + 1;
+  const auto tail = static_cast<int>(i % kTailsOfRow);
+  if (back > drift_rows(drift)) return;
+  add_drift(drift, static_cast<int>(blockIdx.y), back, tail / kAdamGroups, tail % kAdamGroups);
 }
 
 }  // namespace
 
 void add_drift_step(const DriftStep& drift, Workspace&, CudaStream stream) {
-  const std::int64_t values = drift_values(drift);
-  if (values == 0) return;
-  add_drift_kernel<<<blocks_for(values, kThreads), kThreads, 0, stream>>>(drift);
+  if (drift.n_tables == 0 || drift_rows(drift) == 0) return;
+  const dim3 blocks(blocks_for(drift_rows(drift) * kTailsOfRow, kThreads),
+                    static_cast<unsigned>(drift.n_tables));
+  add_drift_kernel<<<blocks, kThreads, 0, stream>>>(drift);
   check_launch("add_drift_step");
 }
 
