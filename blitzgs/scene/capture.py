@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.formats.ply import read_points
-from blitzgs.scene import colmap, transforms
 from blitzgs.scene.cameras import Camera, Float64, camera_centers, downscaled_size, scaled_matrix, sees_any
-from blitzgs.scene.files import ImageFinder, find_mask
+from blitzgs.scene.files import find_mask
 from blitzgs.scene.image_files import ImageHeader, read_header
+from blitzgs.scene.layouts import SourcePoints, SourceView, read_layout
 from blitzgs.scene.lens import Lens
 from blitzgs.scene.splits import split_views
 from blitzgs.scene.undistort import Rectification, rectify
@@ -29,7 +28,6 @@ from blitzgs.scene.undistort import Rectification, rectify
 _LEAST_SIDE = 8
 _HEADER_THREADS = 16
 _SAMPLED_POINTS = 2000
-_PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
@@ -63,26 +61,6 @@ class Capture:
 
 class MissingImagesError(FileNotFoundError):
     """Some of the images that a capture names are not on disk."""
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """A view as the capture's file describes it."""
-
-    name: str
-    path: Path
-    mask_path: Path | None
-    lens: Lens
-    world_to_camera: Float64
-    is_test: bool | None = None
-
-
-@dataclass(eq=False)
-class _Points:
-    positions: Float64
-    colors: npt.NDArray[np.uint8]
-    track_lengths: npt.NDArray[np.int64] | None = None
-    errors: Float64 | None = None
 
 
 def load_capture(
@@ -128,7 +106,7 @@ def load_capture(
     ):
         if value not in allowed:
             raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
-    views, points = _read_views(root, images, downscale)
+    views, points = read_layout(root, images, downscale)
     if not views:
         raise ValueError(f"{root}: its COLMAP model or transforms.json lists no images")
     views = sorted(_with_finite_poses(views), key=lambda view: view.name)
@@ -186,87 +164,7 @@ def _warn_of_blind_views(cameras: list[Camera], points: Float64) -> None:
         )
 
 
-def _read_views(root: Path, images: str, downscale: float) -> tuple[list[_View], _Points]:
-    if not root.is_dir():
-        raise FileNotFoundError(
-            f"{root} is not a folder: name the folder of the capture (images and a COLMAP model) with --data"
-        )
-    folder = colmap.find_model(root)
-    parts = [part for part in ("train", "val") if colmap.find_model(root / part)]
-    if transforms.find_transforms(root) and (folder is None or "colmap" in folder.relative_to(root).parts):
-        return _read_transforms(root)
-    if folder is not None:
-        return _read_colmap(root, folder, images, downscale)
-    if "train" in parts:
-        found = [_read_colmap(root / p, _model_in(root / p), images, downscale, part=p) for p in parts]
-        return [view for views, _ in found for view in views], found[0][1]
-    incomplete = colmap.find_incomplete_model(root)
-    if incomplete is not None:
-        return _read_colmap(
-            root, incomplete, images, downscale
-        )  # raises an error that names the missing file
-    raise FileNotFoundError(
-        f"{root} holds no capture: expected a COLMAP model (sparse/0 with cameras, images and points3D as "
-        f".bin or .txt), or transforms.json{_hint(root)}"
-    )
-
-
-def _hint(root: Path) -> str:
-    """Return what a folder without a capture has instead, and what to do."""
-    models = [path.parent for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/cameras.*")]
-    if models:
-        return (
-            f"; there is a COLMAP model in {min(models)}: name the folder above its sparse/0 with --data, or "
-            f"move the model to {root / 'sparse' / '0'}"
-        )
-    if any(path.suffix.lower() in _PHOTOGRAPH_SUFFIXES for path in [*root.glob("*"), *root.glob("*/*")]):
-        return "; it has images but not their cameras: run COLMAP on them (docs/guide/first-model.md)"
-    return ""
-
-
-def _model_in(root: Path) -> Path:
-    folder = colmap.find_model(root)
-    assert folder is not None
-    return folder
-
-
-def _read_transforms(root: Path) -> tuple[list[_View], _Points]:
-    content = transforms.read_transforms(root)
-    views = [_View(f.name, f.path, f.mask_path, f.lens, f.world_to_camera, f.is_test) for f in content.frames]
-    if content.points_path is None:
-        return views, _Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
-    return views, _Points(*read_points(content.points_path))
-
-
-def _read_colmap(
-    root: Path, folder: Path, images: str, downscale: float, part: str = ""
-) -> tuple[list[_View], _Points]:
-    model = colmap.read_model(folder)
-    lenses: dict[int, Lens] = {}
-    for camera in model.cameras:
-        try:
-            lenses[camera.id] = Lens(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
-        except ValueError as error:
-            raise ValueError(f"{folder}: camera {camera.id}: {error}") from error
-    names = model.images.names
-    unknown = [names[i] for i, c in enumerate(model.images.camera_ids.tolist()) if c not in lenses]
-    if unknown:
-        raise ValueError(
-            f"{folder}: the cameras of {len(unknown)} images (first: {unknown[0]}) are not there"
-        )
-    lens_of = [lenses[c] for c in model.images.camera_ids.tolist()]
-    paths = ImageFinder(root, images).find_all(names, lens_of, downscale)
-    poses = colmap.world_to_camera(model.images)
-    prefix = f"{part}/" if part else ""
-    views = [
-        _View(prefix + name, path, None, lens, pose)
-        for name, path, lens, pose in zip(names, paths, lens_of, poses, strict=True)
-    ]
-    p = model.points
-    return views, _Points(p.positions, p.colors, p.track_lengths, p.errors)
-
-
-def _with_finite_poses(views: list[_View]) -> list[_View]:
+def _with_finite_poses(views: list[SourceView]) -> list[SourceView]:
     finite = [view for view in views if np.isfinite(view.world_to_camera).all()]
     if not finite:
         raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
@@ -280,7 +178,7 @@ def _with_finite_poses(views: list[_View]) -> list[_View]:
     return finite
 
 
-def _existing(views: list[_View], root: Path, images: str, allow_missing: bool) -> list[int]:
+def _existing(views: list[SourceView], root: Path, images: str, allow_missing: bool) -> list[int]:
     """Return the indices of the views whose image is on disk."""
     exists = [view.path.is_file() for view in views]
     missing = [view.name for view, there in zip(views, exists, strict=True) if not there]
@@ -336,7 +234,7 @@ def _check_masks(cameras: Sequence[Camera], folder: Path | None) -> None:
 
 
 def _camera(
-    view: _View,
+    view: SourceView,
     header: ImageHeader,
     offset: Float64,
     downscale: float,
@@ -383,7 +281,7 @@ def _camera(
     )
 
 
-def _orientation(view: _View, header: ImageHeader, exif: str) -> int:
+def _orientation(view: SourceView, header: ImageHeader, exif: str) -> int:
     """Return the orientation to apply: COLMAP ignores the tag, so the camera's shape decides."""
     if header.orientation == 1 or exif == "ignore":
         return 1
@@ -394,7 +292,7 @@ def _orientation(view: _View, header: ImageHeader, exif: str) -> int:
     return header.orientation if swaps and turned else 1
 
 
-def _split(views: Sequence[_View], root: Path, spec: int | str | Path) -> tuple[list[int], list[int]]:
+def _split(views: Sequence[SourceView], root: Path, spec: int | str | Path) -> tuple[list[int], list[int]]:
     if spec == "auto" and any(view.is_test is not None for view in views):
         test = [i for i, view in enumerate(views) if view.is_test]
         train = [i for i, view in enumerate(views) if not view.is_test]
@@ -404,14 +302,14 @@ def _split(views: Sequence[_View], root: Path, spec: int | str | Path) -> tuple[
     return split_views([v.name for v in views], [v.path for v in views], root, spec)
 
 
-def _finite_points(points: _Points) -> _Points:
+def _finite_points(points: SourcePoints) -> SourcePoints:
     finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(points.positions).all(axis=1))
     if finite.all():
         return points
     warnings.warn(
         f"{int((~finite).sum())} of {finite.size} points are not finite and were dropped", stacklevel=3
     )
-    return _Points(
+    return SourcePoints(
         points.positions[finite],
         points.colors[finite],
         points.track_lengths[finite] if points.track_lengths is not None else None,
@@ -419,7 +317,7 @@ def _finite_points(points: _Points) -> _Points:
     )
 
 
-def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_000) -> _Points:
+def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_000) -> SourcePoints:
     """Return uniform points of random colours in the region that the cameras look at."""
     warnings.warn(f"the capture has no points: starting from {count} random ones", stacklevel=3)
     poses = np.stack([camera.world_to_camera for camera in cameras])
@@ -438,7 +336,7 @@ def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_
         )
     random = np.random.default_rng(0)
     positions = target + offset + random.uniform(-half, half, (count, 3))
-    return _Points(positions, random.integers(0, 256, (count, 3), dtype=np.uint8))
+    return SourcePoints(positions, random.integers(0, 256, (count, 3), dtype=np.uint8))
 
 
 def _extent(centers: Float64, points: Float64) -> float:
