@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Host time of one `blitzgs.rasterization`, forward and backward, on a scene so small that only it counts.
+"""Host time of one call, and of a trainer's step, on a scene so small that only the host's time counts.
 
     python benchmarks/bm_host.py [--device cpu] [--repeats 500] [--json FILE]
 
 50 Gaussians with SH of degree 1 in an image of 32 x 32 px; gradients for every parameter; autograd in one
-thread. On the CPU each figure includes the kernels. On CUDA each step ends with a
-synchronisation, so a figure is the longer of host and device. Each figure is a median over repeats. To
-compare with another version of the package, put its folder into PYTHONPATH.
+thread. The first table has `blitzgs.rasterization`, forward and backward. On the CPU each of its figures
+includes the kernels. On CUDA each pass ends with a synchronisation, so a figure is the longer of host and
+device. Each figure is a median over repeats.
+
+The second table has the steps of a trainer made of `raw_rasterization`, `l1_ssim` and `LazyAdam`
+(`step_together`), by part, without synchronisations; each figure is a mean over repeats. It also says how
+many of torch's operations a step takes. To compare with another version of the package, put its folder into
+PYTHONPATH.
 """
 
 from __future__ import annotations
@@ -16,10 +21,12 @@ import time
 from typing import Any
 
 import torch
-from harness import make_parser, report
+from harness import make_parser, report, write_json
 from scenes import aerial
+from step_parts import Parts, trace
 
-from blitzgs import rasterization
+from blitzgs import l1_ssim, rasterization, raw_rasterization
+from blitzgs.optim import LazyAdam, step_together
 
 GAUSSIANS, WIDTH, HEIGHT = 50, 32, 32
 CALLS: dict[str, dict[str, Any]] = {
@@ -65,8 +72,64 @@ def measure(
     return [1e6 * statistics.median(times) for times in zip(*samples[repeats // 10 :], strict=True)]
 
 
+class Trainer:
+    """A trainer of one view, as small as its host time allows.
+
+    Attributes:
+        params: the parameters by name.
+        part: times the parts of a step.
+    """
+
+    def __init__(self, device: str) -> None:
+        """Take the Gaussians and the view of the benchmark's scene."""
+        self._scene = scene = aerial(GAUSSIANS, device, width=WIDTH, height=HEIGHT)
+        values = {
+            "means": scene.means, "quats": scene.quats, "scales": scene.scales.log(),
+            "opacities": scene.opacities.logit(), "sh0": scene.sh[:, :1], "shN": scene.sh[:, 1:],
+        }  # fmt: skip
+        self.params = {
+            name: torch.nn.Parameter(value.detach().clone().contiguous()) for name, value in values.items()
+        }
+        self._optimizers = {
+            name: LazyAdam([{"params": [param], "name": name}]) for name, param in self.params.items()
+        }
+        self._target = torch.full((1, HEIGHT, WIDTH, 3), 0.5, device=device)
+        self.part = Parts(torch.device(device))
+
+    def step(self) -> None:
+        """Take a step."""
+        scene = self._scene
+        with self.part("render"):
+            image, _, _ = raw_rasterization(
+                *self.params.values(), scene.viewmats, scene.Ks, WIDTH, HEIGHT, sh_degree=1,
+                optimizers=self._optimizers,
+            )  # fmt: skip
+        with self.part("loss"):
+            loss = l1_ssim(image, self._target)
+        with self.part("backward"):
+            loss.backward()
+        with self.part("optimisers"):
+            step_together(self._optimizers, set_to_none=True)
+
+
+def measure_trainer(device: str, repeats: int) -> list[dict[str, Any]]:
+    """Return a row for each part of a trainer's step, and one with the operations of a step."""
+    trainer, counted = Trainer(device), 5
+
+    def steps(count: int) -> None:
+        for _ in range(count):
+            trainer.step()
+
+    steps(repeats // 10 + 1)
+    trainer.part = parts = Parts(torch.device(device))
+    steps(repeats)
+    rows = [{"part": row["part"], "host us": 1e3 * row["host, ms"]} for row in parts.rows(repeats)]
+    counts, _ = trace(lambda: steps(counted), counted, torch.device(device))
+    return [*rows, {"part": "torch's operations (a number)", "host us": counts["torch ops"]}]
+
+
 def main() -> None:
-    """Measure all calls; print a table and optionally write JSON."""
+    """Measure all calls and the step; print tables and optionally write JSON."""
     args = make_parser(__doc__, repeats=500).parse_args()
     rows = []
     with torch.autograd.set_multithreading_enabled(False):
@@ -74,7 +137,11 @@ def main() -> None:
             forward, backward = measure(args.device, args.repeats, **options)
             rows.append({"call": name, "forward us": forward, "backward us": backward,
                          "total us": forward + backward})  # fmt: skip
-    report("Host time of a call", rows, args.json, args.device)
+        report("Host time of a call", rows, None, args.device)
+        steps = measure_trainer(args.device, args.repeats)
+    report("Host time of a trainer's step", steps, None, args.device)
+    if args.json:
+        write_json(args.json, args.device, rows=rows, steps=steps)
 
 
 if __name__ == "__main__":
