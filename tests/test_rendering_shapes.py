@@ -260,3 +260,24 @@ def test_an_array_of_another_library_is_refused_by_name():
     means, quats, *rest = random_scene(n=4, cameras=1).arguments()
     with pytest.raises(TypeError, match=r"quats must be a torch\.Tensor, got ndarray"):
         blitzgs.rasterization(means, quats.numpy(), *rest, sh_degree=3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"Ks": torch.Tensor.double}, ValueError, "Ks is torch.float64 and means torch.float32; convert Ks"),
+        ({"colors": torch.Tensor.half}, ValueError, "colors is torch.float16 and means torch.float32"),
+        ({"means": torch.Tensor.half}, TypeError, "means must be float32 or float64, got torch.float16"),
+        ({"means": torch.Tensor.long}, TypeError, "means must be float32 or float64, got torch.int64"),
+        ({"width": lambda _: 64.5}, TypeError, "width must be a whole number of px, got 64.5"),
+        ({"height": lambda _: 0}, ValueError, "height must be at least 1 px, got 0"),
+    ],
+)
+def test_dtypes_and_sizes_that_do_not_fit_are_refused_by_name(changes, error, message):
+    scene = random_scene(n=5)
+    names = (*PARAMETERS, "viewmats", "Ks", "width", "height")
+    given = {name: getattr(scene, name) for name in names}
+    for name, change in changes.items():
+        given[name] = change(given[name])
+    with pytest.raises(error, match=message):
+        blitzgs.rasterization(**given, sh_degree=scene.sh_degree)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
@@ -128,12 +129,21 @@ def check_further(function: str, further: dict[str, Any]) -> None:
             raise ValueError(f"blitzgs.{function} does not support {name}={value!r}; leave it out")
 
 
-def check_options(render_mode: str, rasterize_mode: str, camera_model: str, tile_size: int) -> None:
+def check_options(
+    width: int, height: int, render_mode: str, rasterize_mode: str, camera_model: str, tile_size: int
+) -> None:
     """Check the arguments that are not tensors.
 
     Raises:
+        TypeError: a size is not a whole number.
         ValueError: one has an unknown value.
     """
+    for name, size in (("width", width), ("height", height)):
+        # While torch traces a function, a size may be a symbol.
+        if not isinstance(size, (Integral, torch.SymInt)):
+            raise TypeError(f"{name} must be a whole number of px, got {size!r}")
+        if isinstance(size, Integral) and size < 1:
+            raise ValueError(f"{name} must be at least 1 px, got {size}")
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
     if rasterize_mode not in RASTERIZE_MODES:
@@ -147,26 +157,32 @@ def check_options(render_mode: str, rasterize_mode: str, camera_model: str, tile
 
 
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
-    """Check that arguments are tensors on one device.
+    """Check that arguments are tensors on one device, all float32 or all float64.
 
     Args:
         required: arguments by name.
         optional: further arguments by name, which may be None.
 
     Raises:
-        TypeError: an argument is not a tensor, but for example an array of another library.
-        ValueError: an argument is on another device, whose memory the kernels could not read.
+        TypeError: an argument is not a tensor, but for example an array of another library, or has a dtype
+            that the kernels do not compute in.
+        ValueError: an argument has another dtype, or is on another device, whose memory the kernels could not
+            read.
     """
-    device, first = None, ""
+    device, dtype, first = None, None, ""
     for name, value in (*required.items(), *optional.items()):
         if value is None and name in optional:
             continue
         if not isinstance(value, Tensor):
             raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
         if device is None:
-            device, first = value.device, name
+            device, dtype, first = value.device, value.dtype, name
+            if dtype not in (torch.float32, torch.float64):
+                raise TypeError(f"{name} must be float32 or float64, got {dtype}: convert all arguments")
         if value.device != device:
             raise ValueError(f"{name} is on {value.device} and {first} on {device}; move one")
+        if value.dtype != dtype:
+            raise ValueError(f"{name} is {value.dtype} and {first} {dtype}; convert {name} to {dtype}")
 
 
 def gaussians_of(

@@ -124,7 +124,7 @@ def rasterization(
     """
     check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
-    check_options(render_mode, rasterize_mode, camera_model, tile_size)
+    check_options(width, height, render_mode, rasterize_mode, camera_model, tile_size)
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}

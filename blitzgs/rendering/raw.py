@@ -92,7 +92,7 @@ def raw_rasterization(
         ValueError: likewise.
         RuntimeError: likewise.
     """
-    check_options(render_mode, rasterize_mode, "pinhole", tile_size)
+    check_options(width, height, render_mode, rasterize_mode, "pinhole", tile_size)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
     if means.dim() != 2:
