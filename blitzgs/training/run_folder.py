@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blitzgs.distributed.group import Ranks
+from blitzgs.distributed.group import Ranks, resolve_device
 from blitzgs.model import PARAMETERS
 from blitzgs.rendering import rasterization
 from blitzgs.training import run
@@ -192,12 +192,17 @@ class RunFolder:
         The optimiser's moments are read too, to apply pending steps; they are dropped before the model is
         copied to `device`.
 
+        Args:
+            device: "cpu", "cuda" or "cuda:N".
+
         Raises:
+            ValueError: there is no such device.
             FileNotFoundError: there is no checkpoint yet.
             CheckpointError: all checkpoints are damaged.
         """
+        place, _ = resolve_device(str(device), local_rank=0, local_world_size=1, share_gpus=False)
         found = run.open_model(self.path, Ranks())
-        columns = {name: found.table[name].to(device) for name in (*PARAMETERS, "level")}
+        columns = {name: found.table[name].to(place) for name in (*PARAMETERS, "level")}
         return Model(
             **columns,
             lod=scene_gate(found.config, found.progress, found.table, Ranks()),

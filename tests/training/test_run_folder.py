@@ -50,6 +50,13 @@ def test_a_run_is_read_without_the_trainer(trained):
     assert done.stdout.splitlines() == ["(32, 48, 3)", "[]"]
 
 
+def test_a_model_asks_for_a_device_that_exists(trained, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(ValueError, match="device cuda: this torch .*; install one with CUDA"):
+        blitzgs.open_run(trained[1]).model("cuda")
+    assert blitzgs.open_run(trained[1]).model(torch.device("cpu")).means.device.type == "cpu"
+
+
 def test_what_a_run_folder_holds(trained, tmp_path):
     folder = blitzgs.open_run(trained[1])
     summary = folder.summary()
