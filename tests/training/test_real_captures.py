@@ -7,7 +7,8 @@ The band's centres are in real_captures.json. A change that is meant to alter qu
     python -m tests.training.test_real_captures cuda      # median of three seeds; two minutes a capture
 
 On a GPU sums are added up in another order every time. Three trainings of `sheffield` with different seeds
-ended at 30.53, 30.82 and 30.82 dB, so a single failure there may be chance; several are not.
+ended at 30.53, 30.82 and 30.82 dB, so a single failure there may be chance; several are not. The centre of
+`sheffield` is that of one training, of seed 0 (docs/decisions/recipe.md, sixth round).
 """
 
 from __future__ import annotations
