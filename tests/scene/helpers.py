@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pycolmap
 
+from blitzgs.scene import colmap
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -67,3 +69,11 @@ def write_capture(root: Path, names: list[str], width: int = 64, height: int = 4
     for seed, name in enumerate(names):
         write_image(root / "images" / name, smooth_image(height, width, seed))
     return root
+
+
+def edit_model(root, change):
+    """Read the COLMAP model of a capture, let `change` alter it, and write it back."""
+    folder = root / "sparse" / "0"
+    model = colmap.read_model(folder, points2d=True, tracks=True)
+    change(model)
+    colmap.write_model(folder, model)
