@@ -3,12 +3,14 @@
 
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
+from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parent
 
@@ -56,4 +58,19 @@ class CMakeBuild(build_ext):
         return []
 
 
-setup(ext_modules=[Extension("blitzgs._lib.kernels", sources=[])], cmdclass={"build_ext": CMakeBuild})
+class CopyRecipes(build_py):
+    """Copies configs/ into the package, so that an installed package has its recipes."""
+
+    def run(self) -> None:
+        super().run()
+        if not self.editable_mode:
+            folder = Path(self.build_lib) / "blitzgs" / "configs"
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in sorted((ROOT / "configs").glob("*.yaml")):
+                shutil.copy(path, folder)
+
+
+setup(
+    ext_modules=[Extension("blitzgs._lib.kernels", sources=[])],
+    cmdclass={"build_ext": CMakeBuild, "build_py": CopyRecipes},
+)

@@ -214,7 +214,15 @@ def test_the_python_example_of_the_readme_runs(tmp_path, monkeypatch):
     example = next(block for block in code_blocks(ROOT / "README.md", ["python"]) if "open_run" in block)
     monkeypatch.chdir(tmp_path)
     write_tiny_capture(tmp_path / "capture")
-    flags = ["--data", "capture", "--out", "runs/demo/run", "--device", "cpu", *(f"--{o}" for o in OVERRIDES)]
+    flags = [
+        "--data",
+        "capture",
+        "--out",
+        "runs/demo/run",
+        "--device",
+        "cpu",
+        *(f"--{o}" for o in ("config=defaults", *OVERRIDES)),
+    ]
     assert cli.main(["train", *flags]) == 0
     names = {}
     exec(compile(example, "README.md", "exec"), names)

@@ -7,9 +7,11 @@ import argparse
 import dataclasses
 import json
 import os
+import sys
 from pathlib import Path
 from typing import cast
 
+import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -20,19 +22,20 @@ from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, load_config, to_dict
 from blitzgs.training.folder_checks import locked
 from blitzgs.training.inputs import open_capture
+from blitzgs.training.recipes import default_recipe, recipe_path
 from blitzgs.training.trainer import Trainer
 
 HELP = """\
 Train a model of a capture, which is a folder DIR with photographs and their cameras: a COLMAP model
 (DIR/sparse/0 and DIR/images) or a transforms.json. At the end the held-out views (every 8th) are measured.
 
-  blitzgs train --config configs/aerial.yaml --data DIR --out RUN
+  blitzgs train --data DIR --out RUN
 
-Choose a configuration of the repository's folder configs/: aerial.yaml (GPU), aerial_cpu.yaml (CPU) or
-smoke.yaml (a first model in minutes). Without one, the fields have the defaults of
-blitzgs/training/config.py, which describes them all. Every field is also a flag, for example
---data.downscale=2 --population.max_gaussians=2000000. --show-config prints the resulting configuration and
-stops.
+A GPU trains with the recipe aerial, a CPU with aerial_cpu. --config takes another recipe (compact: fewer
+Gaussians; smoke: a first model in minutes; city: thousands of photographs; paper: the paper's values), a YAML
+file of yours, or "defaults": the defaults of all fields, which blitzgs/training/config.py describes. Every
+field is also a flag, for example --data.downscale=2 --population.max_gaussians=2000000. --show-config prints
+the resulting configuration and stops.
 
 Times in the configuration count the images that were trained on. --schedule.scale=0.5 makes the whole
 schedule half as long; with --minutes=M the run measures its speed and chooses this factor itself.
@@ -52,9 +55,8 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = add_command(commands, "train", run, "train a model of photographs with known cameras", HELP)
     parser.add_argument(
         "--config",
-        type=Path,
-        metavar="YAML",
-        help="configuration file (default: see above)",
+        metavar="RECIPE",
+        help="name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)",
     )
     parser.add_argument("--data", metavar="DIR", help="folder of the capture")
     parser.add_argument("--out", type=named_path, metavar="RUN", help="folder for the results")
@@ -98,10 +100,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> Config:
-    source = args.config
     own = args.out / run_folder.CONFIG if args.out is not None else None
-    if args.resume and source is None and own is not None and own.exists():
+    if args.config is not None:
+        source = recipe_path(args.config)
+    elif args.resume and own is not None and own.exists():
         source = own
+    else:
+        on_gpu = args.device.startswith("cuda") or (args.device == "auto" and torch.cuda.is_available())
+        recipe = default_recipe(on_gpu)
+        source = recipe_path(recipe)
+        if os.environ.get("RANK", "0") == "0":  # torchrun's number of the process
+            print(f"recipe: {recipe} (choose another one with --config)", file=sys.stderr)
     if not args.resume and source is not None and own is not None and own.exists() and own.samefile(source):
         raise ConfigError(
             f"{source} would be overwritten by the new run's resolved configuration: choose another --out"

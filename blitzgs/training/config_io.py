@@ -100,8 +100,7 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
     try:
         values = yaml.load(path.read_text(encoding="utf-8-sig"), _Loader) or {}
     except OSError as error:
-        hint = "; BlitzGS's own are in configs/ of its repository" if not path.exists() else ""
-        raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}{hint}") from error
+        raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}") from error
     except _UNREADABLE as error:
         raise ConfigError(f"{path}: not valid YAML: {error}") from error
     if not isinstance(values, dict):

@@ -301,7 +301,7 @@ def capture(tmp_path_factory):
 
 
 def train_flags(capture, folder, command="train"):
-    settings = [*OVERRIDES, *SETTINGS, "log.pictures=0"]
+    settings = ["config=defaults", *OVERRIDES, *SETTINGS, "log.pictures=0"]
     return [command, "--data", str(capture), "--out", str(folder), "--resume"] + [f"--{s}" for s in settings]
 
 

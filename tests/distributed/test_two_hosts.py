@@ -57,7 +57,7 @@ def test_a_host_is_lost_and_both_resume(tmp_path):
     data, out = tmp_path / "data", tmp_path / "run"
     write_tiny_capture(data)
     arguments = ["--data", str(data), "--out", str(out), "--resume", "--device", "cpu"]
-    arguments += [f"--{text}" for text in SETTINGS]
+    arguments += [f"--{text}" for text in ("config=defaults", *SETTINGS)]
     hosts = []
     try:
         # The first agent serves the rendezvous, so the second one is killed.

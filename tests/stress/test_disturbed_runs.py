@@ -50,7 +50,7 @@ def _train(arguments):
 
 
 def start(data, out, *flags):
-    settings = [f"--{text}" for text in SETTINGS]
+    settings = [f"--{text}" for text in ("config=defaults", *SETTINGS)]
     process = CONTEXT.Process(
         target=_train, args=(["train", "--data", str(data), "--out", str(out), *settings, *flags],)
     )

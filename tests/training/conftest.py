@@ -20,6 +20,6 @@ def trained(tmp_path_factory):
     """A capture and a short run of it, made by the command line."""
     data, folder = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("runs") / "run"
     write_tiny_capture(data)
-    flags = [f"--{text}" for text in OVERRIDES]
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES)]
     assert main(["train", "--data", str(data), "--out", str(folder), "--schedule.scale=0.4", *flags]) == 0
     return data, folder

@@ -31,7 +31,10 @@ def test_train_leaves_a_summary(trained):
 
 @pytest.mark.parametrize("strategy", ["density", "relocation"])
 def test_the_log_names_the_limit_of_the_population(trained, tmp_path, capsys, strategy):
-    flags = [f"--{text}" for text in (*OVERRIDES, "schedule.iterations=22", "population.growth=0.5")]
+    flags = [
+        f"--{text}"
+        for text in ("config=defaults", *OVERRIDES, "schedule.iterations=22", "population.growth=0.5")
+    ]
     flags += [f"--population.strategy={strategy}", "--population.max_gaussians=420", "--log.pictures=0"]
     assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "r"), *flags]) == 0
     lines = (tmp_path / "r" / "log.jsonl").read_text().splitlines()
@@ -73,7 +76,7 @@ def test_export_restores_the_units_of_the_capture(trained, tmp_path):
 
 
 def test_torchrun_entry(trained, tmp_path):
-    flags = [f"--{text}" for text in (*OVERRIDES, "schedule.scale=0.02", "log.pictures=0")]
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, "schedule.scale=0.02", "log.pictures=0")]
     command = [sys.executable, "train.py", "--data", str(trained[0]), "--out", str(tmp_path / "r"), *flags]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=None)
     assert done.returncode == 0, done.stderr
@@ -97,8 +100,8 @@ def test_torchrun_entry(trained, tmp_path):
             "unrecognized arguments: --log.every 5 (",
         ),
         (["train", "--data", "d"], 2, "required: --out"),
-        (["train", "--config", "missing.yaml", "--out", "x"], 1, "missing.yaml: cannot read"),
-        (["train", "--config", "missing.yaml", "--out", "x"], 1, "configs/ of its repository"),
+        (["train", "--config", "missing.yaml", "--out", "x"], 1, "missing.yaml: no such file or recipe"),
+        (["train", "--config", "missing.yaml", "--out", "x"], 1, "recipes are aerial, aerial_cpu, city"),
         (["eval", "/nowhere"], 1, "/nowhere is not a run"),
         (["export", "/nowhere", "--ply", "x.ply"], 1, "/nowhere is not a run"),
         (["train", "--data", "d", "--out", "x", "--device", "tpu"], 1, "cuda or cuda:N, got 'tpu'"),
@@ -151,7 +154,10 @@ def test_mistakes_with_files_name_them(trained, tmp_path, capsys):
 
 
 def test_eval_without_held_out_views_says_so(trained, tmp_path, capsys):
-    flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.02", "--data.split=0"]
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES)] + [
+        "--schedule.scale=0.02",
+        "--data.split=0",
+    ]
     assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "run"), *flags]) == 0
     assert "no test views: choose another --split" in fails(capsys, "eval", tmp_path / "run")
 
@@ -193,7 +199,10 @@ def test_render_leaves_the_photographs_alone(tmp_path, kind):
         return str(path) if kind == "absolute" else f"../photos/{path.name}"
 
     data, photos = transforms_capture(tmp_path, name_of)
-    flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.02", "--log.pictures=1"]
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES)] + [
+        "--schedule.scale=0.02",
+        "--log.pictures=1",
+    ]
     assert main(["train", "--data", str(data), "--out", str(tmp_path / "run"), *flags]) == 0
     before, everything = digest(photos), {path for path in tmp_path.rglob("*")}
     out = tmp_path / "rend" / "a"

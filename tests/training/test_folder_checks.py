@@ -67,7 +67,7 @@ def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
     holder = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         assert holder.stdout.readline() == "in\n"
-        flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.iterations=2"]
+        flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, "schedule.iterations=2")]
         command = ["train", "--data", str(tmp_path / "data"), "--out", str(out), *flags]
         assert main(command) == 1
         assert f"in use by another run (process {holder.pid} on " in capsys.readouterr().err

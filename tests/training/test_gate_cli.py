@@ -40,7 +40,7 @@ SETTINGS = (
 def lineage_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gate")
     write_tiny_capture(folder / "capture")
-    flags = [f"--{text}" for text in (*OVERRIDES, *SETTINGS)]
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, *SETTINGS)]
     assert main(["train", "--data", str(folder / "capture"), "--out", str(folder / "run"), *flags]) == 0
     return folder
 

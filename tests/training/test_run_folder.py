@@ -260,7 +260,7 @@ def test_export_replaces_regular_files_only(trained, tmp_path, capsys, kind):
 def test_any_path_works(trained, tmp_path, capfd, name):
     data, out = tmp_path / f"data {name}", tmp_path / f"run {name}"
     shutil.copytree(trained[0], data)
-    flags = [f"--{text}" for text in OVERRIDES] + ["--schedule.scale=0.02"]
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, "schedule.scale=0.02")]
     assert main(["train", "--data", str(data), "--out", str(out), *flags]) == 0
     printed = capfd.readouterr().out
     assert "psnr" in printed

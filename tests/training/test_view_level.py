@@ -167,7 +167,7 @@ def test_a_run_on_two_ranks_opens_the_gate_and_clears_the_mask(whole_run, tmp_pa
 
 def test_render_honours_the_gate(tmp_path):
     write_tiny_capture(tmp_path / "capture")
-    out, flags = tmp_path / "run", [f"--{flag}" for flag in (*OVERRIDES, *FLAGS)]
+    out, flags = tmp_path / "run", [f"--{flag}" for flag in ("config=defaults", *OVERRIDES, *FLAGS)]
     data = ["--data", str(tmp_path / "capture"), "--out", str(out)]
     assert main(["train", *data, "--schedule.scale=0.8", *flags]) == 0
     arguments = ["--out", str(tmp_path / "images"), "--raw", "--device", "cpu"]
