@@ -267,10 +267,11 @@ def _log(
     level_count: int,
 ) -> None:
     """Log an event, before its rows are removed and its statistics are reset."""
+    # This waits for the device, so it comes before the work that is only queued.
+    gone = causes.nonzero().squeeze(1)
     clones, splits = parents
     rows = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
     is_split = torch.arange(len(rows), device=rows.device) >= len(clones)
     features = spawn_features(table, rows, is_split, time, extent, level_count)
     lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
-    gone = causes.nonzero().squeeze(1)
     lineage.died(torch.cat((table["id"], new["id"]))[gone], causes[gone], time, step)

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blitzgs.population.candidates import FEATURES
-from blitzgs.population.lineage import ABOUT, read_lineage
+from blitzgs.population.lineage import ABOUT
+from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import GateInfo, write_info
 
 # Largest number of births that a fit takes from a scene, drawn evenly.

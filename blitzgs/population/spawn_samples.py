@@ -14,7 +14,7 @@ from blitzgs.ops.counter_random import uniform
 from blitzgs.output import new_file
 from blitzgs.population.candidates import FEATURES
 from blitzgs.population.gate_fit import Spawns, feature_columns
-from blitzgs.population.lineage import import_pyarrow
+from blitzgs.population.lineage_parts import import_pyarrow
 
 SUFFIX = ".parquet"
 # Number of rows of a sample; a row takes some 40 bytes.

@@ -33,7 +33,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.ops.counter_random import hash_keys, uniform
 from blitzgs.population.candidates import Candidates, Veto
-from blitzgs.population.lineage import read_lineage
+from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import RandomVeto, RankVeto, SpawnGate
 from blitzgs.scene.capture import Capture
 from blitzgs.training import run

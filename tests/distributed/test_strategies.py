@@ -121,7 +121,8 @@ def test_relocation_keeps_the_population_and_grows_to_the_cap(whole):
 
 def test_births_less_deaths_are_the_living(whole, tmp_path):
     pytest.importorskip("pyarrow")
-    from blitzgs.population.lineage import Cause, read_lineage
+    from blitzgs.population.lineage import Cause
+    from blitzgs.population.lineage_parts import read_lineage
 
     options, _, _ = whole
     _train(Ranks(), tmp_path, "population.lineage=true", *options)

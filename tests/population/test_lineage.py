@@ -19,8 +19,8 @@ from blitzgs.population.lineage import (
     Lineage,
     LineageError,
     initial_births,
-    read_lineage,
 )
+from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.redistribution import redistribute
 from tests.distributed.rank_harness import run_ranks
 from tests.population.test_density import random_table

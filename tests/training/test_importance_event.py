@@ -17,7 +17,8 @@ from blitzgs.model import CULL
 from blitzgs.population.candidates import FEATURES
 from blitzgs.population.gate_fit import fit, read_spawns
 from blitzgs.population.importance import PHI, is_culled
-from blitzgs.population.lineage import ABOUT, Cause, read_lineage
+from blitzgs.population.lineage import ABOUT, Cause
+from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.population.spawn_gate import GateError, GateInfo, info_path
 from blitzgs.training import run
 from blitzgs.training.events import importance

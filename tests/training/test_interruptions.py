@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.lineage import read_lineage
+from blitzgs.population.lineage_parts import read_lineage
 from blitzgs.training import checkpoint, run
 from blitzgs.training.agreement import Agreement, SaveClock, StopRequest
 from blitzgs.training.batches import PhotographError
