@@ -3,12 +3,13 @@
 
     python benchmarks/bm_render.py [--scenes aerial1 aerial4 aerial16 garden] [--repeats 30] [--json FILE]
 
-Gradients for every parameter; SH degree 3, float32. Ours: the ops of the training step in order (project,
-intersect, rasterize and their gradients, in compact splats), and the same through `blitzgs.rasterization` and
-autograd: with dense gradients, with sparse ones, and with every entry of meta read. gsplat: `rasterization`
-and autograd, packed and not. Torch's autograd hands the backward pass of CUDA tensors to a thread of its own
-and waits for it; "1 thread" is without that (`torch.autograd.set_multithreading_enabled(False)`). Each figure
-is a median over repeats of CUDA event times; memory is the peak above the inputs.
+Gradients for every parameter; SH degree 3, float32. Ours: the training step's own render (`blitzgs.pipeline`,
+whose host does not wait between projection and compositing) and the gradients of its projection, in compact
+splats. Then the same through `blitzgs.rasterization` and autograd: with dense gradients, with sparse ones,
+and with every entry of meta read. gsplat: `rasterization` and autograd, packed and not. Torch's autograd
+hands the backward pass of CUDA tensors to a thread of its own and waits for it; "1 thread" is without that
+(`torch.autograd.set_multithreading_enabled(False)`). Each figure is a median over repeats of CUDA event
+times; memory is the peak above the inputs.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from typing import Any
 import torch
 from harness import make_parser, write_json
 from scenes import BenchmarkScene, aerial, garden_like
+from timing import Clock
 from torch import Tensor
 
-from blitzgs import rasterization
-from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions, project_splats
-from blitzgs.ops.rasterize import RasterizeForward, rasterize_fwd
+from blitzgs import pipeline, rasterization
+from blitzgs.distributed.transport import LocalTransport
+from blitzgs.model import GaussianTable
+from blitzgs.pipeline import Mark, RenderOptions, Views, unmarked
 
 try:
     import gsplat
@@ -33,7 +36,16 @@ except ImportError:
     gsplat = None
 
 ops = torch.ops.blitzgs
-TILE_SIZE = 16
+OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
+WARM_UP = 5
+# The stages by their marks in `blitzgs.pipeline`; the exchange of a single rank does nothing.
+STAGES = {
+    "project": "project",
+    "sort": "intersect",
+    "raster": "rasterize",
+    "raster back": "rasterize_backward",
+    "project back": "project_backward",
+}
 SCENES: dict[str, Callable[[], BenchmarkScene]] = {
     "aerial1": lambda: aerial(1_000_000, "cuda"),
     "aerial4": lambda: aerial(4_000_000, "cuda"),
@@ -43,63 +55,36 @@ SCENES: dict[str, Callable[[], BenchmarkScene]] = {
 
 
 class OurRender:
-    """The ops of a training step between parameters and image, by stage."""
+    """The training step's own render, `blitzgs.pipeline`, and the gradients of the projection, by stage.
+
+    From the second call on, the host queues all stages of the forward pass with the sizes of earlier calls,
+    and reads the true sizes while the device composites.
+    """
 
     def __init__(self, scene: BenchmarkScene) -> None:
-        raw = scene.raw()
-        self.scene = scene
-        self.parameters = [raw[k].contiguous() for k in ("means", "quats", "scales", "opacities", "sh")]
-        self.cameras = [scene.viewmats, scene.Ks]
-        self.options = ProjectionOptions(scene.width, scene.height, TILE_SIZE, sh_degree=3)
-        self.grid = [len(scene.viewmats), scene.width, scene.height, TILE_SIZE, 0, -1]
+        self.table = GaussianTable.create(scene.raw())
+        self.views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
+        self.transport = LocalTransport()
 
-    def project(self) -> None:
-        """Run the projection."""
-        self.projected = project_splats(ProjectionInputs(self.parameters, self.cameras, self.options))
-
-    def intersect(self) -> None:
-        """List the splats of each tile."""
-        r = self.projected
-        count = int(r.counts[2])
-        self.lists = ops.intersect(r[4], r[5], r[7], r[6], r[1], None, self.grid, count, None, True)
-
-    def rasterize(self) -> None:
-        """Composite the tiles."""
-        r = self.projected
-        self.splats = (r[4], r[5], r[7], r[8], None, *self.lists)
-        self.saved = rasterize_fwd(*self.splats, self.grid, None, True, True)
-
-    def rasterize_backward(self, v_renders: Tensor) -> None:
-        """Differentiate the compositing."""
-        *splats, backgrounds, isect_splats, tile_offsets = self.splats
-        _, rest, last, _, packed_splats, tile_order, packed = self.saved
-        forward_pass = RasterizeForward(
-            splats, backgrounds, [isect_splats, tile_offsets], [rest, last, packed_splats, tile_order]
-        )
-        ops.rasterize_bwd_packed_(*forward_pass, v_renders, self.grid, False, packed)
-        self.v_splats = [packed]
-
-    def project_backward(self) -> None:
-        """Differentiate the projection, to compact splats."""
-        r = self.projected
-        self.gradients = ops.project_bwd(
-            self.parameters, self.cameras, [r[1], r[2], r[3]], self.options.ints, self.options.floats,
-            self.v_splats, None, False,
-        )  # fmt: skip
-
-    def forward(self) -> Tensor:
+    def forward(self, mark: Mark = unmarked) -> Tensor:
         """Return the image [B, H, W, 3]."""
-        self.project()
-        self.intersect()
-        self.rasterize()
-        return self.saved[0]
+        self.frame = pipeline.forward(
+            self.table, self.views, OPTIONS, transport=self.transport, mark=mark, backward_follows=True
+        )
+        return self.frame.renders
 
-    def backward(self, v_renders: Tensor) -> None:
-        """Differentiate, dropping what the forward pass kept as soon as it is used."""
-        self.rasterize_backward(v_renders)
-        del self.saved, self.splats, self.lists
-        self.project_backward()
-        del self.projected, self.v_splats, self.gradients
+    def backward(self, v_renders: Tensor, mark: Mark = unmarked) -> None:
+        """Differentiate, to compact splats, dropping what the forward pass kept as soon as it is used."""
+        v_splats = pipeline.backward_splats(self.frame, v_renders, mark).parts
+        splats = self.frame.projected
+        columns = [splats.camera_ids, splats.visible_ids, splats.splat_offsets]
+        del self.frame, splats
+        inputs = pipeline.inputs_of(self.table, self.views, OPTIONS)
+        ops.project_bwd(
+            list(inputs.gaussians), list(inputs.cameras), columns, inputs.options.ints, inputs.options.floats,
+            v_splats, None, False,
+        )  # fmt: skip
+        mark("project back")
 
 
 class CallRender:
@@ -135,17 +120,17 @@ class CallRender:
         del self.image, self.meta
 
 
-def event_times(steps: list[Callable[[], Any]], repeats: int, warmup: int = 5) -> list[float]:
+def event_times(steps: list[Callable[[], Any]], repeats: int) -> list[float]:
     """Return the median ms of each step when they run in order."""
     samples: list[list[float]] = [[] for _ in steps]
-    for repeat in range(warmup + repeats):
+    for repeat in range(WARM_UP + repeats):
         events = [torch.cuda.Event(enable_timing=True) for _ in range(len(steps) + 1)]
         events[0].record()
         for step, event in zip(steps, events[1:], strict=True):
             step()
             event.record()
         torch.cuda.synchronize()
-        if repeat >= warmup:
+        if repeat >= WARM_UP:
             for sample, begin, end in zip(samples, events, events[1:], strict=False):
                 sample.append(begin.elapsed_time(end))
     return [statistics.median(sample) for sample in samples]
@@ -163,11 +148,16 @@ def measure(render: OurRender | CallRender, v_renders: Tensor, repeats: int) -> 
 
 
 def stages(render: OurRender, v_renders: Tensor, repeats: int) -> dict[str, float]:
-    """Return ms of each stage."""
-    names = ["project", "intersect", "rasterize", "rasterize_backward", "project_backward"]
-    steps = [getattr(render, n) if n != "rasterize_backward" else lambda: render.rasterize_backward(v_renders)
-             for n in names]  # fmt: skip
-    return dict(zip(names, event_times(steps, repeats), strict=True))
+    """Return ms of each stage. The host waits for the device only as a training step does."""
+    samples: dict[str, list[float]] = {stage: [] for stage in STAGES.values()}
+    for _ in range(WARM_UP + repeats):
+        clock = Clock()
+        render.forward(clock.mark)
+        render.backward(v_renders, clock.mark)
+        for mark, ms in clock.stages():
+            if mark in STAGES:
+                samples[STAGES[mark]].append(ms)
+    return {stage: statistics.median(sample[WARM_UP:]) for stage, sample in samples.items()}
 
 
 def run(name: str, repeats: int) -> dict[str, Any]:
@@ -178,9 +168,8 @@ def run(name: str, repeats: int) -> dict[str, Any]:
     ours = OurRender(scene)
     result: dict[str, Any] = {"scene": scene.name, "blitzgs": measure(ours, v, repeats)}
     image = ours.forward()
-    result["visible"], result["rows"], result["intersections"] = ours.projected.counts.tolist()
+    result["visible"], result["rows"], result["intersections"] = ours.frame.projected.counts.tolist()
     result["stages"] = stages(ours, v, repeats)
-    del ours.saved, ours.splats, ours.lists, ours.projected, ours.v_splats, ours.gradients
     sparse = partial(rasterization, sparse_grad=True)
     calls: dict[str, Callable[[], CallRender]] = {
         "rasterization": lambda: CallRender(scene, rasterization),

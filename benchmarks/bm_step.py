@@ -19,15 +19,16 @@ from functools import partial
 from typing import Any
 
 import torch
-from bm_render import CallRender
+from bm_render import OPTIONS, CallRender
 from harness import make_parser, write_json
 from scenes import BenchmarkScene, aerial, garden_like
+from timing import Clock
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, GaussianTable
 from blitzgs.ops.photometric import photometric_fwd_bwd
-from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.pipeline import Views
 from blitzgs.training.batches import Batch
 from blitzgs.training.config import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.training.optimiser import LazyAdam
@@ -38,7 +39,6 @@ from blitzgs.view.blocks import morton_order
 LOSS = LossConfig(ssim=0.2, scale=0)
 STEP, RATE, BEHIND, WARM_UP = 2000, 1e-6, 40, 5
 GAUSSIANS = {"aerial1": 1_000_000, "aerial4": 4_000_000, "aerial16": 16_000_000}
-OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
 
 
 def make_scene(name: str, views: int, order: str) -> BenchmarkScene:
@@ -61,26 +61,6 @@ def random_photographs(scene: BenchmarkScene) -> Batch:
     samples = torch.full((count,), float(targets[0].numel()), device="cuda")
     views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
     return Batch(list(range(count)), views, targets, None, samples, None)
-
-
-class Clock:
-    """Time between marks on the device."""
-
-    def __init__(self) -> None:
-        self.marks: list[tuple[str, torch.cuda.Event]] = []
-        self.mark("")
-
-    def mark(self, stage: str) -> None:
-        """End a stage."""
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        self.marks.append((stage, event))
-
-    def stages(self) -> list[tuple[str, float]]:
-        """Return name and time of each stage, in order."""
-        torch.cuda.synchronize()
-        return [(name, begin.elapsed_time(end))
-                for (_, begin), (name, end) in zip(self.marks, self.marks[1:], strict=False)]  # fmt: skip
 
 
 def make_table(scene: BenchmarkScene) -> GaussianTable:

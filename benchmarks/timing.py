@@ -41,6 +41,26 @@ def median_ms(
     return statistics.median(times)
 
 
+class Clock:
+    """Time between marks on the device."""
+
+    def __init__(self) -> None:
+        self.marks: list[tuple[str, torch.cuda.Event]] = []
+        self.mark("")
+
+    def mark(self, stage: str) -> None:
+        """End a stage."""
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        self.marks.append((stage, event))
+
+    def stages(self) -> list[tuple[str, float]]:
+        """Return name and time of each stage, in order."""
+        torch.cuda.synchronize()
+        return [(name, begin.elapsed_time(end))
+                for (_, begin), (name, end) in zip(self.marks, self.marks[1:], strict=False)]  # fmt: skip
+
+
 def _flatten(value: Any) -> list[Any]:
     if isinstance(value, list | tuple):
         return [leaf for item in value for leaf in _flatten(item)]
