@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from tests.walk import kernel_files, walk_of_a_step, walk_of_ranks
+from tests.walk import cxx_code_lines, kernel_files, python_code_lines, walk_of_a_step, walk_of_ranks
 
 MOST_PYTHON, MOST_KERNELS, MOST_VISITS = 20, 60, 2
 # For rank 0 of two.
@@ -38,6 +38,31 @@ def test_the_kernels_of_a_step_lie_in_few_files(walk):
     kernels = kernel_files(walk.ops)
     assert "csrc/project/project_step_cuda.cu" in kernels and "csrc/math/tiles.h" in kernels
     assert len(kernels) <= MOST_KERNELS, kernels
+
+
+def test_lines_of_code_are_those_without_comments():
+    python = [
+        '"""A',
+        'file."""',
+        "",
+        'x = """a',
+        'b"""  # text',
+        "# comment",
+        "def f():",
+        '    """Do."""',
+        "    pass",
+    ]
+    assert python_code_lines("\n".join(python)) == 4
+    cxx = [
+        "// a file",
+        '#include "a.h"',
+        "/* two",
+        "lines */ int x;",
+        'auto s = "// none";',
+        "  /* one */",
+        "",
+    ]
+    assert cxx_code_lines("\n".join(cxx)) == 3
 
 
 def test_ops_take_few_arguments():

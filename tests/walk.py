@@ -4,14 +4,17 @@
 Python is traced while a trainer takes a step: every function of `blitzgs/` counts at its first call, in the
 order of these calls. Functions of one file that follow each other are one stop. C++ and CUDA are counted from
 the ops that the step calls: the files of `csrc/` that check and register an op and that launch its kernels,
-and all that they include from there.
+and all that they include from there. The lines of a file are all its lines, and those of them with code.
 """
 
 from __future__ import annotations
 
+import ast
+import io
 import re
 import sys
 import tempfile
+import tokenize
 from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -128,9 +131,43 @@ def kernel_files(ops: Iterable[str]) -> list[str]:
     return sorted(str(file.relative_to(ROOT)) for file in files)
 
 
+def lines_of(files: Iterable[str]) -> tuple[int, int]:
+    """Return the number of all lines of files, and of those with code."""
+    texts = [(file.endswith(".py"), (ROOT / file).read_text()) for file in files]
+    code = [python_code_lines(text) if is_python else cxx_code_lines(text) for is_python, text in texts]
+    return sum(len(text.splitlines()) for _, text in texts), sum(code)
+
+
+def python_code_lines(text: str) -> int:
+    """Count the lines that hold more than space, comments and docstrings."""
+    layout = {tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    spans = [(t.start[0], t.end[0]) for t in tokens if t.type not in layout | {tokenize.COMMENT}]
+    lines = {line for first, last in spans for line in range(first, last + 1)}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            lines -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return len(lines)
+
+
+def cxx_code_lines(text: str) -> int:
+    """Count the lines that hold more than space and comments."""
+    comment_or_string = r'//[^\n]*|/\*.*?\*/|"(?:\\.|[^"\\\n])*"'
+    bare = re.sub(
+        comment_or_string,
+        lambda found: found[0] if found[0].startswith('"') else "\n" * found[0].count("\n"),
+        text,
+        flags=re.DOTALL,
+    )
+    return sum(bool(line.strip()) for line in bare.splitlines())
+
+
 def _report(title: str, walk: Walk) -> None:
     kernels = kernel_files(walk.ops)
     print(f"{title}: {len(walk.files)} Python and {len(kernels)} C++/CUDA files, {len(walk.stops)} stops")
+    for name, files in (("Python", walk.files), ("C++/CUDA", kernels)):
+        lines, code = lines_of(files)
+        print(f"  {name}: {lines:,} lines, {code:,} of them with code")
     print("  ops:", *walk.ops)
     for stop in walk.stops:
         print("   ", stop)
