@@ -26,18 +26,25 @@ parquet = pytest.importorskip("pyarrow.parquet")
 VIEWS = {"view", "select", "slice", "unsqueeze", "squeeze", "t", "transpose", "expand", "unbind", "alias"}
 
 
+class SlowDisk:
+    """A disk that notes when it is asked to write, and writes nothing until it is ready."""
+
+    def __init__(self):
+        self.asked, self.ready = threading.Event(), threading.Event()
+        self._write_table = parquet.write_table
+
+    def write_table(self, *args, **options):
+        self.asked.set()
+        assert self.ready.wait(60)
+        self._write_table(*args, **options)
+
+
 @pytest.fixture
 def disk(monkeypatch):
-    """A disk that writes nothing until this is set."""
-    ready, real = threading.Event(), parquet.write_table
-
-    def write_table(*args, **options):
-        assert ready.wait(60)
-        real(*args, **options)
-
-    monkeypatch.setattr(parquet, "write_table", write_table)
-    yield ready
-    ready.set()
+    slow = SlowDisk()
+    monkeypatch.setattr(parquet, "write_table", slow.write_table)
+    yield slow
+    slow.ready.set()
 
 
 def parts(folder):
@@ -51,7 +58,7 @@ def test_events_do_not_wait_for_the_disk(tmp_path, disk):
         lineage.died(torch.tensor([10 * step]), torch.tensor([Cause.SIZE]), step, step)
         lineage.flush(step)
     assert not parts(tmp_path)
-    disk.set()
+    disk.ready.set()
     ledger = lineage.flush_and_check(torch.arange(11, 60, 10), 6)
     lineage.close()
     assert (ledger.births, ledger.deaths) == (10, 5) and len(parts(tmp_path)) == 10
@@ -70,7 +77,8 @@ def test_close_finishes_one_part_and_drops_the_others(tmp_path, disk):
     for step in range(1, 4):
         lineage.born(some([step]), step)
         lineage.flush(step)
-    threading.Timer(0.3, disk.set).start()
+    assert disk.asked.wait(60)
+    threading.Timer(1.0, disk.ready.set).start()
     lineage.close()
     assert parts(tmp_path) == ["births_00000001_0000_0000.parquet"]
     assert not list(tmp_path.glob(".*"))
