@@ -52,11 +52,14 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor means2d, Tensor conics, "
       "Tensor depths, Tensor splat_opacities, Tensor colors, Tensor radii, Tensor tiles_touched, "
       "Tensor rank_masks, Tensor splat_ids, Tensor totals)");
-  // The colours of splats that were projected without sh, [P, 3]. gaussian_ids: the rows of `gaussians`;
-  // shown (opacities, radii, tiles_touched): set to 0 for splats whose colour is not finite.
+  // Gathers the visible Gaussians of a projection without sh, and computes the colours of its splats. tables:
+  // (means, quats, scales, opacities) of all Gaussians; sh: their SH in any number of parts, which become
+  // one; splats: (visible_ids, splat_offsets, camera_ids); shown: (opacities, radii, tiles_touched), set to 0
+  // for splats whose colour is not finite; totals: those of the projection if the splats have spare capacity.
+  // Returns the numbers of the rows, 0 to U - 1, the colours, and the rows of tables and sh.
   m.def(
-      "color_splats_(Tensor[] gaussians, Tensor[] cameras, Tensor gaussian_ids, Tensor camera_ids, "
-      "Tensor(a!)[] shown, int[] ints, float[] floats) -> Tensor colors");
+      "color_rows_(Tensor[] tables, Tensor[] sh, Tensor[] cameras, Tensor[] splats, Tensor(a!)[] shown, "
+      "int[] ints, float[] floats, Tensor? totals=None) -> Tensor[] rows");
   // views: cameras and, of each view, weights of the Gaussians' smallest axes, opacities and mean axes:
   // (viewmats, Ks[, scale_reg[, opacity_reg[, size_reg]]]). v_splats: (v_means2d, v_conics, v_opacities[,
   // v_colors]) or, on CUDA, one table of splat gradients.

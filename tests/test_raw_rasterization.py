@@ -174,6 +174,65 @@ def test_wrong_shapes_are_refused_by_name():
         raw({**p, "shN": p["shN"][:, :3]}, scene, sh_degree=3)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_second_derivative_is_refused(device, name):
+    scene = random_scene(n=30, cameras=1, device=device)
+    p = raw_parameters(scene)
+    (gradient,) = torch.autograd.grad(raw(p, scene, sparse_grad=False)[0].sum(), [p[name]], create_graph=True)
+    with pytest.raises(RuntimeError, match="has first derivatives only"):
+        (gradient.square().sum() + sum(t.sum() for t in p.values())).backward()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_gradients_of_two_views_may_come_at_once(device):
+    """The second view catches up rows that the first one read, which must not spoil the first's gradient."""
+    scene = random_scene(n=50, cameras=2, width=20, height=16, device=device)
+    together, one_by_one = raw_parameters(scene), raw_parameters(scene)
+    options = [
+        {"optimizers": LazyAdam([{"params": [t], "name": name} for name, t in p.items()], lr=0.0)}
+        for p in (together, one_by_one)
+    ]
+    views = [random_scene(n=1, cameras=1, width=20, height=16) for _ in range(2)]
+    for number, view in enumerate(views):
+        view.viewmats, view.Ks = scene.viewmats[number, None], scene.Ks[number, None]
+    for _ in range(2):
+        images = [raw(together, view, **options[0])[0] for view in views]
+        sum(image.square().sum() for image in images).backward()
+        for view in views:
+            raw(one_by_one, view, **options[1])[0].square().sum().backward()
+        for name in NAMES:
+            expected = one_by_one[name].grad.to_dense()
+            assert relative_error(together[name].grad.to_dense(), expected) < 1e-5, name
+        for option in options:
+            option["optimizers"].step()
+            option["optimizers"].zero_grad(set_to_none=True)
+
+
+@pytest.mark.cuda
+@needs_cuda
+def test_a_call_is_repeated_if_there_was_too_little_room():
+    """A first view sees a few Gaussians, so that the next one needs more than was estimated."""
+    scene = random_scene(n=2000, cameras=2, width=96, height=80, device="cuda")
+    scene.viewmats[1, 2, 3] += 200.0  # far away: Gaussians that are splats become few and small
+    expected, actual = raw_parameters(scene), raw_parameters(scene)
+    optimizers = LazyAdam([{"params": [t], "lr": 2.0**-12, "name": name} for name, t in actual.items()])
+    dense = torch.optim.Adam([{"params": [t], "lr": 2.0**-12} for t in expected.values()], eps=1e-8)
+    view = random_scene(n=1, cameras=1, width=96, height=80)
+    for number in (1, 1, 0, 1, 0):
+        view.viewmats, view.Ks = scene.viewmats[number, None], scene.Ks[number, None]
+        image = activated(expected, view)[0]
+        own = raw(actual, view, optimizers=optimizers)[0]
+        assert relative_error(own, image) < 1e-4
+        for optimizer, picture in ((dense, image), (optimizers, own)):
+            optimizer.zero_grad(set_to_none=True)
+            picture.square().sum().backward()
+            optimizer.step()
+    optimizers.catch_up()
+    for name in NAMES:
+        assert relative_error(actual[name], expected[name]) < 2e-3, name
+
+
 @pytest.mark.cuda
 @needs_cuda
 def test_memory_follows_what_is_visible():

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs.ops.color_rows import VisibleRows
 from blitzgs.ops.derivatives import first_only, unrecorded
 from blitzgs.ops.projection import (
     VIEW_TOTALS,
@@ -106,7 +107,10 @@ def gaussians_of(
 
 
 def differentiable_splats(
-    inputs: ProjectionInputs, sparse_grad: bool, splats: ProjectedSplats | None = None
+    inputs: ProjectionInputs,
+    sparse_grad: bool,
+    splats: ProjectedSplats | None = None,
+    rows: TableRows | None = None,
 ) -> ProjectedSplats:
     """Project as `project` does, with grouped arguments.
 
@@ -114,14 +118,14 @@ def differentiable_splats(
         inputs: the inputs of the projection.
         sparse_grad: see `project`.
         splats: the result of `project_splats` for these inputs, if it is already known.
+        rows: the visible rows of these inputs, if `splats` got their colours from them.
     """
     viewmats, Ks = inputs.cameras  # noqa: N806
     if not torch.compiler.is_compiling():
         splats = project_splats(inputs) if splats is None else splats
-        means, quats, scales, opacities, *sh = inputs.gaussians
-        columns = _Project.apply(  # type: ignore[no-untyped-call]
-            means, quats, scales, opacities, sh[0] if sh else None, viewmats, inputs, sparse_grad, splats
-        )
+        tables = inputs.gaussians if rows is None else [*inputs.gaussians, *rows.sh]
+        call = _Call(inputs, sparse_grad, splats, rows)
+        columns = _Project.apply(viewmats, call, *tables)  # type: ignore[no-untyped-call]
         means2d, conics, depths, opacities, colors = columns
         return splats._replace(
             means2d=means2d, conics=conics, depths=depths, opacities=opacities, colors=colors
@@ -204,17 +208,28 @@ def _(
     )
 
 
-def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats) -> None:
+class TableRows(NamedTuple):
+    """The visible rows of tables, gathered for the colours and the backward pass.
+
+    Attributes:
+        visible: the rows.
+        sh: the SH of all Gaussians in parts, from which the rows' SH were joined; empty: without SH.
+    """
+
+    visible: VisibleRows
+    sh: Sequence[Tensor]
+
+
+def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: TableRows | None = None) -> None:
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(
-        *inputs.gaussians,
-        *inputs.cameras,
-        splats.camera_ids,
-        splats.visible_ids,
-        splats.splat_offsets,
-        inputs.level,
-    )
-    ctx.options, ctx.n_gaussians = inputs.options, len(inputs.gaussians)
+    read, visible_ids, ids, ctx.tables, ctx.parts = inputs, splats.visible_ids, None, None, []
+    if rows is not None:
+        read, visible_ids, ids = rows.visible.inputs, rows.visible.numbers, splats.visible_ids
+        # The tables are not saved: the gradient does not depend on their values, which may change.
+        ctx.tables, ctx.parts = (*inputs.gaussians, *rows.sh), [part.shape[1] for part in rows.sh]
+    index = splats.camera_ids, visible_ids, splats.splat_offsets
+    ctx.save_for_backward(*read.gaussians, *read.cameras, *index, inputs.level, ids)
+    ctx.options = inputs.options
 
 
 class _Differentiable(NamedTuple):
@@ -233,40 +248,41 @@ class _Differentiable(NamedTuple):
 
 
 class _Saved(NamedTuple):
-    """The tensors that `_save` saved, in its groups."""
+    """The tensors that `_save` saved, in its groups; ids: of the tables, whose rows are the gaussians."""
 
     gaussians: Sequence[Tensor]
     cameras: Sequence[Tensor]
     splats: Sequence[Tensor]
     level: Tensor | None
+    ids: Tensor | None
 
     @classmethod
     def of(cls, ctx: Any) -> _Saved:
         """Read them. Call this once: checkpointing recomputes saved tensors at each reading."""
-        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level = ctx.saved_tensors  # noqa: N806
-        return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets), level)
+        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level, ids = ctx.saved_tensors  # noqa: N806
+        return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets), level, ids)
 
 
 def _gradients(
     ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: _Differentiable
 ) -> tuple[Tensor | None, ...]:
-    """Return the gradients of all gaussians (None without sh) and viewmats, if they are needed.
+    """Return the gradients of viewmats and of all gaussians, or of the tables, if they are needed.
 
     Args:
         ctx: from `_save`.
-        needed: which of means, quats, scales, opacities and, if given, sh need a gradient.
+        needed: which of means, quats, scales, opacities and the given parts of SH need a gradient.
         need_viewmats: whether viewmats need a gradient.
         sparse: which of these gradients are to be sparse.
         v: gradients of the splats; None: zero.
     """
     saved = _Saved.of(ctx)
     with unrecorded():
-        gradients = _first_gradients(ctx.options, saved, needed, need_viewmats, sparse, v)
-    return first_only("project", gradients, (*saved.gaussians, saved.cameras[0], *v))
+        gradients = _first_gradients(ctx, saved, needed, need_viewmats, sparse, v)
+    return first_only("project", gradients, (*(ctx.tables or saved.gaussians), saved.cameras[0], *v))
 
 
 def _first_gradients(
-    options: ProjectionOptions,
+    ctx: Any,
     saved: _Saved,
     needed: Sequence[bool],
     need_viewmats: bool,
@@ -274,26 +290,32 @@ def _first_gradients(
     v: _Differentiable,
 ) -> tuple[Tensor | None, ...]:
     _, visible_ids, _ = saved.splats
+    gathered = ctx.tables is not None
     # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass, the
     # number of rows is unknown, and tensors are of another type.
     complete = (
-        not any(sparse)
+        not gathered
+        and not any(sparse)
         and type(visible_ids) is Tensor
         and visible_ids.shape[0] == saved.gaussians[0].shape[0]
     )
     # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
-    dense = not complete and not any(sparse) and all(needed)
+    dense = not gathered and not complete and not any(sparse) and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
-        list(saved.gaussians), list(saved.cameras), list(saved.splats), options.ints, options.floats,
+        saved.gaussians, saved.cameras, saved.splats, ctx.options.ints, ctx.options.floats,
         _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
+    if len(ctx.parts) > 1:
+        # Autograd would copy a gradient that is not contiguous, and its indices with it.
+        found[4:] = [part.contiguous() for part in gradients[4].split(ctx.parts, dim=1)]
     if not dense:
         found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
     if not dense and not complete:
-        shapes = [parameter.shape for parameter in saved.gaussians]
-        found = full_gradients(visible_ids, found, shapes, sparse[: len(found)])
-    return (*found, *[None] * (5 - len(found)), v_viewmats if need_viewmats else None)
+        ids = visible_ids if saved.ids is None else saved.ids
+        shapes = [table.shape for table in ctx.tables or saved.gaussians]
+        found = full_gradients(ids, found, shapes, sparse)
+    return (v_viewmats if need_viewmats else None, *found)
 
 
 def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:
@@ -308,6 +330,15 @@ def _splat_gradients(saved: _Saved, v: _Differentiable) -> list[Tensor]:
     return [part if column is None else column for column, part in zip(columns, parts, strict=False)]
 
 
+class _Call(NamedTuple):
+    """The arguments of `differentiable_splats` that have no gradient."""
+
+    inputs: ProjectionInputs
+    sparse_grad: bool
+    splats: ProjectedSplats
+    rows: TableRows | None
+
+
 class _Project(torch.autograd.Function):
     """Makes the splats of `project_splats` differentiable, with the gradient formula registered below.
 
@@ -317,18 +348,19 @@ class _Project(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> Any:
-        _, _, _, opacities, sh, _, inputs, sparse_grad, splats = arguments
-        _save(ctx, inputs, splats)
-        leaves = [sh is not None and tensor.is_leaf for tensor in (opacities, sh)]
-        ctx.sparse = (True, True, True, *leaves) if sparse_grad else (False,) * 5
-        return tuple(_Differentiable.of(splats))
+    def forward(ctx: Any, _viewmats: Tensor, call: _Call, *tables: Tensor) -> Any:
+        _save(ctx, call.inputs, call.splats, call.rows)
+        # The three others are leaves, or computed by operations that accept a sparse gradient.
+        leaves = [call.rows is not None or (len(tables) > 4 and table.is_leaf) for table in tables[3:]]
+        ctx.sparse = [call.sparse_grad and leaf for leaf in (True, True, True, *leaves)]
+        return tuple(_Differentiable.of(call.splats))
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
-        *needed, need_viewmats = ctx.needs_input_grad[:6]
+        need_viewmats, _, *needed = ctx.needs_input_grad
         v = _Differentiable._make(v_output)
-        return (*_gradients(ctx, needed[: ctx.n_gaussians], need_viewmats, ctx.sparse, v), *(None,) * 3)
+        v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, ctx.sparse, v)
+        return (v_viewmats, None, *gradients)
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
@@ -349,8 +381,8 @@ def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
     needed, (need_viewmats, _), *_ = ctx.needs_input_grad
     *v_columns, _, _ = v_output
     v = _Differentiable.of(ProjectedSplats._make((*v_columns, None)))
-    *gradients, v_viewmats = _gradients(ctx, needed, need_viewmats, (False,) * 5, v)
-    return gradients[: len(needed)], [v_viewmats, None], *ctx.no_gradients
+    v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, [False] * len(needed), v)
+    return gradients, [v_viewmats, None], *ctx.no_gradients
 
 
 def _no_gradient(argument: object) -> list[None] | None:

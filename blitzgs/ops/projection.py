@@ -49,14 +49,19 @@ def splats_of(allocated: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
     """
     visible, splats, *_ = counts.tolist()
     lengths = (splats, splats, visible, visible + 1, *(splats,) * 8)
-    # Hide from autograd that these are views: a Function may return views, but its caller could not change
-    # them in place.
+    return ProjectedSplats._make((*first_rows(allocated, lengths), counts))
+
+
+def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor]:
+    """Return the first rows of columns, at most as many as they have.
+
+    Autograd does not see that these are views: a Function may return views, but its caller could not change
+    them in place.
+    """
     with torch._C._AutoDispatchBelowADInplaceOrView():
-        columns = [
-            column[:n] if column.shape[0] > n else column
-            for column, n in zip(allocated, lengths, strict=False)
+        return [
+            column[:n] if column.shape[0] > n else column for column, n in zip(columns, lengths, strict=False)
         ]
-        return ProjectedSplats._make((*columns, counts))
 
 
 class Splats(NamedTuple):
@@ -220,40 +225,6 @@ class Projected(NamedTuple):
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
     """Project without gradients and wait for the number of splats; `project` with grouped arguments."""
     return splats_of(*_projected(inputs))
-
-
-@torch.no_grad()
-def colored_rows(splats: ProjectedSplats, rows: ProjectionInputs) -> ProjectedSplats:
-    """Return the splats of gathered Gaussians from those of the whole table, without another projection.
-
-    Args:
-        splats: `project_splats` of the whole table without SH. Splats whose colour is not finite are hidden
-            in place.
-        rows: the inputs of that projection with the Gaussians `splats.visible_ids` alone, and SH or none.
-
-    Returns:
-        What `project_splats` returns for `rows`; only `counts` are those of `splats`, which count hidden
-        splats.
-    """
-    visible_ids = torch.arange(len(splats.visible_ids), dtype=torch.int32, device=splats.visible_ids.device)
-    of_splats = visible_ids  # of a single view, each visible Gaussian has one splat
-    if rows.n_views > 1:
-        per_row = splats.splat_offsets.diff()
-        of_splats = visible_ids.repeat_interleave(per_row, output_size=len(splats.gaussian_ids))
-    colors = splats.colors
-    if len(rows.gaussians) > 4:
-        colors = torch.ops.blitzgs.color_splats_(
-            list(rows.gaussians), list(rows.cameras), of_splats, splats.camera_ids,
-            [splats.opacities, splats.radii, splats.tiles_touched], rows.options.ints, rows.options.floats,
-        )  # fmt: skip
-    return splats._replace(gaussian_ids=of_splats, visible_ids=visible_ids, colors=colors)
-
-
-@torch.library.register_fake("blitzgs::color_splats_")
-def _(
-    gaussians: Sequence[Tensor], cameras: Sequence[Tensor], gaussian_ids: Tensor, *_others: object
-) -> Tensor:
-    return gaussians[0].new_empty(len(gaussian_ids), 3)
 
 
 def _projected(inputs: ProjectionInputs) -> tuple[ProjectedSplats, Tensor]:

@@ -3,23 +3,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from blitzgs.ops.capacity import Attempt
+from blitzgs.ops.color_rows import VisibleRows, colored_rows
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, capacity_for, splats_of
+from blitzgs.ops.project import TableRows
+from blitzgs.ops.projection import Projected, ProjectedSplats, ProjectionInputs, capacity_for, splats_of
 
 
 class Rendered(NamedTuple):
-    """The outputs of the three ops; see each op for its fields."""
+    """The outputs of the ops; see each op for its fields.
+
+    Attributes:
+        splats: the splats.
+        isect_splats: the tiles' lists.
+        tile_offsets: where they begin.
+        composited: what `rasterize_fwd` returned.
+        rows: the visible rows, if the SH are in tables of which only these are read.
+    """
 
     splats: ProjectedSplats
     isect_splats: Tensor
     tile_offsets: Tensor
     composited: tuple[Tensor, ...]
+    rows: TableRows | None
+
+
+class ShTables(NamedTuple):
+    """SH of which only the rows of visible Gaussians are read.
+
+    Attributes:
+        parts: the SH of all Gaussians in parts, [N, L, 3] each; empty: no SH are rendered.
+        before: called before rows are read, with the rows, int32 [A], and the number of those that are
+            valid, int32 [1] on the device, or None if all are.
+    """
+
+    parts: Sequence[Tensor]
+    before: Callable[[Tensor, Tensor | None], object]
 
 
 def render_queued(
@@ -27,7 +52,8 @@ def render_queued(
     channels: Callable[[ProjectedSplats], Tensor],
     backgrounds: Tensor | None,
     backward_follows: bool,
-    projected: ProjectedSplats | None = None,
+    exact: bool,
+    tables: ShTables | None = None,
 ) -> Rendered:
     """Render without gradients; the differentiable ops take this result instead of computing it again.
 
@@ -40,37 +66,46 @@ def render_queued(
             splats, and `counts` of these splats is None.
         backgrounds: [B, D] or None.
         backward_follows: see the op `rasterize_fwd`.
-        projected: the result of `project_splats` for these inputs, if it is already known.
+        exact: wait for the number of splats, so that no column has spare capacity meanwhile.
+        tables: the SH, if they are not part of `inputs`.
     """
     options = inputs.options
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
-
-    def composite(
-        splats: ProjectedSplats, n_isects: int, n_splats: Tensor | None
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        geometry = splats.means2d, splats.conics, splats.opacities
-        isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
-            *geometry, splats.depths, splats.camera_ids, None, grid, n_isects, n_splats, True
-        )
-        composited = torch.ops.blitzgs.rasterize_fwd(
-            *geometry, channels(splats), backgrounds, isect_splats, tile_offsets, grid, None, True,
-            backward_follows, n_splats,
-        )  # fmt: skip
-        return isect_splats, tile_offsets, composited
-
+    estimate = capacity_for(inputs)
     with torch._C._AutoDispatchBelowAutograd():
-        if projected is not None:
-            return Rendered(projected, *composite(projected, int(projected.counts[2]), None))
-        for attempt in capacity_for(inputs).attempts():
-            found, capacity = inputs.run(attempt.sizes), attempt.sizes
-            read = HostCopy(found.totals).read
-            if capacity is None:
-                isect_splats, tile_offsets, composited = composite(found.splats, int(read()[2]), None)
-            else:
-                isect_splats, tile_offsets, composited = composite(
-                    found.splats, capacity.isects, found.n_splats
-                )
+        for attempt in [Attempt(None, estimate)] if exact else estimate.attempts():
+            capacity = attempt.sizes
+            projected = inputs.run(capacity)
+            read = HostCopy(projected.totals).read
+            splats, rows = projected.splats, None
+            if tables is not None:
+                splats, rows = _colored(projected, inputs, tables, spare=capacity is not None)
+            n_isects = int(read()[2]) if capacity is None else capacity.isects
+            n_splats = None if capacity is None else projected.n_splats
+            geometry = splats.means2d, splats.conics, splats.opacities
+            isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
+                *geometry, splats.depths, splats.camera_ids, None, grid, n_isects, n_splats, True
+            )
+            composited = torch.ops.blitzgs.rasterize_fwd(
+                *geometry, channels(splats), backgrounds, isect_splats, tile_offsets, grid, None, True,
+                backward_follows, n_splats,
+            )  # fmt: skip
             counts = read()[:3]
             needed = counts.tolist()
             attempt.end(needed, capacity is None or capacity.holds(needed))
-        return Rendered(splats_of(found.splats, counts), isect_splats[: needed[2]], tile_offsets, composited)
+        of_tables = None
+        if tables is not None and rows is not None:
+            of_tables = TableRows(rows.first(needed[0]), tables.parts)
+        splats = splats_of(splats, counts)
+        return Rendered(splats, isect_splats[: needed[2]], tile_offsets, composited, of_tables)
+
+
+def _colored(
+    projected: Projected, inputs: ProjectionInputs, tables: ShTables, spare: bool
+) -> tuple[ProjectedSplats, VisibleRows]:
+    """Colour splats from the tables' rows; spare: whether the splats may have spare capacity."""
+    splats, totals = projected.splats, projected.totals if spare else None
+    # The low half of the first total, the number of visible Gaussians.
+    count = None if totals is None else totals.view(torch.int32)[:1]
+    tables.before(splats.visible_ids, count)
+    return colored_rows(splats, inputs, tables.parts, totals)

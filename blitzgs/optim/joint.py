@@ -121,15 +121,17 @@ class Joint:
             table.step(self._step, ids, [gradients[index] for index in inside])
 
     @torch.no_grad()
-    def catch_up(self, params: Collection[Tensor], rows: Tensor | None = None) -> None:
-        """Apply the steps that rows, int32 [A] or None for all, of the tables of some parameters missed."""
+    def catch_up(
+        self, params: Collection[Tensor], rows: Tensor | None = None, count: Tensor | None = None
+    ) -> None:
+        """Apply the steps that rows of the tables of some parameters missed; as `LazyAdam.catch_up`."""
         wanted = {id(param) for param in params}
         for number, (table, inside) in enumerate(zip(self.tables, self._inside, strict=True)):
             if self._current[number] == self._step:
                 continue
             if not any(id(self._known[index][0]) in wanted for index in inside):
                 continue
-            table.catch_up(self._step, rows)
+            table.catch_up(self._step, rows, count)
             if rows is None:
                 self._current[number] = self._step
 

@@ -132,7 +132,12 @@ class LazyAdam(torch.optim.Optimizer):
                 table.step(int(state["step"]), ids, [values])
 
     @torch.no_grad()
-    def catch_up(self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None) -> None:
+    def catch_up(
+        self,
+        params: Iterable[Tensor] | None = None,
+        rows: Tensor | None = None,
+        count: Tensor | None = None,
+    ) -> None:
         """Apply the steps that rows missed, so that the parameters can be read.
 
         The cost is one reading of the rows' step numbers, and work for the rows that are behind and still
@@ -141,17 +146,19 @@ class LazyAdam(torch.optim.Optimizer):
         Args:
             params: the parameters to update; None: all.
             rows: int32 [A], the rows to update, each once; None: all.
+            count: int32 [1] on the device of the rows, how many of them are rows, the first ones; the host
+                does not wait for it. None, or on CUDA a number above A: all of them.
         """
         chosen = None if params is None else {id(param) for param in params}
         wanted = [entry for entry in self._placed() if chosen is None or id(entry[2]) in chosen]
         if self.joint is not None and self.joint.is_current():
-            self.joint.catch_up([param for _, _, param in wanted], rows)
+            self.joint.catch_up([param for _, _, param in wanted], rows, count)
             return
         self.leave_joint()
         for place, group, param in wanted:
             if self.state.get(param):
                 state, table = self._table_of(place, group, param)
-                table.catch_up(int(state["step"]), rows)
+                table.catch_up(int(state["step"]), rows, count)
 
     @torch.no_grad()
     def bring_up_to_date(self) -> None:

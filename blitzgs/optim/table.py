@@ -53,10 +53,10 @@ class Table:
         """Take step number `step` for the rows `ids`, int32 [A], from a gradient for each parameter."""
         torch.ops.blitzgs.lazy_adam_step_(self._tensors, *self._schedule(step), _columns(gradients), ids)
 
-    def catch_up(self, step: int, rows: Tensor | None = None) -> None:
-        """Apply the steps that the rows, int32 [A] or None for all, have missed up to `step`."""
+    def catch_up(self, step: int, rows: Tensor | None = None, count: Tensor | None = None) -> None:
+        """Apply the steps that rows have missed up to `step`; as `LazyAdam.catch_up`."""
         if self._rows > 0:
-            torch.ops.blitzgs.lazy_adam_catch_up_(self._tensors, *self._schedule(step), rows)
+            torch.ops.blitzgs.lazy_adam_catch_up_(self._tensors, *self._schedule(step), rows, count)
 
     def bring_up_to_date(self, step: int) -> None:
         """Apply all missed steps to all rows and their moments."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from blitzgs.ops.project import differentiable_splats, gaussians_of
 from blitzgs.ops.projection import MOST_VIEWS, ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.render import Rendered
 from blitzgs.rendering.arguments import Gaussians, Scene
 from blitzgs.rendering.covariances import Decomposed, shaped_by
 
@@ -56,15 +57,13 @@ def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Ten
     return scene.colors.unbind(0) if gaussians.per_view else (scene.colors,) * parts
 
 
-def project_groups(
-    groups: Sequence[Group], sparse_grad: bool, ready: ProjectedSplats | None
-) -> ProjectedSplats:
+def project_groups(groups: Sequence[Group], sparse_grad: bool, ready: Rendered | None) -> ProjectedSplats:
     """Return the splats of all images, those of a group after those of the groups before.
 
     Args:
         groups: the groups to project.
         sparse_grad: see `blitzgs.ops.project.project`.
-        ready: the splats of the only group, if they have been computed already.
+        ready: what was rendered without gradients, of the only group.
 
     Returns:
         Splats whose camera_ids number all images of the call. Of several groups, visible_ids and
@@ -72,7 +71,8 @@ def project_groups(
     """
     parts = []
     for group in groups:
-        splats = differentiable_splats(group.inputs, sparse_grad, ready)
+        done = () if ready is None else (ready.splats, ready.rows)
+        splats = differentiable_splats(group.inputs, sparse_grad, *done)
         if group.covariances is not None:
             splats = shaped_by(splats, group.inputs, group.covariances)
         parts.append(splats)

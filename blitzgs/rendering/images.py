@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
-from blitzgs.ops.render import Rendered, render_queued
+from blitzgs.ops.render import Rendered, ShTables, render_queued
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.finite import warn_of_non_finite
 from blitzgs.rendering.groups import Group, groups_of, project_groups
@@ -47,7 +48,7 @@ def render(
     gaussians: Gaussians,
     project: ProjectionOptions,
     image: ImageOptions,
-    projected: ProjectedSplats | None = None,
+    tables: ShTables | None = None,
     job: Job | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`.
@@ -57,7 +58,7 @@ def render(
         gaussians: the Gaussians and views.
         project: options of the projection.
         image: options of compositing.
-        projected: the splats of the only group, if they have been computed already.
+        tables: the SH, if only the rows of visible Gaussians are read; only where `may_queue`.
         job: the ranks among which the Gaussians and views are divided; None: this process has all of them.
     """
     compiling = torch.compiler.is_compiling()
@@ -65,9 +66,9 @@ def render(
     hidden = _without_non_finite(gaussians) if by_value else gaussians
     groups = groups_of(hidden, project)
     ready = None
-    if len(groups) == 1 and groups[0].covariances is None and job is None and not compiling:
-        ready = _queued(groups[0], gaussians, project, image, projected)
-    splats = project_groups(groups, image.sparse_grad, projected if ready is None else ready.splats)
+    if job is None and not compiling and may_queue(groups):
+        ready = _queued(groups[0], gaussians, image, tables)
+    splats = project_groups(groups, image.sparse_grad, ready)
     layout = Layout(splats, gaussians.lead, gaussians.count, image.packed)
     arranged = _arranged(layout, gaussians, project, image)
     rendered, through = splats, None
@@ -103,31 +104,28 @@ def render(
     return renders, alphas, meta
 
 
-def _queued(
-    group: Group,
-    gaussians: Gaussians,
-    project: ProjectionOptions,
-    image: ImageOptions,
-    projected: ProjectedSplats | None,
-) -> Rendered | None:
-    """Queue all work on CUDA before the host knows the number of splats; None if that is not possible."""
-    means = group.inputs.gaussians[0]
+def may_queue(groups: Sequence[Group]) -> bool:
+    """Tell whether the work of a call may be queued before the host knows the number of splats."""
+    if len(groups) > 1 or groups[0].covariances is not None:
+        return False
+    means, options = groups[0].inputs.gaussians[0], groups[0].inputs.options
+    return means.shape[0] > 0 and (not means.is_cuda or options.tile_size == CUDA_TILE_SIZE)
+
+
+def _queued(group: Group, gaussians: Gaussians, image: ImageOptions, tables: ShTables | None) -> Rendered:
+    """Queue all work, on CUDA before the host knows the number of splats."""
+    inputs = group.inputs
     # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
-    if (
-        not means.is_cuda
-        or project.tile_size != CUDA_TILE_SIZE
-        or torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
-        or gaussians.count == 0
-    ):
-        return None
-    inputs = [*group.inputs.gaussians, *group.inputs.cameras, gaussians.colors]
-    differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
+    hooked = torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
+    read = [*inputs.gaussians, *inputs.cameras, gaussians.colors, *(() if tables is None else tables.parts)]
+    differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in read)
     return render_queued(
-        group.inputs,
+        inputs,
         lambda splats: _channels(splats, gaussians, image.render_mode, with_spare=True),
         image.backgrounds,
         differentiable and not image.absgrad,
-        projected,
+        hooked or not inputs.gaussians[0].is_cuda,
+        tables,
     )
 
 

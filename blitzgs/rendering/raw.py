@@ -11,20 +11,26 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from blitzgs.lazy_dict import Later, LazyDict
+from blitzgs.lazy_dict import LazyDict
 from blitzgs.ops.gather_rows import gather_rows
-from blitzgs.ops.projection import ProjectionOptions, colored_rows, project_splats
+from blitzgs.ops.projection import ProjectionOptions, project_splats
+from blitzgs.ops.render import ShTables
 from blitzgs.ops.sparse_rows import full_gradients
 from blitzgs.rendering.arguments import Scene, background_rows, check_options, check_tensors, gaussians_of
-from blitzgs.rendering.groups import Group, groups_of
-from blitzgs.rendering.images import ImageOptions, render
+from blitzgs.rendering.groups import groups_of
+from blitzgs.rendering.images import ImageOptions, may_queue, render
 
 
 class CatchesUp(Protocol):
     """An optimiser that may have pending steps, such as `blitzgs.optim.LazyAdam`."""
 
-    def catch_up(self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None) -> None:
-        """Apply the pending steps of rows of parameters."""
+    def catch_up(
+        self,
+        params: Iterable[Tensor] | None = None,
+        rows: Tensor | None = None,
+        count: Tensor | None = None,
+    ) -> None:
+        """Apply the pending steps of rows of parameters, see `blitzgs.optim.LazyAdam.catch_up`."""
 
 
 def raw_rasterization(
@@ -108,35 +114,34 @@ def raw_rasterization(
     lazy = _lazy(optimizers)
     for optimizer in lazy:
         optimizer.catch_up(geometry)
-    groups = groups_of(whole, project)
-    # One projection of a single group finds its visible Gaussians and computes their splats but for colours.
-    splats = project_splats(groups[0].inputs) if len(groups) == 1 else None
-    ids = _visible(groups) if splats is None else splats.visible_ids
-    for optimizer in lazy:
-        optimizer.catch_up(harmonics, ids)
     shaded = "RGB" in render_mode
+    named = {**whole.named, "sh0": (sh0,), **({} if shN is None else {"shN": (shN,)})}
+    gaussians = replace(
+        whole, colors=sh0 if shaded else None, sh_degree=sh_degree if shaded else None, given=named
+    )
+    image = ImageOptions(
+        render_mode, background_rows(backgrounds, gaussians, render_mode), True, sparse_grad, absgrad
+    )
+
+    def before(rows: Tensor, count: Tensor | None) -> None:
+        for optimizer in lazy:
+            optimizer.catch_up(harmonics, rows, count)
+
+    groups = groups_of(gaussians, project)
+    if may_queue(groups):
+        tables = ShTables(harmonics if shaded else (), before)
+        return render("raw_rasterization", gaussians, project, image, tables=tables)
+    # Several groups, or none of Gaussians: gather the rows that any of them sees, and render these.
+    ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
+    before(ids, None)
     means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
         ids, sparse_grad, *geometry, *(harmonics if shaded else ())
     )
-    named = {**whole.named, "sh0": (sh0,), **({} if shN is None else {"shN": (shN,)})}
-    gaussians = replace(
-        whole,
-        scenes=(Scene(means, quats, scales, opacities, sh, viewmats, Ks),),
-        colors=sh,
-        opacities=opacities,
-        sh_degree=sh_degree if shaded else None,
-        given=named,
-    )
-    background = background_rows(backgrounds, gaussians, render_mode)
-    if splats is not None:
-        splats = colored_rows(splats, groups_of(gaussians, project)[0].inputs)
-    image = ImageOptions(render_mode, background, True, False, absgrad)
-    renders, alphas, meta = render("raw_rasterization", gaussians, project, image, splats)
+    scene = Scene(means, quats, scales, opacities, sh, viewmats, Ks)
+    gaussians = replace(gaussians, scenes=(scene,), colors=sh, opacities=opacities)
+    renders, alphas, meta = render("raw_rasterization", gaussians, project, image._replace(sparse_grad=False))
     assert isinstance(meta, LazyDict)
-    if splats is not None and len(viewmats) == 1:
-        meta["gaussian_ids"] = Later(ids.long)
-    else:
-        meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
+    meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
     return renders, alphas, meta
 
 
@@ -170,11 +175,6 @@ def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, sha
     if shaded and (degree + 1) ** 2 > given:
         raise ValueError(f"sh_degree {degree} needs {(degree + 1) ** 2} SH coefficients, got {given}")
     return degree
-
-
-def _visible(groups: list[Group]) -> Tensor:
-    """Return the Gaussians that at least one view of any group sees, int32 [U], ascending."""
-    return torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
 
 
 class _Visible(torch.autograd.Function):

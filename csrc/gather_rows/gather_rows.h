@@ -2,7 +2,7 @@
 // Gathers the same rows of several columns in one launch. A row of a column has `width` words of 4 bytes:
 //   column.to[i stride + k] = column.from[ids[i] width + k],  0 <= i < n,  0 <= k < width.
 // With a stride above the width, several columns are gathered side by side into one. ids int32 [n], rows of
-// the columns; not checked.
+// the columns; not checked. known: null, or (CUDA) the number of valid ids, see valid_splat_count.
 #pragma once
 #include <cstdint>
 
@@ -22,6 +22,7 @@ struct GatheredColumn {
 struct GatherRows {
   const std::int32_t* ids;
   std::int64_t n;
+  const std::int64_t* known;
   int n_columns;
   GatheredColumn columns[kMostGatheredColumns];
 };

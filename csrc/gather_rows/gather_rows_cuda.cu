@@ -14,7 +14,9 @@ __global__ void __launch_bounds__(kThreads) gather_rows_kernel(const __grid_cons
   __shared__ std::int32_t ids[kThreads];
   const GatheredColumn& column = gather.columns[blockIdx.y];
   const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
-  const auto n = static_cast<std::uint32_t>(gather.n - first < kThreads ? gather.n - first : kThreads);
+  const std::int64_t left = valid_splat_count(gather.n, gather.known) - first;
+  if (left <= 0) return;
+  const auto n = static_cast<std::uint32_t>(left < kThreads ? left : kThreads);
   if (threadIdx.x < n) ids[threadIdx.x] = gather.ids[first + threadIdx.x];
   __syncthreads();
   const std::uint32_t width = column.width;

@@ -1,12 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "gather_rows/gather_rows.h"
-
-#include "common/op.h"
+#include "gather_rows/gather_rows_op.h"
 
 namespace blitzgs {
 namespace {
-
-constexpr const char* kOp = "gather_rows";
 
 // Words of 4 bytes in the elements of a row behind its first `axis` dimensions.
 std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
@@ -15,11 +11,11 @@ std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
   return words;
 }
 
-void check_column(const Tensor& column) {
-  STD_TORCH_CHECK(column.dim() >= 1 && column.element_size() % 4 == 0, "blitzgs::", kOp,
+void check_column(const char* op, const Tensor& column) {
+  STD_TORCH_CHECK(column.dim() >= 1 && column.element_size() % 4 == 0, "blitzgs::", op,
                   ": columns must have rows and elements of 4 or 8 bytes, got ", shape_of(column), " of ",
                   column.element_size(), " bytes");
-  STD_TORCH_CHECK(words_behind(column, 1) < (1 << 16), "blitzgs::", kOp,
+  STD_TORCH_CHECK(words_behind(column, 1) < (1 << 16), "blitzgs::", op,
                   ": rows must be shorter than 256 KiB, got ", shape_of(column));
 }
 
@@ -29,15 +25,15 @@ std::vector<std::int64_t> shape_with(const Tensor& column, std::int64_t rows) {
   return shape;
 }
 
-std::vector<Tensor> gather_rows(const std::vector<Tensor>& columns, const std::vector<Tensor>& joined,
-                                const Tensor& ids_in) {
-  check_shape(kOp, "ids", ids_in, {-1});
-  check_dtype(kOp, "ids", ids_in, ScalarType::Int);
-  STD_TORCH_CHECK(columns.size() + joined.size() <= kMostGatheredColumns, "blitzgs::", kOp, ": at most ",
+}  // namespace
+
+std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& columns,
+                                  const std::vector<Tensor>& joined, const Tensor& ids,
+                                  const std::int64_t* known) {
+  STD_TORCH_CHECK(columns.size() + joined.size() <= kMostGatheredColumns, "blitzgs::", op, ": at most ",
                   kMostGatheredColumns, " columns, got ", columns.size() + joined.size());
-  const Tensor ids = as_contiguous(ids_in);
   const std::int64_t n = ids.size(0);
-  GatherRows gather{data<std::int32_t>(ids), n, 0, {}};
+  GatherRows gather{data<std::int32_t>(ids), n, known, 0, {}};
   std::vector<Tensor> held, found;
   const auto add = [&](const Tensor& column, std::uint32_t* to, std::int64_t stride) {
     const Tensor& from = held.emplace_back(as_contiguous(column));
@@ -47,18 +43,18 @@ std::vector<Tensor> gather_rows(const std::vector<Tensor>& columns, const std::v
     return width;
   };
   for (const Tensor& column : columns) {
-    check_column(column);
+    check_column(op, column);
     Tensor& rows = found.emplace_back(make_empty(column, shape_with(column, n)));
     add(column, static_cast<std::uint32_t*>(rows.mutable_data_ptr()), words_behind(column, 1));
   }
   if (!joined.empty()) {
     std::int64_t length = 0, stride = 0;
     for (const Tensor& part : joined) {
-      check_column(part);
-      check_dtype(kOp, "joined columns", part, joined[0].scalar_type());
+      check_column(op, part);
+      check_dtype(op, "joined columns", part, joined[0].scalar_type());
       STD_TORCH_CHECK(part.dim() >= 2 && part.dim() == joined[0].dim() &&
                           words_behind(part, 2) == words_behind(joined[0], 2),
-                      "blitzgs::", kOp, ": joined columns must be alike behind their second dimension, got ",
+                      "blitzgs::", op, ": joined columns must be alike behind their second dimension, got ",
                       shape_of(part), " beside ", shape_of(joined[0]));
       length += part.size(1);
       stride += words_behind(part, 1);
@@ -72,6 +68,16 @@ std::vector<Tensor> gather_rows(const std::vector<Tensor>& columns, const std::v
   DeviceScope scope(ids);
   backend::gather_rows(gather, scope.workspace, scope.stream);
   return found;
+}
+
+namespace {
+
+std::vector<Tensor> gather_rows(const std::vector<Tensor>& columns, const std::vector<Tensor>& joined,
+                                const Tensor& ids) {
+  constexpr const char* kOp = "gather_rows";
+  check_shape(kOp, "ids", ids, {-1});
+  check_dtype(kOp, "ids", ids, ScalarType::Int);
+  return gathered_rows(kOp, columns, joined, as_contiguous(ids), nullptr);
 }
 
 }  // namespace

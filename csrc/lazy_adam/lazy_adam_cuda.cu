@@ -93,8 +93,11 @@ __device__ void catch_up_elements(const AdamArgs<float>& args, const PendingStep
   }
 }
 
-// The number of valid rows in the list.
-__device__ std::int64_t listed(const AdamArgs<float>& args) { return args.count ? *args.count : args.n; }
+// The number of valid rows in the list. A count above n says that the caller had too little room for the list
+// and will repeat its work; the n rows that are there are valid.
+__device__ std::int64_t listed(const AdamArgs<float>& args) {
+  return args.count && *args.count < args.n ? *args.count : args.n;
+}
 
 // Writes the pending rows [n], one thread per listed row, and sets last_step to the target, as if the rows
 // had caught up. Rows for which the rules are not exact enough, which occur only early in a schedule, catch

@@ -259,16 +259,17 @@ struct SplatIndex {
   std::int64_t n_visible;
 };
 
-// color_splats computes the colours of n_splats splats that project() wrote without `sh`, and hides those
-// whose colour is not finite. It reads the means, the SH and the cameras of its inputs, whose rows
-// `gaussian_ids` counts, and writes colors, opacities, radii and tiles_touched; other columns may be null.
+// color_splats computes the colours of the splats that project() wrote without `sh`, and hides those whose
+// colour is not finite. It reads the means, the SH and the cameras of its inputs, whose rows `gaussian_ids`
+// counts, and writes colors, opacities, radii and tiles_touched; other columns may be null. It does nothing
+// if there are more splats than the capacity. On the CPU the sizes of the capacity are the actual numbers.
 
 namespace cpu {
 template <class T>
 void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
 template <class T>
-void color_splats(const ProjectInputs<T>&, std::int64_t n_splats, const ProjectColumns<T>&, Workspace&,
+void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, Workspace&,
                   CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
@@ -283,7 +284,7 @@ template <class T>
 void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
              CudaStream);
 template <class T>
-void color_splats(const ProjectInputs<T>&, std::int64_t n_splats, const ProjectColumns<T>&, Workspace&,
+void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, Workspace&,
                   CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,

@@ -233,11 +233,11 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemor
 }
 
 template <class T>
-void color_splats(const ProjectInputs<T>& in, std::int64_t n_splats, const ProjectColumns<T>& columns,
-                  Workspace&, CudaStream) {
+void color_splats(const ProjectInputs<T>& in, const ProjectCapacity& capacity,
+                  const ProjectColumns<T>& columns, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const ProjectOutputs<T>& out = columns.values;
-  parallel_for(0, n_splats, 1 << 10, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(0, capacity.sizes.splats, 1 << 10, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       const std::int64_t id = columns.ids.gaussian_ids[i];
       if (splat_color(cameras[columns.ids.camera_ids[i]], load3(in.means + 3 * id),
@@ -279,13 +279,13 @@ void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
   }
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                               \
-  template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,        \
-                           Workspace&, CudaStream);                                                          \
-  template void color_splats<T>(const ProjectInputs<T>&, std::int64_t, const ProjectColumns<T>&, Workspace&, \
-                                CudaStream);                                                                 \
-  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,   \
-                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);  \
+#define BLITZGS_INSTANTIATE(T)                                                                              \
+  template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,       \
+                           Workspace&, CudaStream);                                                         \
+  template void color_splats<T>(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&,  \
+                                Workspace&, CudaStream);                                                    \
+  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,  \
+                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream); \
   template void zero_arrays<T>(const ZeroedArrays<T>&, CudaStream);
 BLITZGS_INSTANTIATE(float)
 BLITZGS_INSTANTIATE(double)

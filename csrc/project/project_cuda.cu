@@ -236,9 +236,9 @@ void project<float>(const Inputs& in, const RankTiles& rank_tiles, SplatMemory<f
 }
 
 template <>
-void color_splats<float>(const Inputs& in, std::int64_t n_splats, const ProjectColumns<float>& columns,
-                         Workspace&, CudaStream stream) {
-  write_colors(in, {{0, n_splats}, nullptr}, columns, stream);
+void color_splats<float>(const Inputs& in, const ProjectCapacity& capacity,
+                         const ProjectColumns<float>& columns, Workspace&, CudaStream stream) {
+  write_colors(in, capacity, columns, stream);
 }
 
 }  // namespace blitzgs::cuda

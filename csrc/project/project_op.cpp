@@ -151,40 +151,7 @@ Projected project_fwd(const TensorList& gaussians, const TensorList& cameras, co
           t.opacities,    t.colors,     t.radii,       t.tiles_touched, t.rank_masks, t.splat_ids, totals};
 }
 
-Tensor color_splats(const TensorList& gaussians, const TensorList& cameras, const Tensor& gaussian_ids,
-                    const Tensor& camera_ids, TensorList shown, const IntList& ints,
-                    const FloatList& floats) {
-  constexpr const char* kOp = "color_splats_";
-  const ProjectArguments p(kOp, gaussians, cameras, ints, floats, std::nullopt);
-  STD_TORCH_CHECK(p.sh.has_value(), "blitzgs::", kOp, ": needs sh");
-  const std::int64_t P = gaussian_ids.numel();
-  check_in_place(kOp, "gaussian_ids", gaussian_ids, ScalarType::Int, {P});
-  check_in_place(kOp, "camera_ids", camera_ids, ScalarType::Int, {P});
-  check_group(kOp, "(opacities, radii, tiles_touched)", shown, 3, 3);
-  check_in_place(kOp, "opacities", shown[0], p.means.scalar_type(), {P});
-  check_in_place(kOp, "radii", shown[1], ScalarType::Int, {P, 2});
-  check_in_place(kOp, "tiles_touched", shown[2], ScalarType::Int, {P});
-  Tensor colors = make_empty(p.means, {P, 3});
-  DeviceScope scope(p.means);
-  dispatch_floating(p.means, [&](auto zero) {
-    using T = decltype(zero);
-    ProjectColumns<T> columns{};
-    // The kernels of project_fwd write the ids; those of this op only read them.
-    columns.ids.gaussian_ids = const_cast<std::int32_t*>(data<std::int32_t>(gaussian_ids));
-    columns.ids.camera_ids = const_cast<std::int32_t*>(data<std::int32_t>(camera_ids));
-    columns.values.colors = mutable_data<T>(colors);
-    columns.values.opacities = mutable_data<T>(shown[0]);
-    columns.values.radii = mutable_data<std::int32_t>(shown[1]);
-    columns.values.tiles_touched = mutable_data<std::int32_t>(shown[2]);
-    backend::color_splats(p.inputs<T>(), P, columns, scope.workspace, scope.stream);
-  });
-  return colors;
-}
-
 }  // namespace
 }  // namespace blitzgs
 
-BLITZGS_REGISTER(m) {
-  m.impl("project_fwd", TORCH_BOX(&blitzgs::project_fwd));
-  m.impl("color_splats_", TORCH_BOX(&blitzgs::color_splats));
-}
+BLITZGS_REGISTER(m) { m.impl("project_fwd", TORCH_BOX(&blitzgs::project_fwd)); }

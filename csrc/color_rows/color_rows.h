@@ -1,0 +1,36 @@
+// SPDX-License-Identifier: Apache-2.0
+// Numbers the rows that are gathered for the visible Gaussians of a projection (project.h): row u is the
+// Gaussian visible_ids[u].
+//   rows[u] = u;   row_of_splat[i] = u for the splats i of this Gaussian, splat_offsets[u] .. splat_offsets[u
+//   + 1] - 1.
+// On CUDA nothing is written if there are more splats than the capacity. On the CPU the sizes of the capacity
+// are the actual numbers.
+#pragma once
+#include <cstdint>
+
+#include "common/kernel.h"
+#include "project/project.h"
+
+namespace blitzgs {
+
+struct NumberedRows {
+  const std::int32_t* splat_offsets;  // [U + 1]
+  std::int32_t* rows;                 // [U]
+  std::int32_t* row_of_splat;         // [P]
+};
+
+BLITZGS_HD void number_row(const NumberedRows& numbered, std::int32_t u) {
+  numbered.rows[u] = u;
+  for (std::int32_t i = numbered.splat_offsets[u]; i < numbered.splat_offsets[u + 1]; ++i) {
+    numbered.row_of_splat[i] = u;
+  }
+}
+
+namespace cpu {
+void number_rows(const NumberedRows&, const ProjectCapacity&, CudaStream);
+}
+namespace cuda {
+void number_rows(const NumberedRows&, const ProjectCapacity&, CudaStream);
+}
+
+}  // namespace blitzgs
