@@ -185,10 +185,13 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The rules of the total drift of a row, by the step of its parameters; `like` has the dtype of the
   // parameters.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
-  // Adds a step to the tables of T schedules; rates: 6 T learning rates.
+  // Adds a step to the tables of T schedules and takes it, as lazy_adam_step_, for the same rows of the T
+  // tables of parameters that have these schedules. terms: (decays, shares); states and grads: of each table;
+  // rates: 6 T learning rates; indices: int64, of a sparse gradient.
   m.def(
-      "add_drift_step_(Tensor(a!) tables, Tensor(b!) lr_tables, Tensor decays, Tensor shares, int step, "
-      "float[] rates) -> ()");
+      "drift_step_(Tensor(a!) tables, Tensor(b!) lr_tables, Tensor[] terms, Tensor(c!)[] states, int[] "
+      "steps, "
+      "float[] decays, float[] rates, Tensor[] grads, Tensor indices) -> ()");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "

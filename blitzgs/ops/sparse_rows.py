@@ -67,14 +67,15 @@ def full_gradients(
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the indices int64 [U] and values [U, ...] of a sparse tensor, each index once.
+    """Return the indices int64 [1, U] and values [U, ...] of a sparse tensor, each index once.
 
     Args:
         table: a tensor whose only sparse dimension is the first.
     """
     if not table.is_coalesced():
-        here = table._indices().untyped_storage()._cdata
+        indices = table._indices()
+        here = indices.untyped_storage()._cdata
         if any(known.cdata == here and not known.expired() for known in reversed(_distinct)):
-            return table._indices()[0], table._values()
+            return indices, table._values()
         table = table.coalesce()
-    return table.indices()[0], table.values()
+    return table.indices(), table.values()

@@ -101,18 +101,35 @@ class Drift:
         """Tell whether the tables are full, so that no steps after `step` fit."""
         return step - self.begin >= CAPACITY
 
-    def add(self, step: int, rates: Sequence[float]) -> None:
-        """Add a step to the tables, in one launch that copies nothing to the device.
+    def step(
+        self,
+        step: int,
+        rates: Sequence[float],
+        eps: float,
+        states: Sequence[Tensor],
+        gradients: Sequence[Tensor],
+        indices: Tensor,
+    ) -> None:
+        """Add a step to the tables and take it for some rows; nothing is copied to the device.
 
         Args:
             step: number of the step, from 1.
-            rates: 6 T learning rates, in the order of the tables.
+            rates: 6 T learning rates, in the order of the tables; they are rounded to float32.
+            eps: of the optimiser.
+            states: the T tables of parameters, `AdamState.tensors` each.
+            gradients: those of the rows, for the five columns of each table.
+            indices: int64 [1, A] or [A], the rows, each once.
         """
-        # As in lr_tables.
-        rounded = np.asarray(rates, np.float32).tolist()
-        place = step - self.begin
-        torch.ops.blitzgs.add_drift_step_(
-            self._tables, self._lr_tables, self._decays, self._shares, place, rounded
+        torch.ops.blitzgs.drift_step_(
+            self._tables,
+            self._lr_tables,
+            (self._decays, self._shares),
+            states,
+            (step - self.begin, self.reach, 0),
+            (*self.betas, eps),
+            rates,
+            gradients,
+            indices,
         )
 
     def alone(self, table: int, group: int) -> Drift:
@@ -133,6 +150,6 @@ class Drift:
         return copied
 
 
-@torch.library.register_fake("blitzgs::add_drift_step_")
+@torch.library.register_fake("blitzgs::drift_step_")
 def _(*_args: Any) -> None:
     return None

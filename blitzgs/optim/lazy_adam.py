@@ -115,21 +115,21 @@ class LazyAdam(torch.optim.Optimizer):
             if drift.is_full(int(state["step"])):
                 table.restart(int(state["step"]))
                 drift.restart(int(state["step"]))
-            state["step"] += 1
-            drift.add(int(state["step"]), (0.0,) * 4 + rates_of(group))
             if param.grad.is_sparse:
                 if param.grad.sparse_dim() != 1:
                     raise ValueError(
                         "LazyAdam: a sparse gradient must have whole rows (one sparse dimension), got "
                         f"{param.grad.sparse_dim()} of them"
                     )
-                rows, values = distinct_rows(param.grad)
-                ids = rows.int()
+                indices, values = distinct_rows(param.grad)
             else:
-                ids = torch.arange(len(param), dtype=torch.int32, device=param.device)
-                values = param.grad
-            if param.numel() > 0 and len(ids) > 0:
-                table.step(int(state["step"]), ids, [values])
+                indices, values = torch.arange(len(param), device=param.device), param.grad
+            if param.numel() == 0:
+                indices = indices[:0]
+            rates = (0.0,) * 4 + rates_of(group)
+            gradients = table.columns([values])
+            state["step"] += 1
+            drift.step(int(state["step"]), rates, table.eps, table.tensors, gradients, indices)
 
     @torch.no_grad()
     def catch_up(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,6 +24,8 @@ class Table:
 
     Attributes:
         drift: has the table of the missed steps.
+        eps: of the optimiser.
+        tensors: parameters, moments and steps, as `AdamState.tensors`.
     """
 
     def __init__(
@@ -42,21 +45,24 @@ class Table:
             index: which of its tables belongs to these parameters.
             eps: of the optimiser.
         """
-        self.drift, self._index, self._eps = drift, index, eps
+        self.drift, self.eps, self._index = drift, eps, index
         self._moments = [[state[name] for state in states] for name in MOMENTS]
         self._steps = [states[0][name] for name in STEPS]
         self._rows = len(params[0])
-        columns = [_columns(values) for values in (params, *self._moments)]
-        self._tensors = [*columns[0], *columns[1], *columns[2], *self._steps]  # as `AdamState.tensors`
+        # A parameter alone is the SH column of the op, and the others are empty.
+        alone = len(params) == 1
+        self._empty = [params[0].new_empty(self._rows, 0)] * 4 if alone else []
+        columns = (self.columns(values) for values in (params, *self._moments))
+        self.tensors = [*itertools.chain(*columns), *self._steps]
 
-    def step(self, step: int, ids: Tensor, gradients: Sequence[Tensor]) -> None:
-        """Take step number `step` for the rows `ids`, int32 [A], from a gradient for each parameter."""
-        torch.ops.blitzgs.lazy_adam_step_(self._tensors, *self._schedule(step), _columns(gradients), ids)
+    def columns(self, values: Sequence[Tensor]) -> list[Tensor]:
+        """Return the op's five columns, from a value for each parameter."""
+        return [*self._empty, *values]
 
     def catch_up(self, step: int, rows: Tensor | None = None, count: Tensor | None = None) -> None:
         """Apply the steps that rows have missed up to `step`; as `LazyAdam.catch_up`."""
         if self._rows > 0:
-            torch.ops.blitzgs.lazy_adam_catch_up_(self._tensors, *self._schedule(step), rows, count)
+            torch.ops.blitzgs.lazy_adam_catch_up_(self.tensors, *self._schedule(step), rows, count)
 
     def bring_up_to_date(self, step: int) -> None:
         """Apply all missed steps to all rows and their moments."""
@@ -80,13 +86,8 @@ class Table:
         return (
             [drift.tables[self._index], drift.lr_tables[self._index]],
             [step - drift.begin, drift.reach, 0],
-            [*drift.betas, self._eps],
+            [*drift.betas, self.eps],
         )
-
-
-def _columns(values: Sequence[Tensor]) -> Sequence[Tensor]:
-    """Return the op's five columns; a parameter alone is its SH column, and the others are empty."""
-    return values if len(values) > 1 else [values[0].new_empty(len(values[0]), 0)] * 4 + [values[0]]
 
 
 def rates_of(group: dict[str, Any]) -> tuple[float, float]:

@@ -124,6 +124,21 @@ inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& sh
   return Tensor(handle);
 }
 
+// Entry i of a contiguous tensor along its first dimension, in the same memory.
+inline Tensor part_of(const Tensor& tensor, std::int64_t i) {
+  std::vector<std::int64_t> shape, strides;
+  for (std::int64_t axis = 1; axis < tensor.dim(); ++axis) {
+    shape.push_back(tensor.size(axis));
+    strides.push_back(tensor.stride(axis));
+  }
+  std::int64_t offset = 0;
+  TORCH_ERROR_CODE_CHECK(aoti_torch_get_storage_offset(tensor.get(), &offset));
+  AtenTensorHandle handle = nullptr;
+  TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(
+      tensor.get(), tensor.dim() - 1, shape.data(), strides.data(), offset + i * tensor.stride(0), &handle));
+  return Tensor(handle);
+}
+
 template <class T>
 const T* data(const Tensor& tensor) {
   return static_cast<const T*>(tensor.const_data_ptr());

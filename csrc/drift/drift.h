@@ -4,6 +4,7 @@
 // term (blitzgs/optim/drift.py). For the step s with learning rates r_g, the rows t = s - reach .. s - 1,
 // orders k and groups g:
 //   tail_k[t] += decays[reach - (s - t)][k] shares[s][k] r_g,   and lr_table[s][g] = r_g.
+// narrow_rows turns the int64 indices of a sparse gradient into the int32 rows that lazy_adam takes.
 #pragma once
 #include <cstdint>
 
@@ -41,9 +42,11 @@ BLITZGS_HD void add_drift(const DriftStep& drift, int table, std::int64_t back, 
 
 namespace cpu {
 void add_drift_step(const DriftStep&, Workspace&, CudaStream);
-}
+void narrow_rows(const std::int64_t* indices, std::int64_t n, std::int32_t* rows, CudaStream);
+}  // namespace cpu
 namespace cuda {
 void add_drift_step(const DriftStep&, Workspace&, CudaStream);
-}
+void narrow_rows(const std::int64_t* indices, std::int64_t n, std::int32_t* rows, CudaStream);
+}  // namespace cuda
 
 }  // namespace blitzgs

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "drift/drift.h"
 
+#include <algorithm>
+
 namespace blitzgs::cpu {
 
 void add_drift_step(const DriftStep& drift, Workspace&, CudaStream) {
@@ -11,6 +13,10 @@ void add_drift_step(const DriftStep& drift, Workspace&, CudaStream) {
       }
     }
   }
+}
+
+void narrow_rows(const std::int64_t* indices, std::int64_t n, std::int32_t* rows, CudaStream) {
+  std::transform(indices, indices + n, rows, [](std::int64_t i) { return static_cast<std::int32_t>(i); });
 }
 
 }  // namespace blitzgs::cpu

@@ -4,33 +4,10 @@
 namespace blitzgs {
 namespace {
 
-void lazy_adam_step(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,
+void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
                     const std::vector<std::int64_t>& steps, const std::vector<double>& decays,
                     const std::vector<Tensor>& grads, const Tensor& ids) {
-  constexpr const char* kOp = "lazy_adam_step_";
-  AdamTensors state(kOp, state_in, tables, steps, decays);
-  STD_TORCH_CHECK(grads.size() == kAdamColumns, "blitzgs::", kOp,
-                  ": grads must hold means, quats, scales, opacities, sh; got ", grads.size(), " tensors");
-  STD_TORCH_CHECK(state.step >= 1, "blitzgs::lazy_adam_step_: steps count from 1, got ", state.step);
-  check_dtype(kOp, "ids", ids, ScalarType::Int);
-  check_shape(kOp, "ids", ids, {-1});
-  const Tensor list = as_contiguous(ids);
-  const std::int64_t n = list.size(0);
-  std::vector<Tensor> held;
-  for (int c = 0; c < kAdamColumns; ++c) {
-    const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
-    check_dtype(kOp, "grads", grad, state.like().scalar_type());
-    STD_TORCH_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * state.width(c),
-                    "blitzgs::", kOp, ": the gradient of ", kAdamNames[c], " must have ", n, " rows of ",
-                    state.width(c), " values, got ", shape_of(grad));
-  }
-  DeviceScope scope(state.like());
-  dispatch_floating(state.like(), [&](auto zero) {
-    using T = decltype(zero);
-    AdamArgs<T> args = state.arguments<T>(data<std::int32_t>(list), n);
-    for (int c = 0; c < kAdamColumns; ++c) args.columns[c].grad = data<T>(held[c]);
-    if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
-  });
+  AdamTensors("lazy_adam_step_", state, tables, steps, decays).step_rows(grads, ids);
 }
 
 void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,

@@ -91,6 +91,34 @@ struct AdamTensors {
     return args;
   }
 
+  // Takes the step for the rows `ids`, int32 [A], from a gradient [A, ...] for each column; those of empty
+  // columns are not read.
+  void step_rows(const std::vector<Tensor>& grads, const Tensor& ids) {
+    STD_TORCH_CHECK(grads.size() == kAdamColumns, "blitzgs::", op,
+                    ": grads must hold means, quats, scales, opacities, sh; got ", grads.size(), " tensors");
+    STD_TORCH_CHECK(step >= 1, "blitzgs::", op, ": steps count from 1, got ", step);
+    check_dtype(op, "ids", ids, ScalarType::Int);
+    check_shape(op, "ids", ids, {-1});
+    const Tensor list = as_contiguous(ids);
+    const std::int64_t n = list.size(0);
+    std::vector<Tensor> held;
+    for (int c = 0; c < kAdamColumns; ++c) {
+      const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
+      if (width(c) == 0) continue;
+      check_dtype(op, "grads", grad, like().scalar_type());
+      STD_TORCH_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * width(c), "blitzgs::", op,
+                      ": the gradient of ", kAdamNames[c], " must have ", n, " rows of ", width(c),
+                      " values, got ", shape_of(grad));
+    }
+    DeviceScope scope(like());
+    dispatch_floating(like(), [&](auto zero) {
+      using T = decltype(zero);
+      AdamArgs<T> args = arguments<T>(data<std::int32_t>(list), n);
+      for (int c = 0; c < kAdamColumns; ++c) args.columns[c].grad = data<T>(held[c]);
+      if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
+    });
+  }
+
   std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
 
  private:
