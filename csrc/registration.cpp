@@ -213,6 +213,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("take_rows(Tensor column, Tensor rows, Tensor? fresh) -> Tensor");
   // The same rows of several columns, and then those of `joined`, side by side along the second dimension.
   m.def("gather_rows(Tensor[] columns, Tensor[] joined, Tensor ids) -> Tensor[]");
+  // The inverse of joining: the parts of rows along the second dimension, each in memory of its own.
+  m.def("split_rows(Tensor rows, int[] lengths) -> Tensor[]");
+  // The first rows of columns, in the same memory without autograd's knowledge.
+  m.def("first_rows(Tensor[] columns, int[] lengths) -> Tensor[]");
 
   // For a table in the memory of the host with a pool of blocks on the device: the blocks that views may see,
   // and the exchange of blocks between table and pool. The first n_written columns are written back.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
-from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs, first_rows
+from blitzgs.ops.projection import ProjectedSplats, ProjectionInputs
 
 
 class VisibleRows(NamedTuple):
@@ -23,11 +23,6 @@ class VisibleRows(NamedTuple):
 
     inputs: ProjectionInputs
     numbers: Tensor
-
-    def first(self, count: int) -> VisibleRows:
-        """Return the first `count` rows."""
-        *gaussians, numbers = first_rows((*self.inputs.gaussians, self.numbers), (count,) * 6)
-        return VisibleRows(self.inputs._replace(gaussians=gaussians), numbers)
 
 
 @torch.no_grad()

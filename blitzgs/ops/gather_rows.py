@@ -31,6 +31,25 @@ def gather_rows(columns: Sequence[Tensor], joined: Sequence[Tensor], ids: Tensor
     return found
 
 
+def split_rows(rows: Tensor, lengths: Sequence[int]) -> list[Tensor]:
+    """Return the parts of rows [U, K, ...] along their second dimension, each in memory of its own.
+
+    Args:
+        rows: elements of 4 or 8 bytes.
+        lengths: of at most 8 parts; their sum is K.
+
+    Raises:
+        RuntimeError: the lengths do not fit.
+    """
+    parts: list[Tensor] = torch.ops.blitzgs.split_rows(rows, lengths)
+    return parts
+
+
+@torch.library.register_fake("blitzgs::split_rows")
+def _(rows: Tensor, lengths: Sequence[int]) -> list[Tensor]:
+    return [rows.new_empty(len(rows), length, *rows.shape[2:]) for length in lengths]
+
+
 @torch.library.register_fake("blitzgs::gather_rows")
 def _(columns: Sequence[Tensor], joined: Sequence[Tensor], ids: Tensor) -> list[Tensor]:
     rows = [column.new_empty((len(ids), *column.shape[1:])) for column in columns]

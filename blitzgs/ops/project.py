@@ -11,6 +11,7 @@ from torch import Tensor
 
 from blitzgs.ops.color_rows import VisibleRows
 from blitzgs.ops.derivatives import first_only, unrecorded
+from blitzgs.ops.gather_rows import split_rows
 from blitzgs.ops.projection import (
     VIEW_TOTALS,
     ProjectedSplats,
@@ -308,7 +309,7 @@ def _first_gradients(
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
     if len(ctx.parts) > 1:
         # Autograd would copy a gradient that is not contiguous, and its indices with it.
-        found[4:] = [part.contiguous() for part in gradients[4].split(ctx.parts, dim=1)]
+        found[4:] = split_rows(gradients[4], ctx.parts)
     if not dense:
         found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
     if not dense and not complete:

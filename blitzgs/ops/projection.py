@@ -47,9 +47,16 @@ def splats_of(allocated: Sequence[Tensor], counts: Tensor) -> ProjectedSplats:
         allocated: a `ProjectedSplats`; its `counts` are not read.
         counts: `counts` of the result.
     """
-    visible, splats, *_ = counts.tolist()
-    lengths = (splats, splats, visible, visible + 1, *(splats,) * 8)
-    return ProjectedSplats._make((*first_rows(allocated, lengths), counts))
+    sizes = Sizes(*counts.tolist())
+    if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
+        allocated = first_rows(allocated[:12], lengths_of(sizes))
+    return ProjectedSplats._make((*allocated[:12], counts))
+
+
+def lengths_of(sizes: Sizes) -> list[int]:
+    """Return the lengths of the columns of `ProjectedSplats` but for `counts`."""
+    visible, splats = sizes[:2]
+    return [splats, splats, visible, visible + 1, *[splats] * 8]
 
 
 def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor]:
@@ -58,10 +65,13 @@ def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor
     Autograd does not see that these are views: a Function may return views, but its caller could not change
     them in place.
     """
-    with torch._C._AutoDispatchBelowADInplaceOrView():
-        return [
-            column[:n] if column.shape[0] > n else column for column, n in zip(columns, lengths, strict=False)
-        ]
+    found: list[Tensor] = torch.ops.blitzgs.first_rows(columns, lengths)
+    return found
+
+
+@torch.library.register_fake("blitzgs::first_rows")
+def _(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor]:
+    return [column.new_empty(n, *column.shape[1:]) for column, n in zip(columns, lengths, strict=True)]
 
 
 class Splats(NamedTuple):

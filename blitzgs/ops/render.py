@@ -9,11 +9,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.ops.capacity import Attempt
+from blitzgs.ops.capacity import Attempt, Sizes
 from blitzgs.ops.color_rows import VisibleRows, colored_rows
 from blitzgs.ops.host import HostCopy
 from blitzgs.ops.project import TableRows
-from blitzgs.ops.projection import Projected, ProjectedSplats, ProjectionInputs, capacity_for, splats_of
+from blitzgs.ops.projection import (
+    Projected,
+    ProjectedSplats,
+    ProjectionInputs,
+    capacity_for,
+    first_rows,
+    lengths_of,
+)
 
 
 class Rendered(NamedTuple):
@@ -76,12 +83,14 @@ def render_queued(
         for attempt in [Attempt(None, estimate)] if exact else estimate.attempts():
             capacity = attempt.sizes
             projected = inputs.run(capacity)
-            read = HostCopy(projected.totals).read
+            copy = HostCopy(projected.totals)
             splats, rows = projected.splats, None
             if tables is not None:
                 splats, rows = _colored(projected, inputs, tables, spare=capacity is not None)
-            n_isects = int(read()[2]) if capacity is None else capacity.isects
-            n_splats = None if capacity is None else projected.n_splats
+            if capacity is None:
+                n_isects, n_splats = int(copy.read()[2]), None
+            else:
+                n_isects, n_splats = capacity.isects, projected.n_splats
             geometry = splats.means2d, splats.conics, splats.opacities
             isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
                 *geometry, splats.depths, splats.camera_ids, None, grid, n_isects, n_splats, True
@@ -90,14 +99,14 @@ def render_queued(
                 *geometry, channels(splats), backgrounds, isect_splats, tile_offsets, grid, None, True,
                 backward_follows, n_splats,
             )  # fmt: skip
-            counts = read()[:3]
-            needed = counts.tolist()
-            attempt.end(needed, capacity is None or capacity.holds(needed))
-        of_tables = None
-        if tables is not None and rows is not None:
-            of_tables = TableRows(rows.first(needed[0]), tables.parts)
-        splats = splats_of(splats, counts)
-        return Rendered(splats, isect_splats[: needed[2]], tile_offsets, composited, of_tables)
+            counts = copy.read()[:3]
+            needed = Sizes(*counts.tolist())
+            attempt.end(needed[:3], capacity is None or capacity.holds(needed))
+        splats = splats._replace(counts=counts)
+        if capacity is not None:
+            splats, isect_splats, rows = _without_spare(splats, isect_splats, rows, needed)
+        of_tables = None if tables is None or rows is None else TableRows(rows, tables.parts)
+        return Rendered(splats, isect_splats, tile_offsets, composited, of_tables)
 
 
 def _colored(
@@ -109,3 +118,17 @@ def _colored(
     count = None if totals is None else totals.view(torch.int32)[:1]
     tables.before(splats.visible_ids, count)
     return colored_rows(splats, inputs, tables.parts, totals)
+
+
+def _without_spare(
+    splats: ProjectedSplats, isect_splats: Tensor, rows: VisibleRows | None, needed: Sizes
+) -> tuple[ProjectedSplats, Tensor, VisibleRows | None]:
+    """Cut spare capacity off all columns, in one operation."""
+    own: list[Tensor] = [] if rows is None else [*rows.inputs.gaussians, rows.numbers]
+    lengths = [*lengths_of(needed), needed.isects, *[needed.visible] * len(own)]
+    found = first_rows([*splats[:12], isect_splats, *own], lengths)
+    splats = ProjectedSplats._make((*found[:12], splats.counts))
+    if rows is not None:
+        *gaussians, numbers = found[13:]
+        rows = VisibleRows(rows.inputs._replace(gaussians=gaussians), numbers)
+    return splats, found[12], rows

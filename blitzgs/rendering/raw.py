@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.lazy_dict import LazyDict
-from blitzgs.ops.gather_rows import gather_rows
+from blitzgs.ops.gather_rows import gather_rows, split_rows
 from blitzgs.ops.projection import ProjectionOptions, project_splats
 from blitzgs.ops.render import ShTables
 from blitzgs.ops.sparse_rows import full_gradients
@@ -201,7 +201,6 @@ class _Visible(torch.autograd.Function):
         if len(ctx.lengths) == 1 or v_sh is None:
             gradients += [v_sh] * len(ctx.lengths)
         else:
-            # Autograd would copy a gradient that is not contiguous, and its indices with it.
-            gradients += [part.contiguous() for part in v_sh.split(ctx.lengths, dim=1)]
+            gradients += split_rows(v_sh, ctx.lengths)
         sparse = [ctx.sparse] * len(gradients)
         return None, None, *full_gradients(ids, gradients, ctx.shapes, sparse)

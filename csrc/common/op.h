@@ -124,19 +124,36 @@ inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& sh
   return Tensor(handle);
 }
 
-// Entry i of a contiguous tensor along its first dimension, in the same memory.
+// A tensor in the memory of another one, `offset` elements after its begin. Autograd does not see that it is
+// a view.
+inline Tensor view_of(const Tensor& tensor, const std::vector<std::int64_t>& shape,
+                      const std::vector<std::int64_t>& strides, std::int64_t offset) {
+  AtenTensorHandle handle = nullptr;
+  // Despite the name of its parameter, torch adds the offset to that of the tensor.
+  TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(tensor.get(), static_cast<std::int64_t>(shape.size()),
+                                                        shape.data(), strides.data(), offset, &handle));
+  return Tensor(handle);
+}
+
+// Entry i of a tensor along its first dimension.
 inline Tensor part_of(const Tensor& tensor, std::int64_t i) {
   std::vector<std::int64_t> shape, strides;
   for (std::int64_t axis = 1; axis < tensor.dim(); ++axis) {
     shape.push_back(tensor.size(axis));
     strides.push_back(tensor.stride(axis));
   }
-  std::int64_t offset = 0;
-  TORCH_ERROR_CODE_CHECK(aoti_torch_get_storage_offset(tensor.get(), &offset));
-  AtenTensorHandle handle = nullptr;
-  TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(
-      tensor.get(), tensor.dim() - 1, shape.data(), strides.data(), offset + i * tensor.stride(0), &handle));
-  return Tensor(handle);
+  return view_of(tensor, shape, strides, i * tensor.stride(0));
+}
+
+// The first `length` rows of a tensor, or all if it has no more.
+inline Tensor rows_of(const Tensor& tensor, std::int64_t length) {
+  std::vector<std::int64_t> shape, strides;
+  for (std::int64_t axis = 0; axis < tensor.dim(); ++axis) {
+    shape.push_back(tensor.size(axis));
+    strides.push_back(tensor.stride(axis));
+  }
+  shape[0] = std::min(shape[0], length);
+  return view_of(tensor, shape, strides, 0);
 }
 
 template <class T>

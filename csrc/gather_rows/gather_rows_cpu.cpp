@@ -11,8 +11,8 @@ void gather_rows(const GatherRows& gather, Workspace&, CudaStream) {
     for (int c = 0; c < gather.n_columns; ++c) {
       const GatheredColumn& column = gather.columns[c];
       for (std::int64_t i = begin; i < end; ++i) {
-        std::copy_n(column.from + std::int64_t{gather.ids[i]} * column.width, column.width,
-                    column.to + i * column.stride);
+        const std::int64_t row = gather.ids ? gather.ids[i] : i;
+        std::copy_n(column.from + row * column.from_stride, column.width, column.to + i * column.stride);
       }
     }
   });

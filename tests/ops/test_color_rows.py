@@ -59,7 +59,7 @@ def test_spare_capacity_changes_nothing(cameras, spare):
     found, rows = colored_rows(projected.splats, tables, (sh,), projected.totals)
     require_equal(splats_of(found, sizes), expected)
     visible = expected.visible_ids.long()
-    assert torch.equal(rows.first(len(visible)).inputs.gaussians[0], geometry[0][visible])
+    assert torch.equal(rows.inputs.gaussians[0][: len(visible)], geometry[0][visible])
 
 
 @pytest.mark.cuda

@@ -2,7 +2,8 @@
 import pytest
 import torch
 
-from blitzgs.ops.gather_rows import gather_rows
+from blitzgs.ops.gather_rows import gather_rows, split_rows
+from blitzgs.ops.projection import first_rows
 from tests.helpers import DEVICES
 
 
@@ -33,6 +34,24 @@ def test_bits_and_columns_that_are_not_contiguous(device):
     assert torch.equal(rows.view(torch.int32), column.contiguous().view(torch.int32)[ids])
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("lengths", [(1, 15), (16,), (0, 3, 13)])
+@pytest.mark.parametrize("count", [0, 1, 700])
+def test_parts_of_rows_are_those_of_split(device, dtype, lengths, count):
+    rows = torch.randn(count, 16, 3, dtype=dtype, device=device)
+    for part, expected in zip(split_rows(rows, lengths), rows.split(lengths, dim=1), strict=True):
+        assert torch.equal(part, expected) and part.is_contiguous()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_first_rows_share_their_memory(device):
+    columns = [torch.randn(9, 3, device=device), torch.arange(12, device=device)[3:]]
+    for found, column, count in zip(first_rows(columns, [4, 20]), columns, [4, 20], strict=True):
+        assert torch.equal(found, column[:count]) and found.data_ptr() == column.data_ptr()
+        assert found._base is None
+
+
 def test_errors_name_the_value():
     ids, column = torch.tensor([0], dtype=torch.int32), torch.zeros(4, 3)
     with pytest.raises(RuntimeError, match="ids must be Int, got Long"):
@@ -41,5 +60,10 @@ def test_errors_name_the_value():
         gather_rows([column.half()], [], ids)
     with pytest.raises(RuntimeError, match=r"alike behind their second dimension, got \[4, 2\] beside"):
         gather_rows([], [column[:, :, None], column[:, :2]], ids)
+    for lengths in ([1, 1], [4], [-1, 4]):
+        with pytest.raises(RuntimeError, match="split_rows: lengths must add up to 3"):
+            split_rows(column, lengths)
+    with pytest.raises(RuntimeError, match="first_rows: 1 columns need a length each, got 2"):
+        first_rows([column], [1, 2])
     with pytest.raises(RuntimeError, match="at most 8 columns, got 9"):
         gather_rows([column] * 9, [], ids)
