@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.derivatives import first_only
+from blitzgs.ops.derivatives import first_only, unrecorded
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts
 
 
@@ -64,25 +64,22 @@ class _L1Ssim(torch.autograd.Function):
     def forward(ctx: Any, renders: Tensor, targets: Tensor, masks: Tensor | None, weight: float) -> Tensor:
         # Constants of a fake tensor (FakeTensorMode) would be stored and break later calls.
         constant = masks is None and renders.numel() > 0 and type(renders) is Tensor
-        if constant:
-            views, height, width, _ = renders.shape
-            key = (views, 3 * height * width, float(weight), renders.dtype, renders.device)
-            l1_weights, ssim_weights, divisors = _constants(*key)
-        else:
-            counts = pixel_counts(renders, masks)
-            divisors, share = counts.clamp_min(1), torch.full_like(counts, 1 / len(renders))
-            l1_weights, ssim_weights = (1 - weight) * share, -weight * share
-        parts, v_renders, _ = photometric_fwd_bwd(
-            renders, targets, masks, l1_weights, ssim_weights, samples=divisors
-        )
-        ctx.save_for_backward(v_renders)
         ctx.renders = renders  # not saved, as its values are not needed and may change
         if constant:
+            views, height, width, _ = renders.shape
             samples = views * 3 * height * width
-            loss: Tensor = torch.ops.blitzgs.loss_of_sums(
-                parts, renders, (1 - weight) / samples, -weight / samples, weight
-            )
+            weights = _constants(views, 3 * height * width, float(weight), renders.dtype, renders.device)
+            factors = ((1 - weight) / samples, -weight / samples, weight)
+            loss: Tensor
+            loss, v_renders = torch.ops.blitzgs.l1_ssim_fwd_bwd(renders, targets, weights, factors)
+            ctx.save_for_backward(v_renders)
             return loss
+        counts = pixel_counts(renders, masks)
+        divisors, share = counts.clamp_min(1), torch.full_like(counts, 1 / len(renders))
+        parts, v_renders, _ = photometric_fwd_bwd(
+            renders, targets, masks, (1 - weight) * share, -weight * share, samples=divisors
+        )
+        ctx.save_for_backward(v_renders)
         l1, ssim = parts.sum(dim=1).unbind(dim=1)
         per_view = ((1 - weight) * l1 + weight * (counts - ssim)) / divisors
         return per_view.mean().to(renders.dtype)
@@ -90,7 +87,7 @@ class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, v_loss: Tensor) -> Any:
         (v_renders,) = ctx.saved_tensors
-        with torch.no_grad():
+        with unrecorded():
             gradient: Tensor | None = v_renders * v_loss
         (gradient,) = first_only("l1_ssim", [gradient], [ctx.renders, v_loss])
         return gradient, None, None, None

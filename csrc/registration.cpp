@@ -120,6 +120,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "bool clear_rest=True, bool backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, "
       "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
       "Tensor splat_gradients)");
+  // intersect, unchecked, and then rasterize_fwd. splats: (means2d, conics, splat_opacities, colors). Returns
+  // isect_splats and tile_offsets, and then what rasterize_fwd returns.
+  m.def(
+      "list_and_rasterize(Tensor[] splats, Tensor depths, Tensor camera_ids, Tensor? backgrounds, int[] "
+      "grid, "
+      "int n_isects, bool backward_follows, Tensor? n_splats=None) -> Tensor[] outputs");
   // rasterize_fwd for a backward pass that sums gradients in the table `packed`, which it sets to zero. It
   // does not write the pixels of tiles that are not owned (CUDA).
   m.def(
@@ -170,9 +176,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "report_(Tensor? parts, Tensor? tile_work, int tile_begin, int tile_end, int rank, int n_ranks, "
       "Tensor(a!)[] targets) -> ()");
-  // A scalar of the dtype of `like`: the weighted total of `parts` and an offset.
+  // The loss of whole images, and its gradient. weights: (l1_weights, ssim_weights, samples) of each view,
+  // for the gradient; factors: (l1, ssim, offset), by which the loss follows from the sums over all views.
   m.def(
-      "loss_of_sums(Tensor parts, Tensor like, float l1_weight, float ssim_weight, float offset) -> Tensor");
+      "l1_ssim_fwd_bwd(Tensor renders, Tensor targets, Tensor[] weights, float[] factors) -> (Tensor loss, "
+      "Tensor v_renders)");
 
   // The optimiser: dense Adam over a list of rows, with the groups of arguments of project_bwd_step_; and the
   // statistics of density control.

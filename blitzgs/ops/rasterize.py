@@ -65,7 +65,7 @@ def rasterize(
     tile_begin: int = 0,
     tile_end: int = -1,
     tell_absgrad: Callable[[Tensor], object] | None = None,
-    composited: tuple[Tensor, ...] | None = None,
+    composited: Sequence[Tensor] | None = None,
     through: Through | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Composite the splats of each tile's list into images.
@@ -170,6 +170,24 @@ def _(
     )
 
 
+@torch.library.register_fake("blitzgs::list_and_rasterize")
+def _(
+    splats: Sequence[Tensor],
+    depths: Tensor,
+    camera_ids: Tensor,
+    backgrounds: Tensor | None,
+    grid: Sequence[int],
+    n_isects: int,
+    backward_follows: bool,
+    n_splats: Tensor | None = None,
+) -> list[Tensor]:
+    lists = torch.ops.blitzgs.intersect(*splats[:3], depths, camera_ids, None, grid, n_isects, n_splats, True)
+    outputs = torch.ops.blitzgs.rasterize_fwd(
+        *splats, backgrounds, *lists, grid, None, True, backward_follows, n_splats
+    )
+    return [*lists, *outputs]
+
+
 @torch.library.register_fake("blitzgs::rasterize_bwd")
 def _(
     splats: Sequence[Tensor],
@@ -201,7 +219,7 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
     ctx.absgrad = means2d_abs is not None and means2d_abs.requires_grad
 
 
-def _save(ctx: Any, splats: Any, grid: Any, output: tuple[Tensor, ...]) -> None:
+def _save(ctx: Any, splats: Any, grid: Any, output: Sequence[Tensor]) -> None:
     # The renders are not saved: callers may change them in place, and the backward pass does not need them.
     _, transmittances, last_ids, _, packed_splats, tile_order, splat_gradients = output
     ctx.set_materialize_grads(False)
@@ -278,7 +296,7 @@ class _Call(NamedTuple):
     tell_absgrad: Callable[[Tensor], object] | None
     places: Places | None
     backward_follows: bool
-    composited: tuple[Tensor, ...] | None
+    composited: Sequence[Tensor] | None
 
 
 class _Rasterize(torch.autograd.Function):

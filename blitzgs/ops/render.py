@@ -37,7 +37,7 @@ class Rendered(NamedTuple):
     splats: ProjectedSplats
     isect_splats: Tensor
     tile_offsets: Tensor
-    composited: tuple[Tensor, ...]
+    composited: Sequence[Tensor]
     rows: TableRows | None
 
 
@@ -91,13 +91,9 @@ def render_queued(
                 n_isects, n_splats = int(copy.read()[2]), None
             else:
                 n_isects, n_splats = capacity.isects, projected.n_splats
-            geometry = splats.means2d, splats.conics, splats.opacities
-            isect_splats, tile_offsets = torch.ops.blitzgs.intersect(
-                *geometry, splats.depths, splats.camera_ids, None, grid, n_isects, n_splats, True
-            )
-            composited = torch.ops.blitzgs.rasterize_fwd(
-                *geometry, channels(splats), backgrounds, isect_splats, tile_offsets, grid, None, True,
-                backward_follows, n_splats,
+            isect_splats, tile_offsets, *composited = torch.ops.blitzgs.list_and_rasterize(
+                [splats.means2d, splats.conics, splats.opacities, channels(splats)], splats.depths,
+                splats.camera_ids, backgrounds, grid, n_isects, backward_follows, n_splats,
             )  # fmt: skip
             counts = copy.read()[:3]
             needed = Sizes(*counts.tolist())

@@ -6,6 +6,7 @@
 #include <tuple>
 
 #include "common/op.h"
+#include "rasterize/list_and_rasterize.h"
 
 namespace blitzgs {
 namespace {
@@ -22,6 +23,8 @@ void check_capacity(std::int64_t capacity, std::int64_t count) {
   STD_TORCH_CHECK(count <= capacity, "blitzgs::intersect: n_isects is ", capacity, " but there are ", count,
                   " intersections; pass the sum of tiles_touched, or -1 to have them counted");
 }
+
+}  // namespace
 
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
                                      const Tensor& splat_opacities, const Tensor& depths,
@@ -97,7 +100,6 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
   return {splats, offsets};
 }
 
-}  // namespace
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) { m.impl("intersect", TORCH_BOX(&blitzgs::intersect)); }
