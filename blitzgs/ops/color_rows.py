@@ -25,11 +25,10 @@ class VisibleRows(NamedTuple):
     numbers: Tensor
 
 
-@torch.no_grad()
 def colored_rows(
     splats: ProjectedSplats, tables: ProjectionInputs, sh: Sequence[Tensor], totals: Tensor | None = None
 ) -> tuple[ProjectedSplats, VisibleRows]:
-    """Gather the visible Gaussians and colour their splats.
+    """Gather the visible Gaussians and colour their splats, without gradients.
 
     Args:
         splats: those of `tables`. Splats whose colour is not finite are hidden in place.
@@ -41,16 +40,17 @@ def colored_rows(
     Returns:
         The splats with colours, and the rows, both of the capacity of `splats`.
     """
-    numbers, colors, *gaussians = torch.ops.blitzgs.color_rows_(
-        tables.gaussians,
-        sh,
-        tables.cameras,
-        [splats.visible_ids, splats.splat_offsets, splats.camera_ids],
-        [splats.opacities, splats.radii, splats.tiles_touched],
-        tables.options.ints,
-        tables.options.floats,
-        totals,
-    )
+    with torch._C._AutoDispatchBelowAutograd():
+        numbers, colors, *gaussians = torch.ops.blitzgs.color_rows_(
+            tables.gaussians,
+            sh,
+            tables.cameras,
+            [splats.visible_ids, splats.splat_offsets, splats.camera_ids],
+            [splats.opacities, splats.radii, splats.tiles_touched],
+            tables.options.ints,
+            tables.options.floats,
+            totals,
+        )
     return splats._replace(colors=colors), VisibleRows(tables._replace(gaussians=gaussians), numbers)
 
 

@@ -78,9 +78,8 @@ def render_queued(
     """
     options = inputs.options
     grid = [inputs.n_views, options.width, options.height, options.tile_size, 0, -1]
-    estimate = capacity_for(inputs)
     with torch._C._AutoDispatchBelowAutograd():
-        for attempt in [Attempt(None, estimate)] if exact else estimate.attempts():
+        for attempt in (Attempt(None),) if exact else capacity_for(inputs).attempts():
             capacity = attempt.sizes
             projected = inputs.run(capacity)
             copy = HostCopy(projected.totals)
@@ -88,19 +87,21 @@ def render_queued(
             if tables is not None:
                 splats, rows = _colored(projected, inputs, tables, spare=capacity is not None)
             if capacity is None:
-                n_isects, n_splats = int(copy.read()[2]), None
+                counts = copy.read()[:3]
+                sizes, n_splats = Sizes(*counts.tolist()), None
             else:
-                n_isects, n_splats = capacity.isects, projected.n_splats
+                sizes, n_splats = capacity, projected.n_splats
             isect_splats, tile_offsets, *composited = torch.ops.blitzgs.list_and_rasterize(
                 [splats.means2d, splats.conics, splats.opacities, channels(splats)], splats.depths,
-                splats.camera_ids, backgrounds, grid, n_isects, backward_follows, n_splats,
+                splats.camera_ids, backgrounds, grid, sizes.isects, backward_follows, n_splats,
             )  # fmt: skip
-            counts = copy.read()[:3]
-            needed = Sizes(*counts.tolist())
-            attempt.end(needed[:3], capacity is None or capacity.holds(needed))
+            if capacity is not None:
+                counts = copy.read()[:3]
+                sizes = Sizes(*counts.tolist())
+            attempt.end(sizes[:3], capacity is None or capacity.holds(sizes))
         splats = splats._replace(counts=counts)
         if capacity is not None:
-            splats, isect_splats, rows = _without_spare(splats, isect_splats, rows, needed)
+            splats, isect_splats, rows = _without_spare(splats, isect_splats, rows, sizes)
         of_tables = None if tables is None or rows is None else TableRows(rows, tables.parts)
         return Rendered(splats, isect_splats, tile_offsets, composited, of_tables)
 

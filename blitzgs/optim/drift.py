@@ -120,17 +120,18 @@ class Drift:
             gradients: those of the rows, for the five columns of each table.
             indices: int64 [1, A] or [A], the rows, each once.
         """
-        torch.ops.blitzgs.drift_step_(
-            self._tables,
-            self._lr_tables,
-            (self._decays, self._shares),
-            states,
-            (step - self.begin, self.reach, 0),
-            (*self.betas, eps),
-            rates,
-            gradients,
-            indices,
-        )
+        with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+            torch.ops.blitzgs.drift_step_(
+                self._tables,
+                self._lr_tables,
+                (self._decays, self._shares),
+                states,
+                (step - self.begin, self.reach, 0),
+                (*self.betas, eps),
+                rates,
+                gradients,
+                indices,
+            )
 
     def alone(self, table: int, group: int) -> Drift:
         """Return a copy for a parameter alone, which had the learning rates of a group of a table.

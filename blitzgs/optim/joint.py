@@ -73,6 +73,8 @@ class Joint:
             (param, state, [state[name] for name in _ENTRIES])
             for param, state in zip(params, states, strict=True)
         ]
+        # The parameters of each table, which `_known` keeps alive.
+        self._ids = [{id(params[index]) for index in inside} for inside in self._inside]
         self._eps, self._options = eps, [_options_of(group) for _, group, _ in members]
 
     def is_current(self) -> bool:
@@ -120,20 +122,19 @@ class Joint:
             columns += table.columns([gradients[index] for index in inside])
         self.drift.step(self._step, rates, self._eps, self._states, columns, indices)
 
-    @torch.no_grad()
     def catch_up(
         self, params: Collection[Tensor], rows: Tensor | None = None, count: Tensor | None = None
     ) -> None:
         """Apply the steps that rows of the tables of some parameters missed; as `LazyAdam.catch_up`."""
+        behind = [number for number, step in enumerate(self._current) if step != self._step]
+        if not behind:
+            return
         wanted = {id(param) for param in params}
-        for number, (table, inside) in enumerate(zip(self.tables, self._inside, strict=True)):
-            if self._current[number] == self._step:
-                continue
-            if not any(id(self._known[index][0]) in wanted for index in inside):
-                continue
-            table.catch_up(self._step, rows, count)
-            if rows is None:
-                self._current[number] = self._step
+        for number in behind:
+            if not wanted.isdisjoint(self._ids[number]):
+                self.tables[number].catch_up(self._step, rows, count)
+                if rows is None:
+                    self._current[number] = self._step
 
     def dissolve(self) -> None:
         """Give each member columns and tables of its own, so that its optimiser steps it alone.

@@ -374,7 +374,6 @@ def _check_group(group: dict[str, Any]) -> None:
             raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
 
 
-@torch.no_grad()
 def step_together(optimizers: Iterable[LazyAdam] | Mapping[str, LazyAdam], set_to_none: bool = False) -> None:
     """Take a step of several optimisers, in few calls if their parameters are those of gsplat's trainer.
 

@@ -62,7 +62,8 @@ class Table:
     def catch_up(self, step: int, rows: Tensor | None = None, count: Tensor | None = None) -> None:
         """Apply the steps that rows have missed up to `step`; as `LazyAdam.catch_up`."""
         if self._rows > 0:
-            torch.ops.blitzgs.lazy_adam_catch_up_(self.tensors, *self._schedule(step), rows, count)
+            with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
+                torch.ops.blitzgs.lazy_adam_catch_up_(self.tensors, *self._schedule(step), rows, count)
 
     def bring_up_to_date(self, step: int) -> None:
         """Apply all missed steps to all rows and their moments."""

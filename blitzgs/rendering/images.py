@@ -50,6 +50,7 @@ def render(
     image: ImageOptions,
     tables: ShTables | None = None,
     job: Job | None = None,
+    groups: Sequence[Group] | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`.
 
@@ -60,11 +61,12 @@ def render(
         image: options of compositing.
         tables: the SH, if only the rows of visible Gaussians are read; only where `may_queue`.
         job: the ranks among which the Gaussians and views are divided; None: this process has all of them.
+        groups: `groups_of` the Gaussians, which have SH, if they are already known.
     """
     compiling = torch.compiler.is_compiling()
-    by_value = gaussians.colors is not None and gaussians.sh_degree is None
-    hidden = _without_non_finite(gaussians) if by_value else gaussians
-    groups = groups_of(hidden, project)
+    if groups is None:
+        by_value = gaussians.colors is not None and gaussians.sh_degree is None
+        groups = groups_of(_without_non_finite(gaussians) if by_value else gaussians, project)
     ready = None
     if job is None and not compiling and may_queue(groups):
         ready = _queued(groups[0], gaussians, image, tables)

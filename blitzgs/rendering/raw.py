@@ -16,7 +16,14 @@ from blitzgs.ops.gather_rows import gather_rows, split_rows
 from blitzgs.ops.projection import ProjectionOptions, project_splats
 from blitzgs.ops.render import ShTables
 from blitzgs.ops.sparse_rows import full_gradients
-from blitzgs.rendering.arguments import Scene, background_rows, check_options, check_tensors, gaussians_of
+from blitzgs.rendering.arguments import (
+    Gaussians,
+    Scene,
+    background_rows,
+    check_options,
+    check_tensors,
+    gaussians_of,
+)
 from blitzgs.rendering.groups import groups_of
 from blitzgs.rendering.images import ImageOptions, may_queue, render
 
@@ -115,10 +122,10 @@ def raw_rasterization(
     for optimizer in lazy:
         optimizer.catch_up(geometry)
     shaded = "RGB" in render_mode
-    named = {**whole.named, "sh0": (sh0,), **({} if shN is None else {"shN": (shN,)})}
-    gaussians = replace(
-        whole, colors=sh0 if shaded else None, sh_degree=sh_degree if shaded else None, given=named
-    )
+    named = {name: (tensor,) for name, tensor in tensors.items()}
+    named |= {"viewmats": (viewmats,), "Ks": (Ks,), **({} if shN is None else {"shN": (shN,)})}
+    colors, degree = (sh0, sh_degree) if shaded else (None, None)
+    gaussians = Gaussians(whole.scenes, colors, opacities, degree, False, whole.lead, True, named)
     image = ImageOptions(
         render_mode, background_rows(backgrounds, gaussians, render_mode), True, sparse_grad, absgrad
     )
@@ -130,7 +137,7 @@ def raw_rasterization(
     groups = groups_of(gaussians, project)
     if may_queue(groups):
         tables = ShTables(harmonics if shaded else (), before)
-        return render("raw_rasterization", gaussians, project, image, tables=tables)
+        return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
     # Several groups, or none of Gaussians: gather the rows that any of them sees, and render these.
     ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
     before(ids, None)
