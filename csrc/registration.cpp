@@ -56,7 +56,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // (means, quats, scales, opacities) of all Gaussians; sh: their SH in any number of parts, which become
   // one; splats: (visible_ids, splat_offsets, camera_ids); shown: (opacities, radii, tiles_touched), set to 0
   // for splats whose colour is not finite; totals: those of the projection if the splats have spare capacity.
-  // Returns the numbers of the rows, 0 to U - 1, the colours, and the rows of tables and sh.
+  // Returns the numbers of the rows, 0 to U - 1, visible_ids as int64, the colours, and the rows of tables
+  // and sh.
   m.def(
       "color_rows_(Tensor[] tables, Tensor[] sh, Tensor[] cameras, Tensor[] splats, Tensor(a!)[] shown, "
       "int[] ints, float[] floats, Tensor? totals=None) -> Tensor[] rows");
@@ -195,11 +196,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
   // Adds a step to the tables of T schedules and takes it, as lazy_adam_step_, for the same rows of the T
   // tables of parameters that have these schedules. terms: (decays, shares); states and grads: of each table;
-  // rates: 6 T learning rates; indices: int64, of a sparse gradient.
+  // rates: 6 T learning rates; indices: int64, of a sparse gradient; current: for each table, 1 if the
+  // parameters of all rows stand at the step before, so that none has to catch up.
   m.def(
       "drift_step_(Tensor(a!) tables, Tensor(b!) lr_tables, Tensor[] terms, Tensor(c!)[] states, int[] "
       "steps, "
-      "float[] decays, float[] rates, Tensor[] grads, Tensor indices) -> ()");
+      "float[] decays, float[] rates, Tensor[] grads, Tensor indices, int[] current) -> ()");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor visible_ids, "
       "Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int height, float "

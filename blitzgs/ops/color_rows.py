@@ -19,10 +19,12 @@ class VisibleRows(NamedTuple):
     Attributes:
         inputs: the inputs of the projection with these Gaussians alone, and their SH.
         numbers: int32 [U], 0 to U - 1: the rows of `inputs` that are visible.
+        indices: int64 [U], the Gaussians, as the indices of sparse gradients.
     """
 
     inputs: ProjectionInputs
     numbers: Tensor
+    indices: Tensor
 
 
 def colored_rows(
@@ -41,7 +43,7 @@ def colored_rows(
         The splats with colours, and the rows, both of the capacity of `splats`.
     """
     with torch._C._AutoDispatchBelowAutograd():
-        numbers, colors, *gaussians = torch.ops.blitzgs.color_rows_(
+        numbers, indices, colors, *gaussians = torch.ops.blitzgs.color_rows_(
             tables.gaussians,
             sh,
             tables.cameras,
@@ -51,7 +53,7 @@ def colored_rows(
             tables.options.floats,
             totals,
         )
-    return splats._replace(colors=colors), VisibleRows(tables._replace(gaussians=gaussians), numbers)
+    return splats._replace(colors=colors), VisibleRows(tables._replace(gaussians=gaussians), numbers, indices)
 
 
 @torch.library.register_fake("blitzgs::color_rows_")
@@ -67,4 +69,5 @@ def _(
     if sh:
         rows.append(sh[0].new_empty((len(visible_ids), sum(part.shape[1] for part in sh), 3)))
     colors = tables[0].new_empty(len(camera_ids) if sh else 0, 3)
-    return [torch.empty_like(visible_ids), colors, *rows]
+    indices = visible_ids.new_empty(len(visible_ids), dtype=torch.int64)
+    return [torch.empty_like(visible_ids), indices, colors, *rows]

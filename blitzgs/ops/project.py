@@ -225,7 +225,7 @@ def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: Tab
     ctx.set_materialize_grads(False)
     read, visible_ids, ids, ctx.tables, ctx.parts = inputs, splats.visible_ids, None, None, []
     if rows is not None:
-        read, visible_ids, ids = rows.visible.inputs, rows.visible.numbers, splats.visible_ids
+        read, visible_ids, ids = rows.visible
         # The tables are not saved: the gradient does not depend on their values, which may change.
         ctx.tables, ctx.parts = (*inputs.gaussians, *rows.sh), [part.shape[1] for part in rows.sh]
     index = splats.camera_ids, visible_ids, splats.splat_offsets

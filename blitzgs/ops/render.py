@@ -121,11 +121,11 @@ def _without_spare(
     splats: ProjectedSplats, isect_splats: Tensor, rows: VisibleRows | None, needed: Sizes
 ) -> tuple[ProjectedSplats, Tensor, VisibleRows | None]:
     """Cut spare capacity off all columns, in one operation."""
-    own: list[Tensor] = [] if rows is None else [*rows.inputs.gaussians, rows.numbers]
+    own: list[Tensor] = [] if rows is None else [*rows.inputs.gaussians, rows.numbers, rows.indices]
     lengths = [*lengths_of(needed), needed.isects, *[needed.visible] * len(own)]
     found = first_rows([*splats[:12], isect_splats, *own], lengths)
     splats = ProjectedSplats._make((*found[:12], splats.counts))
     if rows is not None:
-        *gaussians, numbers = found[13:]
-        rows = VisibleRows(rows.inputs._replace(gaussians=gaussians), numbers)
+        *gaussians, numbers, indices = found[13:]
+        rows = VisibleRows(rows.inputs._replace(gaussians=gaussians), numbers, indices)
     return splats, found[12], rows

@@ -109,6 +109,7 @@ class Drift:
         states: Sequence[Tensor],
         gradients: Sequence[Tensor],
         indices: Tensor,
+        current: Sequence[bool],
     ) -> None:
         """Add a step to the tables and take it for some rows; nothing is copied to the device.
 
@@ -119,6 +120,7 @@ class Drift:
             states: the T tables of parameters, `AdamState.tensors` each.
             gradients: those of the rows, for the five columns of each table.
             indices: int64 [1, A] or [A], the rows, each once.
+            current: of each table, whether the parameters of all rows stand at the step before.
         """
         with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
             torch.ops.blitzgs.drift_step_(
@@ -131,6 +133,7 @@ class Drift:
                 rates,
                 gradients,
                 indices,
+                current,
             )
 
     def alone(self, table: int, group: int) -> Drift:

@@ -110,6 +110,7 @@ class Joint:
             for table in self.tables:
                 table.restart(self._step)
             self.drift.restart(self._step)
+        current = [step == self._step for step in self._current]
         self._step += 1
         self._step_number[...] = self._step
         rates, columns = [0.0] * (GROUPS * len(self.tables)), []
@@ -120,7 +121,7 @@ class Joint:
                 rates[GROUPS * number + column + 1] = rest
         for table, inside in zip(self.tables, self._inside, strict=True):
             columns += table.columns([gradients[index] for index in inside])
-        self.drift.step(self._step, rates, self._eps, self._states, columns, indices)
+        self.drift.step(self._step, rates, self._eps, self._states, columns, indices, current)
 
     def catch_up(
         self, params: Collection[Tensor], rows: Tensor | None = None, count: Tensor | None = None

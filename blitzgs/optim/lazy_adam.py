@@ -129,7 +129,7 @@ class LazyAdam(torch.optim.Optimizer):
             rates = (0.0,) * 4 + rates_of(group)
             gradients = table.columns([values])
             state["step"] += 1
-            drift.step(int(state["step"]), rates, table.eps, table.tensors, gradients, indices)
+            drift.step(int(state["step"]), rates, table.eps, table.tensors, gradients, indices, [False])
 
     @torch.no_grad()
     def catch_up(

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Numbers the rows that are gathered for the visible Gaussians of a projection (project.h): row u is the
 // Gaussian visible_ids[u].
-//   rows[u] = u;   row_of_splat[i] = u for the splats i of this Gaussian, splat_offsets[u] .. splat_offsets[u
+//   rows[u] = u;   indices[u] = visible_ids[u];   row_of_splat[i] = u for the splats i of this Gaussian,
+//   splat_offsets[u] .. splat_offsets[u
 //   + 1] - 1.
 // On CUDA nothing is written if there are more splats than the capacity. On the CPU the sizes of the capacity
 // are the actual numbers.
@@ -14,13 +15,16 @@
 namespace blitzgs {
 
 struct NumberedRows {
+  const std::int32_t* visible_ids;    // [U]
   const std::int32_t* splat_offsets;  // [U + 1]
   std::int32_t* rows;                 // [U]
+  std::int64_t* indices;              // [U]
   std::int32_t* row_of_splat;         // [P]
 };
 
 BLITZGS_HD void number_row(const NumberedRows& numbered, std::int32_t u) {
   numbered.rows[u] = u;
+  numbered.indices[u] = numbered.visible_ids[u];
   for (std::int32_t i = numbered.splat_offsets[u]; i < numbered.splat_offsets[u + 1]; ++i) {
     numbered.row_of_splat[i] = u;
   }

@@ -40,12 +40,14 @@ TensorList color_rows(const TensorList& tables, const TensorList& sh, const Tens
   TensorList found = gathered_rows(kOp, tables, sh, visible_ids,
                                    capacity.totals ? capacity.totals + kTotalVisible : nullptr);
   const ProjectArguments p(kOp, found, cameras, ints, floats, std::nullopt);
-  Tensor numbers = make_empty(visible_ids, {U});
+  Tensor numbers = make_empty(visible_ids, {U}), indices = make_empty(visible_ids, {U}, ScalarType::Long);
   Tensor colors = make_empty(p.means, {p.sh ? P : 0, 3});
   DeviceScope scope(p.means);
   auto* row_of_splat = scope.workspace.allocate<std::int32_t>(P);
-  backend::number_rows({data<std::int32_t>(splat_offsets), mutable_data<std::int32_t>(numbers), row_of_splat},
-                       capacity, scope.stream);
+  backend::number_rows(
+      {data<std::int32_t>(visible_ids), data<std::int32_t>(splat_offsets),
+       mutable_data<std::int32_t>(numbers), mutable_data<std::int64_t>(indices), row_of_splat},
+      capacity, scope.stream);
   if (p.sh) {
     dispatch_floating(p.means, [&](auto zero) {
       using T = decltype(zero);
@@ -60,7 +62,7 @@ TensorList color_rows(const TensorList& tables, const TensorList& sh, const Tens
       backend::color_splats(p.inputs<T>(), capacity, columns, scope.workspace, scope.stream);
     });
   }
-  found.insert(found.begin(), {numbers, colors});
+  found.insert(found.begin(), {numbers, indices, colors});
   return found;
 }
 

@@ -56,23 +56,26 @@ Tensor checked_rows(const Tensor& indices) {
 void drift_step(Tensor tables, Tensor lr_tables, const std::vector<Tensor>& terms,
                 const std::vector<Tensor>& states, const std::vector<std::int64_t>& steps,
                 const std::vector<double>& decays, const std::vector<double>& rates,
-                const std::vector<Tensor>& grads, const Tensor& indices) {
+                const std::vector<Tensor>& grads, const Tensor& indices,
+                const std::vector<std::int64_t>& current) {
   STD_TORCH_CHECK(terms.size() == 2 && steps.size() == 3, "blitzgs::", kOp,
                   ": expected terms (decays, shares) and steps (step, explicit_steps, sparse), got ",
                   terms.size(), " and ", steps.size(), " entries");
   add_drift(tables, lr_tables, terms, steps[0], rates);
   if (indices.numel() == 0) return;
   const auto n_tables = static_cast<std::size_t>(tables.size(0));
-  STD_TORCH_CHECK(states.size() == n_tables * kAdamState && grads.size() == n_tables * kAdamColumns,
-                  "blitzgs::", kOp, ": each of ", n_tables, " tables needs ", kAdamState, " states and ",
-                  kAdamColumns, " grads, got ", states.size(), " and ", grads.size());
+  STD_TORCH_CHECK(states.size() == n_tables * kAdamState && grads.size() == n_tables * kAdamColumns &&
+                      current.size() == n_tables,
+                  "blitzgs::", kOp, ": each of ", n_tables, " tables needs ", kAdamState, " states, ",
+                  kAdamColumns, " grads and a number in current, got ", states.size(), ", ", grads.size(),
+                  " and ", current.size());
   const Tensor rows = checked_rows(indices);
   for (std::size_t t = 0; t < n_tables; ++t) {
     const auto state = states.begin() + t * kAdamState;
     const auto own = grads.begin() + t * kAdamColumns;
     AdamTensors adam(kOp, {state, state + kAdamState}, {part_of(tables, t), part_of(lr_tables, t)}, steps,
                      decays);
-    adam.step_rows({own, own + kAdamColumns}, rows);
+    adam.step_rows({own, own + kAdamColumns}, rows, current[t] != 0);
   }
 }
 

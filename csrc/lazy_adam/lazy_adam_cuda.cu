@@ -381,7 +381,7 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
   AdamArgs<float> behind = args;
   behind.step = args.target();
   for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;
-  if (!args.sparse) catch_up(behind, workspace, stream);
+  if (!args.sparse && !args.current) catch_up(behind, workspace, stream);
   if (!args.with_gradient()) return;
   if (is_alone(args)) {
     launch_early("lazy_adam step", step_alone_kernel, alone_size(args, stream), args);

@@ -92,8 +92,8 @@ struct AdamTensors {
   }
 
   // Takes the step for the rows `ids`, int32 [A], from a gradient [A, ...] for each column; those of empty
-  // columns are not read.
-  void step_rows(const std::vector<Tensor>& grads, const Tensor& ids) {
+  // columns are not read. current: the parameters of the rows stand at step - 1.
+  void step_rows(const std::vector<Tensor>& grads, const Tensor& ids, bool current = false) {
     STD_TORCH_CHECK(grads.size() == kAdamColumns, "blitzgs::", op,
                     ": grads must hold means, quats, scales, opacities, sh; got ", grads.size(), " tensors");
     STD_TORCH_CHECK(step >= 1, "blitzgs::", op, ": steps count from 1, got ", step);
@@ -115,6 +115,7 @@ struct AdamTensors {
       using T = decltype(zero);
       AdamArgs<T> args = arguments<T>(data<std::int32_t>(list), n);
       for (int c = 0; c < kAdamColumns; ++c) args.columns[c].grad = data<T>(held[c]);
+      args.current = current;
       if (n > 0) backend::lazy_adam(args, scope.workspace, scope.stream);
     });
   }

@@ -37,6 +37,7 @@ def test_splats_are_those_of_a_projection_with_sh(backend, cameras, degree, leng
     expected = project_splats(tables._replace(gaussians=[*geometry, *([sh] if parts else [])]))
     assert 0 < len(expected.visible_ids) < 90 and (degree is None or not expected.opacities.all())
     require_equal(found, expected)
+    assert torch.equal(rows.indices, expected.visible_ids.long())
     assert torch.equal(rows.numbers, torch.arange(len(expected.visible_ids), device=backend[0]))
     wanted = [*geometry, *([sh] if parts else [])]
     for own, table in zip(rows.inputs.gaussians, wanted, strict=True):

@@ -280,7 +280,7 @@ def test_full_tables_restart_and_still_equal_dense_adam(backend, monkeypatch):
 
 def add_step(tables, step, rates):
     """Add a step that moves no rows."""
-    tables.step(step, rates, 1e-8, [], [], torch.empty(0, dtype=torch.int64))
+    tables.step(step, rates, 1e-8, [], [], torch.empty(0, dtype=torch.int64), [])
 
 
 def test_tables_do_not_grow_over_a_hundred_thousand_steps():
