@@ -237,6 +237,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "swap_blocks_(Tensor(a!)[] pool, Tensor(b!)[] table, int n_written, Tensor slots, Tensor leaving, "
       "Tensor coming) -> ()");
 
+  // A number that is 0 if all values of the columns are finite and none of `nonzero` is 0.
+  m.def("all_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");
+
   // Scene initialisation.
   m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");
   m.def("knn_distances(Tensor points, int k) -> Tensor");

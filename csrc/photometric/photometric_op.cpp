@@ -5,7 +5,6 @@
 #include <tuple>
 
 #include "common/op.h"
-#include "loss_of_sums/loss_of_sums.h"
 #include "report/report.h"
 
 namespace blitzgs {
@@ -150,6 +149,9 @@ Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const std::
               .v_renders;
 }
 
+}  // namespace
+
+// l1_ssim_fwd_bwd calls it, too.
 std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(
     const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
     const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size, std::int64_t tile_begin,
@@ -161,35 +163,10 @@ std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(
   return {*out.parts, *out.v_renders, *out.scale_reg};
 }
 
-std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& targets,
-                                           const std::vector<Tensor>& weights_in,
-                                           const std::vector<double>& factors) {
-  constexpr const char* kOp = "l1_ssim_fwd_bwd";
-  STD_TORCH_CHECK(
-      weights_in.size() == 3 && factors.size() == 3, "blitzgs::", kOp,
-      ": expected weights (l1_weights, ssim_weights, samples) and factors (l1, ssim, offset), got ",
-      weights_in.size(), " and ", factors.size(), " entries");
-  const PhotometricWeights weights{weights_in[0], weights_in[1], weights_in[2], {}};
-  const PhotometricOutputs out =
-      run_photometric(kOp, renders, targets, std::nullopt, &weights, true, 16, 0, -1);
-  const Tensor& parts = *out.parts;
-  Tensor loss = make_empty(renders, {});
-  DeviceScope scope(renders);
-  dispatch_floating(renders, [&](auto zero) {
-    using T = decltype(zero);
-    const LossOfSums<T> sums{data<double>(parts), parts.size(0) * parts.size(1), factors[0], factors[1],
-                             factors[2],          mutable_data<T>(loss)};
-    backend::loss_of_sums(sums, scope.workspace, scope.stream);
-  });
-  return {loss, *out.v_renders};
-}
-
-}  // namespace
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
   m.impl("photometric_fwd", TORCH_BOX(&blitzgs::photometric_fwd));
   m.impl("photometric_bwd", TORCH_BOX(&blitzgs::photometric_bwd));
   m.impl("photometric_fwd_bwd", TORCH_BOX(&blitzgs::photometric_fwd_bwd));
-  m.impl("l1_ssim_fwd_bwd", TORCH_BOX(&blitzgs::l1_ssim_fwd_bwd));
 }

@@ -5,7 +5,6 @@
 #include <tuple>
 
 #include "common/op.h"
-#include "rasterize/list_and_rasterize.h"
 
 namespace blitzgs {
 namespace {
@@ -113,6 +112,7 @@ CompositedTensors composite(const Splats& splats, std::optional<Tensor> splat_gr
 
 }  // namespace
 
+// list_and_rasterize calls it, too.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
@@ -129,24 +129,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
 }
 
 namespace {
-
-// The two ops in one, because each call of an op takes the host microseconds.
-std::vector<Tensor> list_and_rasterize(const std::vector<Tensor>& splats, const Tensor& depths,
-                                       const Tensor& camera_ids, const std::optional<Tensor>& backgrounds,
-                                       const std::vector<std::int64_t>& grid, std::int64_t n_isects,
-                                       bool backward_follows, const std::optional<Tensor>& n_splats) {
-  STD_TORCH_CHECK(
-      splats.size() == 4,
-      "blitzgs::list_and_rasterize: splats must be (means2d, conics, splat_opacities, colors), got ",
-      splats.size(), " tensors");
-  const auto lists = intersect(splats[0], splats[1], splats[2], depths, camera_ids, std::nullopt, grid,
-                               n_isects, n_splats, /*unchecked=*/true);
-  const auto outputs =
-      rasterize_fwd(splats[0], splats[1], splats[2], splats[3], backgrounds, std::get<0>(lists),
-                    std::get<1>(lists), grid, std::nullopt, /*clear_rest=*/true, backward_follows, n_splats);
-  return std::apply([](const auto&... tensors) { return std::vector<Tensor>{tensors...}; },
-                    std::tuple_cat(lists, outputs));
-}
 
 // Makes a Splats of the groups of arguments of the backward ops: splats (means2d, conics, splat_opacities,
 // colors) and lists (isect_splats, tile_offsets).
@@ -289,7 +271,6 @@ void rasterize_bwd_packed(const std::vector<Tensor>& splats_in, const std::optio
 
 BLITZGS_REGISTER(m) {
   m.impl("rasterize_fwd", TORCH_BOX(&blitzgs::rasterize_fwd));
-  m.impl("list_and_rasterize", TORCH_BOX(&blitzgs::list_and_rasterize));
   m.impl("rasterize_bwd", TORCH_BOX(&blitzgs::rasterize_bwd));
 #ifdef BLITZGS_BACKEND_CUDA
   m.impl("rasterize_fwd_packed_", TORCH_BOX(&blitzgs::rasterize_fwd_packed));
