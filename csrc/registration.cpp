@@ -122,7 +122,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
       "Tensor splat_gradients)");
   // intersect, unchecked, and then rasterize_fwd. splats: (means2d, conics, splat_opacities, colors). Returns
-  // isect_splats and tile_offsets, and then what rasterize_fwd returns.
+  // isect_splats and tile_offsets, then what rasterize_fwd returns, and alphas.
   m.def(
       "list_and_rasterize(Tensor[] splats, Tensor depths, Tensor camera_ids, Tensor? backgrounds, int[] "
       "grid, "

@@ -97,8 +97,8 @@ def rasterize(
         tile_end: end of the owned tiles, -1 for all.
         tell_absgrad: the backward pass calls it with the sum over pixels of the absolute gradient of means2d,
             per axis, [P, 2], whichever gradients it computes.
-        composited: the result of the op `rasterize_fwd` for these arguments, if it is already known; None:
-            call the op.
+        composited: the result of the op `rasterize_fwd` for these arguments and alphas, if they are already
+            known; None: call the op.
         through: the same means2d, conics and splat_opacities in an arrangement, which get the gradients in
             their place; not under `torch.compile`.
 
@@ -185,7 +185,7 @@ def _(
     outputs = torch.ops.blitzgs.rasterize_fwd(
         *splats, backgrounds, *lists, grid, None, True, backward_follows, n_splats
     )
-    return [*lists, *outputs]
+    return [*lists, *outputs, torch.empty_like(outputs[1])]
 
 
 @torch.library.register_fake("blitzgs::rasterize_bwd")
@@ -308,12 +308,14 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
         *_, call = arguments
-        output = call.composited
-        if output is None:
+        if call.composited is None:
             output = rasterize_fwd(*call.splats, call.grid, None, True, call.backward_follows)
+            alphas = _ONE - output[1]
+        else:
+            *output, alphas = call.composited
         _save(ctx, call.splats, call.grid, output)
         ctx.tell_absgrad, ctx.places = call.tell_absgrad, call.places
-        return output[0], _ONE - output[1]
+        return output[0], alphas
 
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> tuple[Tensor | None, ...]:

@@ -30,7 +30,7 @@ class Rendered(NamedTuple):
         splats: the splats.
         isect_splats: the tiles' lists.
         tile_offsets: where they begin.
-        composited: what `rasterize_fwd` returned.
+        composited: what `rasterize_fwd` returned, and alphas.
         rows: the visible rows, if the SH are in tables of which only these are read.
     """
 

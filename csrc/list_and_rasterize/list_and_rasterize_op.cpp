@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// intersect and rasterize_fwd in one op, because each call of an op takes the host microseconds.
+// intersect, rasterize_fwd and alphas in one op, because each call of an op takes the host microseconds.
+#include "list_and_rasterize/list_and_rasterize.h"
+
 #include <optional>
 #include <tuple>
 #include <vector>
@@ -35,8 +37,19 @@ std::vector<Tensor> list_and_rasterize(const std::vector<Tensor>& splats, const 
   const auto outputs =
       rasterize_fwd(splats[0], splats[1], splats[2], splats[3], backgrounds, std::get<0>(lists),
                     std::get<1>(lists), grid, std::nullopt, /*clear_rest=*/true, backward_follows, n_splats);
-  return std::apply([](const auto&... tensors) { return std::vector<Tensor>{tensors...}; },
-                    std::tuple_cat(lists, outputs));
+  const Tensor& transmittances = std::get<1>(outputs);
+  Tensor alphas =
+      make_empty(transmittances, {transmittances.size(0), transmittances.size(1), transmittances.size(2)});
+  DeviceScope scope(alphas);
+  dispatch_floating(alphas, [&](auto zero) {
+    using T = decltype(zero);
+    backend::alphas_of(data<T>(transmittances), alphas.numel(), mutable_data<T>(alphas), scope.stream);
+  });
+  return std::apply(
+      [&](const auto&... tensors) {
+        return std::vector<Tensor>{tensors..., alphas};
+      },
+      std::tuple_cat(lists, outputs));
 }
 
 }  // namespace

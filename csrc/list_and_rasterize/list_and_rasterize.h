@@ -1,0 +1,19 @@
+// SPDX-License-Identifier: Apache-2.0
+// alphas[i] = 1 - transmittances[i], 0 <= i < n.
+#pragma once
+#include <cstdint>
+
+#include "common/kernel.h"
+
+namespace blitzgs {
+
+namespace cpu {
+template <class T>
+void alphas_of(const T* transmittances, std::int64_t n, T* alphas, CudaStream);
+}
+namespace cuda {
+template <class T>
+void alphas_of(const T* transmittances, std::int64_t n, T* alphas, CudaStream);
+}
+
+}  // namespace blitzgs
