@@ -3,10 +3,18 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+
+# Pinned memory, and an event that is recorded when it has been written.
+_Place = tuple[Tensor, torch.cuda.Event]
+# The places that no copy uses at present, by device and number of values. Making one takes more of the host's
+# time than the copy.
+_idle: defaultdict[tuple[int, int], list[_Place]] = defaultdict(list)
 
 
 class HostCopy:
@@ -19,19 +27,26 @@ class HostCopy:
 
     def __init__(self, values: Tensor) -> None:
         """Start to copy `values`, int64 [n], to the host."""
-        self._written: torch.cuda.Event | None = None
+        self._place: _Place | None = None
         self._host = values
         if values.is_cuda:
-            self._host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
-            torch.ops.blitzgs.copy_to_host_(self._host, values)
-            self._written = torch.cuda.Event()
-            self._written.record(current_stream(values.device))
+            self._idle = _idle[values.device.index, values.shape[0]]
+            try:
+                place = self._idle.pop()
+            except IndexError:
+                memory = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
+                place = memory, torch.cuda.Event()
+            torch.ops.blitzgs.copy_to_host_(place[0], values)
+            place[1].record(current_stream(values.device))
+            self._place = place
 
     def read(self) -> Tensor:
         """Wait for the copy and return the numbers as a CPU tensor."""
-        if self._written is not None:
-            self._written.synchronize()
-            self._written = None
+        if self._place is not None:
+            memory, written = self._place
+            written.synchronize()
+            self._host, self._place = memory.clone(), None
+            self._idle.append((memory, written))
         return self._host
 
     def __del__(self) -> None:
