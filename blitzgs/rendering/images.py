@@ -119,14 +119,15 @@ def _queued(group: Group, gaussians: Gaussians, image: ImageOptions, tables: ShT
     inputs = group.inputs
     # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
     hooked = torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
+    exact = hooked or not inputs.gaussians[0].is_cuda
     read = [*inputs.gaussians, *inputs.cameras, gaussians.colors, *(() if tables is None else tables.parts)]
     differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in read)
     return render_queued(
         inputs,
-        lambda splats: _channels(splats, gaussians, image.render_mode, with_spare=True),
+        lambda splats: _channels(splats, gaussians, image.render_mode, with_spare=not exact),
         image.backgrounds,
         differentiable and not image.absgrad,
-        hooked or not inputs.gaussians[0].is_cuda,
+        exact,
         tables,
     )
 
