@@ -45,11 +45,8 @@ std::vector<Tensor> list_and_rasterize(const std::vector<Tensor>& splats, const 
     using T = decltype(zero);
     backend::alphas_of(data<T>(transmittances), alphas.numel(), mutable_data<T>(alphas), scope.stream);
   });
-  return std::apply(
-      [&](const auto&... tensors) {
-        return std::vector<Tensor>{tensors..., alphas};
-      },
-      std::tuple_cat(lists, outputs));
+  return std::apply([&](const auto&... tensors) { return std::vector<Tensor>{tensors..., alphas}; },
+                    std::tuple_cat(lists, outputs));
 }
 
 }  // namespace
