@@ -41,6 +41,7 @@ COMMANDS = {
     "scratch": "python benchmarks/bm_scratch.py",
     "photometric": "python benchmarks/bm_photometric.py",
     "accuracy": "python benchmarks/bm_accuracy.py",
+    "lineage": "python benchmarks/bm_lineage.py",
     "quality": (
         "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
         "--recipe aerial=configs/aerial.yaml --seeds 0 1 2"
@@ -52,9 +53,10 @@ COMMANDS |= {
         "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"
     ),
 }
-# The files of a group are of one commit, and so are those that are in no group. Trainings take many minutes
-# and depend on the recipe more than on the kernels; the city has a page of its own.
-GROUPS = (("quality", "drop_in"), ("city", "city_exchange"))
+# The files of a group are of one commit, and so are those that are in no group. Whole trainings take many
+# minutes and depend on the recipe more than on the kernels, several GPUs are seldom at hand, and the city has
+# a page of its own.
+GROUPS = (("quality",), ("exchange", "training", "training_2"), ("city", "city_exchange"))
 # bm_quality.py takes no --json: it collects all of its runs in one file.
 COPIED = {"quality": "cp runs/quality/quality.json benchmarks/results/"}
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -274,6 +276,7 @@ SECTIONS = {
     "drop_in": Section(("drop_in",), row_lines),
     "importance": Section(("importance",), row_lines),
     "gate": Section(("gate",), row_lines),
+    "lineage": Section(("lineage",), row_lines),
     "scratch": Section(("scratch",), row_lines),
     "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),

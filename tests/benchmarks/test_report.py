@@ -144,7 +144,7 @@ def test_a_table_without_results_names_its_command(results):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("step_1", {"commit": "def"}, "step_1.json is of commit def, exchange.json of abc"),
+        ("step_1", {"commit": "def"}, "step_1.json is of commit def, render.json of abc"),
         ("step_1", {"commit": "abc+changes"}, "commit is abc\\+changes"),
         ("step_1", {"commit": "unknown"}, "BLITZGS_COMMIT"),
         ("other", {}, "no table is made of it"),
@@ -156,13 +156,13 @@ def test_results_that_do_not_belong_together_are_refused(results, name, change, 
         report.load_results(results)
 
 
-def test_trainings_may_be_of_another_commit_than_the_ops(results):
-    rows = {"title": "steps", "rows": [{"arm": "four"}], "commit": "def", "command": "c", "environment": {}}
-    (results / "quality.json").unlink(missing_ok=True)
-    (results / "drop_in.json").write_text(json.dumps(rows))
-    assert report.load_results(results)["drop_in"]["commit"] == "def"
-    (results / "quality.json").write_text(json.dumps({"runs": [quality_run(0, 28.0)]}))
-    with pytest.raises(report.ReportError, match="quality.json is of commit abc, drop_in.json of def"):
+def test_several_gpus_may_be_of_another_commit_than_the_ops_of_one(results):
+    rows = {"title": "steps", "rows": [{"ranks": 2}], "commit": "def", "command": "c", "environment": {}}
+    (results / "exchange.json").unlink(missing_ok=True)
+    (results / "training_2.json").write_text(json.dumps(rows))
+    assert report.load_results(results)["training_2"]["commit"] == "def"
+    (results / "training.json").write_text(json.dumps(rows | {"commit": "abc"}))
+    with pytest.raises(report.ReportError, match="training_2.json is of commit def, training.json of abc"):
         report.load_results(results)
 
 
