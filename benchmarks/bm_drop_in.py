@@ -2,7 +2,7 @@
 """Runs gsplat's training loop with gsplat's parts and with ours, and compares time and quality.
 
     python benchmarks/bm_drop_in.py CAPTURE [--steps 7000] [--arms gsplat import four] [--device cuda]
-        [--profile]
+        [--profile] [--one-thread]
 
 The loop, learning rates and density strategy are those of gsplat's `simple_trainer.py` 1.5.3
 (`opponents/gsplat_training.py`), with photographs on the device. Arms:
@@ -13,8 +13,10 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 - four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order.
 
 Times are of the whole training, and of steps between two densifications at its end; PSNR is the mean over
-held-out views. `--profile` then times the parts of a step of each arm, on the host and on the device, and
-prints the ops and kernels that take most time.
+held-out views. `--one-thread` calls `torch.autograd.set_multithreading_enabled(False)` for all arms, as the
+guide recommends: autograd then runs the backward pass in the loop's own thread. `--profile` then times the
+parts of a step of each arm, on the host and on the device, and prints the ops and kernels that take most
+time.
 """
 
 from __future__ import annotations
@@ -218,14 +220,17 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--downscale", type=float, default=1)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
     parser.add_argument("--profile", action="store_true", help="time the parts of a step of each arm")
+    parser.add_argument("--one-thread", action="store_true", help="run autograd in the loop's own thread")
     options = parser.parse_args(arguments)
     capture = load_capture(options.capture, downscale=options.downscale)
     images = ImageStore(capture)
-    title, rows = f"gsplat's loop, {options.steps} steps of {options.capture.name}", []
-    for name in options.arms:
-        rows.append(measure(name, capture, images, options))
-        # After each arm: a run that is cut off leaves what it measured.
-        report(title, rows, options.json, options.device)
+    threads = ", autograd in one thread" if options.one_thread else ""
+    title, rows = f"gsplat's loop, {options.steps} steps of {options.capture.name}{threads}", []
+    with torch.autograd.set_multithreading_enabled(not options.one_thread):
+        for name in options.arms:
+            rows.append(measure(name, capture, images, options))
+            # After each arm: a run that is cut off leaves what it measured.
+            report(title, rows, options.json, options.device)
     images.close()
     return rows
 
