@@ -12,11 +12,11 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 - import: the same with `blitzgs.rasterization` in place of gsplat's function;
 - four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order.
 
-Times are of the whole training, and of steps between two densifications at its end; PSNR is the mean over
-held-out views. `--one-thread` calls `torch.autograd.set_multithreading_enabled(False)` for all arms, as the
-guide recommends: autograd then runs the backward pass in the loop's own thread. `--profile` then times the
-parts of a step of each arm, on the host and on the device, and prints the ops and kernels that take most
-time.
+Times are of the whole training, of the two steps around each time at which the strategy may change the
+population, and of the steps between two such times at the end; PSNR is the mean over held-out views.
+`--one-thread` calls `torch.autograd.set_multithreading_enabled(False)` for all arms, as the guide recommends:
+autograd then runs the backward pass in the loop's own thread. `--profile` then times the parts of a step of
+each arm, on the host and on the device, and prints the ops and kernels that take most time.
 """
 
 from __future__ import annotations
@@ -165,6 +165,20 @@ def seconds_of(trainer: GsplatTrainer, until: int) -> float:
     return time.perf_counter() - start
 
 
+def refined_seconds(trainer: GsplatTrainer, until: int) -> tuple[float, float]:
+    """Continue the training; return the seconds of all steps, and of those around changes of the population.
+
+    The step after a change counts as well, because optimisers and estimates of sizes begin anew in it.
+    """
+    every = trainer._strategy.refine_every
+    rest = changes = 0.0
+    while trainer.step < until:
+        change = -(-trainer.step // every) * every
+        rest += seconds_of(trainer, min(change, until))
+        changes += seconds_of(trainer, min(change + 2, until))
+    return rest + changes, changes
+
+
 @torch.no_grad()
 def psnr(trainer: OneImport, capture: Any, images: ImageStore) -> float:
     """Return the mean PSNR of the held-out views, in dB."""
@@ -184,11 +198,12 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
     changes = {"steps": options.steps, "packed": name == "four"}
     trainer = ARMS[name]("default", GsplatOptions.of("default", changes), capture, images, device, 0)
     last = min(99, options.steps // 10)  # between two densifications
-    first = seconds_of(trainer, options.steps - last)
+    first, changes = refined_seconds(trainer, options.steps - last)
     rest = seconds_of(trainer, options.steps)
     found = {
         "arm": name,
         "training, s": first + rest,
+        "of it around refinements, s": changes,
         "last steps, ms each": rest / last * 1e3,
         "Gaussians": len(trainer.params["means"]),
         "PSNR, dB": psnr(trainer, capture, images),
