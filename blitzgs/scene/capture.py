@@ -319,7 +319,7 @@ def _finite_points(points: SourcePoints) -> SourcePoints:
 
 def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_000) -> SourcePoints:
     """Return uniform points of random colours in the region that the cameras look at."""
-    warnings.warn(f"the capture has no points: starting from {count} random ones", stacklevel=3)
+    warnings.warn(f"the capture has no points; {count} random ones take their place", stacklevel=3)
     poses = np.stack([camera.world_to_camera for camera in cameras])
     centers, axes = camera_centers(poses), poses[:, 2, :3]
     # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
