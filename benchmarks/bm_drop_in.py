@@ -10,7 +10,9 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 - gsplat: `gsplat.rasterization`, `torch.optim.Adam(fused=True)`, and L1 and SSIM by fused_ssim, or by our
   kernel where fused_ssim is not installed;
 - import: the same with `blitzgs.rasterization` in place of gsplat's function;
-- four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order.
+- four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order, with
+  gradients that go straight to the optimisers (`direct_grad=True`);
+- four_grad (only if it is named): the same with gradients in `.grad`.
 
 Times are of the whole training, of the two steps around each time at which the strategy may change the
 population, and of the steps between two such times at the end; PSNR is the mean over held-out views.
@@ -94,7 +96,13 @@ class OneImport(GsplatTrainer):
 
 
 class FourSwaps(OneImport):
-    """The loop with our renderer of raw parameters, optimiser and loss, and rows in Morton order."""
+    """The loop with our renderer of raw parameters, optimiser and loss, and rows in Morton order.
+
+    Attributes:
+        direct_grad: of the renderer.
+    """
+
+    direct_grad = True
 
     def initialise(self, capture: Any) -> Any:
         """Make the parameters and a `LazyAdam` for each."""
@@ -115,6 +123,7 @@ class FourSwaps(OneImport):
         image, _, info = blitzgs.raw_rasterization(
             p["means"], p["quats"], p["scales"], p["opacities"], p["sh0"], p["shN"], views.viewmats, views.Ks,
             views.width, views.height, sh_degree=self.sh_degree, optimizers=self._optimisers,
+            direct_grad=self.direct_grad,
         )  # fmt: skip
         return image, info
 
@@ -142,6 +151,12 @@ class FourSwaps(OneImport):
             optimiser.catch_up()
 
 
+class FourGrad(FourSwaps):
+    """The same with gradients in `.grad`."""
+
+    direct_grad = False
+
+
 class Gsplat(OneImport):
     """gsplat's loop without changes."""
 
@@ -152,7 +167,7 @@ class Gsplat(OneImport):
         super().__init__(*arguments)
 
 
-ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps}
+ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps, "four_grad": FourGrad}
 
 
 def seconds_of(trainer: GsplatTrainer, until: int) -> float:
@@ -195,7 +210,7 @@ def psnr(trainer: OneImport, capture: Any, images: ImageStore) -> float:
 def measure(name: str, capture: Any, images: ImageStore, options: argparse.Namespace) -> dict[str, Any]:
     """Train with one arm; returns a row of the report."""
     device = torch.device(options.device)
-    changes = {"steps": options.steps, "packed": name == "four"}
+    changes = {"steps": options.steps, "packed": issubclass(ARMS[name], FourSwaps)}
     trainer = ARMS[name]("default", GsplatOptions.of("default", changes), capture, images, device, 0)
     last = min(99, options.steps // 10)  # between two densifications
     first, changes = refined_seconds(trainer, options.steps - last)
@@ -233,7 +248,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--downscale", type=float, default=1)
-    parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
+    parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["gsplat", "import", "four"])
     parser.add_argument("--profile", action="store_true", help="time the parts of a step of each arm")
     parser.add_argument("--one-thread", action="store_true", help="run autograd in the loop's own thread")
     options = parser.parse_args(arguments)

@@ -9,9 +9,9 @@ includes the kernels. On CUDA each pass ends with a synchronisation, so a figure
 device. Each figure is a median over repeats.
 
 The second table has the steps of a trainer made of `raw_rasterization`, `l1_ssim` and `LazyAdam`
-(`step_together`), by part, without synchronisations; each figure is a mean over repeats. It also says how
-many of torch's operations a step takes. To compare with another version of the package, put its folder into
-PYTHONPATH.
+(`step_together`), by part, without synchronisations, with gradients in `.grad` and with `direct_grad=True`;
+each figure is a mean over repeats. It also says how many of torch's operations a step takes. To compare with
+another version of the package, put its folder into PYTHONPATH.
 """
 
 from __future__ import annotations
@@ -80,8 +80,9 @@ class Trainer:
         part: times the parts of a step.
     """
 
-    def __init__(self, device: str) -> None:
-        """Take the Gaussians and the view of the benchmark's scene."""
+    def __init__(self, device: str, direct_grad: bool = False) -> None:
+        """Take the Gaussians and the view of the benchmark's scene; `direct_grad`: of the renderer."""
+        self._direct_grad = direct_grad
         self._scene = scene = aerial(GAUSSIANS, device, width=WIDTH, height=HEIGHT)
         values = {
             "means": scene.means, "quats": scene.quats, "scales": scene.scales.log(),
@@ -102,7 +103,7 @@ class Trainer:
         with self.part("render"):
             image, _, _ = raw_rasterization(
                 *self.params.values(), scene.viewmats, scene.Ks, WIDTH, HEIGHT, sh_degree=1,
-                optimizers=self._optimizers,
+                optimizers=self._optimizers, direct_grad=self._direct_grad,
             )  # fmt: skip
         with self.part("loss"):
             loss = l1_ssim(image, self._target)
@@ -112,9 +113,9 @@ class Trainer:
             step_together(self._optimizers, set_to_none=True)
 
 
-def measure_trainer(device: str, repeats: int) -> list[dict[str, Any]]:
-    """Return a row for each part of a trainer's step, and one with the operations of a step."""
-    trainer, counted = Trainer(device), 5
+def measure_trainer(device: str, repeats: int, direct_grad: bool) -> dict[str, float]:
+    """Return the host's microseconds for each part of a trainer's step, and the operations of a step."""
+    trainer, counted = Trainer(device, direct_grad), 5
 
     def steps(count: int) -> None:
         for _ in range(count):
@@ -123,9 +124,9 @@ def measure_trainer(device: str, repeats: int) -> list[dict[str, Any]]:
     steps(repeats // 10 + 1)
     trainer.part = parts = Parts(torch.device(device))
     steps(repeats)
-    rows = [{"part": row["part"], "host us": 1e3 * row["host, ms"]} for row in parts.rows(repeats)]
+    found = {row["part"]: 1e3 * row["host, ms"] for row in parts.rows(repeats)}
     counts, _ = trace(lambda: steps(counted), counted, torch.device(device))
-    return [*rows, {"part": "torch's operations (a number)", "host us": counts["torch ops"]}]
+    return {**found, "torch's operations (a number)": counts["torch ops"]}
 
 
 def main() -> None:
@@ -138,7 +139,11 @@ def main() -> None:
             rows.append({"call": name, "forward us": forward, "backward us": backward,
                          "total us": forward + backward})  # fmt: skip
         report("Host time of a call", rows, None, args.device)
-        steps = measure_trainer(args.device, args.repeats)
+        plain, direct = (measure_trainer(args.device, args.repeats, direct) for direct in (False, True))
+    steps = [
+        {"part": part, "host us": figure, "direct_grad, host us": direct[part]}
+        for part, figure in plain.items()
+    ]
     report("Host time of a trainer's step", steps, None, args.device)
     if args.json:
         write_json(args.json, args.device, rows=rows, steps=steps)

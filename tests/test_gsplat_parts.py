@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.optim import LazyAdam
+from blitzgs.optim import LazyAdam, step_together
 from tests.helpers import random_scene, rasterize_scene, relative_error
 from tests.test_raw_rasterization import NAMES, activated, raw, raw_parameters
 
@@ -19,8 +19,8 @@ RATES = dict(zip(NAMES, (2.0**-9, 2.0**-10, 2.0**-8, 2.0**-6, 2.0**-8, 2.0**-10)
 class Trainer:
     """The loop of gsplat's simple_trainer: its strategy, an optimiser for each parameter."""
 
-    def __init__(self, scene, strategy, lazy, packed):
-        self.scene, self.strategy, self.lazy, self.packed = scene, strategy, lazy, packed
+    def __init__(self, scene, strategy, lazy, packed, direct):
+        self.scene, self.strategy, self.lazy, self.packed, self.direct = scene, strategy, lazy, packed, direct
         self.splats = torch.nn.ParameterDict(
             {name: torch.nn.Parameter(p.detach()) for name, p in raw_parameters(scene).items()}
         )
@@ -39,14 +39,16 @@ class Trainer:
         one.viewmats, one.Ks = self.scene.viewmats[view, None], self.scene.Ks[view, None]
         p = {name: self.splats[name] for name in NAMES}
         if self.lazy:
-            return raw(p, one, optimizers=self.optimizers)
+            return raw(p, one, optimizers=self.optimizers, direct_grad=self.direct)
         return activated(p, one, packed=self.packed)
 
     def step(self, step, view, target):
         image, _, info = self.render(view)
         self.strategy.step_pre_backward(self.splats, self.optimizers, self.state, step, info)
         blitzgs.l1_ssim(image, target).backward()
-        for optimizer in self.optimizers.values():
+        if self.direct:
+            step_together(self.optimizers, set_to_none=True)
+        for optimizer in () if self.direct else self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         if self.lazy:
@@ -69,7 +71,7 @@ def test_the_default_strategy_does_the_same_whatever_renders_and_steps():
     scene = random_scene(n=50, cameras=5, width=20, height=16, dtype=torch.float64)
     targets = torch.rand(5, 1, 16, 20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     trainers = []
-    for lazy, packed in ((False, False), (False, True), (True, True)):
+    for kind in ((False, False, False), (False, True, False), (True, True, False), (True, True, True)):
         strategy = gsplat.DefaultStrategy(
             refine_start_iter=4,
             refine_every=8,
@@ -78,7 +80,7 @@ def test_the_default_strategy_does_the_same_whatever_renders_and_steps():
             prune_opa=0.3,
             verbose=False,
         )
-        trainer = Trainer(scene, strategy, lazy, packed)
+        trainer = Trainer(scene, strategy, *kind)
         torch.manual_seed(3)  # of the strategy's splits
         for step in range(30):
             trainer.step(step, step % 5, targets[step % 5])

@@ -19,7 +19,7 @@ from blitzgs.ops.projection import (
     ProjectionOptions,
     project_splats,
 )
-from blitzgs.ops.sparse_rows import full_gradients
+from blitzgs.ops.sparse_rows import HandOver, full_gradients
 from blitzgs.ops.splat_gradients import packed_table
 
 
@@ -125,6 +125,8 @@ def differentiable_splats(
     if not torch.compiler.is_compiling():
         splats = project_splats(inputs) if splats is None else splats
         tables = inputs.gaussians if rows is None else [*inputs.gaussians, *rows.sh]
+        if rows is not None and rows.hand_over is not None:
+            tables = [rows.hand_over.ticket]
         call = _Call(inputs, sparse_grad, splats, rows)
         columns = _Project.apply(viewmats, call, *tables)  # type: ignore[no-untyped-call]
         means2d, conics, depths, opacities, colors = columns
@@ -215,15 +217,18 @@ class TableRows(NamedTuple):
     Attributes:
         visible: the rows.
         sh: the SH of all Gaussians in parts, from which the rows' SH were joined; empty: without SH.
+        hand_over: takes the gradients of the tables, if autograd is not to have them.
     """
 
     visible: VisibleRows
     sh: Sequence[Tensor]
+    hand_over: HandOver | None
 
 
 def _save(ctx: Any, inputs: ProjectionInputs, splats: ProjectedSplats, rows: TableRows | None = None) -> None:
     ctx.set_materialize_grads(False)
     read, visible_ids, ids, ctx.tables, ctx.parts = inputs, splats.visible_ids, None, None, []
+    ctx.hand_over = None if rows is None else rows.hand_over
     if rows is not None:
         read, visible_ids, ids = rows.visible
         # The tables are not saved: the gradient does not depend on their values, which may change.
@@ -312,7 +317,10 @@ def _first_gradients(
         found[4:] = split_rows(gradients[4], ctx.parts)
     if not dense:
         found = [gradient if wanted else None for gradient, wanted in zip(found, needed, strict=True)]
-    if not dense and not complete:
+    if ctx.hand_over is not None:
+        ctx.hand_over.give(saved.ids, found)
+        found = [None]  # of the ticket
+    elif not dense and not complete:
         ids = visible_ids if saved.ids is None else saved.ids
         shapes = [table.shape for table in ctx.tables or saved.gaussians]
         found = full_gradients(ids, found, shapes, sparse)
@@ -359,6 +367,10 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *v_output: Tensor | None) -> Any:
         need_viewmats, _, *needed = ctx.needs_input_grad
+        if ctx.hand_over is not None:
+            # Autograd runs the ticket's node unless it was asked for other gradients only, as of viewmats.
+            wanted = torch._C._will_engine_execute_node(ctx.next_functions[-1][0])
+            needed = [wanted and need for need in ctx.hand_over.needed]
         v = _Differentiable._make(v_output)
         v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, ctx.sparse, v)
         return (v_viewmats, None, *gradients)

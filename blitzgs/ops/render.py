@@ -21,6 +21,7 @@ from blitzgs.ops.projection import (
     first_rows,
     lengths_of,
 )
+from blitzgs.ops.sparse_rows import HandOver
 
 
 class Rendered(NamedTuple):
@@ -48,10 +49,12 @@ class ShTables(NamedTuple):
         parts: the SH of all Gaussians in parts, [N, L, 3] each; empty: no SH are rendered.
         before: called before rows are read, with the rows, int32 [A], and the number of those that are
             valid, int32 [1] on the device, or None if all are.
+        hand_over: takes the gradients of all tables, if autograd is not to have them.
     """
 
     parts: Sequence[Tensor]
     before: Callable[[Tensor, Tensor | None], object]
+    hand_over: HandOver | None
 
 
 def render_queued(
@@ -102,7 +105,9 @@ def render_queued(
         splats = splats._replace(counts=counts)
         if capacity is not None:
             splats, isect_splats, rows = _without_spare(splats, isect_splats, rows, sizes)
-        of_tables = None if tables is None or rows is None else TableRows(rows, tables.parts)
+        of_tables = None
+        if tables is not None and rows is not None:
+            of_tables = TableRows(rows, tables.parts, tables.hand_over)
         return Rendered(splats, isect_splats, tile_offsets, composited, of_tables)
 
 

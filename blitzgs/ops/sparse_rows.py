@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +15,22 @@ from torch.multiprocessing.reductions import StorageWeakRef
 # unchanged but loses the mark that it is coalesced (each index once). A sum of gradients has an indices
 # tensor of its own.
 _distinct: deque[StorageWeakRef] = deque(maxlen=32)
+
+
+class HandOver(NamedTuple):
+    """Takes the gradients of parameters in place of autograd, to which the parameters are constants.
+
+    Attributes:
+        ticket: [0], requires a gradient and gets none. It stands for the parameters in autograd's graph, on
+            their device: `backward` then lets the caller's stream wait for theirs, as it does for `.grad`.
+        needed: which of the parameters need a gradient.
+        give: called with rows, int64 [U], ascending, each once, and the gradients [U, ...] of all parameters,
+            None for those that need none.
+    """
+
+    ticket: Tensor
+    needed: Sequence[bool]
+    give: Callable[[Tensor, Sequence[Tensor | None]], object]
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:

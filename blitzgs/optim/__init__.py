@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Optimisers for Gaussians with the interface of `torch.optim`."""
 
-from blitzgs.optim.lazy_adam import LazyAdam, step_together
+from blitzgs.optim.lazy_adam import LazyAdam
+from blitzgs.optim.together import step_together
 
 __all__ = ["LazyAdam", "step_together"]

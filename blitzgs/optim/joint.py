@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import GROUPS, Drift
+from blitzgs.optim.handed import Handed, only_handed
 from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of
 
 # Values in a row of the op's first four columns, and of the parameter that takes the place of SH beside them.
@@ -42,7 +43,8 @@ class Joint:
     def __init__(self, members: Sequence[Member], slots: Sequence[Slot]) -> None:
         """Bring the members up to date and join them."""
         self.members, self._slots = members, slots
-        for optimizer in {id(member[0]): member[0] for member in members}.values():
+        self._optimizers = list({id(member[0]): member[0] for member in members}.values())
+        for optimizer in self._optimizers:
             optimizer.bring_up_to_date()
             optimizer.drifts.clear()
             optimizer.joint = self
@@ -70,19 +72,18 @@ class Joint:
         # The step up to which all rows of each table are known to be current.
         self._current = [self._step] * count
         self._known = [
-            (param, state, [state[name] for name in _ENTRIES])
-            for param, state in zip(params, states, strict=True)
+            (*member, param, state, [state[name] for name in _ENTRIES], _options_of(member[1]))
+            for member, param, state in zip(members, params, states, strict=True)
         ]
         # The parameters of each table, which `_known` keeps alive.
         self._ids = [{id(params[index]) for index in inside} for inside in self._inside]
-        self._eps, self._options = eps, [_options_of(group) for _, group, _ in members]
+        self._all_ids = set().union(*self._ids)
+        self._eps = eps
 
     def is_current(self) -> bool:
         """Tell whether the members still have the parameters, state and options that were joined."""
         # Each training step asks this twice, so it is one loop with few calls.
-        for (optimizer, group, place), (param, state, entries), options in zip(
-            self.members, self._known, self._options, strict=True
-        ):
+        for optimizer, group, place, param, state, entries, options in self._known:
             params = group["params"]
             if place >= len(params) or params[place] is not param or optimizer.state.get(param) is not state:
                 return False
@@ -91,6 +92,16 @@ class Joint:
             if (group["betas"], group["eps"]) != options and _options_of(group) != options:
                 return False
         return True
+
+    def param_ids(self) -> set[int]:
+        """Return the `id` of every parameter."""
+        return self._all_ids
+
+    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor | None]) -> None:
+        """Hand gradients to the optimisers, see `LazyAdam.receive`."""
+        handed = Handed(rows, gradients)
+        for optimizer in self._optimizers:
+            optimizer.handed.append(handed)
 
     def has_members(self, members: Sequence[Member]) -> bool:
         """Tell whether these are the members, in the same order."""
@@ -103,7 +114,7 @@ class Joint:
         """Take a step for some rows.
 
         Args:
-            indices: int64 [1, A], the rows, each once.
+            indices: int64 [1, A] or [A], the rows, each once.
             gradients: their gradients for each member, [A, ...].
         """
         if self.drift.is_full(self._step):
@@ -172,7 +183,11 @@ def step_jointly(optimizers: Sequence[Any]) -> bool:
     ]
     if len(members) < len(_WIDTHS):
         return False
-    gradients = _common_gradients(members)
+    gradients = only_handed(members)
+    if gradients is None:
+        for optimizer in optimizers:
+            optimizer.move_handed()
+        gradients = _common_gradients(members)
     if gradients is None:
         return False
     joint: Joint | None = optimizers[0].joint

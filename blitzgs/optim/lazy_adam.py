@@ -12,6 +12,7 @@ from torch.nn import Parameter
 
 from blitzgs.ops.sparse_rows import distinct_rows
 from blitzgs.optim.drift import Drift
+from blitzgs.optim.handed import Handed, move_to_grad
 from blitzgs.optim.joint import Joint, step_jointly
 from blitzgs.optim.table import MOMENTS, STEPS, Table, rates_of
 
@@ -46,6 +47,8 @@ class LazyAdam(torch.optim.Optimizer):
             parameter in it, because strategies replace the parameters and their state. Parameters of
             `joint` have none.
         joint: the parameters that are stepped together, also those of other optimisers (`step_together`).
+        handed: gradients that are not in `.grad`, but count as if they were: those that backward passes of
+            `raw_rasterization(..., direct_grad=True)` handed over since the last `zero_grad`.
     """
 
     def __init__(
@@ -69,19 +72,40 @@ class LazyAdam(torch.optim.Optimizer):
         """
         self.drifts: dict[tuple[int, int], Drift] = {}
         self.joint: Joint | None = None
+        self.handed: list[Handed] = []
         self._drift_groups: list[dict[str, Any]] = []
         super().__init__(params, {"lr": lr, "lr_rest": None, "betas": betas, "eps": eps})
 
     def __getstate__(self) -> dict[str, Any]:
         self.leave_joint()  # its other members do not belong to a copy
         self._follow_groups()
-        own = {"drifts": self.drifts, "joint": None, "_drift_groups": self._drift_groups}
+        own = {"drifts": self.drifts, "joint": None, "handed": [], "_drift_groups": self._drift_groups}
         return {**super().__getstate__(), **own}
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add parameters with options of their own, see `__init__`."""
         super().add_param_group(param_group)
         _check_group(self.param_groups[-1])
+
+    def param_ids(self) -> set[int]:
+        """Return the `id` of every parameter."""
+        return {id(param) for group in self.param_groups for param in group["params"]}
+
+    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor | None]) -> None:
+        """Take gradients that count as if they were added to `.grad`; see `Handed` for the arguments."""
+        self.handed.append(Handed(rows, gradients))
+
+    def move_handed(self) -> None:
+        """Add the gradients that were handed over to `.grad`."""
+        if self.handed:
+            move_to_grad(self.handed, [param for _, _, param in self._placed()])
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Remove all gradients, also those that were handed over; see `torch.optim.Optimizer.zero_grad`."""
+        if set_to_none:
+            self.handed.clear()
+        self.move_handed()
+        super().zero_grad(set_to_none)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -107,6 +131,7 @@ class LazyAdam(torch.optim.Optimizer):
     def _step_alone(self) -> None:
         """Take a step for each parameter by itself."""
         self.leave_joint()
+        self.move_handed()
         for place, group, param in self._placed():
             if param.grad is None:
                 continue
@@ -279,6 +304,7 @@ class LazyAdam(torch.optim.Optimizer):
                 self.state[new] = state
             group["params"] = [new]
             renewed[name] = new
+        self.handed.clear()
         return renewed
 
     def index_of(self, group: dict[str, Any]) -> int | None:
@@ -372,38 +398,3 @@ def _check_group(group: dict[str, Any]) -> None:
     for name in ("weight_decay", "amsgrad", "maximize"):
         if group.get(name):
             raise ValueError(f"LazyAdam: {name}={group[name]} is not supported; leave it out")
-
-
-def step_together(optimizers: Iterable[LazyAdam] | Mapping[str, LazyAdam], set_to_none: bool = False) -> None:
-    """Take a step of several optimisers, in few calls if their parameters are those of gsplat's trainer.
-
-    The result is that of `step` of each. gsplat's strategies need an optimiser for each parameter, but the
-    parameters have the same rows. If their gradients are those of one call of
-    `raw_rasterization(..., optimizers=...)`, means, quats, scales, opacities and sh0 take one call and shN
-    another. Otherwise each optimiser takes its step by itself. A single `LazyAdam` with a group for each
-    parameter does the same in its own `step`. Step hooks of the optimisers are not called.
-
-    Args:
-        optimizers: the optimisers, as a mapping or a sequence.
-        set_to_none: whether to remove the gradients afterwards, as `zero_grad(set_to_none=True)` does.
-
-    Raises:
-        TypeError: an optimiser is not a `LazyAdam`.
-        ValueError: as `LazyAdam.step`.
-    """
-    chosen = list(optimizers.values() if isinstance(optimizers, Mapping) else optimizers)
-    for optimizer in chosen:
-        if not isinstance(optimizer, LazyAdam):
-            raise TypeError(
-                f"step_together: every optimiser must be a LazyAdam, got {type(optimizer).__name__}; call "
-                "the step of the others separately"
-            )
-    if not step_jointly(chosen):
-        for optimizer in chosen:
-            optimizer.step()
-    for optimizer in chosen:
-        optimizer._opt_called = True  # torch's schedulers warn if they do not see a step
-        if set_to_none:
-            for group in optimizer.param_groups:
-                for param in group["params"]:
-                    param.grad = None

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -15,7 +16,7 @@ from blitzgs.lazy_dict import LazyDict
 from blitzgs.ops.gather_rows import gather_rows, split_rows
 from blitzgs.ops.projection import ProjectionOptions, project_splats
 from blitzgs.ops.render import ShTables
-from blitzgs.ops.sparse_rows import full_gradients
+from blitzgs.ops.sparse_rows import HandOver, full_gradients
 from blitzgs.rendering.arguments import (
     Gaussians,
     Scene,
@@ -38,6 +39,16 @@ class CatchesUp(Protocol):
         count: Tensor | None = None,
     ) -> None:
         """Apply the pending steps of rows of parameters, see `blitzgs.optim.LazyAdam.catch_up`."""
+
+
+class TakesGradients(CatchesUp, Protocol):
+    """An optimiser that takes gradients of its parameters from the backward pass, such as `LazyAdam`."""
+
+    def param_ids(self) -> set[int]:
+        """Return the `id` of every parameter."""
+
+    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor | None]) -> None:
+        """Take gradients, see `blitzgs.optim.LazyAdam.receive`."""
 
 
 def raw_rasterization(
@@ -63,6 +74,7 @@ def raw_rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     optimizers: CatchesUp | Iterable[Any] | Mapping[str, Any] = (),
+    direct_grad: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
 
@@ -96,13 +108,18 @@ def raw_rasterization(
         optimizers: the parameters' optimisers, as a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
             among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
             the visible ones.
+        direct_grad: whether the backward pass hands the parameters' gradients to `optimizers`, in less time
+            than autograd needs for sparse tensors. The optimisers then do what they do with `.grad`, but
+            `.grad` of the parameters stays None: hooks on parameters, gradient clipping and `GradScaler` do
+            not see the gradients, and `torch.autograd.grad` does not return them. It needs `sparse_grad`,
+            and a `LazyAdam` for each parameter that requires a gradient.
 
     Returns:
         As `blitzgs.rasterization(..., packed=True)`.
 
     Raises:
         TypeError: as `blitzgs.rasterization`, like the next two.
-        ValueError: likewise.
+        ValueError: likewise; or `direct_grad` is not possible.
         RuntimeError: likewise.
     """
     check_options(width, height, render_mode, rasterize_mode, "pinhole", tile_size)
@@ -122,6 +139,9 @@ def raw_rasterization(
     for optimizer in lazy:
         optimizer.catch_up(geometry)
     shaded = "RGB" in render_mode
+    hand_over = None
+    if direct_grad and torch.is_grad_enabled():
+        hand_over = _hand_over(lazy, (*geometry, *(harmonics if shaded else ())), sparse_grad)
     named = {name: (tensor,) for name, tensor in tensors.items()}
     named |= {"viewmats": (viewmats,), "Ks": (Ks,), **({} if shN is None else {"shN": (shN,)})}
     colors, degree = (sh0, sh_degree) if shaded else (None, None)
@@ -136,13 +156,17 @@ def raw_rasterization(
 
     groups = groups_of(gaussians, project)
     if may_queue(groups):
-        tables = ShTables(harmonics if shaded else (), before)
+        tables = ShTables(harmonics if shaded else (), before, hand_over)
         return render("raw_rasterization", gaussians, project, image, tables=tables, groups=groups)
     # Several groups, or none of Gaussians: gather the rows that any of them sees, and render these.
     ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
     before(ids, None)
+    read = (*geometry, *(harmonics if shaded else ()))
+    if hand_over is not None:
+        read = tuple(table.detach() for table in read)
+    ticket = None if hand_over is None else hand_over.ticket
     means, quats, scales, opacities, sh = _Visible.apply(  # type: ignore[no-untyped-call]
-        ids, sparse_grad, *geometry, *(harmonics if shaded else ())
+        ids, sparse_grad, hand_over, ticket, *read
     )
     scene = Scene(means, quats, scales, opacities, sh, viewmats, Ks)
     gaussians = replace(gaussians, scenes=(scene,), colors=sh, opacities=opacities)
@@ -171,6 +195,41 @@ def _lazy(optimizers: Any) -> list[CatchesUp]:
     return found
 
 
+def _hand_over(lazy: Sequence[Any], params: Sequence[Tensor], sparse_grad: bool) -> HandOver | None:
+    """Return what hands the gradients of means, quats, scales, opacities and SH to their optimisers.
+
+    None: no parameter requires a gradient.
+    """
+    if not sparse_grad:
+        raise ValueError("direct_grad=True needs sparse_grad=True; leave one of them out")
+    needed = [param.requires_grad for param in params]
+    wanted = set(map(id, itertools.compress(params, needed)))
+    owners: list[TakesGradients] = []
+    found: set[int] = set()
+    for optimizer in lazy:
+        if hasattr(optimizer, "param_ids") and (own := wanted & optimizer.param_ids()):
+            owners.append(optimizer)
+            found |= own
+    if found != wanted:
+        names = zip(("means", "quats", "scales", "opacities", "sh0", "shN"), params, strict=False)
+        missing = [name for name, param in names if id(param) in wanted - found]
+        raise ValueError(
+            f"direct_grad=True: no LazyAdam in `optimizers` has {', '.join(missing)}; pass the optimisers of "
+            "all parameters, call requires_grad_(False) for parameters that are not learned, or leave "
+            "direct_grad out"
+        )
+
+    def give(rows: Tensor, gradients: Sequence[Tensor | None]) -> None:
+        if any(gradient is not None for gradient in gradients):
+            given = dict(zip(params, gradients, strict=True))
+            for owner in owners:
+                owner.receive(rows, given)
+
+    if not wanted:
+        return None
+    return HandOver(torch.empty(0, device=params[0].device, requires_grad=True), needed, give)
+
+
 def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, shaded: bool) -> int:
     """Check the SH and return the degree to evaluate."""
     for name, part in zip(("sh0", "shN"), harmonics, strict=False):
@@ -188,13 +247,20 @@ class _Visible(torch.autograd.Function):
     """Gathers the rows `ids` of means, quats, scales and opacities, and of SH in any number of parts.
 
     The result has the SH in one tensor, or None without parts. The gradients of the tables are sparse, or
-    dense if `sparse` is False.
+    dense if `sparse` is False, or go to `hand_over`.
     """
 
     @staticmethod
-    def forward(ctx: Any, ids: Tensor, sparse: bool, *tables: Tensor) -> tuple[Tensor | None, ...]:
+    def forward(
+        ctx: Any,
+        ids: Tensor,
+        sparse: bool,
+        hand_over: HandOver | None,
+        _ticket: Tensor | None,
+        *tables: Tensor,
+    ) -> tuple[Tensor | None, ...]:
         ctx.save_for_backward(ids)
-        ctx.sparse, ctx.shapes = sparse, [table.shape for table in tables]
+        ctx.sparse, ctx.hand_over, ctx.shapes = sparse, hand_over, [table.shape for table in tables]
         ctx.set_materialize_grads(False)
         parts = tables[4:]
         ctx.lengths = [part.shape[1] for part in parts]
@@ -209,5 +275,11 @@ class _Visible(torch.autograd.Function):
             gradients += [v_sh] * len(ctx.lengths)
         else:
             gradients += split_rows(v_sh, ctx.lengths)
-        sparse = [ctx.sparse] * len(gradients)
-        return None, None, *full_gradients(ids, gradients, ctx.shapes, sparse)
+        needed = ctx.needs_input_grad[4:] if ctx.hand_over is None else ctx.hand_over.needed
+        gradients = [gradient if need else None for gradient, need in zip(gradients, needed, strict=True)]
+        if ctx.hand_over is None:
+            gradients = full_gradients(ids, gradients, ctx.shapes, [ctx.sparse] * len(gradients))
+        else:
+            ctx.hand_over.give(ids.long(), gradients)
+            gradients = [None] * len(gradients)
+        return None, None, None, None, *gradients

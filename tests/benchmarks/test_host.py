@@ -5,6 +5,8 @@ import json
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 import bm_host  # noqa: E402
@@ -24,10 +26,13 @@ def test_every_call_is_measured(tmp_path, monkeypatch, capsys):
         steps[name] > 0 for name in parts
     )
     assert count.startswith("torch's operations") and steps[count] > 20
+    direct = {row["part"]: row["direct_grad, host us"] for row in written["steps"]}
+    assert direct.keys() == steps.keys() and 20 < direct[count] < steps[count] / 2
 
 
-def test_the_trainer_whose_steps_are_measured_learns():
-    trainer = bm_host.Trainer("cpu")
+@pytest.mark.parametrize("direct_grad", [False, True])
+def test_the_trainer_whose_steps_are_measured_learns(direct_grad):
+    trainer = bm_host.Trainer("cpu", direct_grad)
     before = {name: value.detach().clone() for name, value in trainer.params.items()}
     for _ in range(3):
         trainer.step()
