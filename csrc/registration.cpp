@@ -238,7 +238,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "Tensor coming) -> ()");
 
   // A number that is 0 if all values of the columns are finite and none of `nonzero` is 0.
-  m.def("all_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");
+  m.def("find_non_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");
 
   // Scene initialisation.
   m.def("voxel_keys(Tensor points, float[] origin, float voxel_size) -> Tensor");

@@ -77,7 +77,7 @@ def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> N
     columns = [t for name, given in gaussians.named.items() if name not in COLOURS for t in given]
     with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
         # Splats whose colour is not finite have no opacity, and no other splat is below 1/255.
-        bad = torch.ops.blitzgs.all_finite(columns, [layout.splats.opacities])
+        bad = torch.ops.blitzgs.find_non_finite(columns, [layout.splats.opacities])
         if not bad.item():
             return
     names = ", ".join(non_finite(gaussians))
@@ -90,7 +90,7 @@ def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> N
         )
 
 
-@torch.library.register_fake("blitzgs::all_finite")
+@torch.library.register_fake("blitzgs::find_non_finite")
 def _(columns: Sequence[Tensor], nonzero: Sequence[Tensor]) -> Tensor:
     return columns[0].new_empty((), dtype=torch.int32)
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "all_finite/all_finite.h"
+#include "find_non_finite/find_non_finite.h"
 
 #include <atomic>
 

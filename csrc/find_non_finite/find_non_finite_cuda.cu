@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "all_finite/all_finite.h"
 #include "common/cuda.cuh"
+#include "find_non_finite/find_non_finite.h"
 
 namespace blitzgs::cuda {
 
@@ -23,14 +23,14 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 void clear_flag(std::int32_t* bad, CudaStream stream) {
-  check(cudaMemsetAsync(bad, 0, sizeof(*bad), stream), "all_finite");
+  check(cudaMemsetAsync(bad, 0, sizeof(*bad), stream), "find_non_finite");
 }
 
 template <>
 void check_columns<float>(const CheckedColumns<float>& checked, CudaStream stream) {
   if (checked.n == 0) return;
   check_columns_kernel<<<dim3(kBlocks, static_cast<unsigned>(checked.n)), kThreads, 0, stream>>>(checked);
-  check_launch("all_finite");
+  check_launch("find_non_finite");
 }
 
 }  // namespace blitzgs::cuda

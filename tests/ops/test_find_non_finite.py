@@ -5,7 +5,7 @@ import torch
 import blitzgs.rendering.finite  # noqa: F401  (registers the fake kernel)
 from tests.helpers import BACKENDS
 
-all_finite = torch.ops.blitzgs.all_finite
+find_non_finite = torch.ops.blitzgs.find_non_finite
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -15,24 +15,24 @@ def test_each_value_of_each_column_is_looked_at(backend, value):
     # 20 columns take two launches; a value of 1e38 squares to infinity, but is finite.
     columns = [torch.full((n, 3), 1e38, dtype=dtype, device=device) for n in (0, 1, 7, 300_000, *[5] * 16)]
     opacities = torch.full((9,), 1e-45, device=device, dtype=dtype)
-    assert not all_finite(columns, [opacities])
+    assert not find_non_finite(columns, [opacities])
     for column in columns[1:]:
         column[-1, 2] = value
-        assert all_finite(columns, [opacities]) and not all_finite([columns[0]], [])
+        assert find_non_finite(columns, [opacities]) and not find_non_finite([columns[0]], [])
         column[-1, 2] = 0.0
-    assert not all_finite(columns, [opacities])
+    assert not find_non_finite(columns, [opacities])
     opacities[8] = -0.0
-    assert all_finite(columns, [opacities]) and all_finite(columns, [opacities[8:]])
+    assert find_non_finite(columns, [opacities]) and find_non_finite(columns, [opacities[8:]])
 
 
 def test_columns_need_not_be_contiguous():
     column = torch.ones(4, 6).T
     column[5, 3] = torch.nan
-    assert all_finite([column], []) and not all_finite([column[:5]], [])
+    assert find_non_finite([column], []) and not find_non_finite([column[:5]], [])
 
 
 def test_errors_name_the_value():
-    with pytest.raises(RuntimeError, match="all_finite: a column must be Float, got Double"):
-        all_finite([torch.ones(2)], [torch.ones(2, dtype=torch.float64)])
-    with pytest.raises(RuntimeError, match="all_finite: there must be columns"):
-        torch.ops.blitzgs.all_finite([], [torch.ones(2)])
+    with pytest.raises(RuntimeError, match="find_non_finite: a column must be Float, got Double"):
+        find_non_finite([torch.ones(2)], [torch.ones(2, dtype=torch.float64)])
+    with pytest.raises(RuntimeError, match="find_non_finite: there must be columns"):
+        torch.ops.blitzgs.find_non_finite([], [torch.ones(2)])

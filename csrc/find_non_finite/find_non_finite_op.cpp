@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "all_finite/all_finite.h"
+#include "find_non_finite/find_non_finite.h"
 
 #include "common/op.h"
 
 namespace blitzgs {
 namespace {
 
-Tensor all_finite(const std::vector<Tensor>& columns_in, const std::vector<Tensor>& nonzero_in) {
-  constexpr const char* kOp = "all_finite";
+Tensor find_non_finite(const std::vector<Tensor>& columns_in, const std::vector<Tensor>& nonzero_in) {
+  constexpr const char* kOp = "find_non_finite";
   STD_TORCH_CHECK(!columns_in.empty(), "blitzgs::", kOp, ": there must be columns");
   std::vector<Tensor> columns;
   for (const std::vector<Tensor>* list : {&columns_in, &nonzero_in}) {
@@ -36,4 +36,4 @@ Tensor all_finite(const std::vector<Tensor>& columns_in, const std::vector<Tenso
 }  // namespace
 }  // namespace blitzgs
 
-BLITZGS_REGISTER(m) { m.impl("all_finite", TORCH_BOX(&blitzgs::all_finite)); }
+BLITZGS_REGISTER(m) { m.impl("find_non_finite", TORCH_BOX(&blitzgs::find_non_finite)); }
