@@ -16,22 +16,6 @@ struct HeldRows {
   BlockRows rows{};
 };
 
-const float* hold_column(const char* op, const char* name, const Tensor& column, std::int64_t n,
-                         HeldRows& held) {
-  check_dtype(op, name, column, ScalarType::Float);
-  check_shape(op, name, column, {n, 3});
-  held.held.push_back(as_contiguous(column));
-  return data<float>(held.held.back());
-}
-
-const std::int32_t* hold_steps(const char* op, const char* name, const Tensor& column, std::int64_t n,
-                               HeldRows& held) {
-  check_dtype(op, name, column, ScalarType::Int);
-  check_shape(op, name, column, {n});
-  held.held.push_back(as_contiguous(column));
-  return data<std::int32_t>(held.held.back());
-}
-
 // rows: (means, scales), and if steps may be pending also the moments (exp_avg and exp_avg_sq of the means,
 // then of the scales), last_step, moment_step and table. blitzgs/ops/blocks.py builds this group.
 HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
@@ -39,26 +23,25 @@ HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
                   ": rows must be (means, scales) or, with pending steps, (means, scales, exp_avg_means, "
                   "exp_avg_sq_means, exp_avg_scales, exp_avg_sq_scales, last_step, moment_step, table), got ",
                   rows.size(), " tensors");
-  const Tensor &means = rows[0], &scales = rows[1];
-  HeldRows held;
-  const std::int64_t n = means.size(0);
+  const std::int64_t n = rows[0].size(0);
   STD_TORCH_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "blitzgs::", op, ": fewer than 2^31 - ",
                   kBlockRows, " rows are supported, got ", n);
+  HeldRows held;
+  const auto hold = [&]<class T>(const T*& column, const char* name, std::size_t at, ScalarType dtype,
+                                 std::initializer_list<std::int64_t> shape) {
+    column = data<T>(held.held.emplace_back(checked(op, name, rows[at], dtype, shape)));
+  };
   held.rows.n = n;
-  held.rows.means = hold_column(op, "means", means, n, held);
-  held.rows.scales = hold_column(op, "scales", scales, n, held);
+  hold(held.rows.means, "means", 0, ScalarType::Float, {n, 3});
+  hold(held.rows.scales, "scales", 1, ScalarType::Float, {n, 3});
   if (rows.size() == 2) return held;
-  held.rows.exp_avg_means = hold_column(op, "exp_avg of means", rows[2], n, held);
-  held.rows.exp_avg_sq_means = hold_column(op, "exp_avg_sq of means", rows[3], n, held);
-  held.rows.exp_avg_scales = hold_column(op, "exp_avg of scales", rows[4], n, held);
-  held.rows.exp_avg_sq_scales = hold_column(op, "exp_avg_sq of scales", rows[5], n, held);
-  held.rows.last_step = hold_steps(op, "last_step", rows[6], n, held);
-  held.rows.moment_step = hold_steps(op, "moment_step", rows[7], n, held);
-  const Tensor& table = rows[8];
-  check_dtype(op, "table", table, ScalarType::Double);
-  check_shape(op, "table", table, {-1, kAdamTable});
-  held.held.push_back(as_contiguous(table));
-  held.rows.table = data<double>(held.held.back());
+  hold(held.rows.exp_avg_means, "exp_avg of means", 2, ScalarType::Float, {n, 3});
+  hold(held.rows.exp_avg_sq_means, "exp_avg_sq of means", 3, ScalarType::Float, {n, 3});
+  hold(held.rows.exp_avg_scales, "exp_avg of scales", 4, ScalarType::Float, {n, 3});
+  hold(held.rows.exp_avg_sq_scales, "exp_avg_sq of scales", 5, ScalarType::Float, {n, 3});
+  hold(held.rows.last_step, "last_step", 6, ScalarType::Int, {n});
+  hold(held.rows.moment_step, "moment_step", 7, ScalarType::Int, {n});
+  hold(held.rows.table, "table", 8, ScalarType::Double, {-1, kAdamTable});
   return held;
 }
 
@@ -67,9 +50,7 @@ void check_bounds(const char* op, const Tensor& bounds, std::int64_t rows) {
 }
 
 Tensor morton_keys(const Tensor& points) {
-  check_dtype("morton_keys", "points", points, ScalarType::Float);
-  check_shape("morton_keys", "points", points, {-1, 3});
-  const Tensor rows = as_contiguous(points);
+  const Tensor rows = checked("morton_keys", "points", points, ScalarType::Float, {-1, 3});
   Tensor keys = make_empty(rows, {rows.size(0)}, ScalarType::Long);
   DeviceScope scope(rows);
   backend::morton_keys(data<float>(rows), rows.size(0), mutable_data<std::int64_t>(keys), scope.workspace,
@@ -82,13 +63,9 @@ void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in,
   const char* op = "update_block_bounds_";
   const HeldRows held = hold_rows(op, rows);
   check_bounds(op, bounds, held.rows.n);
-  std::optional<Tensor> ids;
-  if (ids_in) {
-    check_dtype(op, "ids", *ids_in, ScalarType::Int);
-    check_shape(op, "ids", *ids_in, {-1});
-    ids = as_contiguous(*ids_in);
-    if (ids->size(0) == 0) return;  // an empty tensor may have a null pointer, which would mean all rows
-  }
+  const std::optional<Tensor> ids = checked(op, "ids", ids_in, ScalarType::Int, {-1});
+  // An empty tensor may have a null pointer, which would mean all rows.
+  if (ids && ids->size(0) == 0) return;
   DeviceScope scope(bounds);
   backend::update_block_bounds(held.rows, data_or_null<std::int32_t>(ids), ids ? ids->size(0) : 0,
                                mutable_data<float>(bounds), scope.workspace, scope.stream);
@@ -105,17 +82,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
                   ": cameras are viewmats and Ks, size is width and height, limits are near_plane, "
                   "far_plane and eps2d; got ",
                   cameras.size(), ", ", size.size(), " and ", limits.size(), " of them");
-  const Tensor &viewmats_in = cameras[0], &Ks_in = cameras[1];
   const HeldRows held = hold_rows(op, rows);
   check_bounds(op, bounds, held.rows.n);
-  check_dtype(op, "viewmats", viewmats_in, ScalarType::Float);
-  check_shape(op, "viewmats", viewmats_in, {-1, 4, 4});
-  const std::int64_t views = viewmats_in.size(0);
+  const Tensor viewmats = checked(op, "viewmats", cameras[0], ScalarType::Float, {-1, 4, 4});
+  const std::int64_t views = viewmats.size(0);
   STD_TORCH_CHECK(views <= kMaxViews, "blitzgs::", op, ": at most ", kMaxViews, " views at once, got ",
                   views);
-  check_dtype(op, "Ks", Ks_in, ScalarType::Float);
-  check_shape(op, "Ks", Ks_in, {views, 3, 3});
-  const Tensor viewmats = as_contiguous(viewmats_in), Ks = as_contiguous(Ks_in);
+  const Tensor Ks = checked(op, "Ks", cameras[1], ScalarType::Float, {views, 3, 3});
   const CullCamera camera{data<float>(viewmats),         data<float>(Ks),
                           static_cast<int>(size[0]),     static_cast<int>(size[1]),
                           static_cast<float>(limits[0]), static_cast<float>(limits[1]),
@@ -124,11 +97,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
                   ": a gate needs level_ranges and level");
   BlockGate gate{};
   std::optional<HeldRules> rules;
-  std::optional<Tensor> level_ranges;
+  const std::optional<Tensor> level_ranges =
+      checked(op, "level_ranges", level_ranges_in, ScalarType::Byte, {blocks_of(held.rows.n), 2});
   if (level) {
-    check_dtype(op, "level_ranges", *level_ranges_in, ScalarType::Byte);
-    check_shape(op, "level_ranges", *level_ranges_in, {blocks_of(held.rows.n), 2});
-    level_ranges = as_contiguous(*level_ranges_in);
     rules = hold_rules(op, held.rows.n, static_cast<int>(views), *level, reach, lod_views, cull, columns);
     gate = {rules->rules, data<std::uint8_t>(*level_ranges)};
   }

@@ -108,6 +108,19 @@ inline Tensor as_contiguous(const Tensor& tensor) {
   return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
 }
 
+// Checks a tensor that kernels only read, and returns it in contiguous memory.
+inline Tensor checked(const char* op, const char* name, const Tensor& tensor, ScalarType dtype,
+                      std::initializer_list<std::int64_t> shape) {
+  check_dtype(op, name, tensor, dtype);
+  check_shape(op, name, tensor, shape);
+  return as_contiguous(tensor);
+}
+
+inline std::optional<Tensor> checked(const char* op, const char* name, const std::optional<Tensor>& tensor,
+                                     ScalarType dtype, std::initializer_list<std::int64_t> shape) {
+  return tensor ? std::optional(checked(op, name, *tensor, dtype, shape)) : std::nullopt;
+}
+
 // Calls the C functions of torch directly, because a step allocates some sixty tensors.
 inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& shape,
                          std::optional<ScalarType> dtype = std::nullopt) {
@@ -237,7 +250,6 @@ void dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
 }
 
 // The optional argument n_splats of an op, int64 [1]: how many splats of its columns are valid (kernel.h).
-
 struct SplatCount {
   std::int64_t n_splats;             // the capacity of the columns
   const std::int64_t* known_splats;  // null: all n_splats are valid; else kernels read the number here
@@ -246,6 +258,8 @@ struct SplatCount {
 inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor>& n_splats,
                                       const Tensor& splats) {
   const std::int64_t capacity = splats.size(0);
+  STD_TORCH_CHECK(capacity <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
+                  ": splat indices are 32-bit, got ", capacity, " splats; render fewer views at once");
   if (!n_splats) return {capacity, nullptr};
   check_dtype(op, "n_splats", *n_splats, ScalarType::Long);
   check_shape(op, "n_splats", *n_splats, {1});
@@ -257,6 +271,12 @@ inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor
 #else
   return {valid_splat_count(capacity, data<std::int64_t>(*n_splats)), nullptr};
 #endif
+}
+
+inline void check_tile_range(const char* op, std::int64_t begin, std::int64_t end, std::int64_t tiles) {
+  STD_TORCH_CHECK(0 <= begin && begin <= end && end <= tiles, "blitzgs::", op,
+                  ": tile_begin and tile_end must be a range of the ", tiles, " tiles, got [", begin, ", ",
+                  end, ")");
 }
 
 // The argument `grid` of an op, checked. numbers: n_cameras, width, height, tile_size, tile_begin, tile_end
@@ -277,9 +297,7 @@ inline TileGrid checked_tile_grid(const char* op, const std::vector<std::int64_t
   const TileGrid grid =
       make_tile_grid(static_cast<int>(n_cameras), static_cast<int>(width), static_cast<int>(height),
                      static_cast<int>(tile_size), tile_begin, tile_end);
-  STD_TORCH_CHECK(0 <= grid.tile_begin && grid.tile_begin <= grid.tile_end && grid.tile_end <= grid.count(),
-                  "blitzgs::", op, ": tile_begin and tile_end must be a range of the ", grid.count(),
-                  " tiles, got [", tile_begin, ", ", tile_end, ")");
+  check_tile_range(op, grid.tile_begin, grid.tile_end, grid.count());
   return grid;
 }
 

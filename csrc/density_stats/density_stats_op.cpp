@@ -18,24 +18,15 @@ void density_stats_(Tensor grad_sum, Tensor grad_count, Tensor max_radii, const 
   check_in_place(kOp, "grad_sum", grad_sum, dtype, {rows});
   check_in_place(kOp, "grad_count", grad_count, ScalarType::Int, {rows});
   check_in_place(kOp, "max_radii", max_radii, dtype, {rows});
-  check_dtype(kOp, "visible_ids", visible_ids_in, ScalarType::Int);
-  check_shape(kOp, "visible_ids", visible_ids_in, {-1});
-  const std::int64_t visible = visible_ids_in.size(0);
-  check_dtype(kOp, "splat_offsets", splat_offsets_in, ScalarType::Int);
-  check_shape(kOp, "splat_offsets", splat_offsets_in, {visible + 1});
+  const Tensor visible_ids = checked(kOp, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
+  const std::int64_t visible = visible_ids.size(0);
+  const Tensor splat_offsets =
+      checked(kOp, "splat_offsets", splat_offsets_in, ScalarType::Int, {visible + 1});
+  const Tensor conics = checked(kOp, "conics", conics_in, dtype, {-1, 3});
+  const std::optional<Tensor> phi = checked(kOp, "phi", phi_in, dtype, {rows});
   check_dtype(kOp, "v_means2d", v_means2d_in, dtype);
-  check_dtype(kOp, "conics", conics_in, dtype);
-  check_shape(kOp, "conics", conics_in, {-1, 3});
-  check_shape(kOp, "v_means2d", v_means2d_in, {conics_in.size(0), 2});
-  std::optional<Tensor> phi;
-  if (phi_in) {
-    check_dtype(kOp, "phi", *phi_in, dtype);
-    check_shape(kOp, "phi", *phi_in, {rows});
-    phi = as_contiguous(*phi_in);
-  }
+  check_shape(kOp, "v_means2d", v_means2d_in, {conics.size(0), 2});
   if (visible == 0) return;
-  const Tensor visible_ids = as_contiguous(visible_ids_in), splat_offsets = as_contiguous(splat_offsets_in);
-  const Tensor conics = as_contiguous(conics_in);
   // If v_means2d is a part of the rows of a gradient table, the kernel reads it there, without a copy.
   const Tensor v_means2d = v_means2d_in.stride(1) == 1 ? v_means2d_in : as_contiguous(v_means2d_in);
 

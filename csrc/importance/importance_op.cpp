@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "importance/importance.h"
 
-#include <limits>
 #include <tuple>
 
 #include "common/op.h"
@@ -19,21 +18,14 @@ std::tuple<Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor&
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const std::int64_t splats = means2d_in.size(0);
   check_floating(kOp, "means2d", means2d_in);
-  check_shape(kOp, "means2d", means2d_in, {splats, 2});
-  check_shape(kOp, "conics", conics_in, {splats, 3});
-  check_shape(kOp, "splat_opacities", opacities_in, {splats});
-  check_dtype(kOp, "conics", conics_in, means2d_in.scalar_type());
-  check_dtype(kOp, "splat_opacities", opacities_in, means2d_in.scalar_type());
-  check_shape(kOp, "isect_splats", isect_splats_in, {-1});
-  check_dtype(kOp, "isect_splats", isect_splats_in, ScalarType::Int);
-  check_shape(kOp, "tile_offsets", tile_offsets_in, {grid.count() + 1});
-  check_dtype(kOp, "tile_offsets", tile_offsets_in, ScalarType::Long);
-  STD_TORCH_CHECK(splats <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", kOp,
-                  ": splat indices are 32-bit, got ", splats, " splats; survey fewer views at once");
-  const SplatCount splat_count = checked_splat_count(kOp, n_splats, means2d_in);
-  const Tensor means2d = as_contiguous(means2d_in), conics = as_contiguous(conics_in);
-  const Tensor opacities = as_contiguous(opacities_in), isect_splats = as_contiguous(isect_splats_in);
-  const Tensor tile_offsets = as_contiguous(tile_offsets_in);
+  const ScalarType dtype = means2d_in.scalar_type();
+  const Tensor means2d = checked(kOp, "means2d", means2d_in, dtype, {splats, 2}),
+               conics = checked(kOp, "conics", conics_in, dtype, {splats, 3}),
+               opacities = checked(kOp, "splat_opacities", opacities_in, dtype, {splats}),
+               isect_splats = checked(kOp, "isect_splats", isect_splats_in, ScalarType::Int, {-1}),
+               tile_offsets =
+                   checked(kOp, "tile_offsets", tile_offsets_in, ScalarType::Long, {grid.count() + 1});
+  const SplatCount splat_count = checked_splat_count(kOp, n_splats, means2d);
   Tensor weights = make_empty(means2d, {splats}, ScalarType::Long);
   Tensor pixels = make_empty(means2d, {splats}, ScalarType::Int);
   DeviceScope scope(means2d);

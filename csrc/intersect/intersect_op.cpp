@@ -34,34 +34,18 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
   constexpr const char* kOp = "intersect";
   check_floating(kOp, "means2d", means2d);
   const std::int64_t n_splats = means2d.size(0);
-  check_shape(kOp, "means2d", means2d, {n_splats, 2});
-  check_shape(kOp, "conics", conics, {n_splats, 3});
-  check_shape(kOp, "splat_opacities", splat_opacities, {n_splats});
-  check_shape(kOp, "depths", depths, {n_splats});
-  check_shape(kOp, "camera_ids", camera_ids, {n_splats});
   const ScalarType dtype = means2d.scalar_type();
-  check_dtype(kOp, "conics", conics, dtype);
-  check_dtype(kOp, "splat_opacities", splat_opacities, dtype);
-  check_dtype(kOp, "depths", depths, dtype);
-  check_dtype(kOp, "camera_ids", camera_ids, ScalarType::Int);
-  if (ids) {
-    check_shape(kOp, "ids", *ids, {n_splats});
-    check_dtype(kOp, "ids", *ids, ScalarType::Long);
-  }
+  const Tensor means = checked(kOp, "means2d", means2d, dtype, {n_splats, 2}),
+               shapes = checked(kOp, "conics", conics, dtype, {n_splats, 3}),
+               opacities = checked(kOp, "splat_opacities", splat_opacities, dtype, {n_splats}),
+               order = checked(kOp, "depths", depths, dtype, {n_splats}),
+               cameras = checked(kOp, "camera_ids", camera_ids, ScalarType::Int, {n_splats});
+  const std::optional<Tensor> id_splats = checked(kOp, "ids", ids, ScalarType::Long, {n_splats});
   const SplatCount splat_count = checked_splat_count(kOp, known_splats, means2d);
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   STD_TORCH_CHECK(grid.count() <= std::numeric_limits<std::int32_t>::max(),
                   "blitzgs::intersect: tile numbers are 32-bit, got ", grid.count(),
                   " tiles; use larger tiles or render fewer views at once");
-  STD_TORCH_CHECK(n_splats <= std::numeric_limits<std::int32_t>::max(),
-                  "blitzgs::intersect: splat indices are 32-bit, got ", n_splats,
-                  " splats; render fewer views at once");
-
-  const Tensor means = as_contiguous(means2d), shapes = as_contiguous(conics),
-               opacities = as_contiguous(splat_opacities), order = as_contiguous(depths),
-               cameras = as_contiguous(camera_ids);
-  std::optional<Tensor> id_splats;
-  if (ids) id_splats = as_contiguous(*ids);
   Tensor offsets = make_empty(means, {grid.count() + 1}, ScalarType::Long);
   Tensor splats;
   DeviceScope scope(means);

@@ -15,12 +15,7 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
                         const std::optional<Tensor>& ids, const std::optional<Tensor>& count) {
   constexpr const char* kOp = "lazy_adam_catch_up_";
   AdamTensors state(kOp, state_in, tables, steps, decays);
-  std::optional<Tensor> list;
-  if (ids) {
-    check_dtype(kOp, "ids", *ids, ScalarType::Int);
-    check_shape(kOp, "ids", *ids, {-1});
-    list = as_contiguous(*ids);
-  }
+  const std::optional<Tensor> list = checked(kOp, "ids", ids, ScalarType::Int, {-1});
   const std::int64_t n = max_listed(kOp, count, list ? list->size(0) : state.rows());
   DeviceScope scope(state.like());
   dispatch_floating(state.like(), [&](auto zero) {
@@ -33,12 +28,10 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
 Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64_t explicit_steps,
                              double eps) {
   constexpr const char* kOp = "lazy_adam_final_rules";
-  check_dtype(kOp, "table", table, ScalarType::Double);
-  check_shape(kOp, "table", table, {-1, kAdamTable});
+  const Tensor contiguous = checked(kOp, "table", table, ScalarType::Double, {-1, kAdamTable});
   check_floating(kOp, "like", like);
   STD_TORCH_CHECK(explicit_steps >= 1, "blitzgs::", kOp, ": explicit_steps must be 1 or more, got ",
                   explicit_steps);
-  const Tensor contiguous = as_contiguous(table);
   const std::int64_t n = final_rules_of(table.size(0), explicit_steps);
   std::optional<Tensor> rules;
   DeviceScope scope(contiguous);

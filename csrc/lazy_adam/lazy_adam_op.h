@@ -97,9 +97,7 @@ struct AdamTensors {
     STD_TORCH_CHECK(grads.size() == kAdamColumns, "blitzgs::", op,
                     ": grads must hold means, quats, scales, opacities, sh; got ", grads.size(), " tensors");
     STD_TORCH_CHECK(step >= 1, "blitzgs::", op, ": steps count from 1, got ", step);
-    check_dtype(op, "ids", ids, ScalarType::Int);
-    check_shape(op, "ids", ids, {-1});
-    const Tensor list = as_contiguous(ids);
+    const Tensor list = checked(op, "ids", ids, ScalarType::Int, {-1});
     const std::int64_t n = list.size(0);
     std::vector<Tensor> held;
     for (int c = 0; c < kAdamColumns; ++c) {

@@ -32,48 +32,30 @@ struct PhotometricWeights {
   double scale = 0;
 };
 
-void check_weights(const char* op, const char* name, const Tensor& weights, const Tensor& renders) {
-  check_dtype(op, name, weights, renders.scalar_type());
-  check_shape(op, name, weights, {renders.size(0)});
-}
-
 PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, const Tensor& targets_in,
                                    const std::optional<Tensor>& masks_in, const PhotometricWeights* weights,
                                    bool sums, std::int64_t tile_size, std::int64_t tile_begin,
                                    std::int64_t tile_end) {
   check_floating(op, "renders", renders_in);
-  check_shape(op, "renders", renders_in, {-1, -1, -1, 3});
-  const std::int64_t views = renders_in.size(0), height = renders_in.size(1), width = renders_in.size(2);
+  const ScalarType dtype = renders_in.scalar_type();
+  const Tensor renders = checked(op, "renders", renders_in, dtype, {-1, -1, -1, 3});
+  const std::int64_t views = renders.size(0), height = renders.size(1), width = renders.size(2);
   check_shape(op, "targets", targets_in, {views, height, width, 3});
   const bool bytes = targets_in.scalar_type() == ScalarType::Byte;
-  if (!bytes) check_dtype(op, "targets (if not uint8)", targets_in, renders_in.scalar_type());
+  if (!bytes) check_dtype(op, "targets (if not uint8)", targets_in, dtype);
+  const Tensor targets = as_contiguous(targets_in);
   STD_TORCH_CHECK(tile_size > 0 && tile_size <= 4096, "blitzgs::", op,
                   ": tile_size must be in [1, 4096], got ", tile_size);
   STD_TORCH_CHECK(height < (1 << 24) && width < (1 << 24), "blitzgs::", op, ": images of ", width, " x ",
                   height, " pixels are beyond the limit of 2^24 a side");
-  const Tensor renders = as_contiguous(renders_in), targets = as_contiguous(targets_in);
-  std::optional<Tensor> masks;
-  if (masks_in) {
-    check_dtype(op, "masks", *masks_in, ScalarType::Byte);
-    check_shape(op, "masks", *masks_in, {views, height, width});
-    masks = as_contiguous(*masks_in);
-  }
+  const auto masks = checked(op, "masks", masks_in, ScalarType::Byte, {views, height, width});
   std::optional<Tensor> l1_weights, ssim_weights, samples, visible;
   PhotometricOutputs outputs;
   if (weights) {
-    check_weights(op, "l1_weights", weights->l1, renders);
-    check_weights(op, "ssim_weights", weights->ssim, renders);
-    l1_weights = as_contiguous(weights->l1);
-    ssim_weights = as_contiguous(weights->ssim);
-    if (weights->samples) {
-      check_weights(op, "samples", *weights->samples, renders);
-      samples = as_contiguous(*weights->samples);
-    }
-    if (weights->visible) {
-      check_dtype(op, "visible", *weights->visible, ScalarType::Long);
-      check_shape(op, "visible", *weights->visible, {views});
-      visible = as_contiguous(*weights->visible);
-    }
+    l1_weights = checked(op, "l1_weights", weights->l1, dtype, {views});
+    ssim_weights = checked(op, "ssim_weights", weights->ssim, dtype, {views});
+    samples = checked(op, "samples", weights->samples, dtype, {views});
+    visible = checked(op, "visible", weights->visible, ScalarType::Long, {views});
     outputs.v_renders = make_empty(renders, {views, height, width, 3});
     outputs.scale_reg = make_empty(renders, {visible ? views : 0});
   }
@@ -109,9 +91,7 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     args.tile_begin = tile_begin;
     const std::int64_t tiles = views * args.tiles_x * args.tiles_y;
     args.tile_end = tile_end < 0 ? tiles : tile_end;
-    STD_TORCH_CHECK(0 <= tile_begin && tile_begin <= args.tile_end && args.tile_end <= tiles, "blitzgs::", op,
-                    ": tile_begin and tile_end must be a range of the ", tiles, " tiles, got [", tile_begin,
-                    ", ", tile_end, ")");
+    check_tile_range(op, tile_begin, args.tile_end, tiles);
     fill_window(args.window);
     if (sums) {
       outputs.parts = make_empty(renders, {views, backend::photometric_parts(args), 2}, ScalarType::Double);

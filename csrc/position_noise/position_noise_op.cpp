@@ -15,21 +15,13 @@ void position_noise_(Tensor means, const Tensor& quats_in, const Tensor& scales_
   const ScalarType dtype = means.scalar_type();
   check_in_place(kOp, "means", means, dtype, {-1, 3});
   const std::int64_t rows = means.size(0);
-  check_dtype(kOp, "quats", quats_in, dtype);
-  check_shape(kOp, "quats", quats_in, {rows, 4});
-  check_dtype(kOp, "scales", scales_in, dtype);
-  check_shape(kOp, "scales", scales_in, {rows, 3});
-  check_dtype(kOp, "opacities", opacities_in, dtype);
-  check_shape(kOp, "opacities", opacities_in, {rows});
-  check_dtype(kOp, "ids", ids_in, ScalarType::Long);
-  check_shape(kOp, "ids", ids_in, {rows});
-  check_dtype(kOp, "visible_ids", visible_ids_in, ScalarType::Int);
-  check_shape(kOp, "visible_ids", visible_ids_in, {-1});
-  const std::int64_t visible = visible_ids_in.size(0);
+  const Tensor quats = checked(kOp, "quats", quats_in, dtype, {rows, 4}),
+               scales = checked(kOp, "scales", scales_in, dtype, {rows, 3}),
+               opacities = checked(kOp, "opacities", opacities_in, dtype, {rows}),
+               ids = checked(kOp, "ids", ids_in, ScalarType::Long, {rows}),
+               visible_ids = checked(kOp, "visible_ids", visible_ids_in, ScalarType::Int, {-1});
+  const std::int64_t visible = visible_ids.size(0);
   if (visible == 0 || strength == 0) return;
-  const Tensor quats = as_contiguous(quats_in), scales = as_contiguous(scales_in);
-  const Tensor opacities = as_contiguous(opacities_in), ids = as_contiguous(ids_in);
-  const Tensor visible_ids = as_contiguous(visible_ids_in);
 
   DeviceScope scope(means);
   dispatch_floating(means, [&](auto zero) {

@@ -44,11 +44,11 @@ class HeldSplatGradients {
     STD_TORCH_CHECK(v_splats.size() == 3 || v_splats.size() == 4, "blitzgs::", op,
                     ": v_splats must be v_means2d, v_conics, v_opacities[, v_colors] or one table, got ",
                     v_splats.size(), " tensors");
-    check_column(op, "v_means2d", held_[0], dtype, {splats, 2});
-    check_column(op, "v_conics", held_[1], dtype, {splats, 3});
-    check_column(op, "v_opacities", held_[2], dtype, {splats});
-    if (held_.size() == 4) check_column(op, "v_colors", held_[3], dtype, {splats, 3});
-    if (depths_) check_column(op, "v_depths", *depths_, dtype, {splats});
+    held_[0] = checked(op, "v_means2d", held_[0], dtype, {splats, 2});
+    held_[1] = checked(op, "v_conics", held_[1], dtype, {splats, 3});
+    held_[2] = checked(op, "v_opacities", held_[2], dtype, {splats});
+    if (held_.size() == 4) held_[3] = checked(op, "v_colors", held_[3], dtype, {splats, 3});
+    depths_ = checked(op, "v_depths", depths_, dtype, {splats});
   }
 
   // The source that the kernels read. It points to tensors that this object holds.
@@ -65,13 +65,6 @@ class HeldSplatGradients {
  private:
   static const SplatGradient* table(const Tensor& tensor) {
     return reinterpret_cast<const SplatGradient*>(data<float>(tensor));
-  }
-
-  static void check_column(const char* op, const char* name, Tensor& column, ScalarType dtype,
-                           std::initializer_list<std::int64_t> shape) {
-    check_shape(op, name, column, shape);
-    check_dtype(op, name, column, dtype);
-    column = as_contiguous(column);
   }
 
   static void check_table(const char* op, const Tensor& tensor) {
@@ -115,9 +108,9 @@ struct WeightedViews {
     check_group(op, kNames, views, 2, 5);
     STD_TORCH_CHECK(views[0] && views[1], "blitzgs::", op, ": expected ", kNames, ", got no viewmats or Ks");
     cameras = {*views[0], *views[1]};
-    if (views.size() > 2) scale_reg = contiguous_or_none(views[2]);
-    if (views.size() > 3) opacity_reg = contiguous_or_none(views[3]);
-    if (views.size() > 4) size_reg = contiguous_or_none(views[4]);
+    if (views.size() > 2) scale_reg = views[2];
+    if (views.size() > 3) opacity_reg = views[3];
+    if (views.size() > 4) size_reg = views[4];
   }
 };
 
@@ -129,23 +122,19 @@ struct BackwardSplats {
   OptionalTensor places, scale_reg, opacity_reg, size_reg;
 
   BackwardSplats(const char* op, const ProjectArguments& p, const WeightedViews& views,
-                 const TensorList& splats, bool reads_places)
-      : scale_reg(views.scale_reg), opacity_reg(views.opacity_reg), size_reg(views.size_reg) {
+                 const TensorList& splats, bool reads_places) {
     check_group(op,
                 reads_places ? "(camera_ids, visible_ids, splat_offsets[, places])"
                              : "(camera_ids, visible_ids, splat_offsets)",
                 splats, 3, reads_places ? 4 : 3);
     if (splats.size() > 3) places = splats[3];
-    camera_ids = as_contiguous(splats[0]);
-    visible_ids = as_contiguous(splats[1]);
-    splat_offsets = as_contiguous(splats[2]);
-    check_dtype(op, "camera_ids", camera_ids, ScalarType::Int);
-    check_dtype(op, "visible_ids", visible_ids, ScalarType::Int);
-    check_dtype(op, "splat_offsets", splat_offsets, ScalarType::Int);
-    check_shape(op, "splat_offsets", splat_offsets, {visible() + 1});
-    check_weights(op, p, "scale_reg", scale_reg);
-    check_weights(op, p, "opacity_reg", opacity_reg);
-    check_weights(op, p, "size_reg", size_reg);
+    camera_ids = checked(op, "camera_ids", splats[0], ScalarType::Int, {-1});
+    visible_ids = checked(op, "visible_ids", splats[1], ScalarType::Int, {-1});
+    splat_offsets = checked(op, "splat_offsets", splats[2], ScalarType::Int, {visible() + 1});
+    const ScalarType dtype = p.means.scalar_type();
+    scale_reg = checked(op, "scale_reg", views.scale_reg, dtype, {p.n_views});
+    opacity_reg = checked(op, "opacity_reg", views.opacity_reg, dtype, {p.n_views});
+    size_reg = checked(op, "size_reg", views.size_reg, dtype, {p.n_views});
   }
 
   std::int64_t visible() const { return visible_ids.numel(); }
@@ -157,14 +146,6 @@ struct BackwardSplats {
   template <class T>
   Regularisers<T> regularisers() const {
     return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg), data_or_null<T>(size_reg)};
-  }
-
- private:
-  static void check_weights(const char* op, const ProjectArguments& p, const char* name,
-                            const OptionalTensor& weights) {
-    if (!weights) return;
-    check_shape(op, name, *weights, {p.n_views});
-    check_dtype(op, name, *weights, p.means.scalar_type());
   }
 };
 

@@ -17,21 +17,12 @@ struct Candidates {
   Candidates(const char* op, const TensorList& active, std::int64_t n_gaussians) : count(n_gaussians) {
     check_group(op, "(ids, views, count, n_blocks), each left out with those behind it", active, 0, 4);
     if (active.empty()) return;
-    ids = as_contiguous(active[0]);
-    check_shape(op, "active_ids", *ids, {-1});
-    check_dtype(op, "active_ids", *ids, ScalarType::Int);
-    if (active.size() > 1) {
-      views = as_contiguous(active[1]);
-      check_shape(op, "active_views", *views, {ids->numel()});
-      check_dtype(op, "active_views", *views, ScalarType::Int);
-    }
+    ids = checked(op, "active_ids", active[0], ScalarType::Int, {-1});
+    const std::int64_t length = ids->numel();
+    if (active.size() > 1) views = checked(op, "active_views", active[1], ScalarType::Int, {length});
     if (active.size() > 2) listed = active[2];
-    if (active.size() > 3) {
-      blocks = active[3];
-      check_shape(op, "n_blocks", *blocks, {1});
-      check_dtype(op, "n_blocks", *blocks, ScalarType::Int);
-    }
-    count = max_listed(op, listed, ids->numel());
+    if (active.size() > 3) blocks = checked(op, "n_blocks", active[3], ScalarType::Int, {1});
+    count = max_listed(op, listed, length);
   }
 };
 
@@ -75,33 +66,31 @@ class TorchSplats final : public SplatMemory<T> {
     STD_TORCH_CHECK(
         P <= std::numeric_limits<std::int32_t>::max(), "blitzgs::project_fwd: ", P,
         " splats (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
-    const auto make = [&](const std::vector<std::int64_t>& shape, ScalarType dtype) {
-      return make_empty(like_, shape, dtype);
-    };
-    const auto ints = ScalarType::Int, longs = ScalarType::Long, floats = like_.scalar_type();
-    t_.gaussian_ids = make({P}, ints);
-    t_.camera_ids = make({P}, ints);
-    t_.visible_ids = make({U}, ints);
-    t_.splat_offsets = make({U + 1}, ints);
-    t_.means2d = make({P, 2}, floats);
-    t_.conics = make({P, 3}, floats);
-    t_.depths = make({P}, floats);
-    t_.opacities = make({P}, floats);
-    t_.colors = make({with_colors_ ? P : 0, 3}, floats);
-    t_.radii = make({P, 2}, ints);
-    t_.tiles_touched = make({P}, ints);
-    t_.rank_masks = make({with_masks_ ? P : 0}, longs);
-    t_.splat_ids = make({ids_ ? P : 0}, longs);
-    return {{mutable_data<std::int32_t>(t_.gaussian_ids), mutable_data<std::int32_t>(t_.camera_ids),
-             mutable_data<std::int32_t>(t_.visible_ids), mutable_data<std::int32_t>(t_.splat_offsets)},
-            {mutable_data<T>(t_.means2d), mutable_data<T>(t_.conics), mutable_data<T>(t_.depths),
-             mutable_data<T>(t_.opacities), mutable_data<T>(t_.colors), mutable_data<std::int32_t>(t_.radii),
-             mutable_data<std::int32_t>(t_.tiles_touched),
-             with_masks_ ? mutable_data<std::int64_t>(t_.rank_masks) : nullptr,
-             ids_ ? mutable_data<std::int64_t>(t_.splat_ids) : nullptr, data_or_null<std::int64_t>(ids_)}};
+    // The braces guarantee that memory is allocated in this order.
+    return {{ints(t_.gaussian_ids, {P}), ints(t_.camera_ids, {P}), ints(t_.visible_ids, {U}),
+             ints(t_.splat_offsets, {U + 1})},
+            {floats(t_.means2d, {P, 2}), floats(t_.conics, {P, 3}), floats(t_.depths, {P}),
+             floats(t_.opacities, {P}), floats(t_.colors, {with_colors_ ? P : 0, 3}), ints(t_.radii, {P, 2}),
+             ints(t_.tiles_touched, {P}), longs_if(with_masks_, t_.rank_masks, P),
+             longs_if(ids_.has_value(), t_.splat_ids, P), data_or_null<std::int64_t>(ids_)}};
   }
 
  private:
+  // Each makes a column and returns its memory.
+  T* floats(Tensor& column, const std::vector<std::int64_t>& shape) {
+    column = make_empty(like_, shape);
+    return mutable_data<T>(column);
+  }
+  std::int32_t* ints(Tensor& column, const std::vector<std::int64_t>& shape) {
+    column = make_empty(like_, shape, ScalarType::Int);
+    return mutable_data<std::int32_t>(column);
+  }
+  // Null, and an empty column, if it is not wanted.
+  std::int64_t* longs_if(bool wanted, Tensor& column, std::int64_t length) {
+    column = make_empty(like_, {wanted ? length : 0}, ScalarType::Long);
+    return wanted ? mutable_data<std::int64_t>(column) : nullptr;
+  }
+
   const Tensor& like_;
   bool with_colors_, with_masks_;
   const OptionalTensor& ids_;
@@ -128,11 +117,7 @@ Projected project_fwd(const TensorList& gaussians, const TensorList& cameras, co
   const Candidates candidates(kOp, active, p.count);
   const RankTiles ranks = checked_rank_tiles(kOp, rank_tiles);
   const std::optional<ProjectSizes> sizes = checked_capacity(kOp, capacity);
-  if (ids) {
-    check_dtype(kOp, "ids", *ids, ScalarType::Long);
-    check_shape(kOp, "ids", *ids, {p.count});
-  }
-  const OptionalTensor persistent = contiguous_or_none(ids);
+  const OptionalTensor persistent = checked(kOp, "ids", ids, ScalarType::Long, {p.count});
   Tensor totals = make_empty(p.means, {project_totals(p.n_views, ranks.n_ranks)}, ScalarType::Long);
   SplatTensors t;
   DeviceScope scope(p.means);

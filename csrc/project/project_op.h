@@ -18,10 +18,6 @@ using OptionalTensorList = std::vector<OptionalTensor>;
 using IntList = std::vector<std::int64_t>;
 using FloatList = std::vector<double>;
 
-inline OptionalTensor contiguous_or_none(const OptionalTensor& tensor) {
-  return tensor ? OptionalTensor(as_contiguous(*tensor)) : std::nullopt;
-}
-
 // Checks the number of entries of a group of arguments. names: those of the entries, for the message.
 template <class List>
 void check_group(const char* op, const char* names, const List& list, std::size_t least, std::size_t most) {
@@ -76,7 +72,7 @@ inline void set_fade(const char* op, const Tensor& level, const FloatList& float
 struct ProjectArguments {
   Tensor means, quats, scales, opacities, viewmats, Ks;
   OptionalTensor sh, level;
-  std::int64_t count, n_views, sh_stride;
+  std::int64_t count, n_views, sh_stride = 0;
   ProjectOptions<double> options;
   LevelFade fade{};
 
@@ -86,40 +82,23 @@ struct ProjectArguments {
       : options(checked_options(op, ints, floats)) {
     check_group(op, "(means, quats, scales, opacities[, sh])", gaussians, 4, 5);
     check_group(op, "(viewmats, Ks)", cameras, 2, 2);
-    means = as_contiguous(gaussians[0]);
-    quats = as_contiguous(gaussians[1]);
-    scales = as_contiguous(gaussians[2]);
-    opacities = as_contiguous(gaussians[3]);
-    if (gaussians.size() == 5) sh = as_contiguous(gaussians[4]);
-    viewmats = as_contiguous(cameras[0]);
-    Ks = as_contiguous(cameras[1]);
-    check_floating(op, "means", means);
-    check_shape(op, "means", means, {-1, 3});
-    check_shape(op, "viewmats", viewmats, {-1, 4, 4});
+    check_floating(op, "means", gaussians[0]);
+    const ScalarType dtype = gaussians[0].scalar_type();
+    means = checked(op, "means", gaussians[0], dtype, {-1, 3});
     count = means.size(0);
+    quats = checked(op, "quats", gaussians[1], dtype, {count, 4});
+    scales = checked(op, "scales", gaussians[2], dtype, {count, 3});
+    opacities = checked(op, "opacities", gaussians[3], dtype, {count});
+    viewmats = checked(op, "viewmats", cameras[0], dtype, {-1, 4, 4});
     n_views = viewmats.size(0);
-    sh_stride = sh && sh->dim() == 3 ? sh->size(1) : 0;
-    options.sh_stride = static_cast<int>(sh_stride);
-    check_shape(op, "quats", quats, {count, 4});
-    check_shape(op, "scales", scales, {count, 3});
-    check_shape(op, "opacities", opacities, {count});
-    check_shape(op, "Ks", Ks, {n_views, 3, 3});
-    const ScalarType dtype = means.scalar_type();
-    check_dtype(op, "quats", quats, dtype);
-    check_dtype(op, "scales", scales, dtype);
-    check_dtype(op, "opacities", opacities, dtype);
-    check_dtype(op, "viewmats", viewmats, dtype);
-    check_dtype(op, "Ks", Ks, dtype);
+    Ks = checked(op, "Ks", cameras[1], dtype, {n_views, 3, 3});
     STD_TORCH_CHECK(n_views <= kMaxViews, "blitzgs::", op, ": at most ", kMaxViews,
                     " views in one launch, got ", n_views, "; call it for fewer views at a time");
     STD_TORCH_CHECK(count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
                     ": at most 2^31 - 1 Gaussians on one device, got ", count);
-    if (sh) check_sh(op);
-    if (!level_in) return;
-    check_dtype(op, "level", *level_in, ScalarType::Byte);
-    check_shape(op, "level", *level_in, {count});
-    level = as_contiguous(*level_in);
-    set_fade(op, *level, floats, fade);
+    if (gaussians.size() == 5) set_sh(op, gaussians[4]);
+    level = checked(op, "level", level_in, ScalarType::Byte, {count});
+    if (level) set_fade(op, *level, floats, fade);
   }
 
   template <class T>
@@ -144,9 +123,10 @@ struct ProjectArguments {
   }
 
  private:
-  void check_sh(const char* op) const {
-    check_shape(op, "sh", *sh, {count, -1, 3});
-    check_dtype(op, "sh", *sh, means.scalar_type());
+  void set_sh(const char* op, const Tensor& sh_in) {
+    sh = checked(op, "sh", sh_in, means.scalar_type(), {count, -1, 3});
+    sh_stride = sh->size(1);
+    options.sh_stride = static_cast<int>(sh_stride);
     STD_TORCH_CHECK(options.sh_degree >= 0 && options.sh_degree <= kMaxShDegree, "blitzgs::", op,
                     ": sh_degree must be 0 to 3, got ", options.sh_degree);
     STD_TORCH_CHECK(sh_basis_count(options.sh_degree) <= sh_stride, "blitzgs::", op, ": sh has ", sh_stride,

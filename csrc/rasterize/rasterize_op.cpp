@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "rasterize/rasterize.h"
 
-#include <limits>
 #include <tuple>
 
 #include "common/op.h"
@@ -26,34 +25,17 @@ struct Splats {
         n_splats(means2d_in.size(0)),
         splat_count(checked_splat_count(op, known_splats, means2d_in)) {
     check_floating(op, "means2d", means2d_in);
-    check_shape(op, "means2d", means2d_in, {n_splats, 2});
-    check_shape(op, "conics", conics_in, {n_splats, 3});
-    check_shape(op, "splat_opacities", opacities_in, {n_splats});
-    check_shape(op, "colors", colors_in, {n_splats, -1});
-    n_channels = colors_in.size(1);
-    STD_TORCH_CHECK(n_splats <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op,
-                    ": splat indices are 32-bit, got ", n_splats, " splats; render fewer views at once");
+    const ScalarType dtype = means2d_in.scalar_type();
+    means2d = checked(op, "means2d", means2d_in, dtype, {n_splats, 2});
+    conics = checked(op, "conics", conics_in, dtype, {n_splats, 3});
+    opacities = checked(op, "splat_opacities", opacities_in, dtype, {n_splats});
+    colors = checked(op, "colors", colors_in, dtype, {n_splats, -1});
+    n_channels = colors.size(1);
     STD_TORCH_CHECK(n_channels > 0 && n_channels <= 4096, "blitzgs::", op,
                     ": colors must have 1 to 4096 channels, got ", n_channels);
-    const ScalarType dtype = means2d_in.scalar_type();
-    check_dtype(op, "conics", conics_in, dtype);
-    check_dtype(op, "splat_opacities", opacities_in, dtype);
-    check_dtype(op, "colors", colors_in, dtype);
-    if (backgrounds_in) {
-      check_shape(op, "backgrounds", *backgrounds_in, {grid.n_cameras, n_channels});
-      check_dtype(op, "backgrounds", *backgrounds_in, dtype);
-      backgrounds = as_contiguous(*backgrounds_in);
-    }
-    check_shape(op, "isect_splats", isect_splats_in, {-1});
-    check_dtype(op, "isect_splats", isect_splats_in, ScalarType::Int);
-    check_shape(op, "tile_offsets", tile_offsets_in, {grid.count() + 1});
-    check_dtype(op, "tile_offsets", tile_offsets_in, ScalarType::Long);
-    means2d = as_contiguous(means2d_in);
-    conics = as_contiguous(conics_in);
-    opacities = as_contiguous(opacities_in);
-    colors = as_contiguous(colors_in);
-    isect_splats = as_contiguous(isect_splats_in);
-    tile_offsets = as_contiguous(tile_offsets_in);
+    backgrounds = checked(op, "backgrounds", backgrounds_in, dtype, {grid.n_cameras, n_channels});
+    isect_splats = checked(op, "isect_splats", isect_splats_in, ScalarType::Int, {-1});
+    tile_offsets = checked(op, "tile_offsets", tile_offsets_in, ScalarType::Long, {grid.count() + 1});
   }
 
   template <class T>
@@ -147,28 +129,19 @@ Splats backward_splats(const char* op, const std::vector<Tensor>& splats,
 struct Composited {
   Composited(const char* op, const Splats& splats, const std::vector<Tensor>& composited,
              const Tensor& v_renders_in, const std::optional<Tensor>& v_alphas_in)
-      : v_renders(as_contiguous(v_renders_in)), grid_count(splats.grid.count()) {
+      : grid_count(splats.grid.count()) {
     STD_TORCH_CHECK(composited.size() == 4, "blitzgs::", op,
                     ": composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
                     composited.size(), " tensors");
-    transmittances = as_contiguous(composited[0]);
-    last_ids = as_contiguous(composited[1]);
     packed = composited[2];
     order = composited[3];
     const TileGrid& grid = splats.grid;
     const std::int64_t B = grid.n_cameras, height = grid.height, width = grid.width;
     const ScalarType dtype = splats.means2d.scalar_type();
-    check_shape(op, "v_renders", v_renders, {B, height, width, splats.n_channels});
-    check_dtype(op, "v_renders", v_renders, dtype);
-    check_shape(op, "transmittances", transmittances, {B, height, width});
-    check_dtype(op, "transmittances", transmittances, dtype);
-    check_shape(op, "last_ids", last_ids, {B, height, width});
-    check_dtype(op, "last_ids", last_ids, ScalarType::Int);
-    if (v_alphas_in) {
-      check_shape(op, "v_alphas", *v_alphas_in, {B, height, width});
-      check_dtype(op, "v_alphas", *v_alphas_in, dtype);
-      v_alphas = as_contiguous(*v_alphas_in);
-    }
+    v_renders = checked(op, "v_renders", v_renders_in, dtype, {B, height, width, splats.n_channels});
+    transmittances = checked(op, "transmittances", composited[0], dtype, {B, height, width});
+    last_ids = checked(op, "last_ids", composited[1], ScalarType::Int, {B, height, width});
+    v_alphas = checked(op, "v_alphas", v_alphas_in, dtype, {B, height, width});
     check_in_place(op, "packed_splats", packed, ScalarType::Byte,
                    {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
     check_in_place(op, "tile_order", order, ScalarType::Int, {-1, kTileOrderClasses});

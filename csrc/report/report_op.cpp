@@ -11,26 +11,16 @@ void report_(const std::optional<Tensor>& parts_in, const std::optional<Tensor>&
              std::vector<Tensor> targets) {
   constexpr const char* kOp = "report_";
   Report<float> report{};
-  std::optional<Tensor> parts, tile_work;
-  if (parts_in) {
-    check_shape(kOp, "parts", *parts_in, {-1, -1, 2});
-    check_dtype(kOp, "parts", *parts_in, ScalarType::Double);
-    parts = as_contiguous(*parts_in);
+  const auto parts = checked(kOp, "parts", parts_in, ScalarType::Double, {-1, -1, 2});
+  if (parts) {
     report.views = parts->size(0);
     report.n_parts = parts->size(1);
     report.parts = data<double>(*parts);
   }
-  std::int64_t tiles = 0;
-  if (tile_work_in) {
-    check_shape(kOp, "tile_work", *tile_work_in, {-1});
-    check_dtype(kOp, "tile_work", *tile_work_in, ScalarType::Int);
-    tile_work = as_contiguous(*tile_work_in);
-    tiles = tile_work->size(0);
-    report.tile_work = data<std::int32_t>(*tile_work);
-  }
-  STD_TORCH_CHECK(0 <= tile_begin && tile_begin <= tile_end && tile_end <= tiles, "blitzgs::", kOp,
-                  ": tile_begin and tile_end must be a range of the ", tiles, " tiles, got [", tile_begin,
-                  ", ", tile_end, ")");
+  const auto tile_work = checked(kOp, "tile_work", tile_work_in, ScalarType::Int, {-1});
+  report.tile_work = data_or_null<std::int32_t>(tile_work);
+  const std::int64_t tiles = tile_work ? tile_work->size(0) : 0;
+  check_tile_range(kOp, tile_begin, tile_end, tiles);
   report.tile_begin = tile_begin;
   report.tile_end = tile_end;
   STD_TORCH_CHECK(rank >= 0 && rank < n_ranks, "blitzgs::", kOp, ": rank must be in [0, ", n_ranks, "), got ",

@@ -43,17 +43,13 @@ void add_column(const char* op, SplatColumns<Word>& columns, Word* data, std::in
 // Columns int32 [P, w] and masks int64 [P]; keeps the contiguous forms alive.
 struct HeldSplats {
   HeldSplats(const char* op, const std::vector<Tensor>& columns, const Tensor& masks_in)
-      : masks(as_contiguous(masks_in)) {
-    check_shape(op, "masks", masks, {-1});
-    check_dtype(op, "masks", masks, ScalarType::Long);
+      : masks(checked(op, "masks", masks_in, ScalarType::Long, {-1})) {
     splats.masks = data<std::int64_t>(masks);
     splats.count = masks.size(0);
     STD_TORCH_CHECK(splats.count <= std::numeric_limits<std::int32_t>::max(), "blitzgs::", op, ": ",
                     splats.count, " splats exceed 2^31 - 1; project fewer views at a time");
     for (const Tensor& column : columns) {
-      check_dtype(op, "a column", column, ScalarType::Int);
-      check_shape(op, "a column", column, {splats.count, -1});
-      held.push_back(as_contiguous(column));
+      held.push_back(checked(op, "a column", column, ScalarType::Int, {splats.count, -1}));
       add_column(op, splats.columns, data<std::int32_t>(held.back()), column.size(1));
     }
   }
@@ -66,9 +62,7 @@ struct HeldSplats {
 // The places [runs, n_ranks] that scatter_splats returned, checked and contiguous.
 inline Tensor checked_places(const char* op, const Tensor& places, std::int64_t splats,
                              std::int64_t n_ranks) {
-  check_shape(op, "places", places, {place_runs(splats), n_ranks});
-  check_dtype(op, "places", places, ScalarType::Long);
-  return as_contiguous(places);
+  return checked(op, "places", places, ScalarType::Long, {place_runs(splats), n_ranks});
 }
 
 inline const SplatPlace* places_in(const Tensor& places) {

@@ -13,21 +13,15 @@ void gate_views_(const Tensor& ids_in, Tensor views, const std::optional<Tensor>
                  const Tensor& means_in, const Tensor& level_in, const Tensor& viewmats_in,
                  const std::vector<double>& reach, std::int64_t lod_views,
                  const std::optional<Tensor>& cull_in, const std::vector<std::int64_t>& columns) {
-  check_dtype(kOp, "ids", ids_in, ScalarType::Int);
-  check_shape(kOp, "ids", ids_in, {-1});
-  const std::int64_t capacity = ids_in.size(0);
+  const Tensor ids = checked(kOp, "ids", ids_in, ScalarType::Int, {-1});
+  const std::int64_t capacity = ids.size(0);
   check_in_place(kOp, "views", views, ScalarType::Int, {capacity});
-  check_dtype(kOp, "means", means_in, ScalarType::Float);
-  check_shape(kOp, "means", means_in, {-1, 3});
-  const std::int64_t rows = means_in.size(0);
-  check_dtype(kOp, "viewmats", viewmats_in, ScalarType::Float);
-  check_shape(kOp, "viewmats", viewmats_in, {-1, 4, 4});
-  STD_TORCH_CHECK(viewmats_in.size(0) <= kMaxViews, "blitzgs::", kOp, ": at most ", kMaxViews,
-                  " views at once, got ", viewmats_in.size(0));
-  const Tensor ids = as_contiguous(ids_in), means = as_contiguous(means_in);
-  const Tensor viewmats = as_contiguous(viewmats_in);
-  const HeldRules held =
-      hold_rules(kOp, rows, static_cast<int>(viewmats.size(0)), level_in, reach, lod_views, cull_in, columns);
+  const Tensor means = checked(kOp, "means", means_in, ScalarType::Float, {-1, 3});
+  const Tensor viewmats = checked(kOp, "viewmats", viewmats_in, ScalarType::Float, {-1, 4, 4});
+  STD_TORCH_CHECK(viewmats.size(0) <= kMaxViews, "blitzgs::", kOp, ": at most ", kMaxViews,
+                  " views at once, got ", viewmats.size(0));
+  const HeldRules held = hold_rules(kOp, means.size(0), static_cast<int>(viewmats.size(0)), level_in, reach,
+                                    lod_views, cull_in, columns);
   if (!leaves_out_any(held.rules)) return;
   const ViewGateArgs args{data<std::int32_t>(ids),
                           mutable_data<std::int32_t>(views),

@@ -45,15 +45,9 @@ inline void set_columns(const char* op, const std::vector<std::int64_t>& columns
 inline HeldRules hold_rules(const char* op, std::int64_t rows, int views, const Tensor& level,
                             const std::vector<double>& reach, std::int64_t lod_views,
                             const std::optional<Tensor>& cull, const std::vector<std::int64_t>& columns) {
-  check_dtype(op, "level", level, ScalarType::Byte);
-  check_shape(op, "level", level, {rows});
-  HeldRules held{as_contiguous(level), std::nullopt};
-  if (cull) {
-    check_dtype(op, "cull", *cull, ScalarType::Int);
-    check_shape(op, "cull", *cull, {blocks_of(rows), -1, kSectorWords});
-    held.cull = as_contiguous(*cull);
-    held.rules.cull_columns = held.cull->size(1);
-  }
+  HeldRules held{checked(op, "level", level, ScalarType::Byte, {rows}),
+                 checked(op, "cull", cull, ScalarType::Int, {blocks_of(rows), -1, kSectorWords})};
+  if (held.cull) held.rules.cull_columns = held.cull->size(1);
   held.rules.level = data<std::uint8_t>(held.level);
   held.rules.cull = data_or_null<std::int32_t>(held.cull);
   held.rules.n_rows = rows;
