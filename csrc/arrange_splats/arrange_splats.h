@@ -46,13 +46,9 @@ struct EmptyEntries {
   }
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void fill_entries(const EmptyEntries&, CudaStream);
 void arrange_splats(const ArrangeSplats&, bool back, CudaStream);
-}  // namespace cpu
-namespace cuda {
-void fill_entries(const EmptyEntries&, CudaStream);
-void arrange_splats(const ArrangeSplats&, bool back, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

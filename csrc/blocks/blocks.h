@@ -323,7 +323,7 @@ struct CullInputs {
   BlockGate gate;
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
 // Computes the bounds of the blocks that contain the rows `ids`, or of all blocks if ids is null.
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
@@ -331,14 +331,6 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
 // Waits for the number of blocks that some view may see.
 std::int64_t count_active_blocks(const CullInputs&, Workspace&, CudaStream);
 void cull_blocks(const CullInputs&, const ActiveList&, Workspace&, CudaStream);
-}  // namespace cpu
-namespace cuda {
-void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
-void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
-                         Workspace&, CudaStream);
-// Waits for the number of blocks that some view may see.
-std::int64_t count_active_blocks(const CullInputs&, Workspace&, CudaStream);
-void cull_blocks(const CullInputs&, const ActiveList&, Workspace&, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -30,11 +30,8 @@ BLITZGS_HD void number_row(const NumberedRows& numbered, std::int32_t u) {
   }
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void number_rows(const NumberedRows&, const ProjectCapacity&, CudaStream);
-}
-namespace cuda {
-void number_rows(const NumberedRows&, const ProjectCapacity&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -14,6 +14,15 @@
 #define BLITZGS_HD inline
 #endif
 
+// The namespace of the kernels of the backend that a file is compiled for. Headers declare what both backends
+// have once, in this namespace; the files that define it name `cpu` or `cuda`.
+
+#ifdef BLITZGS_BACKEND_CUDA
+#define BLITZGS_BACKEND cuda
+#else
+#define BLITZGS_BACKEND cpu
+#endif
+
 // Limits that several ops share, each defined here alone.
 
 namespace blitzgs {

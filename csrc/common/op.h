@@ -22,16 +22,8 @@
 
 #ifdef BLITZGS_BACKEND_CUDA
 #define BLITZGS_DISPATCH_KEY CUDA
-namespace blitzgs::cuda {}
-namespace blitzgs {
-namespace backend = cuda;
-}
 #else
 #define BLITZGS_DISPATCH_KEY CPU
-namespace blitzgs::cpu {}
-namespace blitzgs {
-namespace backend = cpu;
-}
 #endif
 
 // STABLE_TORCH_LIBRARY_IMPL pastes its key, so the key macro has to be expanded first. One BLITZGS_REGISTER
@@ -39,8 +31,11 @@ namespace backend = cpu;
 #define BLITZGS_REGISTER_EXPANDED(key, m) STABLE_TORCH_LIBRARY_IMPL(blitzgs, key, m)
 #define BLITZGS_REGISTER(m) BLITZGS_REGISTER_EXPANDED(BLITZGS_DISPATCH_KEY, m)
 
+namespace blitzgs::BLITZGS_BACKEND {}
+
 namespace blitzgs {
 
+namespace backend = BLITZGS_BACKEND;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
@@ -146,27 +141,6 @@ inline Tensor view_of(const Tensor& tensor, const std::vector<std::int64_t>& sha
   TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(tensor.get(), static_cast<std::int64_t>(shape.size()),
                                                         shape.data(), strides.data(), offset, &handle));
   return Tensor(handle);
-}
-
-// Entry i of a tensor along its first dimension.
-inline Tensor part_of(const Tensor& tensor, std::int64_t i) {
-  std::vector<std::int64_t> shape, strides;
-  for (std::int64_t axis = 1; axis < tensor.dim(); ++axis) {
-    shape.push_back(tensor.size(axis));
-    strides.push_back(tensor.stride(axis));
-  }
-  return view_of(tensor, shape, strides, i * tensor.stride(0));
-}
-
-// The first `length` rows of a tensor, or all if it has no more.
-inline Tensor rows_of(const Tensor& tensor, std::int64_t length) {
-  std::vector<std::int64_t> shape, strides;
-  for (std::int64_t axis = 0; axis < tensor.dim(); ++axis) {
-    shape.push_back(tensor.size(axis));
-    strides.push_back(tensor.stride(axis));
-  }
-  shape[0] = std::min(shape[0], length);
-  return view_of(tensor, shape, strides, 0);
 }
 
 template <class T>

@@ -57,13 +57,9 @@ struct CullMask {
   std::int64_t n, words;
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void sectors_of_rows(const CullMask&, CudaStream);
 void rows_of_sectors(const CullMask&, CudaStream);
-}  // namespace cpu
-namespace cuda {
-void sectors_of_rows(const CullMask&, CudaStream);
-void rows_of_sectors(const CullMask&, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

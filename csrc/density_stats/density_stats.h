@@ -63,13 +63,9 @@ BLITZGS_HD void density_stats_of(const DensityStatsArgs<T>& args, std::int64_t u
   args.max_radii[id] = radius;
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 void density_stats(const DensityStatsArgs<T>& args, Workspace&, CudaStream);
-}
-namespace cuda {
-template <class T>
-void density_stats(const DensityStatsArgs<T>& args, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -40,13 +40,9 @@ BLITZGS_HD void add_drift(const DriftStep& drift, int table, std::int64_t back, 
   if (back == 1 && order == 0) drift.lr_tables[row * kAdamGroups + group] = static_cast<float>(rate);
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void add_drift_step(const DriftStep&, Workspace&, CudaStream);
 void narrow_rows(const std::int64_t* indices, std::int64_t n, std::int32_t* rows, CudaStream);
-}  // namespace cpu
-namespace cuda {
-void add_drift_step(const DriftStep&, Workspace&, CudaStream);
-void narrow_rows(const std::int64_t* indices, std::int64_t n, std::int32_t* rows, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -7,6 +7,16 @@
 namespace blitzgs {
 namespace {
 
+// Entry i of a tensor along its first dimension.
+Tensor part_of(const Tensor& tensor, std::int64_t i) {
+  std::vector<std::int64_t> shape, strides;
+  for (std::int64_t axis = 1; axis < tensor.dim(); ++axis) {
+    shape.push_back(tensor.size(axis));
+    strides.push_back(tensor.stride(axis));
+  }
+  return view_of(tensor, shape, strides, i * tensor.stride(0));
+}
+
 constexpr const char* kOp = "drift_step_";
 
 // Adds a step to the tables of all schedules, float64 [T, S + 1, kAdamTable].

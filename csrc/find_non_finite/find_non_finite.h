@@ -29,15 +29,10 @@ BLITZGS_HD bool is_bad(T value, bool zero_is_bad) {
   return zero_is_bad ? value == T(0) : !(value * T(0) == T(0));
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void clear_flag(std::int32_t* bad, CudaStream);
 template <class T>
 void check_columns(const CheckedColumns<T>&, CudaStream);
-}  // namespace cpu
-namespace cuda {
-void clear_flag(std::int32_t* bad, CudaStream);
-template <class T>
-void check_columns(const CheckedColumns<T>&, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -28,11 +28,8 @@ struct GatherRows {
   GatheredColumn columns[kMostGatheredColumns];
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void gather_rows(const GatherRows&, Workspace&, CudaStream);
-}
-namespace cuda {
-void gather_rows(const GatherRows&, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

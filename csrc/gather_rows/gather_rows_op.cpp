@@ -4,6 +4,17 @@
 namespace blitzgs {
 namespace {
 
+// The first `length` rows of a tensor, or all if it has no more.
+Tensor rows_of(const Tensor& tensor, std::int64_t length) {
+  std::vector<std::int64_t> shape, strides;
+  for (std::int64_t axis = 0; axis < tensor.dim(); ++axis) {
+    shape.push_back(tensor.size(axis));
+    strides.push_back(tensor.stride(axis));
+  }
+  shape[0] = std::min(shape[0], length);
+  return view_of(tensor, shape, strides, 0);
+}
+
 // Words of 4 bytes in the elements of a row behind its first `axis` dimensions.
 std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
   std::int64_t words = static_cast<std::int64_t>(column.element_size()) / 4;

@@ -40,13 +40,9 @@ struct ContributionSums {
   std::int32_t* pixels;
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 void contributions(const ContributionInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
-}
-namespace cuda {
-template <class T>
-void contributions(const ContributionInput<T>& in, const ContributionSums& sums, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

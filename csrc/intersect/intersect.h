@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Intersection: makes the list of each tile, the splats that the tile composites, front to back.
 //
-// Splat p (a splat in camera camera_ids[p]) is listed in tile t of that camera iff for_each_tile() of
+// Splat p (a splat in camera camera_ids[p]) is listed in tile t of that camera iff for_each_tile_row() of
 // math/tiles.h visits it. Within a tile the splats are ordered by (depth, id); without ids by (depth, splat).
 // -0 and 0 are different depths; lists are undefined if a depth is NaN.
 //
@@ -43,22 +43,14 @@ struct IntersectInput {
   const std::int64_t* known_splats = nullptr;
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
+// On CUDA it waits for the device, because the host needs the count.
 template <class T>
 std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
+// On CUDA it does not wait for the device, and returns the capacity.
 template <class T>
 std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_splats,
                        std::int64_t* tile_offsets, Workspace&, CudaStream);
-}  // namespace cpu
-
-namespace cuda {
-// Waits for the device, because the host needs the count.
-template <class T>
-std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
-// Does not wait for the device. Returns the capacity.
-template <class T>
-std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_splats,
-                       std::int64_t* tile_offsets, Workspace&, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -179,13 +179,9 @@ void with_knn_length(int k, const F& f) {
   }
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspace&, CudaStream);
-}
-namespace cuda {
-template <class T>
-void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -239,30 +239,6 @@ BLITZGS_HD bool adam_moves(const AdamArgs<T>& args, std::int32_t from, std::int3
   return from < args.target() && from - moment_step < args.explicit_steps;
 }
 
-// The factors by which the moments of a row decay.
-template <class T>
-struct AdamRow {
-  std::int32_t from;                     // the step of the parameters
-  T decay1_to_params, decay2_to_params;  // beta1^k, beta2^k from the moments' step to `from`
-  T decay1_to_target, decay2_to_target;  // beta1^k, beta2^k from the moments' step to the target
-  bool moves;                            // see adam_moves
-};
-
-template <class T>
-BLITZGS_HD AdamRow<T> adam_row(const AdamArgs<T>& args, std::int64_t row) {
-  const std::int32_t target = args.target();
-  if (args.sparse) return {target, T(1), T(1), T(1), T(1), false};
-  const std::int32_t from = args.last_step[row], moment_step = args.moment_step[row];
-  const double *to_params = args.table_row(from - moment_step),
-               *to_target = args.table_row(target - moment_step);
-  return {from,
-          static_cast<T>(to_params[kBeta1Power]),
-          static_cast<T>(to_params[kBeta2Power]),
-          static_cast<T>(to_target[kBeta1Power]),
-          static_cast<T>(to_target[kBeta2Power]),
-          adam_moves(args, from, moment_step)};
-}
-
 // The scalars of one step with a gradient.
 template <class T>
 struct AdamStep {
@@ -300,7 +276,7 @@ BLITZGS_HD int adam_group(int column, std::int64_t element) {
   return column == 4 && element >= 3 ? 5 : column;
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 // With gradients: the listed rows catch up to step - 1 and take the step `step`; their parameters and moments
 // are then at `step`. Without gradients (column.grad null): the parameters of the listed rows catch up to
 // `step`.
@@ -310,12 +286,6 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
 // args.
 template <class T>
 void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream);
-}  // namespace cpu
-namespace cuda {
-template <class T>
-void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
-template <class T>
-void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

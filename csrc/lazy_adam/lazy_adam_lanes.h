@@ -9,6 +9,30 @@
 
 namespace blitzgs::cpu {
 
+// The factors by which the moments of a row decay.
+template <class T>
+struct AdamRow {
+  std::int32_t from;                     // the step of the parameters
+  T decay1_to_params, decay2_to_params;  // beta1^k, beta2^k from the moments' step to `from`
+  T decay1_to_target, decay2_to_target;  // beta1^k, beta2^k from the moments' step to the target
+  bool moves;                            // see adam_moves
+};
+
+template <class T>
+AdamRow<T> adam_row(const AdamArgs<T>& args, std::int64_t row) {
+  const std::int32_t target = args.target();
+  if (args.sparse) return {target, T(1), T(1), T(1), T(1), false};
+  const std::int32_t from = args.last_step[row], moment_step = args.moment_step[row];
+  const double *to_params = args.table_row(from - moment_step),
+               *to_target = args.table_row(target - moment_step);
+  return {from,
+          static_cast<T>(to_params[kBeta1Power]),
+          static_cast<T>(to_params[kBeta2Power]),
+          static_cast<T>(to_target[kBeta1Power]),
+          static_cast<T>(to_target[kBeta2Power]),
+          adam_moves(args, from, moment_step)};
+}
+
 // The function for elements that take their pending steps one by one. They are rare, so plain code handles
 // them.
 template <class T>

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "lazy_adam/lazy_adam.h"
+#include "lazy_adam/lazy_adam_lanes.h"
 
 #include <cmath>
 #include <vector>
@@ -103,14 +103,14 @@ TEST_CASE("a row's moments decay to where its parameters stand and on to the tar
   args.moment_step = moment_step;
   args.step = 50;
   args.explicit_steps = 187;
-  const auto fresh = blitzgs::adam_row(args, 0), stale = blitzgs::adam_row(args, 1);
+  const auto fresh = blitzgs::cpu::adam_row(args, 0), stale = blitzgs::cpu::adam_row(args, 1);
   REQUIRE(fresh.decay1_to_params == 1);
   REQUIRE(fresh.decay2_to_target == Approx(std::pow(kBeta2, 20)).epsilon(1e-12));
   REQUIRE(stale.decay1_to_params == Approx(std::pow(kBeta1, 4)).epsilon(1e-12));
   REQUIRE(stale.decay1_to_target == Approx(std::pow(kBeta1, 10)).epsilon(1e-12));
   REQUIRE((fresh.moves && stale.moves));
   args.step = 400;
-  REQUIRE_FALSE(blitzgs::adam_row(args, 2).moves);  // what is left of its drift is below rounding
+  REQUIRE_FALSE(blitzgs::cpu::adam_row(args, 2).moves);  // what is left of its drift is below rounding
 }
 
 TEST_CASE("rows that never had a gradient do not move, and groups split the SH column") {

@@ -7,13 +7,9 @@
 
 namespace blitzgs {
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 void alphas_of(const T* transmittances, std::int64_t n, T* alphas, CudaStream);
-}
-namespace cuda {
-template <class T>
-void alphas_of(const T* transmittances, std::int64_t n, T* alphas, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

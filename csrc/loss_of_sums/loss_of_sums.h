@@ -17,13 +17,9 @@ struct LossOfSums {
   T* loss;
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 void loss_of_sums(const LossOfSums<T>&, Workspace&, CudaStream);
-}
-namespace cuda {
-template <class T>
-void loss_of_sums(const LossOfSums<T>&, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

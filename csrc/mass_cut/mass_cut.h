@@ -164,12 +164,9 @@ BLITZGS_HD bool descends(const MassSearch& search, bool first) {
   return first ? search.missing > 0 : search.shift > 0;
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 // Runs the steps first_step to last_step - 1.
 void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream);
-}  // namespace cpu
-namespace cuda {
-void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

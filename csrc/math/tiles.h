@@ -222,15 +222,6 @@ BLITZGS_HD void for_each_tile_row(const T* mean2d, const T* conic, T opacity, in
   }
 }
 
-// Calls f(tx, ty) for each touched tile, row by row.
-template <class T, class F>
-BLITZGS_HD void for_each_tile(const T* mean2d, const T* conic, T opacity, int width, int height,
-                              int tile_size, const F& f) {
-  for_each_tile_row(mean2d, conic, opacity, width, height, tile_size, [&](int ty, int begin, int end) {
-    for (int tx = begin; tx < end; ++tx) f(tx, ty);
-  });
-}
-
 // The tiles of each rank: rank m composites the flattened tiles [begin[m], end[m]) of all cameras. Ranges may
 // be empty and may overlap; their begins ascend.
 struct RankTiles {

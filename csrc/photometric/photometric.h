@@ -123,17 +123,11 @@ BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {
   return terms;
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 std::int64_t photometric_parts(const PhotometricArgs<T>& args);
 template <class T>
 void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
-}  // namespace cpu
-namespace cuda {
-template <class T>
-std::int64_t photometric_parts(const PhotometricArgs<T>& args);
-template <class T>
-void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -66,13 +66,9 @@ BLITZGS_HD void position_noise_of(const PositionNoiseArgs<T>& args, std::int64_t
   store3(moved, args.means + 3 * row);
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 void position_noise(const PositionNoiseArgs<T>& args, Workspace&, CudaStream);
-}
-namespace cuda {
-template <class T>
-void position_noise(const PositionNoiseArgs<T>& args, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

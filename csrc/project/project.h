@@ -141,9 +141,14 @@ struct RankSplatGradients {
   }
 };
 
-// The source that a CUDA kernel reads. The CPU reads columns only.
-using SplatGradientSource =
-    std::variant<SplatGradientColumns<float>, PackedSplatGradients, RankSplatGradients>;
+// The source that the kernels of a backend read. The CPU reads columns only.
+#ifdef BLITZGS_BACKEND_CUDA
+template <class T>
+using SplatGradientSource = std::variant<SplatGradientColumns<T>, PackedSplatGradients, RankSplatGradients>;
+#else
+template <class T>
+using SplatGradientSource = SplatGradientColumns<T>;
+#endif
 
 // means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3] or null; viewmats [B, 4, 4], Ks
 // [B, 3, 3]. The candidates are the rows active_ids [n_candidates] (ascending), or all N when null. Bit v of
@@ -259,46 +264,6 @@ struct SplatIndex {
   std::int64_t n_visible;
 };
 
-// color_splats computes the colours of the splats that project() wrote without `sh`, and hides those whose
-// colour is not finite. It reads the means, the SH and the cameras of its inputs, whose rows `gaussian_ids`
-// counts, and writes colors, opacities, radii and tiles_touched; other columns may be null. It does nothing
-// if there are more splats than the capacity. On the CPU the sizes of the capacity are the actual numbers.
-
-namespace cpu {
-template <class T>
-void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
-             CudaStream);
-template <class T>
-void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, Workspace&,
-                  CudaStream);
-template <class T>
-void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
-                 const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
-template <class T>
-void zero_arrays(const ZeroedArrays<T>&, CudaStream);
-}  // namespace cpu
-namespace cuda {
-// If there are more splats than the capacity, the totals are still correct, and the columns hold the first
-// splats, without colours. The caller has to compare the totals with the capacity.
-template <class T>
-void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
-             CudaStream);
-template <class T>
-void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, Workspace&,
-                  CudaStream);
-template <class T>
-void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,
-                 const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
-template <class T>
-void zero_arrays(const ZeroedArrays<T>&, CudaStream);
-}  // namespace cuda
-
-// project_bwd_step is the projection's backward pass and the optimiser's step of the visible Gaussians in one
-// call. The result is that of project_bwd followed by lazy_adam; on CUDA one kernel does both, so that the
-// gradients need not be written to global memory. Parameters are raw, with SH. `adam` lists
-// splats.visible_ids and has no gradients. The parameters of the listed rows must have caught up to step
-// adam.step - 1.
-
 // Allocates the gradients of the visible Gaussians in scratch memory and gives them to `adam`.
 template <class T>
 ProjectGradients<T> scratch_gradients(const SplatIndex& splats, AdamArgs<T>& adam, Workspace& workspace) {
@@ -310,15 +275,31 @@ ProjectGradients<T> scratch_gradients(const SplatIndex& splats, AdamArgs<T>& ada
   return {slots[0], slots[1], slots[2], slots[3], slots[4], nullptr};
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
+// If there are more splats than the capacity (CUDA), the totals are still correct, and the columns hold the
+// first splats, without colours. The caller has to compare the totals with the capacity.
 template <class T>
-void project_bwd_step(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,
-                      const Regularisers<T>&, AdamArgs<T> adam, Workspace&, CudaStream);
-}  // namespace cpu
-namespace cuda {
+void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
+             CudaStream);
+// Computes the colours of the splats that project() wrote without `sh`, and hides those whose colour is not
+// finite. It reads the means, the SH and the cameras of its inputs, whose rows `gaussian_ids` counts, and
+// writes colors, opacities, radii and tiles_touched; other columns may be null. It does nothing if there are
+// more splats than the capacity. On the CPU the sizes of the capacity are the actual numbers.
 template <class T>
-void project_bwd_step(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource&,
+void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, Workspace&,
+                  CudaStream);
+template <class T>
+void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource<T>&,
+                 const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
+template <class T>
+void zero_arrays(const ZeroedArrays<T>&, CudaStream);
+// The projection's backward pass and the optimiser's step of the visible Gaussians in one call. The result is
+// that of project_bwd followed by lazy_adam; on CUDA one kernel does both, so that the gradients need not be
+// written to global memory. Parameters are raw, with SH. `adam` lists splats.visible_ids and has no
+// gradients. The parameters of the listed rows must have caught up to step adam.step - 1.
+template <class T>
+void project_bwd_step(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource<T>&,
                       const Regularisers<T>&, AdamArgs<T> adam, Workspace&, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -148,7 +148,7 @@ void zero_arrays<float>(const ZeroedArrays<float>& arrays, CudaStream stream) {
 }
 
 template <>
-void project_bwd<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
+void project_bwd<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource<float>& v,
                         const Regularisers<float>& regularisers, const ProjectGradients<float>& out,
                         Workspace& workspace, CudaStream stream) {
   const std::int64_t blocks = project_blocks(splats.n_visible);

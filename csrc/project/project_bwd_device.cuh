@@ -229,7 +229,7 @@ struct BackwardInputs {
 
 // Calls f(degree, quads, BackwardInputs); dispatch_sh says what degree and quads are.
 template <class F>
-void dispatch_backward(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
+void dispatch_backward(const Inputs& in, const SplatIndex& splats, const SplatGradientSource<float>& v,
                        const Regularisers<float>& regularisers, const F& f) {
   std::visit(
       [&](const auto& source) {

@@ -14,14 +14,6 @@ namespace blitzgs {
 
 class HeldSplatGradients {
  public:
-#ifdef BLITZGS_BACKEND_CUDA
-  template <class T>
-  using Source = SplatGradientSource;
-#else
-  template <class T>
-  using Source = SplatGradientColumns<T>;
-#endif
-
   // splats: P. sums: none, or [P, 2], to which the kernel writes the gradients of means2d summed over ranks
   // or, with `absolute`, those of mean2d_abs.
   HeldSplatGradients(const char* op, ScalarType dtype, std::int64_t splats,
@@ -53,7 +45,7 @@ class HeldSplatGradients {
 
   // The source that the kernels read. It points to tensors that this object holds.
   template <class T>
-  Source<T> source() const {
+  SplatGradientSource<T> source() const {
 #ifdef BLITZGS_BACKEND_CUDA
     if (places_) return ranks_;
     if (in_tables_) return PackedSplatGradients{table(held_[0])};

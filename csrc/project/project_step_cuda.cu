@@ -121,7 +121,7 @@ bool moves_by_packs(const AdamArgs<float>& adam) {
 }  // namespace
 
 template <>
-void project_bwd_step<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource& v,
+void project_bwd_step<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource<float>& v,
                              const Regularisers<float>& regularisers, AdamArgs<float> adam,
                              Workspace& workspace, CudaStream stream) {
   if (splats.n_visible == 0) return;

@@ -179,15 +179,17 @@ TEST_CASE("each splat knows the ranks that composite its tiles, and the totals c
   std::vector<std::int64_t> expected(8, 0);
   for (std::size_t splat = 0; splat < p.rank_masks.size(); ++splat) {
     std::int64_t mask = 0;
-    for_each_tile(&p.means2d[2 * splat], &p.conics[3 * splat], p.opacities[splat], 40, 30, 16,
-                  [&](int tx, int ty) {
-                    const int tile = 6 * p.camera_ids[splat] + 3 * ty + tx;
-                    for (int m = 0; m < 4; ++m) {
-                      if (tile < ranks.begin[m] || tile >= ranks.end[m]) continue;
-                      mask |= std::int64_t{1} << m;
-                      ++expected[2 * m + 1];
-                    }
-                  });
+    for_each_tile_row(&p.means2d[2 * splat], &p.conics[3 * splat], p.opacities[splat], 40, 30, 16,
+                      [&](int ty, int begin, int end) {
+                        const int row = 6 * p.camera_ids[splat] + 3 * ty;
+                        for (int tile = row + begin; tile < row + end; ++tile) {
+                          for (int m = 0; m < 4; ++m) {
+                            if (tile < ranks.begin[m] || tile >= ranks.end[m]) continue;
+                            mask |= std::int64_t{1} << m;
+                            ++expected[2 * m + 1];
+                          }
+                        }
+                      });
     REQUIRE(p.rank_masks[splat] == mask);
     for (int m = 0; m < 4; ++m) expected[2 * m] += mask >> m & 1;
   }

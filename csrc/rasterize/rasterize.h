@@ -101,7 +101,7 @@ struct RasterizeAux {
   std::int64_t composited;  // the number of composited tiles
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 std::int64_t rasterize_splat_bytes(int n_channels);
 // Whether forward leaves an order of the tiles that it composites.
 bool rasterize_orders_tiles(const TileGrid& grid);
@@ -112,19 +112,10 @@ template <class T>
 void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
                    const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
                    Workspace&, CudaStream);
-}  // namespace cpu
+}  // namespace BLITZGS_BACKEND
 
 namespace cuda {
-std::int64_t rasterize_splat_bytes(int n_channels);
-// Whether forward leaves an order of the tiles that it composites.
-bool rasterize_orders_tiles(const TileGrid& grid);
-template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
-                   Workspace&, CudaStream);
-template <class T>
-void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
-                   const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
-                   Workspace&, CudaStream);
+// rasterize_bwd that adds the gradients to the table `packed` [P] of SplatGradient.
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
                           std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
                           float* packed, Workspace&, CudaStream);

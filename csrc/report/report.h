@@ -34,13 +34,9 @@ struct Report {
   int n_targets;
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 void report(const Report<T>& report, Workspace&, CudaStream);
-}
-namespace cuda {
-template <class T>
-void report(const Report<T>& report, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -67,13 +67,9 @@ BLITZGS_HD Frustum frustum_of(const SeenBlocks& args, int view) {
                       view);
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void seen_blocks(const SeenBlocks&, Workspace&, CudaStream);
 void swap_blocks(const SwapBlocks&, Workspace&, CudaStream);
-}  // namespace cpu
-namespace cuda {
-void seen_blocks(const SeenBlocks&, Workspace&, CudaStream);
-void swap_blocks(const SwapBlocks&, Workspace&, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

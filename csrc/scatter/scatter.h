@@ -115,22 +115,13 @@ struct SplatValues {
   }
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void scatter(const ScatterSplats&, const SplatGroups&, const ScatterTargets&, SplatPlace* places, Workspace&,
              CudaStream);
 void gather(const std::int32_t* packed, const SplatGroups&, const SplatColumns<std::int32_t>&, Workspace&,
             CudaStream);
 template <class T>
 void sum(const SplatValues<T>&, const SplatColumns<T>&, Workspace&, CudaStream);
-}  // namespace cpu
-
-namespace cuda {
-void scatter(const ScatterSplats&, const SplatGroups&, const ScatterTargets&, SplatPlace* places, Workspace&,
-             CudaStream);
-void gather(const std::int32_t* packed, const SplatGroups&, const SplatColumns<std::int32_t>&, Workspace&,
-            CudaStream);
-template <class T>
-void sum(const SplatValues<T>&, const SplatColumns<T>&, Workspace&, CudaStream);
-}  // namespace cuda
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

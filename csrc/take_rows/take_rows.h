@@ -20,11 +20,8 @@ struct TakeRows {
   std::int64_t n, count, row_bytes;
 };
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void take_rows(const TakeRows&, Workspace&, CudaStream);
-}
-namespace cuda {
-void take_rows(const TakeRows&, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -49,11 +49,8 @@ BLITZGS_HD std::int64_t tree_sum_of(const TreeSumsArgs& args, const Row& row) {
   return sum;
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void tree_sums(const TreeSumsArgs& args, CudaStream);
-}
-namespace cuda {
-void tree_sums(const TreeSumsArgs& args, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

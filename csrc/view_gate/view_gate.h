@@ -106,12 +106,9 @@ BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std
   if (kept != seen) args.views[i] = static_cast<std::int32_t>(kept);
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
-}
-namespace cuda {
-void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 // Fills `table` with the table of the rules and the camera centres. All threads of a block call this, each
 // for one level and one view.

@@ -72,11 +72,8 @@ BLITZGS_HD void view_sums_of(const ViewSumsArgs& args, std::int64_t u, const Rou
   args.counted[id] += counted;
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 void view_sums(const ViewSumsArgs& args, CudaStream);
-}
-namespace cuda {
-void view_sums(const ViewSumsArgs& args, CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -32,15 +32,10 @@ BLITZGS_HD std::int64_t voxel_key(const T* point, const VoxelGrid& grid) {
   return key;
 }
 
-namespace cpu {
+namespace BLITZGS_BACKEND {
 template <class T>
 void voxel_keys(const T* points, std::int64_t n, const VoxelGrid& grid, std::int64_t* keys, Workspace&,
                 CudaStream);
-}
-namespace cuda {
-template <class T>
-void voxel_keys(const T* points, std::int64_t n, const VoxelGrid& grid, std::int64_t* keys, Workspace&,
-                CudaStream);
-}
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs
