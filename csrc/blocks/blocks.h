@@ -33,7 +33,6 @@
 #include "common/kernel.h"
 #include "lazy_adam/lazy_adam.h"
 #include "math/frustum.h"
-#include "math/morton.h"
 #include "view_gate/view_gate.h"
 
 namespace blitzgs {
@@ -324,7 +323,6 @@ struct CullInputs {
 };
 
 namespace BLITZGS_BACKEND {
-void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
 // Computes the bounds of the blocks that contain the rows `ids`, or of all blocks if ids is null.
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace&, CudaStream);

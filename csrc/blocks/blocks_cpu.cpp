@@ -81,15 +81,6 @@ void fill_plan(const CullInputs& in, const CullViews& views, const CullPlan& pla
 
 }  // namespace
 
-void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream) {
-  const MortonFrame frame = morton_frame_of(points, n);
-  parallel_for(0, n, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      keys[i] = static_cast<std::int64_t>(morton_code(points + 3 * i, frame) >> 1);
-    }
-  });
-}
-
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace& workspace, CudaStream) {
   std::int64_t count = blocks_of(rows.n);

@@ -3,7 +3,6 @@
 
 #include "blocks/blocks.h"
 #include "common/cuda.cuh"
-#include "math/morton_cuda.cuh"
 #include "view_gate/view_gate.h"
 
 namespace blitzgs::cuda {
@@ -16,14 +15,6 @@ constexpr int kWarps = kBlockRows / 32;
 constexpr int kGroup = kBlockRows;
 // The number of CUDA blocks with kBlockRows threads that fit a multiprocessor of every supported GPU.
 constexpr int kResident = 6;
-
-// keys [n] = the Morton codes of points [n, 3], without their lowest bit so that they fit a signed integer.
-// One thread per point.
-__global__ void make_keys(const float* points, std::int64_t n, const MortonBounds* bounds,
-                          std::int64_t* keys) {
-  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
-  if (i < n) keys[i] = static_cast<std::int64_t>(morton_code(points + 3 * i, frame_of(*bounds)) >> 1);
-}
 
 // Appends the items of a warp's lanes to a list, with one atomic addition for the warp. All lanes call this.
 __device__ void append(bool present, std::int32_t item, std::int32_t* list, std::int32_t* length) {
@@ -230,14 +221,6 @@ unsigned persistent_blocks(std::int64_t blocks) {
 }
 
 }  // namespace
-
-void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace& workspace,
-                 CudaStream stream) {
-  if (n == 0) return;
-  const MortonBounds* bounds = find_morton_bounds(points, n, workspace, stream);
-  make_keys<<<blocks_for(n, 256), 256, 0, stream>>>(points, n, bounds, keys);
-  check_launch("morton_keys");
-}
 
 void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
                          Workspace& workspace, CudaStream stream) {

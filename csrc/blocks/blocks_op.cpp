@@ -49,15 +49,6 @@ void check_bounds(const char* op, const Tensor& bounds, std::int64_t rows) {
   check_in_place(op, "bounds", bounds, ScalarType::Float, {blocks_of(rows), kBlockBounds});
 }
 
-Tensor morton_keys(const Tensor& points) {
-  const Tensor rows = checked("morton_keys", "points", points, ScalarType::Float, {-1, 3});
-  Tensor keys = make_empty(rows, {rows.size(0)}, ScalarType::Long);
-  DeviceScope scope(rows);
-  backend::morton_keys(data<float>(rows), rows.size(0), mutable_data<std::int64_t>(keys), scope.workspace,
-                       scope.stream);
-  return keys;
-}
-
 void update_block_bounds_(Tensor bounds, const std::optional<Tensor>& ids_in,
                           const std::vector<Tensor>& rows) {
   const char* op = "update_block_bounds_";
@@ -123,7 +114,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("morton_keys", TORCH_BOX(&blitzgs::morton_keys));
   m.impl("update_block_bounds_", TORCH_BOX(&blitzgs::update_block_bounds_));
   m.impl("cull_blocks", TORCH_BOX(&blitzgs::cull_blocks));
 }

@@ -72,14 +72,3 @@ TEST_CASE("pending steps widen a row's box along its drift, and rows that are no
   REQUIRE(bounds[3] == 1);
   REQUIRE(bounds[7] == 0);
 }
-
-TEST_CASE("Morton keys interleave the axes") {
-  const std::vector<float> points = {0, 0, 0, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0, 1, 0};
-  std::vector<std::int64_t> keys(5);
-  blitzgs::TestWorkspace workspace;
-  blitzgs::cpu::morton_keys(points.data(), 5, keys.data(), workspace, nullptr);
-  REQUIRE(keys[0] == 0);
-  REQUIRE(keys[3] < keys[4]);  // x is the lowest bit, z the highest
-  REQUIRE(keys[4] < keys[2]);
-  REQUIRE(keys[2] < keys[1]);
-}
