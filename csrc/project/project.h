@@ -38,7 +38,7 @@
 #include "lazy_adam/lazy_adam.h"
 #include "math/tiles.h"
 #include "project/project_splat.h"
-#include "scatter/scatter.h"
+#include "scatter/places.h"
 
 // Smooth levels: the LOD gate (view_gate.h) drops an octree level from a view beyond a certain distance, the
 // reach of the level. With smooth levels the opacity of a Gaussian falls to zero towards this distance, so

@@ -46,7 +46,7 @@ class SplatGradientReader<RankSplatGradients> {
   static constexpr int kMostRuns = 6;  // the stage of a warp holds up to this many runs of 32 splats
   static constexpr int kSpare = 8;     // further slots of the stage, for splats that lie at several ranks
 
-  // The splats of one run of kPlaceSplats splats (scatter.h) that lie at one rank.
+  // The splats of one run of kPlaceSplats splats (places.h) that lie at one rank.
   struct Segment {
     std::uint32_t bits;  // bit i: splat i of the run is one of them
     std::int32_t from;   // the position of the first of them in the rank's table

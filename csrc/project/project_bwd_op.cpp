@@ -8,7 +8,7 @@
 #include "lazy_adam/lazy_adam_op.h"
 #include "project/project.h"
 #include "project/project_op.h"
-#include "scatter/scatter_op.h"
+#include "scatter/places_op.h"
 
 namespace blitzgs {
 

@@ -16,26 +16,15 @@
 #include <cstdint>
 
 #include "common/kernel.h"
-#include "math/tiles.h"
+#include "scatter/places.h"
 
 namespace blitzgs {
 
 constexpr int kScatterBlock = 256;
-constexpr int kPlaceSplats = 32;
 constexpr int kMaxSplatColumns = 8;
 
 inline std::int64_t scatter_blocks(std::int64_t splats) {
   return (splats + kScatterBlock - 1) / kScatterBlock;
-}
-
-inline std::int64_t place_runs(std::int64_t splats) { return (splats + kPlaceSplats - 1) / kPlaceSplats; }
-
-BLITZGS_HD int count_bits(std::uint32_t bits) {
-#ifdef __CUDA_ARCH__
-  return __popc(bits);
-#else
-  return __builtin_popcount(bits);
-#endif
 }
 
 // bits != 0.
@@ -46,18 +35,6 @@ BLITZGS_HD int lowest_bit(std::uint64_t bits) {
   return __builtin_ctzll(bits);
 #endif
 }
-
-// The splats of a run that went to one rank. The ops pass it as an int64.
-struct alignas(8) SplatPlace {
-  std::int32_t first;  // the position of the first of them in the rank's group
-  std::uint32_t bits;  // bit i: splat i of the run is one of them
-
-  // splat: the index in the run, in [0, kPlaceSplats).
-  BLITZGS_HD bool has(std::uint32_t splat) const { return (bits >> splat) & 1u; }
-  BLITZGS_HD std::int64_t of(std::uint32_t splat) const {
-    return first + count_bits(bits & ((1u << splat) - 1u));
-  }
-};
 
 // The columns of some splats. begin: the offset of each column in a splat, in words; the last entry is the
 // number of words in a splat.

@@ -4,6 +4,7 @@
 #include <limits>
 
 #include "common/op.h"
+#include "scatter/places_op.h"
 #include "scatter/scatter.h"
 
 namespace blitzgs {
@@ -58,16 +59,6 @@ struct HeldSplats {
   std::vector<Tensor> held;
   ScatterSplats splats{};
 };
-
-// The places [runs, n_ranks] that scatter_splats returned, checked and contiguous.
-inline Tensor checked_places(const char* op, const Tensor& places, std::int64_t splats,
-                             std::int64_t n_ranks) {
-  return checked(op, "places", places, ScalarType::Long, {place_runs(splats), n_ranks});
-}
-
-inline const SplatPlace* places_in(const Tensor& places) {
-  return reinterpret_cast<const SplatPlace*>(data<std::int64_t>(places));
-}
 
 inline Tensor make_places(const Tensor& like, std::int64_t splats, std::int64_t n_ranks) {
   return make_empty(like, {place_runs(splats), n_ranks}, ScalarType::Long);
