@@ -108,6 +108,12 @@ inline bool can_launch_early(const void* kernel) {
   return answer == kYes;
 }
 
+// Lets a kernel have this much dynamic shared memory, which may be more than the 48 KiB of the default.
+inline void allow_shared_bytes(const char* what, const void* kernel, std::size_t bytes) {
+  const auto size = static_cast<int>(bytes);
+  if (size > 0) check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, size), what);
+}
+
 struct LaunchShape {
   dim3 blocks;
   unsigned threads;
@@ -119,6 +125,8 @@ struct LaunchShape {
 template <class... Parameters>
 void launch_early(const char* what, void (*kernel)(Parameters...), const LaunchShape& shape,
                   const std::type_identity_t<Parameters>&... arguments) {
+  const auto* address = reinterpret_cast<const void*>(kernel);
+  allow_shared_bytes(what, address, shape.shared_bytes);
   cudaLaunchAttribute early{};
   early.id = cudaLaunchAttributeProgrammaticStreamSerialization;
   early.val.programmaticStreamSerializationAllowed = 1;
@@ -128,7 +136,7 @@ void launch_early(const char* what, void (*kernel)(Parameters...), const LaunchS
   config.dynamicSmemBytes = shape.shared_bytes;
   config.stream = shape.stream;
   config.attrs = &early;
-  config.numAttrs = can_launch_early(reinterpret_cast<const void*>(kernel)) ? 1 : 0;
+  config.numAttrs = can_launch_early(address) ? 1 : 0;
   cudaLaunchKernelEx(&config, kernel, arguments...);
   check_launch(what);
 }

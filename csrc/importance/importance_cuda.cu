@@ -144,14 +144,6 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
   send_sums();
 }
 
-void launch_contributions(const ContributionArguments& args, CudaStream stream) {
-  const auto kernel = contributions_kernel;
-  constexpr int kBytes = sizeof(ContributionShared);
-  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "contributions");
-  launch_early("contributions", kernel,
-               {static_cast<unsigned>(args.order.n_tiles), Tile::kThreads, stream, kBytes}, args);
-}
-
 }  // namespace
 
 template <>
@@ -169,7 +161,9 @@ void contributions<float>(const ContributionInput<float>& in, const Contribution
   const TileOrder order(in.grid, owned, workspace.allocate<std::int32_t>(TileOrder::words(in.grid, owned)));
   prepare("contributions", input, packed, nullptr, order, stream);
   const ContributionArguments args{packed, in.isect_splats, in.tile_offsets, in.grid, order, sums};
-  launch_contributions(args, stream);
+  launch_early("contributions", contributions_kernel,
+               {static_cast<unsigned>(order.n_tiles), Tile::kThreads, stream, sizeof(ContributionShared)},
+               args);
 }
 
 }  // namespace blitzgs::cuda

@@ -214,9 +214,7 @@ void sweep(const SweepPass<Key, State>& pass, unsigned blocks, CudaStream stream
   constexpr std::size_t kCounts = kSweepThreads / 32 * sizeof(std::uint32_t) << kBits;
   constexpr std::size_t kBytes =
       kSweepTile * sizeof(std::int32_t) + std::max(kSweepTile * sizeof(Key), kCounts);
-  const auto kernel = sweep_kernel<kBits, Key, State>;
-  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "radix sweep");
-  launch_early("radix sweep", kernel, {blocks, kSweepThreads, stream, kBytes}, pass);
+  launch_early("radix sweep", sweep_kernel<kBits, Key, State>, {blocks, kSweepThreads, stream, kBytes}, pass);
 }
 
 }  // namespace blitzgs::cuda

@@ -349,11 +349,8 @@ Launch cut_strips(const PhotometricArgs<float>& args) {
 
 template <bool kBytes, bool kGradient, bool kSums>
 void launch_kernel(dim3 grid, const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
-  const auto kernel = photometric_kernel<kBytes, kGradient, kSums>;
-  constexpr int kSharedBytes = 2 * sizeof(Shared);
-  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kSharedBytes),
-        "photometric");
-  launch_early("photometric", kernel, {grid, kThreads, stream, kSharedBytes}, args, launch);
+  launch_early("photometric", photometric_kernel<kBytes, kGradient, kSums>,
+               {grid, kThreads, stream, 2 * sizeof(Shared)}, args, launch);
 }
 
 template <bool kBytes>

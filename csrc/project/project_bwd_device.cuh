@@ -94,14 +94,9 @@ class SplatGradientReader<RankSplatGradients> {
         fits &= count == 0 || from + count <= source_.sizes[s % n_ranks];
         segment_list()[s] = {bits, from, total};
       }
-      int sum = count;
-#pragma unroll
-      for (int step = 1; step < 32; step *= 2) {
-        const int before = __shfl_up_sync(kFullWarp, sum, step);
-        if (lane() >= step) sum += before;
-      }
-      if (s < segments) segment_list()[s].to += sum - count;
-      total += __shfl_sync(kFullWarp, sum, 31);
+      const int until = sum_of_lanes_until(count, lane());
+      if (s < segments) segment_list()[s].to += until - count;
+      total += __shfl_sync(kFullWarp, until, 31);
     }
     fits_ = __all_sync(kFullWarp, fits) && total <= nothing();
     __syncwarp();
@@ -363,10 +358,7 @@ void launch_backward(const BackwardInputs<Source>& args, const Sink& sink, CudaS
   const auto kernel = backward_kernel<DEGREE, QUADS, Source, Sink>;
   const std::size_t bytes =
       SplatGradientReader<Source>::shared_bytes(args.v, args.in.n_views, kBackwardThreads / 32);
-  if (bytes > 0) {
-    check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)),
-          "project_bwd");
-  }
+  allow_shared_bytes("project_bwd", reinterpret_cast<const void*>(kernel), bytes);
   const unsigned blocks = blocks_for(args.splats.n_visible, kBackwardThreads);
   kernel<<<blocks, kBackwardThreads, bytes, stream>>>(args, sink);
   check_launch("project_bwd");
