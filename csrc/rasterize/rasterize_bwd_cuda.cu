@@ -5,9 +5,6 @@
 // needs only the final transmittance and last_ids from the forward pass. For each entry and pixel this gives
 // two numbers: the weight alpha T and g = dL/d(ln alpha). The half-warp writes these for sixteen entries to
 // shared memory. Each lane then sums over the sixteen pixels for one of the entries (gradients.cuh).
-#include <algorithm>
-#include <stdexcept>
-#include <string>
 
 #include "common/cuda.cuh"
 #include "rasterize/gradients.cuh"
@@ -16,14 +13,7 @@ namespace blitzgs::cuda {
 
 namespace {
 
-struct BackwardArguments {
-  const PackedSplat* splats;
-  ChannelChunk chunk;
-  const float* backgrounds;
-  const std::int32_t* isect_splats;
-  const std::int64_t* tile_offsets;
-  TileGrid grid;
-  TileOrder order;
+struct BackwardArguments : ChunkInput {
   RasterizeSaved<float> saved;
   PackedGradient* splat_gradients;  // [P], added to atomically, or null
   PackedGradient* entry_gradients;  // [I], written once each (deterministic)
@@ -229,11 +219,9 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
 
 template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
 void launch_backward(const BackwardArguments& args, CudaStream stream) {
-  const auto kernel = backward_kernel<CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>;
-  constexpr int kBytes = sizeof(BackwardShared<CHANNELS, DETERMINISTIC>);
-  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_bwd");
-  launch_early("rasterize_bwd", kernel,
-               {static_cast<unsigned>(args.order.n_tiles), Tile::kThreads, stream, kBytes}, args);
+  const LaunchShape shape{static_cast<unsigned>(args.order.n_tiles), Tile::kThreads, stream,
+                          sizeof(BackwardShared<CHANNELS, DETERMINISTIC>)};
+  launch_early("rasterize_bwd", backward_kernel<CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>, shape, args);
 }
 
 void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream stream) {
@@ -257,11 +245,8 @@ void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream 
 class SplatGradientSums {
  public:
   SplatGradientSums(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                    std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, Workspace& workspace,
-                    CudaStream stream)
-      : in_(in),
-        saved_(saved),
-        aux_(aux),
+                    std::int64_t n_isects, bool deterministic, Workspace& workspace, CudaStream stream)
+      : saved_(saved),
         n_isects_(n_isects),
         stream_(stream),
         empty_(n_isects == 0 || in.grid.tile_end <= in.grid.tile_begin) {
@@ -271,38 +256,22 @@ class SplatGradientSums {
     sorted_ = sort_entries(in.isect_splats, n_isects, in.n_splats, workspace, stream);
   }
 
-  ChannelChunk chunk(int first) const {
-    return {packed_colors(aux_, in_.n_channels), in_.colors, in_.n_channels, first,
-            std::min(kChunkChannels, in_.n_channels - first)};
-  }
-
-  // Adds the gradients by the channels of the chunk to `packed` [P].
-  void add(const ChannelChunk& chunk, bool absolute, PackedGradient* packed) const {
+  // Adds the gradients by the channels of a chunk to `packed` [P].
+  void add(const ChunkInput& chunk, bool absolute, PackedGradient* packed) const {
     if (empty_) return;
     if (entries_) {
       check(cudaMemsetAsync(entries_, 0, n_isects_ * sizeof(PackedGradient), stream_), "rasterize_bwd");
     }
-    const BackwardArguments args{packed_splats(aux_),
-                                 chunk,
-                                 in_.backgrounds,
-                                 in_.isect_splats,
-                                 in_.tile_offsets,
-                                 in_.grid,
-                                 TileOrder(in_.grid, aux_.composited, aux_.order),
-                                 saved_,
-                                 packed,
-                                 entries_};
-    dispatch_backward(args, absolute, stream_);
+    dispatch_backward({chunk, saved_, packed, entries_}, absolute, stream_);
     if (!entries_) return;
     sum_entries_kernel<<<blocks_for(3 * n_isects_, 256), 256, 0, stream_>>>(
-        sorted_.splats, sorted_.entries, n_isects_, in_.tile_offsets + in_.grid.count(), entries_, packed);
+        sorted_.splats, sorted_.entries, n_isects_, chunk.tile_offsets + chunk.grid.count(), entries_,
+        packed);
     check_launch("rasterize_bwd");
   }
 
  private:
-  const RasterizeInput<float>& in_;
   const RasterizeSaved<float>& saved_;
-  const RasterizeAux& aux_;
   std::int64_t n_isects_;
   CudaStream stream_;
   bool empty_;
@@ -319,15 +288,15 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
                           CudaStream stream) {
   if (in.n_splats == 0) return;
   const bool absolute = gradients.v_means2d_abs != nullptr;
-  const SplatGradientSums splats(in, saved, n_isects, aux, deterministic, workspace, stream);
+  const SplatGradientSums splats(in, saved, n_isects, deterministic, workspace, stream);
   auto* packed = static_cast<PackedGradient*>(workspace.allocate_bytes(in.n_splats * sizeof(PackedGradient)));
   for (int first = 0; first < in.n_channels; first += kChunkChannels) {
-    const ChannelChunk chunk = splats.chunk(first);
+    const ChunkInput input(in, aux, first);
     check(cudaMemsetAsync(packed, 0, in.n_splats * sizeof(PackedGradient), stream), "rasterize_bwd");
-    splats.add(chunk, absolute, packed);
+    splats.add(input, absolute, packed);
     launch_early("rasterize_bwd", unpack_kernel,
                  {blocks_for(in.n_splats, kUnpackThreads), kUnpackThreads, stream}, packed, in.n_splats,
-                 chunk, absolute && first > 0, gradients);
+                 input.chunk, absolute && first > 0, gradients);
   }
 }
 
@@ -335,8 +304,8 @@ void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<
                           std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
                           float* packed, Workspace& workspace, CudaStream stream) {
   if (in.n_splats == 0) return;
-  const SplatGradientSums splats(in, saved, n_isects, aux, deterministic, workspace, stream);
-  splats.add(splats.chunk(0), absolute, reinterpret_cast<PackedGradient*>(packed));
+  const SplatGradientSums splats(in, saved, n_isects, deterministic, workspace, stream);
+  splats.add({in, aux, 0}, absolute, reinterpret_cast<PackedGradient*>(packed));
 }
 
 }  // namespace blitzgs::cuda

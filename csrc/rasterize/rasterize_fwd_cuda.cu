@@ -1,7 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <string>
-
 #include "common/cuda.cuh"
 #include "rasterize/forward.cuh"
 
@@ -9,14 +6,7 @@ namespace blitzgs::cuda {
 
 namespace {
 
-struct ForwardArguments {
-  const PackedSplat* splats;
-  ChannelChunk chunk;
-  const float* backgrounds;
-  const std::int32_t* isect_splats;
-  const std::int64_t* tile_offsets;
-  TileGrid grid;
-  TileOrder order;
+struct ForwardArguments : ChunkInput {
   RasterizeOutput<float> out;
   // The number of splats of out.splat_gradients that all blocks, and each block, set to zero.
   std::int64_t zero_splats, splats_per_block;
@@ -169,9 +159,8 @@ void launch_forward(ForwardArguments args, CudaStream stream) {
   if (tiles == 0) return;
   args.splats_per_block = (args.zero_splats + tiles - 1) / tiles;
   const auto kernel = args.chunk.count == 4 ? forward_kernel<4> : forward_kernel<3>;
-  constexpr int kBytes = sizeof(EntryBatch<kForwardBatch>);
-  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes), "rasterize_fwd");
-  launch_early("rasterize_fwd", kernel, {tiles, Tile::kThreads, stream, kBytes}, args);
+  launch_early("rasterize_fwd", kernel, {tiles, Tile::kThreads, stream, sizeof(EntryBatch<kForwardBatch>)},
+               args);
 }
 
 }  // namespace
@@ -191,24 +180,10 @@ void rasterize_fwd<float>(const RasterizeInput<float>& in, const RasterizeOutput
     zero_gradients(out, zero_splats, stream);
     return;
   }
-  PackedSplat* const splats = packed_splats(aux);
-  float4* const colors = packed_colors(aux, in.n_channels);
-  const TileOrder order(in.grid, aux.composited, aux.order);
-  prepare("rasterize_fwd", in, splats, colors, order, stream);
+  prepare("rasterize_fwd", in, packed_splats(aux), packed_colors(aux, in.n_channels),
+          TileOrder(in.grid, aux.composited, aux.order), stream);
   for (int first = 0; first < in.n_channels; first += kChunkChannels) {
-    const ForwardArguments args{
-        splats,
-        {colors, in.colors, in.n_channels, first, std::min(kChunkChannels, in.n_channels - first)},
-        in.backgrounds,
-        in.isect_splats,
-        in.tile_offsets,
-        in.grid,
-        order,
-        out,
-        zero_splats,
-        0,
-        in.known_splats};
-    launch_forward(args, stream);
+    launch_forward({{in, aux, first}, out, zero_splats, 0, in.known_splats}, stream);
   }
 }
 

@@ -9,6 +9,7 @@
 // pixels touches about three subtiles. The two halves of a warp visit different lists in lockstep. The test
 // is conservative, so it changes no pixel.
 #pragma once
+#include <algorithm>
 #include <cstdint>
 #include <stdexcept>
 #include <string>
@@ -143,6 +144,27 @@ struct ChannelChunk {
   const float4* packed;  // packed_colors(), or null
   const float* colors;   // [P, n_channels], read if `packed` is null
   int n_channels, first, count;
+};
+
+// What a launch of either pass reads for one chunk of channels.
+struct ChunkInput {
+  const PackedSplat* splats;
+  ChannelChunk chunk;
+  const float* backgrounds;
+  const std::int32_t* isect_splats;
+  const std::int64_t* tile_offsets;
+  TileGrid grid;
+  TileOrder order;
+
+  ChunkInput(const RasterizeInput<float>& in, const RasterizeAux& aux, int first)
+      : splats(packed_splats(aux)),
+        chunk{packed_colors(aux, in.n_channels), in.colors, in.n_channels, first,
+              std::min(kChunkChannels, in.n_channels - first)},
+        backgrounds(in.backgrounds),
+        isect_splats(in.isect_splats),
+        tile_offsets(in.tile_offsets),
+        grid(in.grid),
+        order(in.grid, aux.composited, aux.order) {}
 };
 
 // Asynchronous copies to shared memory. The thread that starts them waits for them with copies_done().
