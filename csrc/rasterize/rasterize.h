@@ -89,7 +89,7 @@ struct RasterizeGradients {
   T* v_means2d_abs;  // null: not wanted
 };
 
-// The number of classes of list length by which CUDA orders tiles (tile_batch.cuh).
+// The number of classes of list length by which CUDA orders tiles (tile_order.cuh).
 inline constexpr int kTileOrderClasses = 16;
 
 // Memory that forward fills for backward besides its outputs, in the layout of the backend. Backward may be
@@ -97,7 +97,7 @@ inline constexpr int kTileOrderClasses = 16;
 struct RasterizeAux {
   void* packed;         // the packed splats, splats * rasterize_splat_bytes() bytes, 64-byte aligned
   std::int64_t splats;  // the capacity of forward
-  std::int32_t* order;  // [1 + composited, kTileOrderClasses] of tile_batch.cuh; null: tiles by their numbers
+  std::int32_t* order;  // [1 + composited, kTileOrderClasses] of tile_order.cuh; null: tiles by their numbers
   std::int64_t composited;  // the number of composited tiles
 };
 
