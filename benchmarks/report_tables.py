@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import city_report
@@ -36,6 +37,7 @@ COMMANDS = {
     "training": f"python {TRAINING}",
     "training_2": f"torchrun --nproc-per-node=2 {TRAINING}",
     "drop_in": "python benchmarks/bm_drop_in.py CAPTURE",
+    "drop_in_1": "python benchmarks/bm_drop_in.py CAPTURE --one-thread",
     "importance": "python benchmarks/bm_importance.py",
     "gate": "python benchmarks/bm_gate.py",
     "scratch": "python benchmarks/bm_scratch.py",
@@ -45,6 +47,10 @@ COMMANDS = {
     "quality": (
         "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
         "--recipe aerial=configs/aerial.yaml --seeds 0 1 2"
+    ),
+    "ablation": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/ablation "
+        "--capture NAME=CAPTURE --per-gpu 3"
     ),
 }
 COMMANDS |= {
@@ -56,10 +62,22 @@ COMMANDS |= {
 # The files of a group are of one commit, and so are those that are in no group. Whole trainings take many
 # minutes and depend on the recipe more than on the kernels, several GPUs are seldom at hand, and the city has
 # a page of its own.
-GROUPS = (("quality",), ("exchange", "training", "training_2"), ("city", "city_exchange"))
+GROUPS = (
+    ("quality",),
+    ("ablation",),
+    ("drop_in", "drop_in_1"),
+    ("exchange", "training", "training_2"),
+    ("city", "city_exchange"),
+)
 # bm_quality.py takes no --json: it collects all of its runs in one file.
-COPIED = {"quality": "cp runs/quality/quality.json benchmarks/results/"}
+COPIED = {
+    "quality": "cp runs/quality/quality.json benchmarks/results/",
+    "ablation": "cp runs/ablation/quality.json benchmarks/results/ablation.json",
+}
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
+ABLATION_COLUMNS = (
+    "scene", "arm", "seeds", "PSNR", "corrected PSNR", "SSIM", "peak M", "final M", "peak GB"
+)  # fmt: skip
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -210,6 +228,17 @@ def quality_lines(quality: Json) -> list[str]:
     return table(["capture", *QUALITY_COLUMNS], rows)
 
 
+def ablation_lines(ablation: Json) -> list[str]:
+    """Tabulate the arms of the model level by capture: medians over the seeds, the worst in brackets."""
+    import tables_report  # needs the package, as above
+    import yaml
+
+    done = [run for run in ablation["runs"] if run["status"] == "done"]
+    arms = yaml.safe_load((Path(__file__).parent / "paper_tables.yaml").read_text())["ablation"]["arms"]
+    rows, _ = tables_report.arm_rows(done, arms)
+    return table(ABLATION_COLUMNS, ([str(row[column]) for column in ABLATION_COLUMNS] for row in rows))
+
+
 SUMMARY_HEAD = ["work", "BlitzGS", "compared with", "ratio", "command"]
 
 
@@ -274,6 +303,7 @@ SECTIONS = {
     "training": Section(("training",), row_lines),
     "training_2": Section(("training_2",), row_lines),
     "drop_in": Section(("drop_in",), row_lines),
+    "drop_in_1": Section(("drop_in_1",), row_lines),
     "importance": Section(("importance",), row_lines),
     "gate": Section(("gate",), row_lines),
     "lineage": Section(("lineage",), row_lines),
@@ -281,6 +311,7 @@ SECTIONS = {
     "photometric": Section(("photometric",), photometric_lines),
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),
+    "ablation": Section(("ablation",), ablation_lines),
     "summary": Section(("render", "step_1", "step_4"), summary_lines),
     "summary_ranks": Section(("exchange",), summary_ranks_lines),
     "city_exchange": Section(("city_exchange",), exchange_lines),

@@ -34,6 +34,7 @@ def _mean_memory(run: Run) -> float | None:
 # seed.
 FIGURES: tuple[tuple[str, Callable[[Run], float | None], str, Worst], ...] = (
     ("PSNR", lambda run: _end(run)["psnr"], "{:.2f}", min),
+    ("corrected PSNR", lambda run: _end(run).get("psnr_corrected"), "{:.2f}", min),
     ("SSIM", lambda run: _end(run)["ssim"], "{:.4f}", min),
     ("LPIPS", lambda run: _end(run).get("lpips"), "{:.4f}", max),
     ("images/s", lambda run: run["images_per_second"], "{:.0f}", min),
