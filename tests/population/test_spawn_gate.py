@@ -2,6 +2,7 @@
 """The spawn gate: trees equal XGBoost's, the veto equals sorting, and a fit predicts predictable lives."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -85,10 +86,14 @@ def test_the_default_gate_loads_and_ranks_candidates():
     held_out = gate.info.auc["held_out"]
     assert {entry["run"] for entry in held_out} == set(gate.info.scenes)
     assert all(entry["auc"] > 0.6 for entry in held_out)
-    some = candidates()
-    some.features[:, 2] = 10.0 ** torch.linspace(-5, -1, 1000)  # scales as they are
-    scores = gate.scores(some.features)
-    assert scores[-100:].double().mean() > scores[:100].double().mean()  # large ones weigh more
+    # Usual values; the two features that predict survival best on each capture vary in their usual range.
+    usual = {"gradient": 2e-4, "parent_opacity": 0.75, "parent_age": 2000, "views": 23, "time": 4000}
+    for varied, low, high in (("parent_color_gradient", 1e-8, 1e-6), ("parent_scale", 3e-4, 5e-3)):
+        row = {"parent_scale": 2e-3, "parent_flatness": 0.27, "parent_color_gradient": 1e-7, **usual}
+        features = torch.tensor([[row.get(name, 0.0) for name in FEATURES]]).repeat(1000, 1)
+        features[:, FEATURES.index(varied)] = torch.logspace(math.log10(low), math.log10(high), 1000)
+        scores = gate.scores(features).double()
+        assert scores[-100:].mean() > scores[:100].mean(), varied  # large values weigh more
     assert gate_file("gates/mine.json") == Path("gates/mine.json")
 
 
