@@ -9,8 +9,8 @@ namespace {
 
 constexpr int kPoseThreads = 256;
 
-// The sink of backward_kernel (project_bwd_device.cuh) that writes the gradients of the Gaussians to global
-// memory, with one row for each visible Gaussian or (dense) one for each Gaussian.
+// The sink of project_backward_kernel (project_bwd_device.cuh) that writes the gradients of the Gaussians to
+// global memory, with one row for each visible Gaussian or (dense) one for each Gaussian.
 struct StoreGradients {
   struct Shared {};
   struct Own {};

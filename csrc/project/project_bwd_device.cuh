@@ -249,7 +249,8 @@ struct WarpRows {
 // sink may use the warp's stages to reorder values between lanes.
 template <int DEGREE, bool QUADS, class Source, class Sink>
 __global__ void __launch_bounds__(kBackwardThreads, 3)
-    backward_kernel(const __grid_constant__ BackwardInputs<Source> args, const __grid_constant__ Sink sink) {
+    project_backward_kernel(const __grid_constant__ BackwardInputs<Source> args,
+                            const __grid_constant__ Sink sink) {
   using Coefficients = ShRow<DEGREE>;
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ ShStage<DEGREE> stages[QUADS ? kBackwardThreads / 32 : 1];
@@ -355,7 +356,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
 
 template <int DEGREE, bool QUADS, class Source, class Sink>
 void launch_backward(const BackwardInputs<Source>& args, const Sink& sink, CudaStream stream) {
-  const auto kernel = backward_kernel<DEGREE, QUADS, Source, Sink>;
+  const auto kernel = project_backward_kernel<DEGREE, QUADS, Source, Sink>;
   const std::size_t bytes =
       SplatGradientReader<Source>::shared_bytes(args.v, args.in.n_views, kBackwardThreads / 32);
   allow_shared_bytes("project_bwd", reinterpret_cast<const void*>(kernel), bytes);

@@ -11,8 +11,8 @@ namespace {
 constexpr int kPacks = 12;  // packs of four floats in an SH row of degree 3
 constexpr int kBatch = 4;   // packs that a lane has in flight
 
-// The sink of backward_kernel (project_bwd_device.cuh) that takes the Adam step of the visible Gaussians
-// (lazy_adam.h). The gradients stay in registers and shared memory.
+// The sink of project_backward_kernel (project_bwd_device.cuh) that takes the Adam step of the visible
+// Gaussians (lazy_adam.h). The gradients stay in registers and shared memory.
 struct StepRows {
   struct Shared {
     AdamStep<float> step;
