@@ -14,6 +14,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.population import gate_evaluation, gate_fit, spawn_samples
 from blitzgs.population.spawn_gate import SpawnGate, gate_file
 from blitzgs.training import run as run_folder
+from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_io import ConfigError, load_config
 from blitzgs.training.gate_replay import replay
 from blitzgs.training.inputs import open_capture
@@ -45,6 +46,13 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     fit.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="file for the gate, .json or .ubj"
+    )
+    fit.add_argument(
+        "--gate-from",
+        type=float,
+        default=ScheduleConfig.gate_from,
+        metavar="IMAGES",
+        help="also evaluate the spawns from this time on alone, which a gate is to judge (%(default)s)",
     )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     sample.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
@@ -82,7 +90,7 @@ def run_fit(args: argparse.Namespace) -> int:
         raise ValueError(f"--out {args.out}: a gate's file ends in .json or .ubj")
     runs = [_spawns(path) for path in args.runs]
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    figures = gate_fit.fit(runs, args.out)
+    figures = gate_fit.fit(runs, args.out, args.gate_from)
     print(f"{args.out}: fitted on {len(runs)} runs; {figures['protocol']}:")
     for entry in figures["held_out"]:
         print(f"  {_judgement(entry)}")
@@ -115,8 +123,7 @@ def run_evaluate(args: argparse.Namespace) -> int:
         seen = "  (the gate was fitted on this scene)" if result["seen"] else ""
         r = result.get("regions", {}).get("r")
         regions = "" if r is None else f"; regions r {r:.2f}"
-        onset = f"; from the onset on AUC {result['judged']['auc']:.3f}" if "judged" in result else ""
-        print(_judgement(result) + onset + regions + seen)
+        print(_judgement(result) + regions + seen)
     print(f"{args.out}: evaluation.json, survival.svg and maps of regions")
     return 0
 
@@ -168,10 +175,13 @@ def _lineage(folder: Path) -> Path:
 
 
 def _judgement(entry: dict[str, Any]) -> str:
-    return (
+    text = (
         f"{entry['run']}: AUC {entry['auc']:.3f}, best single feature {entry['best_feature']} "
         f"{entry['best_feature_auc']:.3f}; {entry['spawns']:,} spawns, {entry['survived']:.0%} survived"
     )
+    if "judged" in entry:
+        text += f"; {entry['judged']['spawns']:,} from the gate's onset on, AUC {entry['judged']['auc']:.3f}"
+    return text
 
 
 def _table(results: Sequence[dict[str, Any]]) -> str:

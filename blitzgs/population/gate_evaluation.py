@@ -31,16 +31,15 @@ def evaluate(gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, folder: 
         folder: folder for the pictures.
 
     Returns:
-        For each run: `gate_fit.judge` of all its spawns and, as `judged`, of those that a gate would judge
-        (if some of these survived and some did not), whether the gate was fitted on its scene, the share
-        of initial Gaussians and of each birth cohort that survived, and `regions`.
+        For each run: `gate_fit.judge`, whether the gate was fitted on its scene, the share of initial
+        Gaussians and of each birth cohort that survived, and `regions`.
     """
     results, curves = [], {}
     for run in runs:
         scores = gate.scores(torch.from_numpy(run.features)).double().numpy()
         late = run.times >= gate_from
         cohorts = survival_by_cohort(run)
-        result = judge(run, scores) | {
+        result = judge(run, scores, gate_from) | {
             "seen": run.scene in gate.info.scenes.values(),
             "initial_survival": run.initial_survival,
             "cohorts": cohorts,
@@ -48,8 +47,6 @@ def evaluate(gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, folder: 
         if late.any():
             where, actual, predicted = region_rates(run.only(late), scores[late])
             result["regions"] = {"cells": int(where.sum()), "r": correlation(actual[where], predicted[where])}
-            if 0 < run.survived[late].mean() < 1:
-                result["judged"] = judge(run.only(late), scores[late])
             picture = maps({"survived": actual, "predicted at birth, as many": predicted})
             (folder / f"regions_{run.name}.svg").write_text(picture)
         curves[run.name] = [(entry["until"], entry["survived"]) for entry in cohorts]

@@ -136,7 +136,7 @@ def best_feature(spawns: Spawns) -> tuple[str, float]:
     return max(((name, max(value, 1 - value)) for name, value in found), key=lambda pair: pair[1])
 
 
-def fit(runs: Sequence[Spawns], path: Path, seed: int = 0) -> dict[str, Any]:
+def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 0) -> dict[str, Any]:
     """Fit a gate on all runs, and measure how well such a gate predicts on scenes that it was not fitted on.
 
     With several scenes, each scene is left out once: a gate is fitted on the runs of the other scenes and
@@ -145,11 +145,11 @@ def fit(runs: Sequence[Spawns], path: Path, seed: int = 0) -> dict[str, Any]:
     Args:
         runs: at least one run.
         path: path of the model, `NAME.json`; its metadata are written beside it.
+        gate_from: time in images from which on a gate is going to judge spawns; see `judge`.
         seed: seed of the draws of rows.
 
     Returns:
-        The figures that go into the metadata: for each run held out, the AUC of the gate, that of the best
-        single feature and its name, the spawns and the share that survived.
+        The figures that go into the metadata: `judge` for each run held out.
 
     Raises:
         ValueError: the runs are of different schedules.
@@ -169,7 +169,8 @@ def fit(runs: Sequence[Spawns], path: Path, seed: int = 0) -> dict[str, Any]:
         else:
             judged = _hash_uniform(run.parents) < HELD_OUT
             booster = _train(xgboost, runs, [_hash_uniform(o.parents) >= HELD_OUT for o in runs], seed)
-        figures.append(judge(run, _predict(xgboost, booster, run.features), judged))
+        held_out = run.only(judged)
+        figures.append(judge(held_out, _predict(xgboost, booster, held_out.features), gate_from))
     protocol = "leave one scene out" if len(scenes) > 1 else "a quarter of the parents held out"
     result = {"protocol": protocol, "held_out": figures}
     booster = _train(xgboost, runs, [np.ones(len(run.survived), bool) for run in runs], seed)
@@ -178,12 +179,21 @@ def fit(runs: Sequence[Spawns], path: Path, seed: int = 0) -> dict[str, Any]:
     return result
 
 
-def judge(run: Spawns, scores: NDArray[Any], rows: NDArray[np.bool_] | None = None) -> dict[str, Any]:
-    """Return how scores separate the spawns of a run (or some of them) that survived from the others."""
-    if rows is not None:
-        run, scores = run.only(rows), scores[rows]
+def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str, Any]:
+    """Return how scores separate the spawns of a run that survived from the others.
+
+    Args:
+        run: the spawns, some of which survived and some did not.
+        scores: [K], the gate's.
+        gate_from: time in images from which on a gate judges spawns.
+
+    Returns:
+        The AUC of the scores, that of the best single feature and its name, the number of spawns, and the
+        share that survived. `judged` has the same of the spawns from `gate_from` on, if this leaves some out
+        and if some of these survived and some did not.
+    """
     name, single = best_feature(run)
-    return {
+    found = {
         "run": run.name,
         "auc": auc(scores, run.survived),
         "best_feature": name,
@@ -191,6 +201,10 @@ def judge(run: Spawns, scores: NDArray[Any], rows: NDArray[np.bool_] | None = No
         "spawns": len(run.survived),
         "survived": float(run.survived.mean()),
     }
+    late = run.times >= gate_from
+    if not late.all() and 0 < run.survived[late].sum() < late.sum():
+        found["judged"] = judge(run.only(late), scores[late])
+    return found
 
 
 def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[np.bool_]], seed: int) -> Any:

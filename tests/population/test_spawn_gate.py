@@ -80,6 +80,18 @@ def test_trees_are_those_of_xgboost(gate, tmp_path, device, suffix):
     assert SpawnGate(copy).scores(some.features[:0]).shape == (0,)
 
 
+def test_spawns_from_the_onset_on_are_also_judged_alone():
+    run = spawns("a", 400)
+    run.features[:, 6] = np.arange(400)  # time
+    scores = np.where(run.times < 300, 0.0, run.survived)  # knows the late ones only
+    figures = judge(run, scores, gate_from=300)
+    assert figures["spawns"] == 400 and figures["auc"] < 0.8
+    assert figures["judged"]["spawns"] == 100 and figures["judged"]["auc"] == 1
+    assert "judged" not in figures["judged"]
+    assert "judged" not in judge(run, scores, gate_from=0)  # that would be all of them
+    assert "judged" not in judge(run, scores, gate_from=400)  # none
+
+
 def test_the_default_gate_loads_and_ranks_candidates():
     gate = SpawnGate(gate_file("default"))
     assert gate.info.schedule["schedule.iterations"] == 30_000 and len(gate.info.scenes) >= 2
