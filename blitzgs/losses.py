@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from blitzgs.ops.derivatives import first_only, unrecorded
+from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts
 
 
@@ -87,9 +87,7 @@ class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, v_loss: Tensor) -> Any:
         (v_renders,) = ctx.saved_tensors
-        with unrecorded():
-            gradient: Tensor | None = v_renders * v_loss
-        (gradient,) = first_only("l1_ssim", [gradient], [ctx.renders, v_loss])
+        (gradient,) = first_only("l1_ssim", lambda: [v_renders * v_loss], [ctx.renders, v_loss])
         return gradient, None, None, None
 
 

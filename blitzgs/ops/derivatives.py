@@ -3,25 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-_NOTHING: AbstractContextManager[object] = nullcontext()
-
-
-def unrecorded() -> AbstractContextManager[object]:
-    """Return a context in which autograd records nothing; usually nothing has to be done."""
-    return torch.no_grad() if torch.is_grad_enabled() else _NOTHING
-
 
 def first_only(
-    op: str, gradients: Sequence[Tensor | None], inputs: Sequence[Tensor | None]
-) -> tuple[Tensor | None, ...]:
-    """Return gradients that cannot be differentiated again.
+    op: str, compute: Callable[[], Sequence[Tensor | None]], inputs: Sequence[Tensor | None]
+) -> Sequence[Tensor | None]:
+    """Return the gradients that `compute` returns, so that they cannot be differentiated again.
 
     Autograd sees no connection between a hand-written gradient and the op's inputs, so a second derivative
     would silently be zero. When torch records the backward pass (`create_graph=True`), this function
@@ -29,11 +21,13 @@ def first_only(
 
     Args:
         op: name of the op, for the error.
-        gradients: gradients of the op's inputs, computed without recording.
+        compute: returns gradients of the op's inputs; autograd records nothing of it.
         inputs: tensors that the gradients depend on: the op's inputs and the gradients of its outputs.
     """
     if not torch.is_grad_enabled():
-        return tuple(gradients)
+        return compute()
+    with torch.no_grad():
+        gradients = compute()
     wanted = [gradient for gradient in gradients if gradient is not None]
     given = [tensor for tensor in inputs if tensor is not None]
     marked = iter(_FirstOnly.apply(op, len(wanted), *wanted, *given))  # type: ignore[no-untyped-call]

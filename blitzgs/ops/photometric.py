@@ -188,11 +188,12 @@ def _save_inputs(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
 
 def _backward(ctx: Any, v_l1_sums: Tensor, v_ssim_sums: Tensor) -> tuple[Tensor | None, ...]:
     renders, targets, masks = ctx.saved_tensors
-    with torch.no_grad():
-        v_renders = torch.ops.blitzgs.photometric_bwd(
-            renders, targets, masks, v_l1_sums, v_ssim_sums, *ctx.tiles
-        )
-    (v_renders,) = first_only("photometric_loss", [v_renders], [renders, v_l1_sums, v_ssim_sums])
+    sums = v_l1_sums, v_ssim_sums
+    (v_renders,) = first_only(
+        "photometric_loss",
+        lambda: [torch.ops.blitzgs.photometric_bwd(renders, targets, masks, *sums, *ctx.tiles)],
+        [renders, *sums],
+    )
     return v_renders, None, None, None, None, None
 
 

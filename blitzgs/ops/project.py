@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.ops.color_rows import VisibleRows
-from blitzgs.ops.derivatives import first_only, unrecorded
+from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.gather_rows import split_rows
 from blitzgs.ops.projection import (
     VIEW_TOTALS,
@@ -271,7 +271,7 @@ class _Saved(NamedTuple):
 
 def _gradients(
     ctx: Any, needed: Sequence[bool], need_viewmats: bool, sparse: Sequence[bool], v: _Differentiable
-) -> tuple[Tensor | None, ...]:
+) -> Sequence[Tensor | None]:
     """Return the gradients of viewmats and of all gaussians, or of the tables, if they are needed.
 
     Args:
@@ -282,9 +282,11 @@ def _gradients(
         v: gradients of the splats; None: zero.
     """
     saved = _Saved.of(ctx)
-    with unrecorded():
-        gradients = _first_gradients(ctx, saved, needed, need_viewmats, sparse, v)
-    return first_only("project", gradients, (*(ctx.tables or saved.gaussians), saved.cameras[0], *v))
+    return first_only(
+        "project",
+        lambda: _first_gradients(ctx, saved, needed, need_viewmats, sparse, v),
+        (*(ctx.tables or saved.gaussians), saved.cameras[0], *v),
+    )
 
 
 def _first_gradients(
@@ -371,7 +373,7 @@ class _Project(torch.autograd.Function):
             # Autograd runs the ticket's node unless it was asked for other gradients only, as of viewmats.
             wanted = torch._C._will_engine_execute_node(ctx.next_functions[-1][0])
             needed = [wanted and need for need in ctx.hand_over.needed]
-        v = _Differentiable._make(v_output)
+        v = _Differentiable(*v_output)
         v_viewmats, *gradients = _gradients(ctx, needed, need_viewmats, ctx.sparse, v)
         return (v_viewmats, None, *gradients)
 

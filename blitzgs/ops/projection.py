@@ -180,7 +180,7 @@ class ProjectionInputs(NamedTuple):
     @property
     def n_views(self) -> int:
         """The number of views B."""
-        return len(self.cameras[0])
+        return self.cameras[0].shape[0]
 
     def run(self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()) -> Projected:
         """Project the Gaussians, without gradients.
@@ -251,7 +251,7 @@ def _projected(inputs: ProjectionInputs) -> tuple[ProjectedSplats, Tensor]:
 def capacity_for(inputs: ProjectionInputs) -> CapacityEstimate:
     """Return the capacity estimate shared by all calls of this size."""
     means = inputs.gaussians[0]
-    return _estimate(means.device, len(means), inputs.n_views)
+    return _estimate(means.device, means.shape[0], inputs.n_views)
 
 
 @lru_cache(maxsize=16)

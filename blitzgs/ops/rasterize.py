@@ -11,7 +11,7 @@ from torch import Tensor
 
 from blitzgs._library import without_autograd
 from blitzgs.ops.arrange_splats import Places
-from blitzgs.ops.derivatives import first_only, unrecorded
+from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import tile_counts
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, GradientBuffer, gradient_columns
 
@@ -119,9 +119,13 @@ def rasterize(
     else:
         geometry = (means2d, conics, splat_opacities) if through is None else through.columns
         places = None if through is None else through.places
-        differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in (*geometry, colors))
-        # The inputs whose gradients stay packed, see `_gradients`.
-        packed = differentiable and tell_absgrad is None
+        # Whether gradients will be packed, see `_gradients`.
+        packed = (
+            composited is None
+            and tell_absgrad is None
+            and torch.is_grad_enabled()
+            and any(x.requires_grad for x in (*geometry, colors))
+        )
         call = _Call(splats, grid, tell_absgrad, places, packed, composited)
         renders, alphas = _Rasterize.apply(*geometry, colors, backgrounds, call)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
@@ -248,7 +252,7 @@ def _backward(
 
 def _gradients(
     ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None, absgrad: bool, may_pack: bool = False
-) -> tuple[Tensor | None, ...]:
+) -> Sequence[Tensor | None]:
     """Return the gradients of means2d, conics, splat_opacities, colors, backgrounds and means2d_abs.
 
     With `may_pack` they may, on CUDA, be columns of one table, which `project_bwd` reads without copying.
@@ -256,9 +260,11 @@ def _gradients(
     if v_renders is None and v_alphas is None:
         return (None,) * 6
     saved = _saved(ctx)
-    with unrecorded():
-        gradients = _first_gradients(ctx, saved, v_renders, v_alphas, absgrad, may_pack)
-    return first_only("rasterize", gradients, (*saved.splats, saved.backgrounds, v_renders, v_alphas))
+    return first_only(
+        "rasterize",
+        lambda: _first_gradients(ctx, saved, v_renders, v_alphas, absgrad, may_pack),
+        (*saved.splats, saved.backgrounds, v_renders, v_alphas),
+    )
 
 
 def _first_gradients(

@@ -16,9 +16,13 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 # are.
 _MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT = torch.ops.blitzgs.splat_gradient_layout()
 
-# Where the `gradient_columns` begin, and their shapes behind the number of splats.
-_BEGINS = (_MEAN2D, _CONIC, _OPACITY, _COLOR)
-_WIDTHS: tuple[tuple[int, ...], ...] = ((2,), (3,), (), (3,))
+# Where the `gradient_columns` begin, their shapes behind the number of splats, and their strides.
+_COLUMNS: tuple[tuple[int, tuple[int, ...], tuple[int, ...]], ...] = (
+    (_MEAN2D, (2,), (SPLAT_GRADIENT, 1)),
+    (_CONIC, (3,), (SPLAT_GRADIENT, 1)),
+    (_OPACITY, (), (SPLAT_GRADIENT,)),
+    (_COLOR, (3,), (SPLAT_GRADIENT, 1)),
+)
 
 
 def gradient_columns(packed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -54,13 +58,13 @@ def packed_table(columns: Sequence[Tensor | None]) -> Tensor | None:
     whole = columns[0]._base
     if whole is None or whole.dim() != 2 or whole.shape[1] != SPLAT_GRADIENT or not whole.is_contiguous():
         return None
-    first, count = whole.storage_offset(), len(columns[0])
-    for column, begin, width in zip(columns, _BEGINS, _WIDTHS, strict=True):
+    first, count = whole.storage_offset(), columns[0].shape[0]
+    for column, (begin, width, stride) in zip(columns, _COLUMNS, strict=True):
         if column is None or column._base is not whole or column.storage_offset() != first + begin:
             return None
-        if column.shape != (count, *width) or column.stride() != (SPLAT_GRADIENT, *(1 for _ in width)):
+        if column.shape != (count, *width) or column.stride() != stride:
             return None
-    return whole if len(whole) == count else whole[:count]
+    return whole if whole.shape[0] == count else whole[:count]
 
 
 class SplatGradients(NamedTuple):
@@ -160,10 +164,11 @@ class GradientBuffer:
     def take(self, means2d: Tensor) -> Tensor:
         """Return zeros [P, 12] for the P splats."""
         zeros, self._zeros = self._zeros, None
-        if zeros is not None and len(zeros) >= len(means2d):
-            return zeros if len(zeros) == len(means2d) else zeros[: len(means2d)]
+        count = means2d.shape[0]
+        if zeros is not None and zeros.shape[0] >= count:
+            return zeros if zeros.shape[0] == count else zeros[:count]
         others = None if self._others is None else self._others()
-        return means2d.new_zeros(len(means2d), SPLAT_GRADIENT) if others is None else others
+        return means2d.new_zeros(count, SPLAT_GRADIENT) if others is None else others
 
 
 @torch.library.register_fake("blitzgs::splat_gradient_layout")

@@ -139,11 +139,12 @@ def check_options(
         ValueError: one has an unknown value.
     """
     for name, size in (("width", width), ("height", height)):
-        # While torch traces a function, a size may be a symbol.
-        if not isinstance(size, (Integral, torch.SymInt)):
+        # int comes first, because asking an abstract class takes longer.
+        if isinstance(size, (int, Integral)):
+            if size < 1:
+                raise ValueError(f"{name} must be at least 1 px, got {size}")
+        elif not isinstance(size, torch.SymInt):  # while torch traces a function
             raise TypeError(f"{name} must be a whole number of px, got {size!r}")
-        if isinstance(size, Integral) and size < 1:
-            raise ValueError(f"{name} must be at least 1 px, got {size}")
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
     if rasterize_mode not in RASTERIZE_MODES:

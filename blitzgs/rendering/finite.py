@@ -71,10 +71,11 @@ def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> N
     One pass over the arguments tells whether a closer check is needed. SH coefficients, the largest part of a
     Gaussian, are only checked for visible Gaussians.
     """
-    first = gaussians.named["means"][0]
+    named = gaussians.named
+    first = named["means"][0]
     if first.is_cuda and next(_calls(first.device, first.shape[0])) % EVERY_CUDA_CALLS:
         return
-    columns = [t for name, given in gaussians.named.items() if name not in COLOURS for t in given]
+    columns = [t for name, given in named.items() if name not in COLOURS for t in given]
     with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
         # Splats whose colour is not finite have no opacity, and no other splat is below 1/255.
         bad = torch.ops.blitzgs.find_non_finite(columns, [layout.splats.opacities])
