@@ -299,16 +299,14 @@ def _first_gradients(
 ) -> tuple[Tensor | None, ...]:
     _, visible_ids, _ = saved.splats
     gathered = ctx.tables is not None
+    all_dense = not gathered and not any(sparse)
     # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass, the
     # number of rows is unknown, and tensors are of another type.
     complete = (
-        not gathered
-        and not any(sparse)
-        and type(visible_ids) is Tensor
-        and visible_ids.shape[0] == saved.gaussians[0].shape[0]
+        all_dense and type(visible_ids) is Tensor and visible_ids.shape[0] == saved.gaussians[0].shape[0]
     )
     # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
-    dense = not gathered and not complete and not any(sparse) and all(needed)
+    dense = all_dense and not complete and all(needed)
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
         saved.gaussians, saved.cameras, saved.splats, ctx.options.ints, ctx.options.floats,
         _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level,
@@ -361,9 +359,11 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, _viewmats: Tensor, call: _Call, *tables: Tensor) -> Any:
         _save(ctx, call.inputs, call.splats, call.rows)
-        # The three others are leaves, or computed by operations that accept a sparse gradient.
-        leaves = [call.rows is not None or (len(tables) > 4 and table.is_leaf) for table in tables[3:]]
-        ctx.sparse = [call.sparse_grad and leaf for leaf in (True, True, True, *leaves)]
+        # The first three are leaves, or computed by operations that accept a sparse gradient.
+        ctx.sparse = [
+            call.sparse_grad and (i < 3 or call.rows is not None or (len(tables) > 4 and table.is_leaf))
+            for i, table in enumerate(tables)
+        ]
         return tuple(_Differentiable.of(call.splats))
 
     @staticmethod
