@@ -46,7 +46,7 @@ class Model:
         self.extent, rates = capture.extent, {"means": MEANS_RATE * capture.extent, **RATES}
         self.params = {name: torch.nn.Parameter(value) for name, value in start.items()}
         groups = [{"params": [p], "lr": rates[name], "name": name} for name, p in self.params.items()]
-        self.optimizer = LazyAdam(groups, eps=1e-15)
+        self.optimizer, self.means_group = LazyAdam(groups, eps=1e-15), groups[0]
         self.sort_by_place()
 
     def sort_by_place(self) -> None:
@@ -59,7 +59,7 @@ class Model:
         height, width = view["image"].shape[1:3]
         image, _, meta = blitzgs.raw_rasterization(
             *self.params.values(), view["pose"], view["K"], width, height, sh_degree=degree,
-            optimizers=self.optimizer,
+            optimizers=self.optimizer, direct_grad=True,
         )  # fmt: skip
         return image, meta
 
@@ -126,9 +126,8 @@ def main(arguments: list[str] | None = None) -> Model:
     options = parser.parse_args(arguments)
     capture, device = load_capture(options.data, downscale=options.downscale), torch.device(options.device)
     images, chance, model = ImageStore(capture), random.Random(0), Model(capture, device)
-    means = model.optimizer.param_groups[0]
     for step in range(1, options.steps + 1):
-        means["lr"] = MEANS_RATE * capture.extent * MEANS_DECAY ** (step / options.steps)
+        model.means_group["lr"] = MEANS_RATE * capture.extent * MEANS_DECAY ** (step / options.steps)
         degree = min(SH_DEGREE, step * 10 // options.steps)
         loss = model.step(load_view(capture, images, chance.choice(capture.train), device), degree)
         if step % 100 == 0:
@@ -147,4 +146,5 @@ def main(arguments: list[str] | None = None) -> Model:
 
 
 if __name__ == "__main__":
+    torch.autograd.set_multithreading_enabled(False)  # on a GPU, a thread of its own costs more than it saves
     main()
