@@ -105,6 +105,21 @@ def test_nothing_visible_is_an_empty_image(device):
     assert p["means"].grad.coalesce().values().shape == (0, 3)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_gradients_add_up_after_a_view_of_nothing(device):
+    """Torch adds to an empty sparse gradient in place."""
+    scene = spread(random_scene(n=60, cameras=3, width=20, height=16, device=device))
+    scene.viewmats[0, 2, 3] -= 1e4
+    sparse, dense = raw_parameters(scene), raw_parameters(scene)
+    for p, is_sparse in ((sparse, True), (dense, False)):
+        for view, mode in enumerate(("RGB", "D", "RGB")):
+            one = random_scene(n=1, cameras=1, width=20, height=16, device=device)
+            one.viewmats, one.Ks = scene.viewmats[view][None], scene.Ks[view][None]
+            raw(p, one, render_mode=mode, sparse_grad=is_sparse)[0].square().sum().backward()
+    for name in NAMES:
+        assert relative_error(sparse[name].grad.to_dense(), dense[name].grad) < 1e-4, name
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("in_one", [True, False])
 def test_lazy_steps_are_those_of_dense_adam(backend, in_one):
