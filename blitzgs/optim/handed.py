@@ -17,11 +17,11 @@ class Handed(NamedTuple):
 
     Attributes:
         rows: int64 [U], ascending, each once.
-        gradients: [U, ...] by parameter, or None for one that needs none.
+        gradients: [U, ...] of each parameter that needs one.
     """
 
     rows: Tensor
-    gradients: Mapping[Tensor, Tensor | None]
+    gradients: Mapping[Tensor, Tensor]
 
 
 @torch.no_grad()

@@ -97,7 +97,7 @@ class Joint:
         """Return the `id` of every parameter."""
         return self._all_ids
 
-    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor | None]) -> None:
+    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor]) -> None:
         """Hand gradients to the optimisers, see `LazyAdam.receive`."""
         handed = Handed(rows, gradients)
         for optimizer in self._optimizers:

@@ -91,7 +91,7 @@ class LazyAdam(torch.optim.Optimizer):
         """Return the `id` of every parameter."""
         return {id(param) for group in self.param_groups for param in group["params"]}
 
-    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor | None]) -> None:
+    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor]) -> None:
         """Take gradients that count as if they were added to `.grad`; see `Handed` for the arguments."""
         self.handed.append(Handed(rows, gradients))
 

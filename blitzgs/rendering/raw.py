@@ -47,7 +47,7 @@ class TakesGradients(CatchesUp, Protocol):
     def param_ids(self) -> set[int]:
         """Return the `id` of every parameter."""
 
-    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor | None]) -> None:
+    def receive(self, rows: Tensor, gradients: Mapping[Tensor, Tensor]) -> None:
         """Take gradients, see `blitzgs.optim.LazyAdam.receive`."""
 
 
@@ -220,8 +220,13 @@ def _hand_over(lazy: Sequence[Any], params: Sequence[Tensor], sparse_grad: bool)
         )
 
     def give(rows: Tensor, gradients: Sequence[Tensor | None]) -> None:
-        if any(gradient is not None for gradient in gradients):
-            given = dict(zip(params, gradients, strict=True))
+        # As autograd does, leave out parameters that were frozen after the call.
+        given = {
+            param: gradient
+            for param, gradient in zip(params, gradients, strict=True)
+            if gradient is not None and param.requires_grad
+        }
+        if given:
             for owner in owners:
                 owner.receive(rows, given)
 

@@ -244,6 +244,18 @@ def test_frozen_parameters_stay(frozen):
     require_same(script, frozen=frozen)
 
 
+def test_parameters_frozen_before_the_backward_pass_stay():
+    def script(arm):
+        for view in range(4):
+            image = arm.render(view)[0]
+            arm.params["scales"].requires_grad_(view != 1)
+            image.square().sum().backward()
+            arm.step()
+            arm.zero_grad()
+
+    require_same(script)
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("frozen", [(), ("quats", "sh0")])
 def test_many_views(backend, frozen):
