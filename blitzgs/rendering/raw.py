@@ -111,8 +111,9 @@ def raw_rasterization(
         direct_grad: whether the backward pass hands the parameters' gradients to `optimizers`, in less time
             than autograd needs for sparse tensors. The optimisers then do what they do with `.grad`, but
             `.grad` of the parameters stays None: hooks on parameters, gradient clipping and `GradScaler` do
-            not see the gradients, and `torch.autograd.grad` does not return them. It needs `sparse_grad`,
-            and a `LazyAdam` for each parameter that requires a gradient.
+            not see the gradients, `torch.autograd.grad` does not return them, and `p.grad = None` does not
+            remove them (`zero_grad` of the optimisers does). It needs `sparse_grad`, and a `LazyAdam` for
+            each parameter that requires a gradient.
 
     Returns:
         As `blitzgs.rasterization(..., packed=True)`.
