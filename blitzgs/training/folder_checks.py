@@ -12,7 +12,7 @@ import shutil
 import socket
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from blitzgs.distributed.group import Ranks
@@ -117,6 +117,27 @@ def check_writable(folder: Path, ranks: Ranks) -> None:
         raise FolderError(
             f"{folder}: ranks {', '.join(map(str, unseen))} do not see what rank 0 writes there: --out must "
             "be on a file system that all hosts share"
+        )
+
+
+def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> None:
+    """Check that a run will not replace files of another program: every run has a folder of checkpoints.
+
+    Args:
+        checkpoints: that folder; it may be missing.
+        files: names of the files beside it that a run writes.
+        ranks: the job.
+
+    Raises:
+        FileExistsError: on every rank; it is missing, and one of the files exists.
+    """
+    found = None
+    if ranks.rank == 0 and not os.path.lexists(checkpoints):
+        found = next((name for name in files if os.path.lexists(checkpoints.parent / name)), None)
+    if (found := ranks.broadcast_object(found)) is not None:
+        raise FileExistsError(
+            f"{checkpoints.parent} has a file {found}, which a run would replace, and no checkpoints: choose "
+            "another --out"
         )
 
 

@@ -23,7 +23,7 @@ from blitzgs.training.batches import Images
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import save_config
 from blitzgs.training.evaluation import load_lpips
-from blitzgs.training.folder_checks import check_room, check_writable
+from blitzgs.training.folder_checks import check_room, check_unclaimed, check_writable
 from blitzgs.training.gate import lineage_subject, open_gate
 from blitzgs.training.inputs import check_alike, check_capture, train_views_fingerprint
 from blitzgs.training.loss import weighted
@@ -31,7 +31,7 @@ from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.run import Progress
 from blitzgs.training.run_cameras import CAMERAS, save_cameras
-from blitzgs.training.run_log import RunLog
+from blitzgs.training.run_log import LOG, RunLog
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.schedule import Schedule, stretched
 from blitzgs.training.state import TrainingState
@@ -58,13 +58,14 @@ def set_up(
         resume: continue from the newest checkpoint in `folder`, if there is one.
 
     Raises:
-        FileExistsError: the folder holds a trained run and `resume` is not set.
+        FileExistsError: the folder holds a trained run and `resume` is not set, or files of another program.
         ConfigError: the run to resume was started with another configuration.
         GateError: the spawn gate cannot be read, or differs from that of the run to resume.
         MismatchError: the ranks differ in configuration, code or capture.
         FolderError: a rank cannot write to the folder, or the disk has too little space.
     """
     check_alike(config, capture, ranks, resume)
+    check_unclaimed(folder / run.CHECKPOINTS, (run.CONFIG, CAMERAS, LOG, run.SUMMARY), ranks)
     check_writable(folder / run.CHECKPOINTS, ranks)
     space = Space.of(capture.offset, capture.extent)
     lpips = load_lpips(config.log.lpips_weights)
