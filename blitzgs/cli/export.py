@@ -6,9 +6,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from pathlib import Path
 
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_run, named_path
 from blitzgs.distributed.group import Ranks
+from blitzgs.output import check_replaceable
 from blitzgs.training.export import COORDINATES, Exported, export_ply, without_antialiasing
 from blitzgs.training.run_folder import open_run
 
@@ -54,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Export the model of a run; returns the exit status."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise ValueError("export writes one file from one process: run it without torchrun")
+    _check_format(args.ply)
     with Ranks.from_environment(args.device) as ranks:
         folder = open_run(args.folder)
         model = folder.model(ranks.device)
@@ -66,6 +69,21 @@ def run(args: argparse.Namespace) -> int:
     print(f"{args.ply}: {len(model):,} Gaussians, {args.ply.stat().st_size / 1e6:.1f} MB")
     _explain(exported, antialiased, args)
     return 0
+
+
+def _check_format(path: Path) -> None:
+    """Check that no file of another format is replaced.
+
+    Raises:
+        FileExistsError: the file is not empty and no PLY.
+        OSError: it is no regular file.
+    """
+    check_replaceable(path)
+    if path.exists():
+        with open(path, "rb") as file:
+            start = file.read(3)
+        if start not in (b"", b"ply"):
+            raise FileExistsError(f"{path} exists and is not a PLY file: choose another --ply")
 
 
 def _explain(exported: Exported, antialiased: bool, args: argparse.Namespace) -> None:

@@ -251,6 +251,14 @@ def test_export_replaces_regular_files_only(trained, tmp_path, capsys, kind):
     assert kind == "device" or (tmp_path / "target").read_text() == "precious"
 
 
+def test_export_replaces_no_file_of_another_format(trained, tmp_path, capsys):
+    path = tmp_path / "notes.txt"
+    path.write_text("precious")
+    assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
+    assert "notes.txt exists and is not a PLY file: choose another --ply" in capsys.readouterr().err
+    assert path.read_text() == "precious"
+
+
 # Paths may have any characters.
 
 
