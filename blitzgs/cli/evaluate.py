@@ -46,6 +46,8 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure the views of a run; returns the exit status."""
+    if args.pictures < 0:
+        raise ValueError(f"--pictures: must be 0 or more, got {args.pictures}")
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
         model = run_folder.open_model(args.folder, ranks, args.data)
         config = model.config

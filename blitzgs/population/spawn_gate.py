@@ -84,6 +84,8 @@ def read_info(path: Path) -> GateInfo:
             raise GateError(f"{beside}: format {found}, this version reads {FORMAT}")
         info = GateInfo(**(content | {"features": tuple(content["features"])}))
     except FileNotFoundError:
+        if not path.exists():
+            raise GateError(f"{path}: no such gate; `blitzgs gate fit` makes one") from None
         raise GateError(f"{beside} is missing: a gate is a model and its metadata, keep both") from None
     except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
         raise GateError(f"{beside} is not the metadata of a gate: {error!r}") from error

@@ -12,7 +12,7 @@ DEFAULT_EVERY = 8
 def every_nth(count: int, n: int) -> list[int]:
     """Return the test views 0, n, 2n, ... of `count` (views sorted by name); none if n is 0."""
     if n < 0 or n == 1:
-        raise ValueError(f"every {n}-th view cannot be held out: n must be 0 (none) or at least 2")
+        raise ValueError(f"data.split: must be 0 (no view is held out) or at least 2, got {n}")
     return list(range(0, count, n)) if n else []
 
 

@@ -120,7 +120,7 @@ def test_a_finished_city_is_reused_and_nothing_else_is_touched(city, tmp_path):
     with pytest.raises(FileExistsError, match=r"another city \(seed 0, not 5\)"):
         generate_city(city, **SMALL, seed=5)
     (tmp_path / "precious.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="holds no generated city"):
+    with pytest.raises(FileExistsError, match="has files but no generated city; choose another folder"):
         generate_city(tmp_path, **SMALL, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["precious.txt"]
 

@@ -103,6 +103,7 @@ def test_torchrun_entry(trained, tmp_path):
         (["train", "--config", "missing.yaml", "--out", "x"], 1, "missing.yaml: no such file or recipe"),
         (["train", "--config", "missing.yaml", "--out", "x"], 1, "recipes are aerial, aerial_cpu, city"),
         (["eval", "/nowhere"], 1, "/nowhere is not a run"),
+        (["eval", "/nowhere", "--pictures=-3"], 1, "--pictures: must be 0 or more, got -3"),
         (["export", "/nowhere", "--ply", "x.ply"], 1, "/nowhere is not a run"),
         (["train", "--data", "d", "--out", "x", "--device", "tpu"], 1, "cuda or cuda:N, got 'tpu'"),
         (["train", "--data", "d", "--out", "x", "--device", "cuda:x"], 1, "cuda or cuda:N, got 'cuda:x'"),

@@ -133,6 +133,9 @@ def test_what_is_missing_is_named(tmp_path, capsys):
     assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.txt")]) == 1
     assert "a gate's file ends in .json or .ubj" in capsys.readouterr().err
     assert main(["gate", "evaluate", str(tmp_path / "g.json"), "x", "--out", str(tmp_path)]) == 1
+    assert "g.json: no such gate; `blitzgs gate fit` makes one" in capsys.readouterr().err
+    (tmp_path / "g.json").write_text("{}")
+    assert main(["gate", "evaluate", str(tmp_path / "g.json"), "x", "--out", str(tmp_path)]) == 1
     assert "g.meta.json is missing: a gate is a model and its metadata" in capsys.readouterr().err
 
 

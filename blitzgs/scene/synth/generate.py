@@ -119,6 +119,8 @@ def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
         raise FileExistsError(f"{out} is a file; choose a folder for the city")
     if not any(out.iterdir()):
         return False
+    if not (out / MANIFEST).exists():
+        raise FileExistsError(f"{out} has files but no generated city; choose another folder")
     try:
         found = json.loads((out / MANIFEST).read_text())
         if not isinstance(found, dict):
