@@ -110,8 +110,14 @@ def branch_point(folder: Path, config: Config) -> Path:
 
     Raises:
         FileNotFoundError: there is none.
+        ValueError: the run ends before the gate's onset.
     """
     schedule, found = Schedule(config.schedule), []
+    if not schedule.gates(schedule.iterations - 1):
+        raise ValueError(
+            f"{folder} ends before the gate's onset (schedule.gate_from {config.schedule.gate_from}, "
+            f"{schedule.iterations} images): replay a run that goes on after it"
+        )
     for manifest in (folder / run.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
         step = json.loads(manifest.read_text())["state"]["progress"]["step"]
         # Events before the end of a step belong to it.
@@ -154,7 +160,7 @@ def replay(
         the share of the candidates that it knew (`matched`).
 
     Raises:
-        ValueError: the run logged no lineage, or was trained by the clock.
+        ValueError: the run logged no lineage, was trained by the clock, or ends before the gate's onset.
         FileNotFoundError: it has no checkpoint from before the onset.
         FileExistsError: `out` holds a replay already.
     """

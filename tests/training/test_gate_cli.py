@@ -15,9 +15,9 @@ from blitzgs.population.candidates import Candidates
 from blitzgs.population.gate_evaluation import correlation, region_rates, survival_by_cohort
 from blitzgs.population.gate_fit import read_spawns
 from blitzgs.population.spawn_samples import read_sample
-from blitzgs.training.gate_replay import OracleVeto, event_keys, label_events
+from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events
 from tests.population.test_spawn_gate import candidates, spawns
-from tests.training.tiny import OVERRIDES, write_tiny_capture
+from tests.training.tiny import OVERRIDES, tiny_config, write_tiny_capture
 from tests.training.tiny_runs import events_of
 
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -125,6 +125,12 @@ def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys):
     births = str(next((lineage_run / "run" / "lineage").glob("births*.parquet")))
     assert main(["gate", "fit", births, "--out", str(gates[0])]) == 1
     assert "is not a sample of spawns" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_run_that_ends_before_the_gate_is_not_replayed(tmp_path):
+    config = tiny_config("schedule.gate_from=1000000")
+    with pytest.raises(ValueError, match=r"ends before the gate's onset \(schedule.gate_from 1000000, "):
+        branch_point(tmp_path, config)
 
 
 def test_what_is_missing_is_named(tmp_path, capsys):
