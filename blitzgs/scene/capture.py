@@ -188,6 +188,10 @@ def _existing(views: list[SourceView], root: Path, images: str, allow_missing: b
     shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
     message = f"{len(missing)} of {len(views)} images are not in {root / images}: {shown}"
     if not found:
+        # A user may name the folder of the model, CAPTURE/sparse/0.
+        above = next((folder for folder in root.resolve().parents[:2] if (folder / images).is_dir()), None)
+        if above is not None and not (root / images).is_dir():
+            raise FileNotFoundError(f"{message}; the capture may be the folder above: --data={above}")
         raise FileNotFoundError(
             f"{message}; name their folder, relative to the capture, with --data.images=FOLDER"
         )

@@ -179,6 +179,12 @@ def test_distorted_captures_become_pinhole_ones(tmp_path):
     assert 0.9 < mask.mean() < 1
 
 
+def test_the_folder_of_the_model_is_no_capture(tmp_path):
+    write_capture(tmp_path, NAMES)
+    with pytest.raises(FileNotFoundError, match=f"the folder above: --data={tmp_path.resolve()}$"):
+        load_capture(tmp_path / "sparse" / "0")
+
+
 def test_missing_images_are_named_or_dropped(tmp_path):
     write_capture(tmp_path, NAMES)
     (tmp_path / "images" / NAMES[3]).unlink()
