@@ -16,6 +16,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 
+# A file that `OutputFolder` leaves in its folder. Where it is missing, existing files belong to another
+# program or to the user.
+MARK = ".blitzgs"
+_MARK_TEXT = "blitzgs wrote the files of this folder, and replaces them when it writes here again.\n"
 # Largest number of bytes in a file name on common file systems, minus those for a suffix and a number.
 _LONGEST_NAME = 200
 
@@ -74,7 +78,11 @@ def check_replaceable(path: Path) -> None:
 
 
 class OutputFolder:
-    """A folder for one output file per name; no file is written outside it or over an input."""
+    """A folder for one output file per name; no file is written outside it or over an input.
+
+    Existing files are replaced only in a folder that an `OutputFolder` has written to before, which has a
+    file `MARK`. So a copy of the photographs is safe as well.
+    """
 
     def __init__(self, root: Path, inputs: Iterable[Path] = ()) -> None:
         """Prepare the folder; the first write creates it.
@@ -105,7 +113,8 @@ class OutputFolder:
             flat: put every file into the folder itself, `a/b.jpg` as `a_b.jpg` + suffix.
 
         Raises:
-            OSError: a path is an input, is no regular file, or leaves the folder through a link.
+            OSError: a path is an input, is no regular file, leaves the folder through a link, or exists in a
+                folder without `MARK`.
         """
         shared = _shared_parts([name for name in names if name.startswith("/")])
         parts = [_inner_parts(name, shared if name.startswith("/") else 0) for name in names]
@@ -152,11 +161,17 @@ class OutputFolder:
         source = self._inputs.get(identity) if (identity := _identity(path)) is not None else None
         if source is not None:
             raise OSError(f"{path} would overwrite the input {source}: choose another --out")
+        if os.path.lexists(path) and not (self.root / MARK).exists():
+            raise FileExistsError(
+                f"{path} exists, and no earlier call of blitzgs wrote to {self.root}: choose another --out"
+            )
 
     def write(self, path: Path, content: bytes) -> None:
         """Write the file of one of `paths`; the folder is checked again before."""
         self.check(path)
         path.parent.mkdir(parents=True, exist_ok=True)
+        if not (self.root / MARK).exists():
+            write_file(self.root / MARK, _MARK_TEXT, sync=False)
         self.check(path)
         write_file(path, content, sync=False)
 

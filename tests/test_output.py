@@ -69,6 +69,20 @@ def test_inputs_are_never_overwritten(tmp_path):
     assert (photos / "a.png").read_bytes() == b"photograph"
 
 
+def test_files_of_others_are_kept_and_own_files_are_replaced(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"a copy of a photograph")
+    with pytest.raises(FileExistsError, match="a.png exists, and no earlier call .* choose another --out"):
+        OutputFolder(tmp_path).paths(["a.jpg", "b.jpg"], ".png")
+    with pytest.raises(FileExistsError, match="a.png exists"):
+        OutputFolder(tmp_path).write(tmp_path / "a.png", b"render")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+    for content in (b"render", b"render again"):
+        output = OutputFolder(tmp_path / "out")
+        (path,) = output.paths(["a.jpg"], ".png")
+        output.write(path, content)
+        assert path.read_bytes() == content
+
+
 def test_a_link_that_appears_later_is_not_followed(tmp_path):
     (tmp_path / "other").mkdir()
     output = OutputFolder(tmp_path / "out")

@@ -57,8 +57,8 @@ def test_eval_repeats_the_metrics_of_training(trained, tmp_path, capsys):
 def test_render_writes_every_view(trained, tmp_path):
     assert main(["render", str(trained[1]), "--split", "test", "--raw", "--out", str(tmp_path / "raw")]) == 0
     assert main(["render", str(trained[1]), "--split", "all", "--out", str(tmp_path / "png")]) == 0
-    raw = {path.stem: np.load(path) for path in (tmp_path / "raw").iterdir()}
-    assert len(raw) == 1 and len(list((tmp_path / "png").iterdir())) == 8
+    raw = {path.stem: np.load(path) for path in (tmp_path / "raw").glob("*.npy")}
+    assert len(raw) == 1 and len(list((tmp_path / "png").glob("*.png"))) == 8
     for name, image in raw.items():
         assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.float32
         png = cv2.imread(str(tmp_path / "png" / f"{name}.png"))[..., ::-1]
@@ -209,7 +209,7 @@ def test_render_leaves_the_photographs_alone(tmp_path, kind):
     out = tmp_path / "rend" / "a"
     assert main(["render", str(tmp_path / "run"), "--split", "all", "--out", str(out)]) == 0
     assert digest(photos) == before
-    assert len([path for path in out.rglob("*") if path.is_file()]) == 8
+    assert len(list(out.rglob("*.png"))) == 8
     assert all(
         out in path.parents or path in out.parents or path == out
         for path in set(tmp_path.rglob("*")) - everything
@@ -218,3 +218,11 @@ def test_render_leaves_the_photographs_alone(tmp_path, kind):
     assert main(["render", str(tmp_path / "run"), "--split", "all", "--out", str(photos)]) == 1
     assert main(["eval", str(tmp_path / "run"), "--out", str(photos)]) == 1
     assert digest(photos) == before
+    # Nor is a copy of them replaced.
+    written = sorted(out.rglob("*.png"))
+    for name in (path.relative_to(out) for path in written):
+        (tmp_path / "copy" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "copy" / name).write_bytes(b"photograph")
+    assert main(["render", str(tmp_path / "run"), "--split", "all", "--out", str(tmp_path / "copy")]) == 1
+    assert {path.read_bytes() for path in (tmp_path / "copy").rglob("*") if path.is_file()} == {b"photograph"}
+    assert main(["render", str(tmp_path / "run"), "--split", "all", "--out", str(out)]) == 0
