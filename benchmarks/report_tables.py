@@ -54,6 +54,12 @@ COMMANDS = {
     ),
 }
 COMMANDS |= {
+    "adaptive": (
+        "python benchmarks/bm_quality.py --plan benchmarks/adaptive.yaml --out runs/adaptive "
+        "--capture NAME=CAPTURE --per-gpu 3"
+    ),
+    "oracle": "blitzgs gate replay GATE RUN --out REPLAY",
+    "offload": "python benchmarks/bm_offload.py --ratios 2 4",
     "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --popping",
     "city_exchange": (
         "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"
@@ -64,7 +70,8 @@ COMMANDS |= {
 # a page of its own.
 GROUPS = (
     ("quality",),
-    ("ablation",),
+    ("ablation", "adaptive", "oracle"),
+    ("offload",),
     ("drop_in", "drop_in_1"),
     ("exchange", "training", "training_2"),
     ("city", "city_exchange"),
@@ -73,11 +80,30 @@ GROUPS = (
 COPIED = {
     "quality": "cp runs/quality/quality.json benchmarks/results/",
     "ablation": "cp runs/ablation/quality.json benchmarks/results/ablation.json",
+    "adaptive": "cp runs/adaptive/quality.json benchmarks/results/adaptive.json",
 }
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
 ABLATION_COLUMNS = (
     "scene", "arm", "seeds", "PSNR", "corrected PSNR", "SSIM", "peak M", "final M", "peak GB"
 )  # fmt: skip
+GATE_COLUMNS = ("arm", "seeds", "PSNR", "SSIM", "seconds", "peak M", "final M", "peak GB", "mean GB",
+                "paper PSNR", "paper peak", "paper time")  # fmt: skip
+OFFLOAD_COLUMNS = {
+    "arm": "arm", "order": "views in order", "pool_gb": "GB on the GPU", "step_ms": "ms a step",
+    "cost": "relative", "resident_hits": "blocks already there", "moved_mb_per_step": "MB moved a step",
+    "sweep_s": "s for a sweep",
+}  # fmt: skip
+# Arms of benchmarks/ablation.yaml and adaptive.yaml that the paper does not have.
+OUR_ARMS = {
+    "full_60": "full, pass 2 keeps 0.6",
+    "from_5000": "gate from 5,000 on, pass 2 keeps 0.65",
+    "early": "gate from 2,000 on with rate 0.3, pass 2 keeps 0.65",
+    "early_60": "gate from 2,000 on, pass 2 keeps 0.75",
+    "early_alone": "gate from 2,000 on, no pass 1, pass 2 keeps 0.7",
+}
+ADAPTIVE_ARMS = {"fixed": "fixed schedule", "adaptive": "adaptive schedule"}
+# Arms of the tables rho and onset that are arms of the ablation.
+SAME_ARMS = {"rate_0": "no_gate", "rate_60": "full", "from_24k": "full"}
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -228,15 +254,58 @@ def quality_lines(quality: Json) -> list[str]:
     return table(["capture", *QUALITY_COLUMNS], rows)
 
 
-def ablation_lines(ablation: Json) -> list[str]:
-    """Tabulate the arms of the model level by capture: medians over the seeds, the worst in brackets."""
-    import tables_report  # needs the package, as above
+def arms_of(table: str) -> dict[str, Json]:
+    """Return the arms of a table of the paper."""
     import yaml
 
-    done = [run for run in ablation["runs"] if run["status"] == "done"]
-    arms = yaml.safe_load((Path(__file__).parent / "paper_tables.yaml").read_text())["ablation"]["arms"]
+    plan = yaml.safe_load((Path(__file__).parent / "paper_tables.yaml").read_text())
+    arms: dict[str, Json] = plan[table]["arms"]
+    return arms
+
+
+def arm_lines(file: Json, arms: dict[str, Json], columns: Iterable[str]) -> list[str]:
+    """Tabulate arms by capture: medians over the seeds, the worst in brackets."""
+    import tables_report  # needs the package, which the other tables do not
+
+    done = [run for run in file["runs"] if run["status"] == "done"]
     rows, _ = tables_report.arm_rows(done, arms)
-    return table(ABLATION_COLUMNS, ([str(row[column]) for column in ABLATION_COLUMNS] for row in rows))
+    return table(columns, ([str(row[column]) for column in columns] for row in rows))
+
+
+def ablation_lines(ablation: Json) -> list[str]:
+    """Tabulate the arms of the model level."""
+    ours = {name: {"title": title} for name, title in OUR_ARMS.items()}
+    return arm_lines(ablation, arms_of("ablation") | ours, ABLATION_COLUMNS)
+
+
+def adaptive_lines(adaptive: Json) -> list[str]:
+    """Tabulate the fixed and the adaptive schedule."""
+    arms = {name: {"title": title} for name, title in ADAPTIVE_ARMS.items()}
+    return arm_lines(adaptive, arms, (*ABLATION_COLUMNS, "seconds"))
+
+
+def gate_lines(name: str) -> Callable[[Json], list[str]]:
+    """Return the function that makes the table rho or onset of the captures that have all of its arms."""
+
+    def lines(ablation: Json) -> list[str]:
+        arms = arms_of(name)
+        recipes = {SAME_ARMS.get(arm, arm): about for arm, about in arms.items()}
+        trained: dict[str, set[str]] = {}
+        for run in ablation["runs"]:
+            trained.setdefault(run["capture"], set()).add(run["recipe"])
+        runs = [run for run in ablation["runs"] if trained[run["capture"]] >= set(recipes)]
+        return arm_lines({"runs": runs}, recipes, GATE_COLUMNS)
+
+    return lines
+
+
+def offload_lines(offload: Json) -> list[str]:
+    """Tabulate steps with all Gaussians on the GPU, and with a pool."""
+    rows = []
+    for result in offload["results"]:
+        values = [result.get(name, "–") for name in OFFLOAD_COLUMNS]
+        rows.append([value if isinstance(value, str) else f"{value:.3g}" for value in values])
+    return table(OFFLOAD_COLUMNS.values(), rows)
 
 
 SUMMARY_HEAD = ["work", "BlitzGS", "compared with", "ratio", "command"]
@@ -312,6 +381,11 @@ SECTIONS = {
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),
     "ablation": Section(("ablation",), ablation_lines),
+    "rho": Section(("ablation",), gate_lines("rho")),
+    "onset": Section(("ablation",), gate_lines("onset")),
+    "oracle": Section(("oracle",), row_lines),
+    "adaptive": Section(("adaptive",), adaptive_lines),
+    "offload": Section(("offload",), offload_lines),
     "summary": Section(("render", "step_1", "step_4"), summary_lines),
     "summary_ranks": Section(("exchange",), summary_ranks_lines),
     "city_exchange": Section(("city_exchange",), exchange_lines),
