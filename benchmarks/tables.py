@@ -100,9 +100,9 @@ def train(table: str, plan: dict[str, Any], args: argparse.Namespace, scenes: di
         common += ["--capture", f"{name}={text}"]
     for name, text in recipes.items():
         common += ["--recipe", f"{name}={text}"]
-    for flag in ("lpips", "minutes"):
+    for flag in ("lpips", "minutes", "per_gpu"):
         if (value := getattr(args, flag)) is not None:
-            common += [f"--{flag}", str(value)]
+            common += [f"--{flag.replace('_', '-')}", str(value)]
     status = 0
     for ranks in args.ranks if table == "scaling" else [1]:
         if args.dry_run:
@@ -218,6 +218,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
     )
+    parser.add_argument("--per-gpu", type=bm_quality.positive, metavar="N", help="as for bm_quality.py")
     parser.add_argument(
         "--ranks", type=bm_quality.positive, nargs="+", default=[1, 2, 4], help="of scaling and cost"
     )

@@ -73,7 +73,7 @@ def test_arms_without_a_gate_file_and_onsets(monkeypatch):
 def test_a_trajectory_is_trained_once_and_tabulated(tmp_path, capture, capsys):
     out = tmp_path / "out"
     flags = ["trajectory", "--out", str(out), "--scenes", f"tiny={capture}", "--config", "defaults"]
-    flags += ["--flags", FLAGS, "--gpus", "0", "--seeds", "1"]
+    flags += ["--flags", FLAGS, "--gpus", "0", "--per-gpu", "2", "--seeds", "1"]
     assert tables.main([*flags, "--dry-run"]) == 0 and not out.exists()
     assert "to run: tiny.full.s1" in capsys.readouterr().out
     with pytest.raises(SystemExit):
@@ -89,6 +89,7 @@ def test_a_trajectory_is_trained_once_and_tabulated(tmp_path, capture, capsys):
         tables.main(flags)
     assert "--resume carries on" in capsys.readouterr().err
     written = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*")}
+    assert [json.loads(path.read_text())["per_gpu"] for path in written] == [2]
     assert tables.main([*flags, "--resume"]) == 0 and len(written) == 1
     assert written == {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*")}
 
