@@ -9,14 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, named_path
 from blitzgs.distributed.group import Ranks
+from blitzgs.output import OutputFolder
 from blitzgs.population import gate_evaluation, gate_fit, spawn_samples
 from blitzgs.population.spawn_gate import SpawnGate, gate_file
 from blitzgs.training import run as run_folder
 from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_io import ConfigError, load_config
-from blitzgs.training.gate_replay import replay
+from blitzgs.training.gate_replay import FIGURES, TABLE, replay
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.schedule import Schedule
 
@@ -42,10 +43,10 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
     fit.add_argument(
-        "runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage, or a sample"
+        "runs", type=named_path, nargs="+", metavar="RUN", help="folder of a run with lineage, or a sample"
     )
     fit.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="file for the gate, .json or .ubj"
+        "--out", type=named_path, required=True, metavar="FILE", help="file for the gate, .json or .ubj"
     )
     fit.add_argument(
         "--gate-from",
@@ -55,17 +56,19 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         help="also evaluate the spawns from this time on alone, which a gate is to judge (%(default)s)",
     )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
-    sample.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
+    sample.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
     sample.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="file for the sample, .parquet"
+        "--out", type=named_path, required=True, metavar="FILE", help="file for the sample, .parquet"
     )
     sample.add_argument(
         "--rows", type=int, default=spawn_samples.MOST_ROWS, help="about so many births (%(default)s)"
     )
     judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
     judge.add_argument("gate", type=gate_file, metavar="GATE", help="file of the gate, or: default")
-    judge.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run with lineage")
-    judge.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for figures and maps")
+    judge.add_argument("runs", type=named_path, nargs="+", metavar="RUN", help="folder of a run with lineage")
+    judge.add_argument(
+        "--out", type=named_path, required=True, metavar="DIR", help="folder for figures and maps"
+    )
     again = add_command(
         actions,
         "replay",
@@ -73,9 +76,9 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "train from one checkpoint without a gate, with it, with an oracle and at random",
     )
     again.add_argument("gate", type=gate_file, metavar="GATE", help="file of the gate, or: default")
-    again.add_argument("folder", type=Path, metavar="RUN", help="folder of a run with lineage")
+    again.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
     again.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for one run for each of these"
+        "--out", type=named_path, required=True, metavar="DIR", help="folder for one run for each of these"
     )
     again.add_argument(
         "--rate", type=float, default=0.6, help="share of the candidates to withhold (%(default)s)"
@@ -114,17 +117,20 @@ def run_evaluate(args: argparse.Namespace) -> int:
     """Judge a gate; returns the exit status."""
     gate = SpawnGate(args.gate)
     runs = [gate_fit.read_spawns(_lineage(folder)) for folder in args.runs]
+    output = OutputFolder(args.out)
+    figures = args.out / "evaluation.json"
+    output.check(figures)
     args.out.mkdir(parents=True, exist_ok=True)
     schedule = load_config(args.runs[0] / run_folder.CONFIG).schedule
     gate_from = Schedule(schedule).pace.image(schedule.gate_from)
-    results = gate_evaluation.evaluate(gate, runs, gate_from, args.out)
-    (args.out / "evaluation.json").write_text(json.dumps(results, indent=1) + "\n")
+    results = gate_evaluation.evaluate(gate, runs, gate_from, output)
+    output.write(figures, (json.dumps(results, indent=1) + "\n").encode())
     for result in results:
         seen = "  (the gate was fitted on this scene)" if result["seen"] else ""
         r = result.get("regions", {}).get("r")
         regions = "" if r is None else f"; regions r {r:.2f}"
         print(_judgement(result) + regions + seen)
-    print(f"{args.out}: evaluation.json, survival.svg and maps of regions")
+    print(f"{args.out}: {figures.name}, {gate_evaluation.SURVIVAL} and maps of regions")
     return 0
 
 
@@ -145,8 +151,8 @@ def run_replay(args: argparse.Namespace) -> int:
         for result in replay(config, capture, images, args.folder, args.out, gate, args.rate, ranks):
             results.append(result)
             if ranks.rank == 0:
-                (args.out / "replay.json").write_text(json.dumps(results, indent=1) + "\n")
-                (args.out / "replay.md").write_text(_table(results))
+                (args.out / FIGURES).write_text(json.dumps(results, indent=1) + "\n")
+                (args.out / TABLE).write_text(_table(results))
         if ranks.rank == 0:
             print(_table(results))
     return 0

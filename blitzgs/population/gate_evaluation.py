@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,29 +12,40 @@ import torch
 from numpy.typing import NDArray
 
 from blitzgs.charts import line_chart, maps
-from blitzgs.population.gate_fit import Spawns, judge
+from blitzgs.output import OutputFolder
+from blitzgs.population.gate_fit import Spawns, judge, told_apart
 from blitzgs.population.spawn_gate import SpawnGate
 
+SURVIVAL = "survival.svg"
 COHORTS = 15
 # Cells of a map along its longer side, and the smallest number of spawns for which a cell has a value.
 CELLS, LEAST_IN_CELL = 32, 30
 
 
-def evaluate(gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, folder: Path) -> list[dict[str, Any]]:
+def evaluate(
+    gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, output: OutputFolder
+) -> list[dict[str, Any]]:
     """Evaluate a gate on runs, and draw survival.svg and regions_NAME.svg.
 
     Args:
         gate: the gate.
         runs: the runs; their schedules may differ.
         gate_from: time in images from which on a gate judges spawns; only later spawns are in the maps.
-        folder: folder for the pictures.
+        output: folder for the pictures.
 
     Returns:
         For each run: `gate_fit.judge`, whether the gate was fitted on its scene, the share of initial
         Gaussians and of each birth cohort that survived, and `regions`.
+
+    Raises:
+        OSError: a picture cannot be written, or would replace a file that BlitzGS did not write.
     """
     results, curves = [], {}
-    for run in runs:
+    runs = told_apart(runs)
+    survival = output.root / SURVIVAL
+    output.check(survival)
+    pictures = output.paths([f"regions_{run.name}" for run in runs], ".svg", flat=True)
+    for run, path in zip(runs, pictures, strict=True):
         scores = gate.scores(torch.from_numpy(run.features)).double().numpy()
         late = run.times >= gate_from
         cohorts = survival_by_cohort(run)
@@ -48,11 +58,11 @@ def evaluate(gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, folder: 
             where, actual, predicted = region_rates(run.only(late), scores[late])
             result["regions"] = {"cells": int(where.sum()), "r": correlation(actual[where], predicted[where])}
             picture = maps({"survived": actual, "predicted at birth, as many": predicted})
-            (folder / f"regions_{run.name}.svg").write_text(picture)
+            output.write(path, picture.encode())
         curves[run.name] = [(entry["until"], entry["survived"]) for entry in cohorts]
         results.append(result)
     chart = line_chart(curves, "born at, images", "share that reaches the final model", most=1.0)
-    (folder / "survival.svg").write_text(chart)
+    output.write(survival, chart.encode())
     return results
 
 

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from blitzgs.output import write_file
 from blitzgs.population.candidates import FEATURES
 from blitzgs.population.lineage import ABOUT
 from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.population.spawn_gate import GateInfo, write_info
+from blitzgs.population.spawn_gate import GateInfo, check_no_other, write_info
 
 # Largest number of births that a fit takes from a scene, drawn evenly.
 MOST_ROWS = 4_000_000
@@ -88,25 +89,21 @@ def read_spawns(folder: Path) -> Spawns:
 
     Raises:
         FileNotFoundError: there is no lineage.
-        ValueError: there are no spawns, or all or none of them survived.
+        ValueError: a file is damaged, there are no spawns, or all or none of them survived.
         ImportError: pyarrow is not installed.
     """
     tables = read_lineage(folder)
-    about = json.loads((folder / ABOUT).read_text())
+    about = read_about((folder / ABOUT).read_bytes(), folder / ABOUT)
     births, deaths = tables["births"], tables["deaths"]
     spawned = births["parent"] >= 0
     alive = ~np.isin(births["id"], deaths["id"])
     survived = alive[spawned]
-    if not len(survived) or survived.all() or not survived.any():
-        raise ValueError(
-            f"{folder}: {int(survived.sum()):,} of {len(survived):,} spawns survived; a gate needs a "
-            "finished run in which some did and some did not"
-        )
+    check_outcomes(survived, folder)
     return Spawns(
         name=about["name"],
         scene=about["scene"],
         schedule=about["schedule"],
-        features=feature_columns({name: births[name][spawned] for name in FEATURES if name in births}),
+        features=feature_columns({name: births[name][spawned] for name in births}, len(survived)),
         survived=survived,
         parents=births["parent"][spawned],
         positions=np.stack([births[axis][spawned] for axis in "xyz"], 1),
@@ -114,9 +111,52 @@ def read_spawns(folder: Path) -> Spawns:
     )
 
 
-def feature_columns(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-    """Return the features of spawns, float32 [K, F], from columns by name; NaN where there is none."""
-    unknown = np.full(len(next(iter(columns.values()))), np.nan, np.float32)
+def read_about(text: bytes | str, file: Path) -> dict[str, Any]:
+    """Read the description of a run that is stored with its spawns.
+
+    Raises:
+        ValueError: it is damaged; names the file.
+    """
+    try:
+        about = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file}: the description of the run is damaged: {error}") from error
+    kinds = {"name": str, "scene": str, "schedule": dict}
+    if not isinstance(about, dict) or not all(isinstance(about.get(k), kind) for k, kind in kinds.items()):
+        raise ValueError(f"{file}: the description of the run is damaged: it has no {', '.join(kinds)}")
+    return about
+
+
+def check_outcomes(survived: NDArray[np.bool_], source: object) -> None:
+    """Check that some spawns survived and some did not.
+
+    Raises:
+        ValueError: this is not so; names `source`.
+    """
+    if not 0 < survived.sum() < len(survived):
+        raise ValueError(
+            f"{source}: {int(survived.sum()):,} of {len(survived):,} spawns survived; a gate needs a "
+            "finished run in which some did and some did not"
+        )
+
+
+def told_apart(runs: Sequence[Spawns]) -> list[Spawns]:
+    """Number runs of the same name, which is that of the capture's folder: `capture`, `capture_2`."""
+    found: list[Spawns] = []
+    names: set[str] = set()
+    for run in runs:
+        name, number = run.name, 1
+        while name in names:
+            number += 1
+            name = f"{run.name}_{number}"
+        names.add(name)
+        found.append(dataclasses.replace(run, name=name))
+    return found
+
+
+def feature_columns(columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[np.float32]:
+    """Return the features of K spawns, float32 [K, F], from columns by name; NaN where there is none."""
+    unknown = np.full(count, np.nan, np.float32)
     return np.stack([columns.get(name, unknown).astype(np.float32) for name in FEATURES], 1)
 
 
@@ -144,7 +184,7 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
 
     Args:
         runs: at least one run.
-        path: path of the model, `NAME.json`; its metadata are written beside it.
+        path: path of the model, `NAME.json` or `NAME.ubj`; its metadata are written beside it.
         gate_from: time in images from which on a gate is going to judge spawns; see `judge`.
         seed: seed of the draws of rows.
 
@@ -152,10 +192,13 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
         The figures that go into the metadata: `judge` for each run held out.
 
     Raises:
-        ValueError: the runs are of different schedules.
+        ValueError: the runs are of different schedules, or a run has too few spawns.
+        FileExistsError: one of the two files exists and belongs to no gate.
         ImportError: xgboost is not installed.
     """
     xgboost = _xgboost()
+    check_no_other(path)
+    runs = told_apart(runs)
     schedules = {json.dumps(run.schedule, sort_keys=True) for run in runs}
     if len(schedules) > 1:
         raise ValueError("the runs have different schedules; fit one gate for each: " + "; ".join(schedules))
@@ -168,13 +211,15 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
             booster = _train(xgboost, others, [np.ones(len(o.survived), bool) for o in others], seed)
         else:
             judged = _hash_uniform(run.parents) < HELD_OUT
+            for part in (judged, ~judged):
+                check_outcomes(run.survived[part], f"{run.name}, of which a part is held out")
             booster = _train(xgboost, runs, [_hash_uniform(o.parents) >= HELD_OUT for o in runs], seed)
         held_out = run.only(judged)
         figures.append(judge(held_out, _predict(xgboost, booster, held_out.features), gate_from))
     protocol = "leave one scene out" if len(scenes) > 1 else "a quarter of the parents held out"
     result = {"protocol": protocol, "held_out": figures}
     booster = _train(xgboost, runs, [np.ones(len(run.survived), bool) for run in runs], seed)
-    booster.save_model(path)
+    write_file(path, bytes(booster.save_raw(path.suffix[1:])))
     write_info(path, GateInfo(FEATURES, runs[0].schedule, {run.name: run.scene for run in runs}, auc=result))
     return result
 

@@ -7,7 +7,7 @@ A file holds the rows of one table from one rank, and has in its name up to whic
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
@@ -153,25 +153,63 @@ def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
 
     Raises:
         FileNotFoundError: there is no log.
+        ValueError: a file is damaged; names it.
         ImportError: pyarrow is not installed.
     """
-    arrow, parquet = import_pyarrow()
+    arrow, _ = import_pyarrow()
     tables = {}
     for table in ("births", "deaths"):
-        paths = sorted(path for path in folder.glob(f"{table}_*.parquet") if PART_NAME.fullmatch(path.name))
+        found = (path for path in folder.glob(f"{table}_*.parquet") if PART_NAME.fullmatch(path.name))
+        paths = sorted(path for path in found if path.is_file())
         if not paths and table == "births":
             raise FileNotFoundError(
                 f"{folder} holds no lineage: train with --population.lineage=true to log it"
             )
-        parts = [parquet.read_table(path) for path in paths]
+        # A log of an older version lacks some of the features.
+        needed = [name for group in TABLES[table] for name in group if name not in FEATURES]
+        parts = [read_numbers(path) for path in paths]
+        for part, path in zip(parts, paths, strict=True):
+            check_columns(part, needed, path)
         if parts:
-            joined = arrow.concat_tables(parts)
+            try:
+                joined = arrow.concat_tables(parts)
+            except arrow.ArrowInvalid as error:
+                raise ValueError(f"{folder}: the files of its {table} have different columns") from error
             tables[table] = {name: joined[name].to_numpy() for name in joined.column_names}
         else:
             tables[table] = {
                 name: torch.empty(0, dtype=torch.int64).numpy() for name in ("id", "time", "cause")
             }
     return tables
+
+
+def read_numbers(path: Path) -> Any:
+    """Read a Parquet file whose columns are numbers or truth values, none of them missing.
+
+    Returns:
+        The table, as pyarrow has it.
+
+    Raises:
+        ValueError: it is no such file, or is damaged; names the file.
+        ImportError: pyarrow is not installed.
+    """
+    arrow, parquet = import_pyarrow()
+    try:
+        table = parquet.read_table(path)
+    except (OSError, arrow.ArrowException) as error:
+        raise ValueError(f"{path} is not a Parquet file, or is damaged: {error}") from error
+    kinds = arrow.types
+    for field, column in zip(table.schema, table.columns, strict=True):
+        is_number = kinds.is_integer(field.type) or kinds.is_floating(field.type)
+        if column.null_count or not (is_number or kinds.is_boolean(field.type)):
+            raise ValueError(f"{path}: the column {field.name} has values that are not numbers")
+    return table
+
+
+def check_columns(table: Any, needed: Iterable[str], path: Path) -> None:
+    """Check that a table has all columns of those names; raise ValueError with the file's path."""
+    if lost := [name for name in needed if name not in table.column_names]:
+        raise ValueError(f"{path} is damaged: it has no column {', '.join(lost)}")
 
 
 def import_pyarrow() -> tuple[ModuleType, ModuleType]:

@@ -24,6 +24,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.tree_sums import tree_sums
+from blitzgs.output import check_replaceable, write_file
 from blitzgs.population.candidates import FEATURES, Candidates
 
 FORMAT = 1
@@ -67,7 +68,28 @@ def info_path(path: Path) -> Path:
 
 def write_info(path: Path, info: GateInfo) -> None:
     """Write the metadata beside a model file."""
-    info_path(path).write_text(json.dumps({"format": FORMAT} | dataclasses.asdict(info), indent=1) + "\n")
+    write_file(info_path(path), json.dumps({"format": FORMAT} | dataclasses.asdict(info), indent=1) + "\n")
+
+
+def check_no_other(path: Path) -> None:
+    """Check that a new gate replaces no file of another kind; the metadata tell which models are gates.
+
+    Raises:
+        FileExistsError: the model file exists without metadata, or what is in their place are none.
+        OSError: one of the two is no regular file.
+    """
+    beside = info_path(path)
+    for file in (path, beside):
+        check_replaceable(file)
+    try:
+        content = json.loads(beside.read_text())
+        known = isinstance(content, dict) and {"format", "features"} <= content.keys()
+    except FileNotFoundError:
+        known, beside = not path.exists(), path
+    except (ValueError, RecursionError):
+        known = False
+    if not known:
+        raise FileExistsError(f"{beside} exists and does not belong to a gate: choose another --out")
 
 
 def read_info(path: Path) -> GateInfo:
@@ -76,19 +98,23 @@ def read_info(path: Path) -> GateInfo:
     Raises:
         GateError: they are missing, damaged, of another format, or of other features.
     """
+    if not path.name:
+        raise GateError(f"{path}: no such gate; `blitzgs gate fit` makes one")
     beside = info_path(path)
     try:
         content = json.loads(beside.read_text())
         found = content.pop("format")
-        if found != FORMAT:
-            raise GateError(f"{beside}: format {found}, this version reads {FORMAT}")
-        info = GateInfo(**(content | {"features": tuple(content["features"])}))
+        info = GateInfo(**(content | {"features": tuple(content["features"])})) if found == FORMAT else None
+        if info and not all(isinstance(part, dict) for part in (info.schedule, info.scenes, info.auc)):
+            raise TypeError("schedule, scenes and auc must be objects")
     except FileNotFoundError:
         if not path.exists():
             raise GateError(f"{path}: no such gate; `blitzgs gate fit` makes one") from None
         raise GateError(f"{beside} is missing: a gate is a model and its metadata, keep both") from None
-    except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise GateError(f"{beside} is not the metadata of a gate: {error!r}") from error
+    if info is None:
+        raise GateError(f"{beside}: format {found}, this version reads {FORMAT}")
     if info.features != FEATURES:
         raise GateError(
             f"{beside}: the gate was fitted on the features {list(info.features)}, this version computes "
@@ -116,7 +142,9 @@ class SpawnGate:
         self.info = read_info(path)
         try:
             self._trees = _Trees.of(_read_model(path))
-        except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
+        except GateError:
+            raise
+        except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
             raise GateError(f"{path} is not a binary classifier in XGBoost's JSON: {error!r}") from error
 
     def scores(self, features: Tensor) -> Tensor:
@@ -190,7 +218,11 @@ def _read_model(path: Path) -> dict[str, Any]:
         raise GateError(
             f"{path}: only .json is read without xgboost (pip install xgboost); save the model as .json"
         ) from error
-    booster = xgboost.Booster(model_file=str(path))
+    try:
+        booster = xgboost.Booster(model_file=str(path))
+    except xgboost.core.XGBoostError as error:
+        # The lines after the first are the stack of the library.
+        raise ValueError(str(error).partition("\n")[0]) from error
     content = json.loads(booster.save_raw("json"))
     return content
 
@@ -238,6 +270,8 @@ class _Trees:
                     splits.append((2 * feature + unknown, first + left, first + tree["right_children"][node]))
                 thresholds.append(0.0 if left < 0 else value)
                 leaves.append(round(value * 2**_LEAF_BITS) if left < 0 else 0)
+        if not roots:
+            raise ValueError("no trees")
         bits = torch.tensor(thresholds, dtype=torch.float32).view(torch.int32)
         nodes = torch.cat((bits[:, None], torch.tensor(splits, dtype=torch.int32).view(-1, 3)), 1)
         return cls(torch.tensor(roots, dtype=torch.int32), nodes, torch.tensor(leaves), depth)

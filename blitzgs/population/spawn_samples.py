@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,10 @@ import numpy as np
 import torch
 
 from blitzgs.ops.counter_random import uniform
-from blitzgs.output import new_file
+from blitzgs.output import check_replaceable, new_file
 from blitzgs.population.candidates import FEATURES
-from blitzgs.population.gate_fit import Spawns, feature_columns
-from blitzgs.population.lineage_parts import import_pyarrow
+from blitzgs.population.gate_fit import Spawns, check_outcomes, feature_columns, read_about
+from blitzgs.population.lineage_parts import check_columns, import_pyarrow, read_numbers
 
 SUFFIX = ".parquet"
 # Number of rows of a sample; a row takes some 40 bytes.
@@ -37,9 +38,11 @@ def write_sample(run: Spawns, path: Path, most: int = MOST_ROWS) -> float:
         The share of the parents that was drawn.
 
     Raises:
+        FileExistsError: the file exists and is not a sample.
         ImportError: pyarrow is not installed.
     """
     arrow, parquet = import_pyarrow()
+    check_no_other(path)
     rate = min(1.0, most / len(run.survived))
     some = run.only((uniform(_SEED, torch.from_numpy(run.parents)) < rate).numpy())
     columns: dict[str, Any] = {"parent": some.parents, "survived": some.survived}
@@ -60,33 +63,51 @@ def write_sample(run: Spawns, path: Path, most: int = MOST_ROWS) -> float:
     return rate
 
 
+def check_no_other(path: Path) -> None:
+    """Check that a new sample replaces no file of another kind, such as a part of a lineage.
+
+    Raises:
+        FileExistsError: the file exists and is not a sample.
+        OSError: it is no regular file.
+    """
+    check_replaceable(path)
+    if not path.exists():
+        return
+    arrow, parquet = import_pyarrow()
+    try:
+        known = _ABOUT in (parquet.read_schema(path).metadata or {})
+    except (OSError, arrow.ArrowException):
+        known = False
+    if not known:
+        raise FileExistsError(f"{path} exists and is not a sample of spawns: choose another --out")
+
+
 def read_sample(path: Path) -> Spawns:
     """Read a sample back.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a sample.
+        ValueError: it is not a sample, or is damaged; names the file.
         ImportError: pyarrow is not installed.
     """
-    arrow, parquet = import_pyarrow()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such sample of spawns")
-    try:
-        table = parquet.read_table(path)
-    except (OSError, arrow.ArrowInvalid) as error:
-        raise ValueError(f"{path} is not a Parquet file: {error}") from error
+    table = read_numbers(path)
     content = (table.schema.metadata or {}).get(_ABOUT)
     if content is None:
         raise ValueError(f"{path} is not a sample of spawns: write one with blitzgs gate sample")
+    check_columns(table, ("parent", "survived", *_AXES), path)
     columns = {name: table[name].to_numpy() for name in table.column_names}
-    about = json.loads(content)
+    about = read_about(content, path)
+    survived = columns["survived"].astype(bool)
+    check_outcomes(survived, path)
     return Spawns(
         name=about["name"],
         scene=about["scene"],
         schedule=about["schedule"],
-        features=feature_columns({name: columns[name] for name in FEATURES if name in columns}),
-        survived=columns["survived"].astype(bool),
+        features=feature_columns(columns, len(table)),
+        survived=survived,
         parents=columns["parent"],
         positions=np.stack([columns[axis] for axis in _AXES], 1),
-        initial_survival=about["initial_survival"],
+        initial_survival=about.get("initial_survival", math.nan),
     )

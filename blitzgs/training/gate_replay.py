@@ -44,6 +44,7 @@ from blitzgs.training.schedule import Schedule
 from blitzgs.training.trainer import Trainer
 
 REFERENCE = "reference"
+FIGURES, TABLE = "replay.json", "replay.md"
 
 
 class OracleVeto:
@@ -110,7 +111,7 @@ def branch_point(folder: Path, config: Config) -> Path:
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: the run ends before the gate's onset.
+        ValueError: the run ends before the gate's onset, or a checkpoint is damaged.
     """
     schedule, found = Schedule(config.schedule), []
     if not schedule.gates(schedule.iterations - 1):
@@ -119,7 +120,10 @@ def branch_point(folder: Path, config: Config) -> Path:
             f"{schedule.iterations} images): replay a run that goes on after it"
         )
     for manifest in (folder / run.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
-        step = json.loads(manifest.read_text())["state"]["progress"]["step"]
+        try:
+            step = int(json.loads(manifest.read_text())["state"]["progress"]["step"])
+        except (ValueError, LookupError, TypeError, RecursionError) as error:
+            raise ValueError(f"{manifest} is damaged: {error!r}") from error
         # Events before the end of a step belong to it.
         if not schedule.gates(step * schedule.batch_size - 1):
             found.append((step, manifest.parent))
@@ -174,7 +178,7 @@ def replay(
             "differ in length, and could not be compared. Train it with schedule.scale instead"
         )
     # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
-    if ranks.broadcast_object((out / REFERENCE).exists()):
+    if ranks.broadcast_object(any((out / name).exists() for name in (REFERENCE, FIGURES, TABLE))):
         raise FileExistsError(f"{out} already holds a replay: choose another --out, or delete it")
     point = branch_point(source, config)
 

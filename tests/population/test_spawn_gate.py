@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The spawn gate: trees equal XGBoost's, the veto equals sorting, and a fit predicts predictable lives."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -159,9 +160,51 @@ def test_fitting_one_scene_holds_out_parents(tmp_path):
         fit([spawns("a"), spawns("b", schedule={"x": 1})], tmp_path / "h.json")
 
 
+def test_scenes_of_the_same_name_are_told_apart(tmp_path):
+    path = tmp_path / "g.json"
+    runs = [dataclasses.replace(spawns(scene, seed=k), name="capture") for k, scene in enumerate("ab")]
+    assert [entry["run"] for entry in fit(runs, path)["held_out"]] == ["capture", "capture_2"]
+    assert SpawnGate(path).info.scenes == {"capture": "a", "capture_2": "b"}
+
+
+def test_too_few_spawns_to_hold_some_out_are_refused(tmp_path):
+    run = spawns("a")
+    with pytest.raises(ValueError, match=r"^a, of which a part is held out: 1 of 1 spawns survived"):
+        fit([run.only(run.parents == run.parents[0])], tmp_path / "g.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_fit_replaces_only_a_gate(tmp_path):
+    path = tmp_path / "package.json"
+    for file, text in ((path, "the user's"), (info_path(path), "{}"), (info_path(path), "[" * 100_000)):
+        file.write_text(text)
+        with pytest.raises(FileExistsError, match=f"{file} exists and does not belong to a gate: choose"):
+            fit([spawns("a")], path)
+        assert file.read_text() == text
+        file.unlink()
+    (tmp_path / "target.json").symlink_to(path)
+    with pytest.raises(OSError, match="is a symbolic link, which is not overwritten"):
+        fit([spawns("a")], tmp_path / "target.json")
+    fit([spawns("a")], path)
+    fit([spawns("b", seed=1)], path)
+    assert SpawnGate(path).info.scenes == {"b": "b"}
+
+
 def spoil_tree(path, field, value):
     model = json.loads(path.read_text())
-    model["learner"]["gradient_booster"]["model"]["trees"][3][field][0] = value
+    tree = model["learner"]["gradient_booster"]["model"]["trees"][3]
+    # In a leaf's place, `split_conditions` has its value.
+    tree[field][tree["left_children"].index(-1) if field == "split_conditions" else 0] = value
+    path.write_text(json.dumps(model))
+
+
+def spoil_info(path, **fields):
+    info_path(path).write_text(json.dumps(json.loads(info_path(path).read_text()) | fields))
+
+
+def without_trees(path):
+    model = json.loads(path.read_text())
+    model["learner"]["gradient_booster"]["model"]["trees"] = []
     path.write_text(json.dumps(model))
 
 
@@ -184,6 +227,14 @@ def spoil_tree(path, field, value):
         (lambda path: spoil_tree(path, "left_children", 0), "the nodes of a tree do not form one"),
         (lambda path: spoil_tree(path, "right_children", 1 << 20), "the nodes of a tree do not form one"),
         (lambda path: spoil_tree(path, "split_indices", 99), "a split of feature 99"),
+        (lambda path: spoil_tree(path, "split_conditions", math.inf), "convert float infinity to integer"),
+        (without_trees, "no trees"),
+        (lambda path: path.write_text("[" * 100_000), "is not a binary classifier in XGBoost's JSON"),
+        (lambda path: info_path(path).write_text("null"), "is not the metadata of a gate"),
+        (lambda path: info_path(path).write_text("[" * 100_000), "is not the metadata of a gate"),
+        (lambda path: info_path(path).write_text('{"format": ' + "9" * 5000 + "}"), "is not the metadata"),
+        (lambda path: spoil_info(path, scenes=["a"]), "schedule, scenes and auc must be objects"),
+        (lambda path: spoil_info(path, format=7), "format 7, this version reads 1"),
     ],
 )
 def test_bad_files_are_named(gate, tmp_path, break_it, message):
@@ -194,3 +245,14 @@ def test_bad_files_are_named(gate, tmp_path, break_it, message):
     break_it(path)
     with pytest.raises(GateError, match=message):
         SpawnGate(path)
+
+
+def test_a_bad_gate_in_ubjson_is_named_without_the_stack_of_xgboost(gate, tmp_path):
+    path = tmp_path / "gate.ubj"
+    path.write_text("no")
+    info_path(path).write_text(info_path(gate[0]).read_text())
+    with pytest.raises(GateError, match=r"gate.ubj is not a binary classifier") as caught:
+        SpawnGate(path)
+    assert "Stack trace" not in str(caught.value)
+    with pytest.raises(GateError, match=r"^\.: no such gate"):
+        SpawnGate(gate_file(""))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`blitzgs gate`: from the lineage of runs to a gate, its figures and its replay."""
 
+import io
 import json
 import shutil
 from xml.etree import ElementTree
@@ -20,6 +21,7 @@ from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import OVERRIDES, tiny_config, write_tiny_capture
 from tests.training.tiny_runs import events_of
 
+pyarrow = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
 pytest.importorskip("xgboost")
 # Density events at 20, 40, 60 and 80; the gate judges from 60 on, a checkpoint lies at 50.
@@ -125,6 +127,118 @@ def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys):
     births = str(next((lineage_run / "run" / "lineage").glob("births*.parquet")))
     assert main(["gate", "fit", births, "--out", str(gates[0])]) == 1
     assert "is not a sample of spawns" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_no_other_file_is_replaced(lineage_run, tmp_path, capsys):
+    run, gate = shutil.copytree(lineage_run / "run", tmp_path / "run"), tmp_path / "gate.json"
+    assert main(["gate", "fit", str(run), "--out", str(gate)]) == 0
+    births = next((run / "lineage").glob("births*.parquet"))
+    before = births.read_bytes()
+    assert main(["gate", "sample", str(run), "--out", str(births)]) == 1
+    assert "is not a sample of spawns: choose another --out" in capsys.readouterr().err
+    assert births.read_bytes() == before
+    sample = str(tmp_path / "sample.parquet")
+    for _ in range(2):
+        assert main(["gate", "sample", str(run), "--out", sample]) == 0
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for name in ("evaluation.json", "survival.svg", "regions_capture.svg"):
+        (mine / name).write_text("mine")
+        assert main(["gate", "evaluate", str(gate), str(run), "--out", str(mine)]) == 1
+        error = f"{mine / name} exists, and no earlier call of blitzgs wrote to {mine}: choose another --out"
+        assert error in capsys.readouterr().err
+        assert [path.read_text() for path in mine.iterdir()] == ["mine"]
+        (mine / name).unlink()
+    (mine / "replay.json").write_text("mine")
+    assert main(["gate", "replay", str(gate), str(run), "--out", str(mine)]) == 1
+    assert "already holds a replay: choose another --out" in capsys.readouterr().err
+    assert (mine / "replay.json").read_text() == "mine"
+
+
+def test_runs_of_the_same_name_have_pictures_of_their_own(lineage_run, tmp_path):
+    run, out = str(lineage_run / "run"), tmp_path / "judged"
+    for _ in range(2):  # what an earlier call wrote is replaced
+        assert main(["gate", "evaluate", "default", run, run, "--out", str(out)]) == 0
+    entries = json.loads((out / "evaluation.json").read_text())
+    assert [entry["run"] for entry in entries] == ["capture", "capture_2"]
+    assert {path.name for path in out.glob("*.svg")} == {
+        "survival.svg",
+        "regions_capture.svg",
+        "regions_capture_2.svg",
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("births", lambda data: data[:2000], "is not a Parquet file, or is damaged"),
+        ("births", lambda data: without(data, "parent"), "is damaged: it has no column parent"),
+        ("births", lambda data: with_text(data, "id"), "the column id has values that are not numbers"),
+        ("deaths", lambda data: without(data, "id"), "is damaged: it has no column id"),
+        ("about", lambda data: b"", "the description of the run is damaged"),
+        ("about", lambda data: b"[" * 100_000, "the description of the run is damaged"),
+        ("about", lambda data: b"{}", "the description of the run is damaged: it has no name, scene"),
+    ],
+)
+def test_a_damaged_lineage_is_named(lineage_run, tmp_path, capsys, name, damage, message):
+    run = shutil.copytree(lineage_run / "run", tmp_path / "run")
+    file = next((run / "lineage").glob(f"{name}*"))
+    file.write_bytes(damage(file.read_bytes()))
+    assert main(["gate", "fit", str(run), "--out", str(tmp_path / "gate.json")]) == 1
+    error = capsys.readouterr().err
+    assert str(file) in error and message in error
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda data: without(data, "survived"), "is damaged: it has no column survived"),
+        (lambda data: only_survivors(data), "spawns survived; a gate needs a finished run"),
+        (lambda data: with_about(data, b"{}"), "the description of the run is damaged"),
+    ],
+)
+def test_a_damaged_sample_is_named(lineage_run, tmp_path, capsys, damage, message):
+    sample = tmp_path / "sample.parquet"
+    assert main(["gate", "sample", str(lineage_run / "run"), "--out", str(sample)]) == 0
+    sample.write_bytes(damage(sample.read_bytes()))
+    assert main(["gate", "fit", str(sample), "--out", str(tmp_path / "gate.json")]) == 1
+    error = capsys.readouterr().err
+    assert str(sample) in error and message in error
+
+
+def changed(data, change):
+    target = io.BytesIO()
+    parquet.write_table(change(parquet.read_table(io.BytesIO(data))), target)
+    return target.getvalue()
+
+
+def without(data, name):
+    return changed(data, lambda table: table.drop_columns([name]))
+
+
+def with_text(data, name):
+    return changed(
+        data,
+        lambda table: table.set_column(
+            table.column_names.index(name), name, table[name].cast(pyarrow.string())
+        ),
+    )
+
+
+def only_survivors(data):
+    return changed(data, lambda table: table.filter(table["survived"]))
+
+
+def with_about(data, text):
+    return changed(data, lambda table: table.replace_schema_metadata({b"blitzgs.spawns": text}))
+
+
+def test_a_damaged_checkpoint_is_named(lineage_run, tmp_path):
+    run = shutil.copytree(lineage_run / "run", tmp_path / "run")
+    manifest = next((run / "checkpoints").glob("*/manifest.json"))
+    manifest.write_text("{}")
+    with pytest.raises(ValueError, match=f"{manifest} is damaged"):
+        branch_point(run, tiny_config(*SETTINGS))
 
 
 def test_a_run_that_ends_before_the_gate_is_not_replayed(tmp_path):
