@@ -181,7 +181,7 @@ def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[
     """Read positions, float64 [M, 3], and colours, uint8 [M, 3] (grey if there are none), of a point cloud.
 
     Raises:
-        ValueError: the file is damaged or has no x, y, z.
+        ValueError: the file is damaged, has no x, y, z, or has colours of another kind.
     """
     _, table = _read_table(Path(path))
     names = table.dtype.names or ()
@@ -191,6 +191,11 @@ def read_points(path: Path | str) -> tuple[npt.NDArray[np.float64], npt.NDArray[
     if not {"red", "green", "blue"} <= set(names):
         return positions, np.full((len(table), 3), 128, dtype=np.uint8)
     colors = np.stack([table[channel] for channel in ("red", "green", "blue")], axis=1)
+    # Some programs write bytes as signed ones.
+    if colors.dtype.itemsize > 1 and not (usable := (colors >= 0) & (colors <= 255)).all():
+        raise ValueError(
+            f"{path}: a point has the colour {colors[~usable][0]}: bytes or fractions from 0 to 1 are read"
+        )
     if colors.dtype.kind == "f":
         colors = np.clip(colors * 255 + 0.5, 0, 255)
     return positions, colors.astype(np.uint8)

@@ -51,6 +51,11 @@ def downscaled_size(width: int, height: int, factor: float) -> tuple[int, int]:
     return max(1, int(width / factor + 0.5)), max(1, int(height / factor + 0.5))
 
 
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Tell whether two sizes (width, height) have the same ratio of sides, to rounding by two pixels."""
+    return abs(size[0] * other[1] - size[1] * other[0]) <= 2 * max(*size, *other)
+
+
 def sees_any(camera: Camera, points: Float64) -> bool:
     """Tell whether any of the re-centred points [M, 3] is in front of a camera and within its image."""
     x, y, depth = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]

@@ -16,7 +16,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.scene.cameras import Camera, Float64, camera_centers, downscaled_size, scaled_matrix, sees_any
+from blitzgs.scene.cameras import (
+    Camera,
+    Float64,
+    camera_centers,
+    downscaled_size,
+    same_shape,
+    scaled_matrix,
+    sees_any,
+)
 from blitzgs.scene.files import find_mask
 from blitzgs.scene.image_files import ImageHeader, read_header
 from blitzgs.scene.layouts import SourcePoints, SourceView, read_layout
@@ -32,6 +40,10 @@ _MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
 _LEAST_SPREAD = 1e-6
+# Coordinates from here on are damage; the squares of smaller ones are finite.
+_FARTHEST = 1e100
+# Longest side of an image that the renderer takes.
+_MOST_SIDE = (1 << 24) - 1
 
 
 @dataclass(eq=False)
@@ -98,7 +110,7 @@ def load_capture(
         ValueError: a file is damaged, or sizes, poses or options are invalid.
     """
     root = Path(path)
-    if downscale < 1:
+    if not downscale >= 1:  # NaN too
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     for option, value, allowed in (
         ("exif", exif, ("auto", "apply", "ignore")),
@@ -164,12 +176,16 @@ def _warn_of_blind_views(cameras: list[Camera], points: Float64) -> None:
         )
 
 
+def _is_usable(coordinates: Float64) -> npt.NDArray[np.bool_]:
+    return np.asarray(np.abs(coordinates) < _FARTHEST)  # false for NaN
+
+
 def _with_finite_poses(views: list[SourceView]) -> list[SourceView]:
-    finite = [view for view in views if np.isfinite(view.world_to_camera).all()]
+    finite = [view for view in views if _is_usable(view.world_to_camera).all()]
     if not finite:
         raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
     if len(finite) < len(views):
-        first = next(v.name for v in views if not np.isfinite(v.world_to_camera).all())
+        first = next(v.name for v in views if not _is_usable(v.world_to_camera).all())
         warnings.warn(
             f"{len(views) - len(finite)} of {len(views)} views have no finite pose and were dropped "
             f"(first: {first})",
@@ -249,14 +265,22 @@ def _camera(
 ) -> Camera:
     orientation = _orientation(view, header, exif)
     width, height = (header.height, header.width) if orientation >= 5 else (header.width, header.height)
-    if abs(width * view.lens.height - height * view.lens.width) > 2 * max(view.lens.width, view.lens.height):
+    full = (view.lens.width, view.lens.height)
+    if not same_shape((width, height), full) or min(width, height) < min(_LEAST_SIDE, *full):
         raise ValueError(
             f"{view.path} is {width} x {height}, which does not fit its camera of {view.lens.width} x "
             f"{view.lens.height}: the image was cropped or turned after the poses were found"
         )
+    if max(width, height) > _MOST_SIDE:
+        raise ValueError(
+            f"{view.path} is {width} x {height}: no side may be longer than {_MOST_SIDE:,} pixels"
+        )
     lens = view.lens.scaled(width, height)
     if lens not in plans:
-        plans[lens] = rectify(lens, policy)
+        try:
+            plans[lens] = rectify(lens, policy)
+        except ValueError as error:
+            raise ValueError(f"the camera of {view.path}: {error}") from error
     plan = plans[lens]
     # Images from images_N are downscaled already; only the rest of the factor is applied while decoding.
     already = max(1.0, view.lens.width / width) if downscale > 1 else 1.0
@@ -307,7 +331,7 @@ def _split(views: Sequence[SourceView], root: Path, spec: int | str | Path) -> t
 
 
 def _finite_points(points: SourcePoints) -> SourcePoints:
-    finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(points.positions).all(axis=1))
+    finite: npt.NDArray[np.bool_] = np.asarray(_is_usable(points.positions).all(axis=1))
     if finite.all():
         return points
     warnings.warn(

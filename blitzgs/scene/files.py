@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path, PurePath
@@ -78,7 +79,7 @@ def _mega_nerf_mapping(root: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     mapping = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         if not line.strip():
             continue
         original, separator, metadata = line.rpartition(",")
@@ -86,6 +87,11 @@ def _mega_nerf_mapping(root: Path) -> dict[str, str]:
             raise ValueError(f"{path}: line {number}: expected 'image name,metadata name', got '{line}'")
         mapping[original.strip()] = PurePath(metadata.strip()).stem
     return mapping
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file; bytes that are not UTF-8 are decoded as those of file names are."""
+    return os.fsdecode(path.read_bytes()).removeprefix("\ufeff").splitlines()
 
 
 def find_mask(folder: Path, name: str) -> Path | None:

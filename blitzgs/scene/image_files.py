@@ -166,7 +166,9 @@ def decode_mask(data: bytes, name: str) -> UInt8:
     Raises:
         ValueError: the file cannot be decoded.
     """
-    pixels = _imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, name)
+    # Labels may be small numbers of 16 bits, which a conversion to 8 bits would make black.
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = _imdecode(data, flags, name)
     return np.asarray((pixels > 0).astype(np.uint8))
 
 

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.formats.native import native_io
-from blitzgs.scene.cameras import Camera
+from blitzgs.scene.cameras import Camera, same_shape
 from blitzgs.scene.capture import Capture
 from blitzgs.scene.image_files import UInt8, apply_orientation, decode_mask, decode_rgb, read_whole
 from blitzgs.scene.undistort import Rectification
@@ -289,7 +289,13 @@ class ImageStore:
         stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
         if (mask.shape[1], mask.shape[0]) == stored:
             mask = apply_orientation(mask, camera.orientation)
-        if mask.shape != (lens.height, lens.width):  # the mask has another resolution
+        height, width = mask.shape
+        if not same_shape((width, height), (lens.width, lens.height)):
+            raise ValueError(
+                f"{path} is {width} x {height}, which does not fit the image of {lens.width} x {lens.height} "
+                f"that it masks, {camera.image_path}"
+            )
+        if (width, height) != (lens.width, lens.height):  # the mask has another resolution
             mask = _uint8(cv2.resize(mask, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST))
         return mask
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,11 +112,16 @@ def _read_colmap(
     model = colmap.read_model(folder)
     lenses: dict[int, Lens] = {}
     for camera in model.cameras:
+        if camera.id in lenses:
+            raise ValueError(f"{folder}: there are two cameras {camera.id}")
         try:
             lenses[camera.id] = Lens(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
         except ValueError as error:
             raise ValueError(f"{folder}: camera {camera.id}: {error}") from error
     names = model.images.names
+    if len(set(names)) < len(names):
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise ValueError(f"{folder}: there are two images called {twice}")
     unknown = [names[i] for i, c in enumerate(model.images.camera_ids.tolist()) if c not in lenses]
     if unknown:
         raise ValueError(

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
+from blitzgs.scene.files import read_lines
+
 DEFAULT_EVERY = 8
 
 
@@ -28,7 +30,7 @@ def from_list(names: Sequence[str], path: Path) -> list[int]:
         for key in {name, pure.name, pure.stem, str(pure.with_suffix(""))}:
             lookup.setdefault(key, set()).add(index)
     test: set[int] = set()
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         entry = line.split("#")[0].strip()
         if not entry:
             continue
@@ -47,7 +49,7 @@ def from_list(names: Sequence[str], path: Path) -> list[int]:
 def is_val(name: str, image_path: Path, root: Path) -> bool:
     """Tell whether an image is in Mega-NeRF's `val/` folder of the capture."""
     inside = image_path.relative_to(root) if image_path.is_relative_to(root) else PurePath(name)
-    return inside.parts[0] == "val" or PurePath(name).parts[0] == "val"
+    return ("val",) in (inside.parts[:1], PurePath(name).parts[:1])
 
 
 def split_views(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -71,21 +71,25 @@ def read_transforms(root: Path) -> Transforms:
             entries = content["frames"]
             if not isinstance(entries, list):
                 raise TypeError("'frames' is not a list")
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(f"{path}: not a transforms file with a list of frames ({error})") from error
         if "ply_file_path" in content:
+            if not isinstance(content["ply_file_path"], str):
+                raise ValueError(f"{path}: ply_file_path must be text, got {content['ply_file_path']!r}")
             points_path = root / content["ply_file_path"]
         for index, entry in enumerate(entries):
             try:
                 frames.append(_read_frame(root, path, content, entry))
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, ArithmeticError) as error:
                 reason = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
                 raise ValueError(f"{path}: frame {index}: {reason}") from error
     return Transforms(frames, points_path)
 
 
 def _read_frame(root: Path, file: Path, content: Mapping[str, Any], entry: Mapping[str, Any]) -> Frame:
-    relative = str(entry["file_path"])
+    relative = entry["file_path"]
+    if not isinstance(relative, str) or not PurePath(relative).name:
+        raise ValueError(f"file_path must name an image, got {relative!r}")
     path = next((p for s in _SUFFIXES if (p := root / (relative + s)).is_file()), root / relative)
     mask = root / str(entry["mask_path"]) if "mask_path" in entry else None
     return Frame(
@@ -114,8 +118,11 @@ def _read_pose(matrix: object) -> Float64:
     rotation = camera_to_world[:3, :3] * np.array([1.0, -1.0, -1.0])
     # Some exporters do not remove the scale of the rig.
     rotation = rotation / np.linalg.norm(rotation, axis=0)
-    if np.isfinite(rotation).all() and not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
-        raise ValueError("transform_matrix is not a rotation and a translation")
+    if np.isfinite(rotation).all():
+        if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
+            raise ValueError("transform_matrix is not a rotation and a translation")
+        if np.linalg.det(rotation) < 0:
+            raise ValueError("transform_matrix mirrors the scene: one of its axes has the wrong sign")
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ camera_to_world[:3, 3]
     return pose
@@ -129,6 +136,8 @@ def _read_lens(fields: Mapping[str, Any], path: Path) -> Lens:
     else:
         header = read_header(path)
         width, height = header.width, header.height
+    if min(width, height) < 1:
+        raise ValueError(f"the image's size must be at least 1 x 1, got {width} x {height}")
     if "fl_x" in fields:
         fx = float(fields["fl_x"])
         fy = float(fields.get("fl_y", fx))

@@ -138,6 +138,15 @@ def test_point_clouds_with_faces_and_without_colours(tmp_path):
     assert read_points(tmp_path / "b.ply")[1].tolist() == [[128, 128, 128]]
 
 
+@pytest.mark.parametrize(("kind", "red"), [("u2", 30_000), ("i4", -1), ("f4", float("nan")), ("f8", -0.5)])
+def test_colours_that_are_no_bytes_or_fractions_are_refused(tmp_path, kind, red):
+    types = [(n, "f8") for n in "xyz"] + [(c, kind) for c in ("red", "green", "blue")]
+    rows = np.array([(1, 2, 3, red, 0, 0)], dtype=types)
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "a.ply")
+    with pytest.raises(ValueError, match="a.ply: a point has the colour"):
+        read_points(tmp_path / "a.ply")
+
+
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "model.ply"
     write_ply(path, **gaussians(5, 1))

@@ -110,6 +110,42 @@ def test_images_that_do_not_fit_their_camera_are_refused(tmp_path):
     write_image(tmp_path / "images" / NAMES[1], smooth_image(48, 90))
     with pytest.raises(ValueError, match=rf"{NAMES[1]} is 90 x 48, which does not fit its camera of 64 x 48"):
         load_capture(tmp_path)
+    # A placeholder; the rounding of its sides allows every shape.
+    write_image(tmp_path / "images" / NAMES[1], smooth_image(1, 1))
+    with pytest.raises(ValueError, match=rf"{NAMES[1]} is 1 x 1, which does not fit its camera of 64 x 48"):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [
+        ((0, 0), "is 0 x 0, which does not fit its camera of 64 x 48"),
+        ((64_000_000, 48_000_000), "is 64000000 x 48000000: no side may be longer than 16,777,215 pixels"),
+    ],
+)
+def test_sizes_that_no_image_has_are_refused(tmp_path, size, message):
+    write_capture(tmp_path, NAMES[:2])
+    path = tmp_path / "images" / NAMES[1]
+    data = bytearray(path.read_bytes())
+    data[16:24] = struct.pack(">II", *size)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=f"{path} {message}"):
+        load_capture(tmp_path)
+
+
+def test_two_cameras_of_one_id_or_images_of_one_name_are_refused(tmp_path):
+    write_capture(tmp_path, NAMES[:3])
+    edit_model(tmp_path, lambda model: model.cameras.append(model.cameras[0]))
+    with pytest.raises(ValueError, match=f"{tmp_path}/sparse/0: there are two cameras 1"):
+        load_capture(tmp_path)
+
+    def name_twice(model):
+        model.cameras.pop()
+        model.images.names[1] = model.images.names[0]
+
+    edit_model(tmp_path, name_twice)
+    with pytest.raises(ValueError, match=f"{tmp_path}/sparse/0: there are two images called {NAMES[0]}"):
+        load_capture(tmp_path)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -153,6 +189,28 @@ def test_masks_are_found_turned_and_shrunk_so_that_mixed_pixels_are_excluded(tmp
     assert ImageStore(load_capture(tmp_path, masks=False)).mask(0) is None
     with pytest.raises(FileNotFoundError, match="other: no such folder of masks"):
         load_capture(tmp_path, masks="other")
+
+
+def test_labels_of_16_bits_are_not_black(tmp_path):
+    write_capture(tmp_path, NAMES[:1], width=64, height=48)
+    mask = np.zeros((48, 64), dtype=np.uint16)
+    mask[:, 17:] = 1
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "v00.png"), mask)
+    np.testing.assert_array_equal(ImageStore(load_capture(tmp_path)).mask(0).numpy(), mask)
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path):
+    write_capture(tmp_path, NAMES[:1], width=64, height=48)
+    (tmp_path / "masks").mkdir()
+    for size, fits in (((24, 32), True), ((383, 512), True), ((48, 48), False)):
+        cv2.imwrite(str(tmp_path / "masks" / "v00.png"), np.full(size, 255, dtype=np.uint8))
+        store = ImageStore(load_capture(tmp_path))
+        if fits:
+            assert store.mask(0).all()
+            continue
+        with pytest.raises(ValueError, match=r"masks/v00.png is 48 x 48, which does not fit .* 64 x 48"):
+            store.mask(0)
 
 
 def test_distorted_captures_become_pinhole_ones(tmp_path):
@@ -201,14 +259,16 @@ def test_views_and_points_that_are_not_finite_are_dropped_with_a_warning(tmp_pat
     def damage(model):
         model.images.quats[2] = 0
         model.images.translations[4, 1] = np.nan
+        model.images.translations[6, 1] = 1e200
         model.points.positions[5, 0] = np.inf
+        model.points.positions[7, 0] = -1e200
 
     edit_model(tmp_path, damage)
     with pytest.warns(UserWarning) as caught:
         capture = load_capture(tmp_path)
     messages = " ".join(str(w.message) for w in caught)
-    assert "2 of 9 views have no finite pose" in messages and "1 of 20 points are not finite" in messages
-    assert len(capture.cameras) == 7 and len(capture.points) == 19 and len(capture.track_lengths) == 19
+    assert "3 of 9 views have no finite pose" in messages and "2 of 20 points are not finite" in messages
+    assert len(capture.cameras) == 6 and len(capture.points) == 18 and len(capture.track_lengths) == 18
 
     edit_model(tmp_path, lambda m: m.images.quats.fill(np.nan))
     with pytest.raises(ValueError, match="none of the 9 views has a pose"):

@@ -2,6 +2,7 @@
 """Captures are found in each layout on disk, and a folder without one says what is missing."""
 
 import json
+import math
 import shutil
 
 import cv2
@@ -13,6 +14,7 @@ from blitzgs.scene.images import ImageStore
 from tests.scene.helpers import edit_model, smooth_image, write_capture, write_image
 
 pytestmark = [
+    pytest.mark.filterwarnings("ignore:overflow encountered"),
     pytest.mark.filterwarnings("ignore:all training cameras are in one place"),
     pytest.mark.filterwarnings("ignore:.* see none of the points"),
 ]
@@ -108,6 +110,45 @@ def test_blender_transforms(tmp_path):
     image = ImageStore(capture, background=(1.0, 0.5, 0.0)).get(0)
     assert image[0, 0].tolist() == [255, 128, 0] and image[6, 6].tolist() == [30, 20, 10]
     assert len(capture.points) == 100_000
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"w": math.inf, "h": 48}, "frame 0: cannot convert float infinity to integer"),
+        ({"w": 0, "h": 0}, "frame 0: the image's size must be at least 1 x 1, got 0 x 0"),
+        ({"fl_x": 10**400}, "frame 0: int too large to convert to float"),
+        ({"fl_x": None}, "frame 0: float.* argument must be a string or a real number"),
+        ({"file_path": ""}, "frame 0: file_path must name an image, got ''"),
+        ({"file_path": None}, "frame 0: file_path must name an image, got None"),
+        ({"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}, "frame 0: .* mirrors the scene"),
+        ({"ply_file_path": None}, "ply_file_path must be text, got None"),
+        ({"k1": 1e300}, "the camera of .*a.png: the lens does not see along its own axis"),
+    ],
+)
+def test_transforms_that_make_no_sense_are_named(tmp_path, fields, message):
+    write_image(tmp_path / "a.png", smooth_image(48, 64))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
+    content = {"frames": [frame | fields]} | fields
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message) as caught:
+        load_capture(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ['{"frames": ' + "[" * 100_000, "[]"])
+def test_transforms_that_are_damaged_are_named(tmp_path, text):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(ValueError, match=f"{tmp_path}/transforms.json: not a transforms file"):
+        load_capture(tmp_path)
+
+
+def test_an_angle_of_zero_is_named(tmp_path):
+    write_image(tmp_path / "a.png", smooth_image(48, 64))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "camera_angle_x": 0}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    with pytest.raises(ValueError, match="frame 0: float division by zero"):
+        load_capture(tmp_path)
 
 
 def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):

@@ -22,6 +22,16 @@ def test_list_file_matches_names_file_names_and_stems(tmp_path):
     assert split_views(NAMES, PATHS, ROOT, tmp_path / "test.txt") == ([2], [0, 1, 3])
 
 
+def test_a_list_file_may_have_names_that_are_not_utf_8(tmp_path):
+    (tmp_path / "test.txt").write_bytes(b"\xfc.jpg\n")
+    names = ["1.jpg", "\udcfc.jpg"]
+    assert split_views(names, [tmp_path / name for name in names], tmp_path, "test.txt") == ([0], [1])
+
+
+def test_a_name_without_parts_is_split_like_any_other(tmp_path):
+    assert split_views([".", "1.jpg"], [tmp_path, tmp_path / "1.jpg"], tmp_path) == ([1], [0])
+
+
 @pytest.mark.parametrize(
     ("line", "message"), [("1.jpg", "line 1: '1.jpg' names 2 views"), ("9", "names no view of the capture")]
 )
