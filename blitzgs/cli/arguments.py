@@ -38,14 +38,17 @@ def named_path(text: str) -> Path:
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Add the argument RUN, the folder of a run."""
     parser.add_argument(
-        "folder", type=Path, metavar="RUN", help="folder that blitzgs train wrote (its --out)"
+        "folder", type=named_path, metavar="RUN", help="folder that blitzgs train wrote (its --out)"
     )
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
     """Add the flag --data, the present folder of a run's capture."""
     parser.add_argument(
-        "--data", metavar="DIR", help="folder of the capture, if it has moved since the training"
+        "--data",
+        type=named_path,
+        metavar="DIR",
+        help="folder of the capture, if it has moved since the training",
     )
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -141,8 +142,9 @@ def run_replay(args: argparse.Namespace) -> int:
     gate = SpawnGate(args.gate)
     if not (args.folder / run_folder.CONFIG).exists():
         raise ConfigError(f"{args.folder} is not a run: it has no {run_folder.CONFIG}")
-    overrides = [] if args.data is None else [f"data.path={json.dumps(args.data)}"]
-    config = load_config(args.folder / run_folder.CONFIG, overrides)
+    config = load_config(args.folder / run_folder.CONFIG)
+    if args.data is not None:
+        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(args.data)))
     results: list[dict[str, Any]] = []
     with Ranks.from_environment(
         args.device, config.ranks.timeout_seconds, "auto", config.ranks.share_gpus

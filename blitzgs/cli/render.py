@@ -28,7 +28,9 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add the command."""
     parser = add_command(commands, "render", run, "render the views of a run to files, without photographs")
     add_run(parser)
-    parser.add_argument("--data", metavar="DIR", help="take the cameras from this capture, not from the run")
+    parser.add_argument(
+        "--data", type=named_path, metavar="DIR", help="take the cameras from this capture, not from the run"
+    )
     add_device(parser, shares_gpus=True)
     parser.add_argument(
         "--split", choices=("test", "train", "all"), default="test", help="which views (%(default)s)"

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.scene.cameras import (
+    MOST_SIDE,
     Camera,
     Float64,
     camera_centers,
@@ -42,8 +43,6 @@ _MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 _LEAST_SPREAD = 1e-6
 # Coordinates from here on are damage; the squares of smaller ones are finite.
 _FARTHEST = 1e100
-# Longest side of an image that the renderer takes.
-_MOST_SIDE = (1 << 24) - 1
 
 
 @dataclass(eq=False)
@@ -271,9 +270,9 @@ def _camera(
             f"{view.path} is {width} x {height}, which does not fit its camera of {view.lens.width} x "
             f"{view.lens.height}: the image was cropped or turned after the poses were found"
         )
-    if max(width, height) > _MOST_SIDE:
+    if max(width, height) > MOST_SIDE:
         raise ValueError(
-            f"{view.path} is {width} x {height}: no side may be longer than {_MOST_SIDE:,} pixels"
+            f"{view.path} is {width} x {height}: no side may be longer than {MOST_SIDE:,} pixels"
         )
     lens = view.lens.scaled(width, height)
     if lens not in plans:

@@ -115,17 +115,23 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
     return merged
 
 
+_MOST_DEPTH = 20
+
+
 def _nest(names: list[str], value: Any) -> dict[str, Any]:
     return {names[0]: value if len(names) == 1 else _nest(names[1:], value)}
 
 
-def _merge(target: dict[str, Any], changes: dict[str, Any], where: str) -> None:
+def _merge(target: dict[str, Any], changes: dict[str, Any], where: str, depth: int = 0) -> None:
+    # An anchor can make a section contain itself.
+    if depth > _MOST_DEPTH:
+        raise ConfigError(f"{where}: sections are nested more than {_MOST_DEPTH} deep")
     for name, value in changes.items():
         if isinstance(value, dict):
             section = target.setdefault(name, {})
             if not isinstance(section, dict):
                 raise ConfigError(f"{where}: '{name}' is a value, not a section")
-            _merge(section, value, where)
+            _merge(section, value, where, depth + 1)
         else:
             target[name] = value
 
@@ -170,7 +176,10 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
         except ValueError:
             pass
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ConfigError(f"{path}: {value} is too large") from None
     if hint is str and isinstance(value, int) and not isinstance(value, bool):
         return str(value)
     if hint is int and isinstance(value, float) and value.is_integer():

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -53,6 +54,7 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
 
     Raises:
         ValueError: `coordinates` has another value.
+        FileExistsError: the file of the offset is needed, and another program has a file of its name.
         OSError: the file cannot be written, or is no regular file.
     """
     if coordinates not in COORDINATES:
@@ -73,7 +75,12 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
             f"comment lod reference_distance {gate.reference_distance * space.unit!r} fork {gate.fork!r} "
             f"levels {gate.count} finest {gate.finest}" + (" smooth" if gate.smooth else "")
         )
+    sidecar = path.with_name(path.name + ".offset.json")
     if centred:
+        if os.path.lexists(sidecar) and not _has_offset(sidecar):
+            raise FileExistsError(
+                f"{sidecar} exists and is not the offset of an exported model: choose another name"
+            )
         x, y, z = space.offset
         comments.append(f"comment offset {x!r} {y!r} {z!r}")
         rounding = _rounding(means, np.zeros(3))
@@ -89,11 +96,22 @@ def export_ply(model: Model, path: Path, coordinates: str = "auto") -> Exported:
         levels=None if model.lod is None else model.level,
     )
     if not centred:
+        # The offset of an earlier export to this name would move the model once more.
+        if _has_offset(sidecar):
+            sidecar.unlink()
         return Exported(None, None, rounding)
-    sidecar = path.with_name(path.name + ".offset.json")
     meaning = "capture coordinates = coordinates in the file + offset"
     write_file(sidecar, json.dumps({"file": path.name, "offset": space.offset, "meaning": meaning}, indent=1))
     return Exported(space.offset, sidecar, rounding)
+
+
+def _has_offset(sidecar: Path) -> bool:
+    """Tell whether a file is the offset of an exported model."""
+    try:
+        content = json.loads(sidecar.read_text())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and {"file", "offset", "meaning"} <= content.keys()
 
 
 def _rounding(means: Tensor, offset: np.ndarray) -> float:

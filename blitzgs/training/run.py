@@ -217,7 +217,7 @@ def check_is_run(folder: Path) -> None:
         raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
 
 
-def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedModel:
+def open_model(folder: Path, ranks: Ranks, data: Path | None = None) -> TrainedModel:
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
     Args:
@@ -238,7 +238,7 @@ def open_model(folder: Path, ranks: Ranks, data: str | None = None) -> TrainedMo
     if ranks.rank == 0:
         _compare_with_file(config, folder / CONFIG)
     if data is not None:
-        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=data))
+        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
     optimiser = LazyAdam(config.optimiser, Schedule(config.schedule), restored.space.extent, home)
     optimiser.catch_up(table, None, progress.step)
     return TrainedModel(config, progress, restored.space, table, pool_bytes)

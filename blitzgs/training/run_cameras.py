@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.output import write_file
+from blitzgs.scene.cameras import MOST_SIDE
 from blitzgs.scene.capture import Capture
 from blitzgs.training.views import CameraLike
 
@@ -56,6 +57,31 @@ class RunCameras:
     inputs: list[Path]
 
 
+def checked_camera(
+    name: str, width: int, height: int, K: npt.ArrayLike, world_to_camera: npt.ArrayLike
+) -> RunCamera:
+    """Return a camera with these values, in arrays of its own.
+
+    Raises:
+        ValueError: a value is impossible; the message names it.
+    """
+    intrinsics, pose = np.array(K, dtype=np.float64), np.array(world_to_camera, dtype=np.float64)
+    for argument, matrix, shape in (("K", intrinsics, (3, 3)), ("world_to_camera", pose, (4, 4))):
+        if matrix.shape != shape or not np.isfinite(matrix).all():
+            raise ValueError(f"{argument} must be a finite matrix {shape}, got {matrix.tolist()}")
+    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
+        raise ValueError(f"K must have positive focal lengths, got {intrinsics.tolist()}")
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise ValueError(f"world_to_camera[:3, :3] must be a rotation, got {rotation.tolist()}")
+    for argument, size in (("width", width), ("height", height)):
+        if size < 1 or size != int(size):
+            raise ValueError(f"{argument} must be an integer of at least 1, got {size}")
+        if size > MOST_SIDE:
+            raise ValueError(f"{argument} must be at most {MOST_SIDE:,}, got {size:,}")
+    return RunCamera(name, int(width), int(height), intrinsics, pose)
+
+
 def save_cameras(folder: Path, capture: Capture) -> None:
     """Write the cameras of a capture into the folder of a run."""
     views = [
@@ -91,12 +117,8 @@ def load_cameras(folder: Path) -> RunCameras:
         if content["version"] != _VERSION:
             raise ValueError(f"version {content['version']}, this program reads {_VERSION}")
         cameras = [
-            RunCamera(
-                str(view["name"]),
-                int(view["width"]),
-                int(view["height"]),
-                _matrix(view["K"], 3),
-                _matrix(view["world_to_camera"], 4),
+            checked_camera(
+                str(view["name"]), view["width"], view["height"], view["K"], view["world_to_camera"]
             )
             for view in content["cameras"]
         ]
@@ -104,7 +126,15 @@ def load_cameras(folder: Path) -> RunCameras:
         return RunCameras(cameras, train, test, [Path(text) for text in content["inputs"]])
     except FileNotFoundError:
         raise
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
         raise ValueError(f"{path} is damaged ({error}): give the capture with --data DIR instead") from error
 
 
@@ -112,13 +142,6 @@ def input_files(capture: Capture) -> list[Path]:
     """Return the paths of a capture's photographs and masks, which no command may overwrite."""
     images = [camera.image_path for camera in capture.cameras]
     return images + [camera.mask_path for camera in capture.cameras if camera.mask_path is not None]
-
-
-def _matrix(rows: object, size: int) -> npt.NDArray[np.float64]:
-    matrix = np.array(rows, dtype=np.float64)
-    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise ValueError(f"a matrix is not {size} x {size} finite numbers")
-    return matrix
 
 
 def _indices(values: Sequence[int], count: int) -> list[int]:

@@ -25,7 +25,7 @@ from blitzgs.training import run
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import load_config
 from blitzgs.training.lod import scene_gate
-from blitzgs.training.run_cameras import RunCamera, RunCameras, load_cameras
+from blitzgs.training.run_cameras import RunCamera, RunCameras, checked_camera, load_cameras
 from blitzgs.training.run_log import LOG
 from blitzgs.training.views import CameraLike, Space, render_options, viewmat
 from blitzgs.view.gate import SceneGate, centres_of
@@ -133,18 +133,10 @@ class Model:
         Raises:
             ValueError: an argument has another shape or value; the message names it.
         """
-        intrinsics, pose = np.array(K, dtype=np.float64), np.array(world_to_camera, dtype=np.float64)
-        for argument, matrix, shape in (("K", intrinsics, (3, 3)), ("world_to_camera", pose, (4, 4))):
-            if matrix.shape != shape or not np.isfinite(matrix).all():
-                raise ValueError(f"{argument} must be a finite matrix {shape}, got {matrix.tolist()}")
-        rotation = pose[:3, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-            raise ValueError(f"world_to_camera[:3, :3] must be a rotation, got {rotation.tolist()}")
-        for argument, size in (("width", width), ("height", height)):
-            if size < 1 or size != int(size):
-                raise ValueError(f"{argument} must be an integer of at least 1, got {size}")
-        pose[:3, 3] += rotation @ np.array(self.space.offset)
-        return RunCamera(name, int(width), int(height), intrinsics, pose)
+        camera = checked_camera(name, width, height, K, world_to_camera)
+        pose = camera.world_to_camera
+        pose[:3, 3] += pose[:3, :3] @ np.array(self.space.offset)
+        return camera
 
 
 class RunFolder:

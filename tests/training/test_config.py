@@ -55,6 +55,8 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--log.tensorboard=1", "log.tensorboard: must be true or false, got 1"),
         ("--seed", "not an override: write --section.field=value"),
         ("--seed=[", "seed: cannot read the value"),
+        ("--schedule.scale=" + "9" * 400, "schedule.scale: 9+ is too large"),
+        ("--log=&all {every: *all}", "log: sections are nested more than 20 deep"),
     ],
 )
 def test_errors_name_the_field(override, message):

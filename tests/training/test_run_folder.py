@@ -133,7 +133,18 @@ def test_a_lost_photograph_costs_its_view_alone(copy, capsys):
 
 def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, capsys):
     _, folder = copy
-    for damage in ("", "{", '{"version": 2}', '{"version": 1, "cameras": [{}]}', "[]"):
+    content = json.loads((folder / "cameras.json").read_text())
+    damages = ["", "{", '{"version": 2}', '{"version": 1, "cameras": [{}]}', "[]", "[" * 100_000]
+    for field, value in (
+        ("width", 0),
+        ("width", 1 << 24),
+        ("height", math.inf),
+        ("K", np.zeros((3, 3)).tolist()),
+        ("world_to_camera", np.zeros((4, 4)).tolist()),
+    ):
+        damages.append(json.dumps(content | {"cameras": [content["cameras"][0] | {field: value}]}))
+    damages.append(json.dumps(content | {"test": [math.inf]}))
+    for damage in damages:
         (folder / "cameras.json").write_text(damage)
         assert main(["render", str(folder), "--out", str(tmp_path / "out")]) == 1
         assert "cameras.json is damaged" in (message := capsys.readouterr().err) and "--data" in message
@@ -211,6 +222,15 @@ def test_georeferenced_models_are_exported_around_their_origin(trained, tmp_path
     flags = ["--coordinates", "centred"]
     assert main(["export", str(trained[1]), "--ply", str(tmp_path / "c.ply"), *flags]) == 0
     assert "c.ply.offset.json says" in capsys.readouterr().out
+    # An offset that no longer holds does not stay.
+    assert main(["export", str(trained[1]), "--ply", str(tmp_path / "c.ply")]) == 0
+    assert not (tmp_path / "c.ply.offset.json").exists()
+    mine = tmp_path / "d.ply.offset.json"
+    mine.write_text("mine")
+    assert main(["export", str(trained[1]), "--ply", str(tmp_path / "d.ply"), *flags]) == 1
+    assert "is not the offset of an exported model: choose another name" in capsys.readouterr().err
+    assert main(["export", str(trained[1]), "--ply", str(tmp_path / "d.ply")]) == 0
+    assert mine.read_text() == "mine"
 
 
 def test_antialiased_models_are_marked_and_can_be_baked(tmp_path, capsys):

@@ -73,6 +73,10 @@ def generate_city(
     """
     options = CityOptions(extent, views, width, height, points_per_view, oblique, seed)
     out = Path(out)
+    if out.name in ("", ".."):
+        raise ValueError(f"synthetic city: the folder must be given by its name, got '{out}'")
+    if processes is not None and processes < 1:
+        raise ValueError(f"synthetic city: processes must be at least 1, got {processes}")
     if _reusable(out, options, overwrite):
         return out
     partial = out.with_name(f".{out.name}.partial")
@@ -125,7 +129,7 @@ def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
         found = json.loads((out / MANIFEST).read_text())
         if not isinstance(found, dict):
             raise ValueError("not a JSON object")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise FileExistsError(
             f"{out} holds no generated city ({MANIFEST}: {error}); choose another folder"
         ) from error
