@@ -84,13 +84,12 @@ def _logged(path: Path, run_id: str) -> list[tuple[int, int]]:
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             record = json.loads(line)
-            is_own = record.get("run") == run_id  # or of a run that ended before its first checkpoint
-        except (ValueError, AttributeError):
+            if record.get("run") != run_id:  # of a run that ended before its first checkpoint
+                continue
+            if record.get("event") in ("pass_1", "pass_2"):
+                points.append((int(record["t"]), int(record["before"])))
+            if record.get("event") in ("densify", "pass_1", "pass_2"):
+                points.append((int(record["t"]), int(record["gaussians"])))
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             continue  # torn when the disk was full or the process was killed
-        if not is_own:
-            continue
-        if record.get("event") in ("pass_1", "pass_2"):
-            points.append((record["t"], record["before"]))
-        if record.get("event") in ("densify", "pass_1", "pass_2"):
-            points.append((record["t"], record["gaussians"]))
     return points

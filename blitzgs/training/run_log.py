@@ -226,7 +226,7 @@ def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:
             repeated = record.get("run") == run_id and (
                 record["t"] > done or (record["t"] == total and record.get("event") == "evaluation")
             )
-        except (ValueError, LookupError, TypeError, AttributeError):
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             repeated = True  # an incomplete line, from a crash
         if not repeated:
             kept.append(line + "\n")

@@ -195,6 +195,21 @@ TEST_CASE("messages say file, place and reason in printable characters") {
                       "c.txt: line 2: '\\x80' is not a valid camera parameter");
 }
 
+TEST_CASE("an image in the place of observations is refused, whether these are read or not") {
+  const std::string header = "\xef\xbb\xbf# a byte order mark comes before\n";
+  const std::string first = "1 1 0 0 0 0 0 0 1 a.jpg\n", second = "2 1 0 0 0 0 0 0 1 b.jpg\n";
+  for (const bool with_points2d : {false, true}) {
+    std::istringstream whole(header + first + "\n" + second + "1.5 2 -1 3 4 7\n");
+    REQUIRE(read_images_text(whole, "i.txt", with_points2d).names.size() == 2);
+    std::istringstream joined(header + first + second);
+    REQUIRE_THROWS_AS(read_images_text(joined, "i.txt", with_points2d), FormatError);
+    std::istringstream torn(header + first + "1.5 2\n");
+    REQUIRE_THROWS_AS(read_images_text(torn, "i.txt", with_points2d), FormatError);
+    std::istringstream no_id(header + first + "1.5 2 x\n");
+    REQUIRE_THROWS_AS(read_images_text(no_id, "i.txt", with_points2d), FormatError);
+  }
+}
+
 TEST_CASE("columns that disagree are not written") {
   std::ostringstream out;
   ColmapImages images = some_images();

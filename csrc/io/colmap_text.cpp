@@ -23,6 +23,19 @@ void put_after_blank(std::ostream& out, T value) {
   put(out, value);
 }
 
+// Without the empty line of an image that has no observations, the next image stands here and would be lost.
+void skip_observations(TextReader& reader) {
+  std::uint64_t tokens = 0;
+  std::string_view last;
+  for (; reader.has_token(); ++tokens) last = reader.token("an observation");
+  std::int64_t id = 0;
+  const auto [end, error] = std::from_chars(last.data(), last.data() + last.size(), id);
+  if (tokens % 3 != 0 || (tokens > 0 && (error != std::errc() || end != last.data() + last.size()))) {
+    reader.fail(
+        "expected the observations of an image (x, y and point id of each), which may be an empty line");
+  }
+}
+
 }  // namespace
 
 std::vector<ColmapCamera> read_cameras_text(std::istream& in, const std::string& name) {
@@ -58,7 +71,9 @@ ColmapImages read_images_text(std::istream& in, const std::string& name, bool wi
       reader.fail("image " + std::to_string(images.ids.back()) + " has no name");
     }
     // Every image has a line of observations, which may be empty; only the last one may be missing.
-    if (reader.next_line() && with_points2d) {
+    const bool has_line = reader.next_line();
+    if (has_line && !with_points2d) skip_observations(reader);
+    if (has_line && with_points2d) {
       while (reader.has_token()) {
         images.points2d.push_back(reader.number<double>("observation x"));
         images.points2d.push_back(reader.number<double>("observation y"));

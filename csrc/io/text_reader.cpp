@@ -5,12 +5,14 @@ namespace blitzgs::io {
 
 namespace {
 constexpr std::string_view kBlanks = " \t\r\v\f";
-}
+constexpr std::string_view kByteOrderMark = "\xef\xbb\xbf";
+}  // namespace
 
 bool TextReader::next_line() {
   if (!std::getline(in_, line_)) return false;
   ++line_number_;
   left_ = line_;
+  if (line_number_ == 1 && left_.starts_with(kByteOrderMark)) left_.remove_prefix(kByteOrderMark.size());
   if (!left_.empty() && left_.back() == '\r') left_.remove_suffix(1);
   return true;
 }

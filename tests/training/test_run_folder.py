@@ -150,6 +150,18 @@ def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, capsys):
         assert "cameras.json is damaged" in (message := capsys.readouterr().err) and "--data" in message
 
 
+def test_damaged_records_of_the_log_do_not_end_a_run(copy):
+    data, folder = copy
+    (manifest,) = (folder / "checkpoints").glob("*/manifest.json")
+    record = {"run": json.loads(manifest.read_text())["state"]["run"], "event": "densify", "t": 5}
+    with open(folder / "log.jsonl", "a") as log:
+        log.write(f"{json.dumps(record)}\n{'[' * 100_000}\n5\n")
+    assert blitzgs.open_run(folder).log()[-2:] == [record, 5]
+    (folder / "summary.json").unlink()
+    assert main(["train", "--out", str(folder), "--data", str(data), "--resume"]) == 0
+    assert (folder / "summary.json").exists()
+
+
 # The configuration in the checkpoint is used.
 
 
