@@ -58,12 +58,17 @@ def evaluate(
             where, actual, predicted = region_rates(run.only(late), scores[late])
             result["regions"] = {"cells": int(where.sum()), "r": correlation(actual[where], predicted[where])}
             picture = maps({"survived": actual, "predicted at birth, as many": predicted})
-            output.write(path, picture.encode())
+            output.write(path, _utf8(picture))
         curves[run.name] = [(entry["until"], entry["survived"]) for entry in cohorts]
         results.append(result)
     chart = line_chart(curves, "born at, images", "share that reaches the final model", most=1.0)
-    output.write(survival, chart.encode())
+    output.write(survival, _utf8(chart))
     return results
+
+
+def _utf8(picture: str) -> bytes:
+    # The name of a capture's folder, which a picture shows, may have bytes that are not UTF-8.
+    return picture.encode(errors="backslashreplace")
 
 
 def survival_by_cohort(run: Spawns) -> list[dict[str, float]]:

@@ -100,9 +100,10 @@ class PartWriter:
         arrow, parquet = self._parquet
         try:
             # The file must be on disk when `finish` returns, because a checkpoint refers to it.
-            with new_file(self._folder / name) as partial:
+            # pyarrow takes no path that is not UTF-8, so it gets the open file.
+            with new_file(self._folder / name) as partial, partial.open("wb") as file:
                 # Ids and floats hardly repeat, so a dictionary would take time and save nothing.
-                parquet.write_table(arrow.table(columns), partial, compression="zstd", use_dictionary=False)
+                parquet.write_table(arrow.table(columns), file, compression="zstd", use_dictionary=False)
         except OSError as error:
             self._failed.append((name, columns, error))
 
@@ -195,7 +196,8 @@ def read_numbers(path: Path) -> Any:
     """
     arrow, parquet = import_pyarrow()
     try:
-        table = parquet.read_table(path)
+        with path.open("rb") as file:
+            table = parquet.read_table(file)
     except (OSError, arrow.ArrowException) as error:
         raise ValueError(f"{path} is not a Parquet file, or is damaged: {error}") from error
     kinds = arrow.types

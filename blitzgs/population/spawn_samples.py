@@ -57,9 +57,10 @@ def write_sample(run: Spawns, path: Path, most: int = MOST_ROWS) -> float:
         "rate": rate,
     }
     table = arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
-    with new_file(path) as partial:
-        table = table.replace_schema_metadata({_ABOUT: json.dumps(about)})
-        parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
+    table = table.replace_schema_metadata({_ABOUT: json.dumps(about)})
+    # pyarrow takes no path that is not UTF-8, so it gets the open file.
+    with new_file(path) as partial, partial.open("wb") as file:
+        parquet.write_table(table, file, compression="zstd", use_dictionary=False)
     return rate
 
 
@@ -75,7 +76,8 @@ def check_no_other(path: Path) -> None:
         return
     arrow, parquet = import_pyarrow()
     try:
-        known = _ABOUT in (parquet.read_schema(path).metadata or {})
+        with path.open("rb") as file:
+            known = _ABOUT in (parquet.read_schema(file).metadata or {})
     except (OSError, arrow.ArrowException):
         known = False
     if not known:

@@ -112,7 +112,7 @@ def capture_fingerprint(capture: Capture) -> str:
     """Return a digest of the cameras, the points and the split."""
     digest = hashlib.sha256()
     for camera in capture.cameras:
-        digest.update(f"{camera.name} {camera.width} {camera.height}".encode())
+        digest.update(os.fsencode(f"{camera.name} {camera.width} {camera.height}"))
         digest.update(camera.K.tobytes() + camera.world_to_camera.tobytes())
     digest.update(capture.points.tobytes() + capture.colors.tobytes())
     digest.update(repr((capture.train, capture.test)).encode())

@@ -75,10 +75,8 @@ def checked_camera(
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise ValueError(f"world_to_camera[:3, :3] must be a rotation, got {rotation.tolist()}")
     for argument, size in (("width", width), ("height", height)):
-        if size < 1 or size != int(size):
-            raise ValueError(f"{argument} must be an integer of at least 1, got {size}")
-        if size > MOST_SIDE:
-            raise ValueError(f"{argument} must be at most {MOST_SIDE:,}, got {size:,}")
+        if not 1 <= size <= MOST_SIDE or size != int(size):
+            raise ValueError(f"{argument} must be an integer from 1 to {MOST_SIDE:,}, got {size}")
     return RunCamera(name, int(width), int(height), intrinsics, pose)
 
 

@@ -16,6 +16,7 @@ from blitzgs.population.candidates import Candidates
 from blitzgs.population.gate_evaluation import correlation, region_rates, survival_by_cohort
 from blitzgs.population.gate_fit import read_spawns
 from blitzgs.population.spawn_samples import read_sample
+from blitzgs.scene.colmap import read_model, write_model
 from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events
 from tests.population.test_spawn_gate import candidates, spawns
 from tests.training.tiny import OVERRIDES, tiny_config, write_tiny_capture
@@ -153,6 +154,23 @@ def test_no_other_file_is_replaced(lineage_run, tmp_path, capsys):
     assert main(["gate", "replay", str(gate), str(run), "--out", str(mine)]) == 1
     assert "already holds a replay: choose another --out" in capsys.readouterr().err
     assert (mine / "replay.json").read_text() == "mine"
+
+
+def test_names_need_not_be_utf_8(lineage_run, tmp_path):
+    root = tmp_path / "bytes \udcff"
+    shutil.copytree(lineage_run / "capture", root / "\udcff")
+    sparse = root / "\udcff" / "sparse" / "0"
+    model = read_model(sparse)
+    model.images.names[0] = "\udcfe.png"
+    write_model(sparse, model)
+    (root / "\udcff" / "images" / "00.png").rename(root / "\udcff" / "images" / "\udcfe.png")
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, *SETTINGS)]
+    run, gate, sample = str(root / "run"), str(root / "gate.json"), str(root / "sample.parquet")
+    assert main(["train", "--data", str(root / "\udcff"), "--out", run, *flags]) == 0
+    assert main(["gate", "sample", run, "--out", sample]) == 0
+    assert main(["gate", "fit", sample, "--out", gate]) == 0
+    assert main(["gate", "evaluate", gate, run, "--out", str(root / "judged")]) == 0
+    ElementTree.parse(root / "judged" / "survival.svg")
 
 
 def test_runs_of_the_same_name_have_pictures_of_their_own(lineage_run, tmp_path):

@@ -90,8 +90,8 @@ def test_what_a_run_folder_holds(trained, tmp_path):
             {"world_to_camera": np.diag([1.0, 1.0, -1.0, 1.0])},
             r"world_to_camera\[:3, :3\] must be a rotation",
         ),
-        ({"width": 0}, "width must be an integer of at least 1, got 0"),
-        ({"height": 32.5}, "height must be an integer of at least 1, got 32.5"),
+        ({"width": 0}, "width must be an integer from 1 to 16,777,215, got 0"),
+        ({"height": 32.5}, "height must be an integer from 1 to 16,777,215, got 32.5"),
     ],
 )
 def test_a_camera_that_cannot_be_rendered_is_refused(trained, change, message):
