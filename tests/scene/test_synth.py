@@ -136,6 +136,11 @@ def test_overwriting_and_failing_leave_no_half_made_city(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         generate_city(out, **tiny, seed=1, overwrite=True, progress=interrupt)
     assert json.loads((out / "city.json").read_text())["seed"] == 0
+    for other in (out / "images" / "mine.jpg", out / "sparse" / "0" / "mine.txt"):
+        other.write_text("mine")
+        with pytest.raises(FileExistsError, match=f"{other} is no part of the city, and would be lost"):
+            generate_city(out, **tiny, seed=1, overwrite=True)
+        other.unlink()
     generate_city(out, **tiny, seed=1, overwrite=True)
     assert json.loads((out / "city.json").read_text())["seed"] == 1
     assert sorted(os.listdir(tmp_path)) == ["city"]

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from blitzgs.output import write_file
-from blitzgs.scene.colmap import write_model
+from blitzgs.scene.colmap import FILES, read_model, write_model
 from blitzgs.scene.synth.dataset import colmap_model
 from blitzgs.scene.synth.flight import plan_flight
 from blitzgs.scene.synth.options import CityOptions
@@ -25,6 +25,7 @@ from blitzgs.scene.synth.tracks import track
 MANIFEST = "city.json"
 _STARTED = "started.json"  # the manifest of a city that is not finished
 _LOCK = ".lock"
+_FOLDERS = ("images", "sparse")
 
 
 def generate_city(
@@ -141,7 +142,21 @@ def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
         raise FileExistsError(
             f"{out} holds another city ({'; '.join(different)}); choose another folder, or --overwrite it"
         )
+    if different:
+        _check_no_others(out)
     return not different
+
+
+def _check_no_others(out: Path) -> None:
+    """Check that the folders of a city, which are replaced as a whole, have no other files."""
+    sparse = out / "sparse" / "0"
+    own = {sparse / f"{name}.bin" for name in FILES}
+    if all(path.is_file() for path in own):
+        own |= {out / "images" / name for name in read_model(sparse).images.names}
+    for folder in _FOLDERS:
+        for path in sorted((out / folder).rglob("*")):
+            if path not in own and not path.is_dir():
+                raise FileExistsError(f"{path} is no part of the city, and would be lost: move it elsewhere")
 
 
 def _write(folder: Path, options: CityOptions, processes: int, progress: Progress | None) -> None:
@@ -157,7 +172,7 @@ def _write(folder: Path, options: CityOptions, processes: int, progress: Progres
 def _replace(out: Path, made: Path) -> None:
     """Replace the city in `out` by a new one; other files in it stay."""
     (out / MANIFEST).unlink()
-    for name in ("images", "sparse"):
+    for name in _FOLDERS:
         shutil.rmtree(out / name, ignore_errors=True)
         (made / name).rename(out / name)
     (made / MANIFEST).rename(out / MANIFEST)
