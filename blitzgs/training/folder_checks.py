@@ -125,7 +125,7 @@ def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> No
 
     Args:
         checkpoints: that folder; it may be missing.
-        files: names of the files beside it that a run writes.
+        files: names of the files and folders beside it that a run writes.
         ranks: the job.
 
     Raises:
@@ -136,7 +136,7 @@ def check_unclaimed(checkpoints: Path, files: Sequence[str], ranks: Ranks) -> No
         found = next((name for name in files if os.path.lexists(checkpoints.parent / name)), None)
     if (found := ranks.broadcast_object(found)) is not None:
         raise FileExistsError(
-            f"{checkpoints.parent} has a file {found}, which a run would replace, and no checkpoints: choose "
+            f"{checkpoints.parent} has {found}, which a run would replace, and no checkpoints: choose "
             "another --out"
         )
 

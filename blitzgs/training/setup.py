@@ -29,6 +29,7 @@ from blitzgs.training.inputs import check_alike, check_capture, train_views_fing
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.optimiser import LazyAdam
+from blitzgs.training.population_report import PICTURE
 from blitzgs.training.run import Progress
 from blitzgs.training.run_cameras import CAMERAS, save_cameras
 from blitzgs.training.run_log import LOG, RunLog
@@ -65,7 +66,8 @@ def set_up(
         FolderError: a rank cannot write to the folder, or the disk has too little space.
     """
     check_alike(config, capture, ranks, resume)
-    check_unclaimed(folder / run.CHECKPOINTS, (run.CONFIG, CAMERAS, LOG, run.SUMMARY), ranks)
+    written = (run.CONFIG, CAMERAS, LOG, run.SUMMARY, PICTURE, run.LINEAGE)
+    check_unclaimed(folder / run.CHECKPOINTS, written, ranks)
     check_writable(folder / run.CHECKPOINTS, ranks)
     space = Space.of(capture.offset, capture.extent)
     lpips = load_lpips(config.log.lpips_weights)

@@ -32,11 +32,13 @@ def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path, monkeypatc
     assert not list(tmp_path.rglob(".probe*"))
 
 
-@pytest.mark.parametrize("name", ["config.yaml", "cameras.json", "log.jsonl", "summary.json"])
+@pytest.mark.parametrize(
+    "name", ["config.yaml", "cameras.json", "log.jsonl", "summary.json", "trajectory.svg", "lineage"]
+)
 @pytest.mark.parametrize("resume", [True, False])
 def test_files_of_other_programs_are_not_replaced(tmp_path, name, resume):
     (tmp_path / name).write_text("precious")
-    with pytest.raises(FileExistsError, match=f"has a file {name}, which a run would replace"):
+    with pytest.raises(FileExistsError, match=f"has {name}, which a run would replace"):
         Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(), resume=resume)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "precious")]
 
