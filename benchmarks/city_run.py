@@ -31,13 +31,13 @@ from quality_plan import RunSpec
 from quality_run import describe, means_of, synchronize, write
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.training.agreement import Agreement
 from blitzgs.training.config import Config
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.population_report import population_report
 from blitzgs.training.run import TrainedModel
 from blitzgs.training.run_log import LOG
-from blitzgs.training.state import never
 from blitzgs.training.trainer import Trainer
 
 # A training stops so long before its process ends itself, in seconds; it is then evaluated.
@@ -67,7 +67,7 @@ class CityRun(RunSpec):
 class CityTrainer(Trainer):
     """A trainer that neither evaluates nor saves at its end, which its caller does or leaves out."""
 
-    def finish(self) -> Record:
+    def finish(self, agreement: Agreement) -> Record:
         """Do nothing."""
         return {}
 
@@ -186,7 +186,6 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
         timer.cancel()
         is_done = result["finished"] or deadline.is_set()
         synchronize(ranks.device)
-        state.stops = never
         images_seen, seconds = state.images_seen, state.progress.seconds
         host_peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         result |= {

@@ -25,6 +25,7 @@ from quality_plan import RunSpec
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.training import run
+from blitzgs.training.agreement import Agreement
 from blitzgs.training.evaluation import METRICS, evaluate, load_lpips
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture
@@ -120,7 +121,7 @@ class RecordedTrainer(Trainer):
         if step < self.state.schedule.steps and self.recorder.due(self.state.images_seen):
             self._record(end=False)
 
-    def finish(self) -> dict[str, Any]:
+    def finish(self, agreement: Agreement) -> dict[str, Any]:
         """Measure the trained model."""
         self._record(end=True)
         self.population = population_report(self.state, self.memory)

@@ -32,6 +32,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.model import REQUIRED, GaussianTable
 from blitzgs.scene.cameras import camera_centers
 from blitzgs.scene.capture import Capture
+from blitzgs.training.agreement import Agreement
 from blitzgs.training.batches import Images
 from blitzgs.training.config import Config
 from blitzgs.training.trainer import Trainer
@@ -151,7 +152,7 @@ class Merged:
 class _BlockTrainer(Trainer):
     """A trainer that leaves its model in memory."""
 
-    def finish(self) -> dict[str, Any]:
+    def finish(self, agreement: Agreement) -> dict[str, Any]:
         """Apply all pending steps; write nothing."""
         self.state.catch_up()
         return {}

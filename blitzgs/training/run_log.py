@@ -27,6 +27,9 @@ BOARD = "tensorboard"
 # Largest number of records that are kept while the disk is full; then the oldest are dropped.
 _MOST_WAITING = 10_000
 
+# Events after the last image, which a run that is resumed there logs again.
+_AT_THE_END = ("population", "image_memory", "evaluation")
+
 _SHOWN: dict[str, Callable[[float], str]] = {
     "loss": lambda value: f"loss {value:.4f}",
     "psnr": lambda value: f"{value:.2f} dB",
@@ -224,7 +227,7 @@ def _drop_repeated(path: Path, run_id: str, done: int, total: int) -> None:
         try:
             record = json.loads(line)
             repeated = record.get("run") == run_id and (
-                record["t"] > done or (record["t"] == total and record.get("event") == "evaluation")
+                record["t"] > done or (record["t"] == total and record.get("event") in _AT_THE_END)
             )
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             repeated = True  # an incomplete line, from a crash

@@ -116,15 +116,15 @@ class Trainer:
                         break
                     if decision.save:
                         save.run(state)
-            state.stops = never
-            self._check_photographs()
-            return self.finish()
+                self._check_photographs()
+                return self.finish(agreement)
         except PhotographError as error:  # on every rank
             self._stop(f"saved after {state.images_seen:,} images, before a photograph that cannot be read")
             raise PhotographError(
                 f"{error}. The model so far is saved: put the photograph back and continue with --resume"
             ) from error
         finally:
+            state.stops = never
             self.close()
 
     def _step_or_save(self, step: int, is_first: bool) -> None:
@@ -149,11 +149,14 @@ class Trainer:
 
     def _stop_for(self, signal: str | None) -> None:
         """Save where the run is, because of a signal."""
-        self._stop(f"stopped by {signal}; continue with --resume")
+        self._stop(_stopped_by(signal))
 
     def _stop(self, text: str) -> None:
         """Save a checkpoint and log why the run stops."""
         save.run_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
+        self._log_stop(text)
+
+    def _log_stop(self, text: str) -> None:
         self.state.log.event(self.state.images_seen, "stopped", {"reason": text}, text)
 
     def close(self) -> None:
@@ -233,22 +236,28 @@ class Trainer:
             state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
         )
 
-    def finish(self) -> dict[str, Any]:
-        """Save and evaluate the trained model; return and write the summary."""
+    def finish(self, agreement: Agreement) -> dict[str, Any] | None:
+        """Save and evaluate the trained model; return and write the summary.
+
+        Returns:
+            The summary; None if the run was asked to stop before the evaluation's end. It is then saved.
+        """
         state, step = self.state, self.state.progress.step
         residency = state.stepper.report(whole=True)
         state.catch_up()
         if state.population() == 0:
             raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
-        with StopRequest() as stop:
-            agreement = Agreement(state.ranks, stop, state.save_clock)
-            save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
+        save.run_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
         population = population_report(state, self.memory)
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()
         state.log.event(state.images_seen, "image_memory", dataclasses.asdict(images), str(images))
+        metrics = evaluate.run(state)
+        if not metrics:
+            self._log_stop(_stopped_by(agreement.now(step).signal))
+            return None
         summary = (
-            evaluate.run(state)
+            metrics
             | {
                 "images": state.images_seen,
                 "seconds": state.progress.seconds,
@@ -281,3 +290,7 @@ class Trainer:
             except OSError as error:
                 warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)
         return summary
+
+
+def _stopped_by(signal: str | None) -> str:
+    return f"stopped by {signal}; continue with --resume"

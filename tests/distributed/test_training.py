@@ -218,11 +218,12 @@ def test_a_held_out_photograph_lost_on_several_ranks_is_named_by_all_and_costs_n
     assert all(run_ranks(_lose_a_held_out_photograph, 2, tmp_path, True))
 
 
-def _stop_in_an_evaluation(ranks, folder):
-    """Ask rank 1 to stop when it compares its first view; return the views that each rank compares."""
+def _stop_in_an_evaluation(ranks, folder, every):
+    """Ask the last rank to stop when it compares its first view; return when each rank compared a view."""
     capture, images = tiny_scene()
     capture.test = capture.train * 6
-    trainer = Trainer(tiny_config(*SETTINGS, "schedule.evaluate_every=22"), capture, images, folder, ranks)
+    config = tiny_config(*SETTINGS, f"schedule.evaluate_every={every}")
+    trainer = Trainer(config, capture, images, folder, ranks)
     get, compared = images.get, []
 
     def stopping(index):
@@ -237,13 +238,16 @@ def _stop_in_an_evaluation(ranks, folder):
 
 
 @pytest.mark.parametrize("world_size", [1, 2])
-def test_a_signal_within_an_evaluation_does_not_wait_for_its_end(tmp_path, world_size):
+@pytest.mark.parametrize(("every", "step"), [(22, 12), (0, 30)])  # images 22 and 23; after the last image
+def test_a_signal_within_an_evaluation_does_not_wait_for_its_end(tmp_path, world_size, every, step):
     """torchrun ends a process 30 seconds after it was asked to stop; an evaluation may take longer."""
-    for compared, summary in run_ranks(_stop_in_an_evaluation, world_size, tmp_path):
-        assert compared == [12] and summary is None  # images 22 and 23
-    assert run.restore(tmp_path, Ranks()).progress.step == 12
+    for compared, summary in run_ranks(_stop_in_an_evaluation, world_size, tmp_path, every):
+        assert compared == [step] and summary is None
+    assert run.restore(tmp_path, Ranks()).progress.step == step
     events = [record.get("event") for record in read_log(tmp_path)]
-    assert "evaluation stopped" in events and "evaluation" not in events
+    assert "evaluation stopped" in events and "evaluation" not in events and events[-1] == "stopped"
+    for summary, _ in run_ranks(_train, world_size, tmp_path, f"schedule.evaluate_every={every}"):
+        assert summary["images"] == 60 and "psnr" in summary
 
 
 def _resume_with_fewer_views(ranks, folder):

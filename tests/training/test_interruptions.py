@@ -344,7 +344,8 @@ def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypat
     trainer(tmp_path, "schedule.checkpoint_every=50", resume=True).train()  # the finished run once more
     found = read_log(tmp_path)
     assert [r["t"] for r in found if "loss" in r] == [20, 40, 60, 80, 100]
-    assert [r["t"] for r in found if r.get("event") == "evaluation"] == [100]
+    for event in ("population", "image_memory", "evaluation"):
+        assert [r["t"] for r in found if r.get("event") == event] == [100]
     assert len({r["run"] for r in found}) == 1
     origins = [r["origin"] for r in found if r.get("event") == "start"]
     assert origins == [
