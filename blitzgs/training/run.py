@@ -117,7 +117,7 @@ class TrainedModel:
         """
         if self.pool_bytes == 0:
             return self.table
-        self.table = HostTable(self.table.columns, pinned=device.type == "cuda")
+        self.table = HostTable(self.table.release(), pinned=device.type == "cuda")
         return Residence(self.table, device, self.pool_bytes, None)
 
 

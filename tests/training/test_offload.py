@@ -137,9 +137,11 @@ def test_two_ranks_share_a_run_beyond_their_memory(tmp_path):
             assert torch.equal(got[name], expected[name]), name
 
 
-def test_a_model_is_rendered_through_a_pool(tmp_path):
-    trainer, _ = train(tmp_path, RESIDENT, "schedule.iterations=15", "view.lod=true", "view.most_kept=1",
-                       "schedule.densify_until=10")  # fmt: skip
+def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypatch):
+    stop_at(monkeypatch, 15)  # the mask is cleared later
+    trainer, _ = train(tmp_path, RESIDENT, "schedule.iterations=30", "view.lod=true", "view.most_kept=1",
+                       "schedule.densify_until=10", "population.importance=true", "population.pass1_keep=1",
+                       "schedule.t1=12", "schedule.t2=0", "view.cull=true")  # fmt: skip
     model, ranks = run.open_model(tmp_path, Ranks()), Ranks()
     table = model.table
     lod = scene_gate(model.config, model.progress, table, ranks)
