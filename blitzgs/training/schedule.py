@@ -133,7 +133,8 @@ class Schedule:
     def _clear_cull(self) -> tuple[EventKind, float, float, float]:
         """Return when the cull mask is dropped: halfway between the last importance pass and the end."""
         config = self._config
-        last = config.t2 or config.t1
+        # A pass that is set to a time after the end does not happen.
+        last = max(time for time in (0, config.t1, config.t2) if time < config.iterations)
         time = math.floor((last + config.iterations) / 2)
         return "clear_cull", time, time + 1, min(last, 1)
 
