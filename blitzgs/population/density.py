@@ -31,7 +31,8 @@ class DensityRules:
 
     Attributes:
         grad_threshold: mean 2D-mean gradient norm (half-image units) from which a Gaussian is densified.
-        clone_scale: Gaussians with a largest axis up to this are cloned, larger ones split.
+        clone_scale: Gaussians with a largest axis up to this are cloned, larger ones split; 0:
+            all are split.
         min_opacity: Gaussians of lower opacity are pruned.
         max_screen_radius: pixels; Gaussians with a larger radius since the last event are pruned. None: none
             are.
@@ -111,7 +112,8 @@ def densify(
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = (gradient >= rules.grad_threshold) & (table["grad_count"] >= rules.min_observations)
     wanted, vetoed = candidates.sum(), 0
-    small = table["scales"].amax(dim=1) <= math.log(rules.clone_scale)
+    largest = math.log(rules.clone_scale) if rules.clone_scale > 0 else -math.inf
+    small = table["scales"].amax(dim=1) <= largest
     if veto is not None:
         rows = candidates.nonzero().squeeze(1)
         is_split = ~small[rows]

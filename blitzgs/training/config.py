@@ -236,7 +236,8 @@ class PopulationConfig:
         absolute_gradients: use the sum over pixels of the absolute gradients instead (AbsGS), in which
             opposite gradients of a Gaussian's two halves do not cancel.
         absolute_threshold: replaces `grad_threshold` with `absolute_gradients`.
-        clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split.
+        clone_scale: Gaussians up to this largest axis (relative to extent) are cloned, larger ones split; 0:
+            all are split.
         min_opacity: Gaussians of lower opacity are pruned.
         reset_opacity: cap of the opacities at each `schedule.reset_every`.
         opacity_decay: share of its opacity that every Gaussian loses at each density event.

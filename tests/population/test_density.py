@@ -100,8 +100,9 @@ def brute_force(table: GaussianTable, rules: DensityRules) -> dict[int, dict[str
         DensityRules(5e-4, 0.05, 0.05, max_screen_radius=20.0, max_scale=0.25),
         DensityRules(5e-4, 0.05, 0.05, max_gaussians=230),
         DensityRules(5e-4, 0.05, 0.05, max_gaussians=100),
+        DensityRules(5e-4, 0.0, 0.05),
     ],
-    ids=["plain", "size", "cap", "full"],
+    ids=["plain", "size", "cap", "full", "splits only"],
 )
 def test_matches_row_by_row(rules):
     table = random_table(200)
