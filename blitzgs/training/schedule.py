@@ -152,7 +152,7 @@ class Schedule:
     def sh_degree(self, begin: int, limit: int) -> int:
         """Return the SH degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
         time = self.pace.time(begin + self.batch_size)
-        return min(limit, math.ceil(time / self._config.sh_every - 1e-9) - 1)
+        return min(limit, max(1, math.ceil(time / self._config.sh_every - 1e-9)) - 1)
 
     def gathers_statistics(self, begin: int) -> bool:
         """Tell whether a later density event uses the statistics of the step at [begin, begin + B)."""
