@@ -153,6 +153,13 @@ def problems(config: Config) -> Iterator[str]:
     if 0 < config.optimiser.position < 1e-20:
         # The rate falls by a power of the ratio of position_final to it, which must stay a number.
         yield f"optimiser.position: must be 0 or at least 1e-20, got {config.optimiser.position}"
+    beta1, beta2 = config.optimiser.beta1, config.optimiser.beta2
+    if beta1 * beta1 >= beta2:
+        # Otherwise the steps of a row without gradients do not fade, and cannot be applied later.
+        yield (
+            f"optimiser.beta1: must be below the square root of optimiser.beta2 ({beta2}), or Adam's steps "
+            f"grow without gradients; got {beta1}"
+        )
     yield from _problems_of_length(schedule)
     yield from _problems_of_places(schedule)
     if schedule.reset_every > 0 and not population.min_opacity < population.reset_opacity:

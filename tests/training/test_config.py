@@ -136,6 +136,7 @@ def test_senseless_numbers_are_refused_by_name(name, default, value):
         ("loss.size=.inf", r"loss.size: must be in"),
         ("model.near=2e6", "model.near: must be in"),
         ("model.far=0.001", "model.near: must be below model.far"),
+        ("optimiser.beta1=0.9999", "optimiser.beta1: must be below the square root of optimiser.beta2"),
         ("data.exif=maybe", "data.exif: must be one of auto, apply, ignore, got maybe"),
         ("ranks.timeout_seconds=-1", r"ranks.timeout_seconds: must be in \[1, 1,000,000\], got -1.0"),
     ],
