@@ -173,6 +173,7 @@ def run(name: str, repeats: int) -> dict[str, Any]:
     sparse = partial(rasterization, sparse_grad=True)
     calls: dict[str, Callable[[], CallRender]] = {
         "rasterization": lambda: CallRender(scene, rasterization),
+        "rasterization, 1 thread": lambda: CallRender(scene, rasterization, one_thread=True),
         "sparse": lambda: CallRender(scene, sparse),
         "sparse, meta": lambda: CallRender(scene, sparse, read_meta=True),
         "sparse, 1 thread": lambda: CallRender(scene, sparse, one_thread=True),

@@ -161,17 +161,19 @@ def call_lines(render: Json) -> list[str]:
     columns = {
         "blitzgs": "the training step's ops",
         "rasterization": "the call, dense gradients",
+        "rasterization, 1 thread": "dense, autograd in one thread",
         "sparse": "sparse gradients",
         "sparse, 1 thread": "sparse, autograd in one thread",
         "sparse, meta": "sparse, all of meta read",
         "gsplat": "gsplat",
         "gsplat, 1 thread": "gsplat, autograd in one thread",
     }
+    measured = [name for name in columns if any(name in result for result in render["results"])]
     rows = [
-        [result["scene"], *(ms(result[name]["total"]) if name in result else "–" for name in columns)]
+        [result["scene"], *(ms(result[name]["total"]) if name in result else "–" for name in measured)]
         for result in render["results"]
     ]
-    return table(["scene", *columns.values()], rows)
+    return table(["scene", *(columns[name] for name in measured)], rows)
 
 
 def step_lines(*files: Json) -> list[str]:
