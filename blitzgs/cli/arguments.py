@@ -7,6 +7,8 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from blitzgs.training.config_ranges import RANGES
+
 Commands = argparse._SubParsersAction  # argparse has no public name for it
 
 
@@ -50,6 +52,24 @@ def add_capture(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of the capture, if it has moved since the training",
     )
+
+
+def add_pool(parser: argparse.ArgumentParser) -> None:
+    """Add the flag --resident-gb: views may need a larger pool on fewer ranks than the run was trained on."""
+    parser.add_argument(
+        "--resident-gb",
+        type=_gigabytes,
+        metavar="GB",
+        help="gigabytes of each device for Gaussians, the others stay in host memory; 0: no limit (default: "
+        "memory.resident_gb of the run)",
+    )
+
+
+def _gigabytes(text: str) -> float:
+    value, allowed = float(text), RANGES["memory.resident_gb"]
+    if value not in allowed:
+        raise argparse.ArgumentTypeError(f"must be {allowed}, got {text}")
+    return value
 
 
 def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> None:

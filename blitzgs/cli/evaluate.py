@@ -7,7 +7,15 @@ import argparse
 import dataclasses
 import json
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_run, named_path
+from blitzgs.cli.arguments import (
+    Commands,
+    add_capture,
+    add_command,
+    add_device,
+    add_pool,
+    add_run,
+    named_path,
+)
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.progress import image_progress
@@ -25,6 +33,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     add_run(parser)
     add_capture(parser)
     add_device(parser, shares_gpus=True)
+    add_pool(parser)
     parser.add_argument(
         "--split", choices=("test", "train"), default="test", help="which views (%(default)s)"
     )
@@ -49,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if args.pictures < 0:
         raise ValueError(f"--pictures: must be 0 or more, got {args.pictures}")
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
-        model = run_folder.open_model(args.folder, ranks, args.data)
+        model = run_folder.open_model(args.folder, ranks, args.data, args.resident_gb)
         config = model.config
         if args.allow_missing:
             data = dataclasses.replace(config.data, allow_missing=True)

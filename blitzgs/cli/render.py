@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from blitzgs.cli.arguments import Commands, add_command, add_device, add_run, named_path
+from blitzgs.cli.arguments import Commands, add_command, add_device, add_pool, add_run, named_path
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.output import OutputFolder
@@ -32,6 +32,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "--data", type=named_path, metavar="DIR", help="take the cameras from this capture, not from the run"
     )
     add_device(parser, shares_gpus=True)
+    add_pool(parser)
     parser.add_argument(
         "--split", choices=("test", "train", "all"), default="test", help="which views (%(default)s)"
     )
@@ -46,7 +47,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Render the views of a run; returns the exit status."""
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
-        model = run_folder.open_model(args.folder, ranks, args.data)
+        model = run_folder.open_model(args.folder, ranks, args.data, args.resident_gb)
         stored = _cameras(args, model, ranks)
         cameras: Sequence[CameraLike] = stored.cameras
         indices = range(len(cameras)) if args.split == "all" else getattr(stored, args.split)

@@ -217,19 +217,22 @@ def check_is_run(folder: Path) -> None:
         raise FileNotFoundError(f"{folder} is not a run: it has no {CONFIG} and no {CHECKPOINTS}")
 
 
-def open_model(folder: Path, ranks: Ranks, data: Path | None = None) -> TrainedModel:
+def open_model(
+    folder: Path, ranks: Ranks, data: Path | None = None, resident_gb: float | None = None
+) -> TrainedModel:
     """Open the newest model of a run for rendering, with the configuration that was saved with it.
 
     Args:
         folder: folder of the run.
         ranks: the job.
         data: present folder of the capture; None: unchanged.
+        resident_gb: gigabytes of each device for Gaussians; 0: no limit; None: as the run.
 
     Raises:
         FileNotFoundError: the folder is not a run, or holds no checkpoint.
     """
     check_is_run(folder)
-    pool_bytes = _pool_bytes(folder / CONFIG)
+    pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
     home = torch.device("cpu") if pool_bytes > 0 else ranks.device
     restored = restore(folder, ranks, home)
     if restored is None:
@@ -244,12 +247,12 @@ def open_model(folder: Path, ranks: Ranks, data: Path | None = None) -> TrainedM
     return TrainedModel(config, progress, restored.space, table, pool_bytes)
 
 
-def _pool_bytes(path: Path) -> int:
-    """Return how many bytes of a device the configuration gives to the Gaussians; 0: no limit."""
+def _resident_gb(path: Path) -> float:
+    """Return how many gigabytes of a device the configuration gives to the Gaussians; 0: no limit."""
     try:
-        return int(load_config(path).memory.resident_gb * 1e9)
+        return load_config(path).memory.resident_gb
     except ConfigError:
-        return 0
+        return 0.0
 
 
 def _compare_with_file(config: Config, path: Path) -> None:

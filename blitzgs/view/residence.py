@@ -34,6 +34,7 @@ from blitzgs.view.host_table import HostTable
 _WRITTEN = (
     *PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step", "grad_sum", "grad_count", "max_radii",
 )  # fmt: skip
+_SETTING = "memory.resident_gb (eval, render: --resident-gb)"
 _FREE = -1
 
 
@@ -135,7 +136,7 @@ class Residence:
         slots = min(self._blocks, self._budget // self._bytes_in - has_rest)
         if slots < min(1, self._blocks):
             raise ResidenceError(
-                f"memory.resident_gb: {self._budget / 1e9:g} GB are less than two blocks of 256 Gaussians, "
+                f"{_SETTING}: {self._budget / 1e9:g} GB are less than two blocks of 256 Gaussians, "
                 f"which take {2 * self._bytes_in / 1e9:.4f} GB"
             )
         rows = slots * BLOCK_ROWS + self._rest
@@ -309,7 +310,8 @@ class Residence:
         raise ResidenceError(
             f"views that are rendered together see {needed:,} blocks of 256 Gaussians, "
             f"{needed * self._bytes_in / 1e9:.3f} GB, and the pool has room for {slots:,}, "
-            f"{slots * self._bytes_in / 1e9:.3f} GB: raise memory.resident_gb, or lower schedule.batch_size"
+            f"{slots * self._bytes_in / 1e9:.3f} GB: raise {_SETTING}, or train with a lower "
+            "schedule.batch_size"
         )
 
     def _first_to_go(self, slots: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:

@@ -113,6 +113,30 @@ def test_render_and_export_need_no_photographs(copy, tmp_path):
     assert main(["export", str(folder), "--ply", str(tmp_path / "m.ply")]) == 0
 
 
+@pytest.mark.parametrize("command", ["eval", "render"])
+def test_a_run_is_shown_with_another_pool_than_it_was_trained_with(copy, tmp_path, capsys, command):
+    data, folder = copy
+    config = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(config.replace("resident_gb: 0.0", "resident_gb: 1.0e-06"))
+    arguments = [command, str(folder), "--out", str(tmp_path / "out")]
+    arguments += ["--data", str(data)] if command == "eval" else []
+    assert main(arguments) == 1
+    assert "--resident-gb" in capsys.readouterr().err
+    for gigabytes in ("0", "1"):
+        assert main([*arguments, "--resident-gb", gigabytes]) == 0
+    with pytest.raises(SystemExit):
+        main([*arguments, "--resident-gb", "nan"])
+    assert "--resident-gb: must be in [0, 1,000,000], got nan" in capsys.readouterr().err
+
+
+def test_a_split_without_views_is_named(copy, tmp_path, capsys):
+    cameras = copy[1] / "cameras.json"
+    cameras.write_text(json.dumps(json.loads(cameras.read_text()) | {"test": []}))
+    assert main(["render", str(copy[1]), "--out", str(tmp_path / "out")]) == 1
+    assert "has no test views: choose another --split" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_lost_photograph_costs_its_view_alone(copy, capsys):
     data, folder = copy
     whole = json.loads((folder / "evaluation" / "000040" / "metrics.json").read_text())

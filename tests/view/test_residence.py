@@ -141,7 +141,7 @@ def test_a_step_waits_for_blocks_that_were_not_prefetched():
     _, residence = make_residence(slots=max(counts) - 1)
     with pytest.raises(
         ResidenceError,
-        match=rf"see {max(counts)} blocks .* room for {max(counts) - 1},.*raise memory.resident_gb",
+        match=rf"see {max(counts)} blocks .* room for {max(counts) - 1},.*raise memory.*--resident-gb",
     ):
         for step in range(4):
             residence.load_for_step(step, first(views, step), 1)
