@@ -84,8 +84,9 @@ def measure_levels(points: Tensor, centres: Tensor, fork: float, base_resolution
     box = 1.1 * max((_quantile(axis, 0.99) - _quantile(axis, 0.01)).item() for axis in points.unbind(1))
     if not (box > 0 and d_min > 0):
         raise ValueError(
-            f"octree levels need a spread-out cloud seen from outside its points: the box is {box:g} and the "
-            f"smallest camera distance {d_min:g}"
+            "octree levels need points that are spread out, and cameras at some distance from them: the box "
+            f"of the points measures {box:g}, and the smallest distance is {d_min:g}. Check the points of "
+            "the capture; if it has none (an empty points3D.txt), training starts from random points"
         )
     count = min(MAX_LEVELS, max(1, round(math.log(d_max / d_min, fork)) + 1))
     base = round(math.log2(1.0 / base_resolution)) - count // 2 + 1

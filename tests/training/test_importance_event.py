@@ -319,8 +319,14 @@ def test_a_pass_that_a_signal_cuts_short_happens_after_the_resume(tmp_path, monk
 @pytest.mark.parametrize(
     "options, named",
     [
-        (["population.pass1_keep=1e-4"], "after 40 images kept none of .* population.pass1_keep=0.0001"),
-        (["population.pass2_keep=1e-4"], "after 80 images kept none of .* pass2_keep=0.0001"),
+        (
+            ["population.pass1_keep=1e-4"],
+            r"after 40 images kept none .*: raise population.pass1_keep \(0.0001\)$",
+        ),
+        (
+            ["population.pass2_keep=1e-4"],
+            r"after 80 images kept none .* population.pass2_keep \(0.0001\), or lower",
+        ),
     ],
 )
 def test_a_pass_that_keeps_nothing_ends_the_run_before_it_is_saved(tmp_path, options, named):

@@ -72,16 +72,13 @@ def run(state: TrainingState, event: Event) -> None:
 def _nothing_kept(state: TrainingState, event: Event, before: int) -> str:
     population = state.config.population
     if event.kind == "pass_1":
-        values = f"population.pass1_keep={population.pass1_keep:g}"
+        remedy = f"raise population.pass1_keep ({population.pass1_keep:g})"
     else:
-        values = (
-            f"population.pass2_mass={population.pass2_mass:g}, pass2_keep={population.pass2_keep:g} and "
-            f"min_opacity={population.min_opacity:g}"
+        remedy = (
+            f"raise population.pass2_mass ({population.pass2_mass:g}) or population.pass2_keep "
+            f"({population.pass2_keep:g}), or lower population.min_opacity ({population.min_opacity:g})"
         )
-    return (
-        f"the importance pass after {event.time:,} images kept none of {before:,} Gaussians: with so few, "
-        f"{values} keep too little"
-    )
+    return f"the importance pass after {event.time:,} images kept none of {before:,} Gaussians: {remedy}"
 
 
 def view_batches(state: TrainingState) -> Iterator[ViewBatch]:
