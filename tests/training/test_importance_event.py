@@ -69,7 +69,8 @@ def test_how_many_gaussians_the_importance_passes_keep(whole_run):
     }
 
 
-def test_the_cull_mask_is_kept_where_views_use_it(tmp_path):
+def test_the_cull_mask_is_kept_where_views_use_it(tmp_path, monkeypatch):
+    stop_at(monkeypatch, 45)  # the mask is cleared after 50 images
     trainer, _ = train(tmp_path, "view.cull=true", "schedule.iterations=60")
     table = trainer.state.table
     assert table[CULL].shape == (len(table), 1)
