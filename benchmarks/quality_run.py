@@ -95,8 +95,10 @@ def means_of(metrics: dict[str, Any]) -> dict[str, float]:
     """Return the mean of each metric over the views.
 
     Raises:
-        ValueError: the model is broken, and a mean is not finite.
+        ValueError: no view can be measured, or the model is broken, and a mean is not finite.
     """
+    if not metrics["views"]:
+        raise ValueError("nothing can be measured: all pixels of the views are masked")
     means = {name: float(metrics[name]) for name in METRICS if name in metrics}
     if not all(torch.tensor(value).isfinite() for value in means.values()):
         raise ValueError(f"the training diverged: {means}")

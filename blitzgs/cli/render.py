@@ -51,6 +51,8 @@ def run(args: argparse.Namespace) -> int:
         stored = _cameras(args, model, ranks)
         cameras: Sequence[CameraLike] = stored.cameras
         indices = range(len(cameras)) if args.split == "all" else getattr(stored, args.split)
+        if not indices:
+            raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
         views = ViewSet(list(cameras), model.space, ranks.device)
         gate = lod_gate(model.config, model.progress)
         options = render_options(model.config, model.space, model.progress.sh_degree, gate)

@@ -227,7 +227,8 @@ def evaluate(
     names = [cameras[index].name for index in indices]
     masked = [name for name in names if name not in found]
     if masked and ranks.rank == 0:
-        text = f"{len(masked)} views are left out, as all their pixels are masked: {', '.join(masked[:5])}"
+        shown = ", ".join(masked[:5]) + (", ..." if len(masked) > 5 else "")
+        text = f"{len(masked)} of {len(names)} views cannot be measured, as they are masked: {shown}"
         warnings.warn(text, stacklevel=2)
     per_view = {name: found[name] for name in names if name in found}
     result: dict[str, Any] = {}

@@ -164,7 +164,8 @@ def replay(
         the share of the candidates that it knew (`matched`).
 
     Raises:
-        ValueError: the run logged no lineage, was trained by the clock, or ends before the gate's onset.
+        ValueError: the run logged no lineage, was trained by the clock, ends before the gate's onset, or all
+            pixels of the views that are measured are masked.
         FileNotFoundError: it has no checkpoint from before the onset.
         FileExistsError: `out` holds a replay already.
     """
@@ -176,6 +177,12 @@ def replay(
         raise ValueError(
             f"{source} was trained with schedule.minutes ({config.schedule.minutes:g}): its arms would "
             "differ in length, and could not be compared. Train it with schedule.scale instead"
+        )
+    masks = (images.mask(index) for index in capture.test or capture.train)
+    if not any(mask is None or bool(mask.any()) for mask in masks):
+        raise ValueError(
+            f"{source}: its arms could not be compared, because the views that are measured are masked as a "
+            "whole. Train it with another data.split or other masks"
         )
     # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
     if ranks.broadcast_object(any((out / name).exists() for name in (REFERENCE, FIGURES, TABLE))):

@@ -242,3 +242,8 @@ def test_several_ranks_train_one_run_to_the_same_model(tmp_path, capture):
     assert two["gaussians"] == one["gaussians"] and len(two["population"]["peak_memory_bytes"]) == 2
     psnr = [run["evaluations"][-1]["test"]["psnr"] for run in (one, two)]
     assert psnr[1] == pytest.approx(psnr[0], abs=0.05)
+
+
+def test_a_capture_without_a_view_to_measure_is_named():
+    with pytest.raises(ValueError, match="nothing can be measured: all pixels of the views are masked"):
+        quality_run.means_of({"views": {}})

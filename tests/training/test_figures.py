@@ -12,14 +12,14 @@ from blitzgs.training.trainer import Trainer
 from tests.training.tiny import tiny_config, tiny_scene
 
 
-def test_a_fully_masked_view_counts_for_nothing(tmp_path):
+def test_a_fully_masked_view_counts_for_nothing(tmp_path, capsys):
     capture, images = tiny_scene()
     capture.train, capture.test = [1, 2, 4, 5, 6, 7], [0, 3]
     images.masks = [None] * 8
     config = tiny_config("schedule.iterations=20")
     plain = Trainer(config, capture, images, tmp_path / "plain", Ranks()).train()
     images.masks[3] = torch.zeros(32, 48, dtype=torch.uint8)
-    with pytest.warns(UserWarning, match="1 views are left out, as all their pixels are masked: 03.png"):
+    with pytest.warns(UserWarning, match="1 of 2 views cannot be measured, as they are masked: 03.png"):
         summary = Trainer(config, capture, images, tmp_path / "masked", Ranks()).train()
     views = [
         json.loads((tmp_path / name / "evaluation" / "000020" / "metrics.json").read_text())["views"]
@@ -27,6 +27,12 @@ def test_a_fully_masked_view_counts_for_nothing(tmp_path):
     ]
     assert list(views[0]) == ["00.png", "03.png"] and list(views[1]) == ["00.png"]
     assert summary["psnr"] == views[0]["00.png"]["psnr"] != plain["psnr"]
+    images.masks[0] = images.masks[3]
+    with pytest.warns(
+        UserWarning, match="2 of 2 views cannot be measured, as they are masked: 00.png, 03.png"
+    ):
+        summary = Trainer(config, capture, images, tmp_path / "nothing", Ranks()).train()
+    assert "psnr" not in summary and "evaluation: all pixels are masked" in capsys.readouterr().out
 
 
 def test_figures_of_training_views_are_called_so(tmp_path, capsys):

@@ -6,6 +6,7 @@ import json
 import shutil
 from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -19,7 +20,7 @@ from blitzgs.population.spawn_samples import read_sample
 from blitzgs.scene.colmap import read_model, write_model
 from blitzgs.training.gate_replay import OracleVeto, branch_point, event_keys, label_events
 from tests.population.test_spawn_gate import candidates, spawns
-from tests.training.tiny import OVERRIDES, tiny_config, write_tiny_capture
+from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, tiny_config, write_tiny_capture
 from tests.training.tiny_runs import events_of
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -257,6 +258,17 @@ def test_a_damaged_checkpoint_is_named(lineage_run, tmp_path):
     manifest.write_text("{}")
     with pytest.raises(ValueError, match=f"{manifest} is damaged"):
         branch_point(run, tiny_config(*SETTINGS))
+
+
+def test_a_run_without_a_view_to_measure_is_not_replayed(lineage_run, tmp_path, capsys):
+    capture, gate = shutil.copytree(lineage_run / "capture", tmp_path / "capture"), str(tmp_path / "g.json")
+    (capture / "masks").mkdir()
+    cv2.imwrite(str(capture / "masks" / "00.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    run, out = str(lineage_run / "run"), tmp_path / "out"
+    assert main(["gate", "fit", run, "--out", gate]) == 0
+    assert main(["gate", "replay", gate, run, "--data", str(capture), "--out", str(out)]) == 1
+    assert "its arms could not be compared, because the views" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_a_run_that_ends_before_the_gate_is_not_replayed(tmp_path):

@@ -33,7 +33,8 @@ def run(state: TrainingState, event: Event | None = None) -> dict[str, Any]:
             return {}
         means = {name: value for name, value in metrics.items() if name != "views"}
         what = "evaluation" if capture.test else "evaluation of TRAINING views (none is held out)"
-        text = f"{what}: " + "  ".join(f"{name} {value:.4f}" for name, value in means.items())
+        figures = "  ".join(f"{name} {value:.4f}" for name, value in means.items())
+        text = f"{what}: {figures or 'all pixels are masked'}"
         means["split"] = "test" if capture.test else "train"
         state.log.event(state.images_seen, "evaluation", means, text)
     return means
