@@ -20,6 +20,7 @@ from blitzgs.training.config import ScheduleConfig
 from blitzgs.training.config_io import ConfigError, load_config
 from blitzgs.training.gate_replay import FIGURES, TABLE, replay
 from blitzgs.training.inputs import open_capture
+from blitzgs.training.run_folder import open_run
 from blitzgs.training.schedule import Schedule
 
 HELP = """\
@@ -107,7 +108,7 @@ def run_sample(args: argparse.Namespace) -> int:
         raise ValueError(f"--out {args.out}: a sample's file ends in {spawn_samples.SUFFIX}")
     if args.rows < 1:
         raise ValueError(f"--rows: must be at least 1, got {args.rows}")
-    run = gate_fit.read_spawns(_lineage(args.folder))
+    run = _spawns_of(args.folder)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     rate = spawn_samples.write_sample(run, args.out, args.rows)
     print(f"{args.out}: {rate:.2%} of {len(run.survived):,} spawns of {run.name}")
@@ -117,7 +118,7 @@ def run_sample(args: argparse.Namespace) -> int:
 def run_evaluate(args: argparse.Namespace) -> int:
     """Judge a gate; returns the exit status."""
     gate = SpawnGate(args.gate)
-    runs = [gate_fit.read_spawns(_lineage(folder)) for folder in args.runs]
+    runs = [_spawns_of(folder) for folder in args.runs]
     output = OutputFolder(args.out)
     figures = args.out / "evaluation.json"
     output.check(figures)
@@ -164,22 +165,24 @@ def _spawns(path: Path) -> gate_fit.Spawns:
     """Read the spawns of a run, or a sample of them."""
     if path.suffix == spawn_samples.SUFFIX:
         return spawn_samples.read_sample(path)
-    return gate_fit.read_spawns(_lineage(path))
+    return _spawns_of(path)
 
 
-def _lineage(folder: Path) -> Path:
-    """Return where the lineage of a finished run lies.
+def _spawns_of(folder: Path) -> gate_fit.Spawns:
+    """Read the spawns of a run.
 
     Raises:
-        ValueError: the run is not finished, so it is not known which Gaussians survive.
+        ValueError: the run is not finished, so it is not known which Gaussians survive; or its lineage is
+            damaged.
     """
     lineage = folder / run_folder.LINEAGE
-    if lineage.is_dir() and not (folder / run_folder.SUMMARY).exists():
+    summary = open_run(folder).summary() if lineage.is_dir() else {}
+    if lineage.is_dir() and not summary:
         raise ValueError(
             f"{folder} is not finished (it has no {run_folder.SUMMARY}), so it is not known which Gaussians "
             "survive; finish it with blitzgs train ... --resume"
         )
-    return lineage
+    return gate_fit.read_spawns(lineage, summary.get("gaussians"))
 
 
 def _judgement(entry: dict[str, Any]) -> str:

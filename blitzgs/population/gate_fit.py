@@ -81,15 +81,16 @@ class Spawns:
         )
 
 
-def read_spawns(folder: Path) -> Spawns:
+def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
     """Read the spawns of a finished run from its lineage.
 
     Args:
         folder: folder of the lineage.
+        gaussians: number of Gaussians of the finished model, which the lineage must have; None: unknown.
 
     Raises:
         FileNotFoundError: there is no lineage.
-        ValueError: a file is damaged, there are no spawns, or all or none of them survived.
+        ValueError: a file is damaged or lost, there are no spawns, or all or none of them survived.
         ImportError: pyarrow is not installed.
     """
     tables = read_lineage(folder)
@@ -97,6 +98,8 @@ def read_spawns(folder: Path) -> Spawns:
     births, deaths = tables["births"], tables["deaths"]
     spawned = births["parent"] >= 0
     alive = ~np.isin(births["id"], deaths["id"])
+    if not np.isin(deaths["id"], births["id"]).all() or gaussians not in (None, int(alive.sum())):
+        raise ValueError(f"{folder} is not complete: a file of its births or deaths is lost")
     survived = alive[spawned]
     check_outcomes(survived, folder)
     return Spawns(

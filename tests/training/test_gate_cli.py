@@ -208,6 +208,17 @@ def test_a_damaged_lineage_is_named(lineage_run, tmp_path, capsys, name, damage,
     assert str(file) in error and message in error
 
 
+@pytest.mark.parametrize("table", ["births", "deaths"])
+@pytest.mark.parametrize("which", [0, -1])
+def test_a_lost_file_of_the_lineage_is_noticed(lineage_run, tmp_path, capsys, table, which):
+    run = shutil.copytree(lineage_run / "run", tmp_path / "run")
+    sorted((run / "lineage").glob(f"{table}*"))[which].unlink()
+    assert main(["gate", "fit", str(run), "--out", str(tmp_path / "gate.json")]) == 1
+    assert "lineage is not complete: a file of its births or deaths is lost" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
