@@ -265,8 +265,10 @@ class _Trees:
                     splits.append((0, -1, -1))
                 else:
                     feature, unknown = tree["split_indices"][node], bool(tree["default_left"][node])
-                    if not 0 <= feature < count:
+                    if not (isinstance(feature, int) and 0 <= feature < count):
                         raise ValueError(f"a split of feature {feature}")
+                    if node in tree.get("categories_nodes", ()) or math.isnan(value):
+                        raise ValueError(f"a split of feature {feature} without a threshold")
                     splits.append((2 * feature + unknown, first + left, first + tree["right_children"][node]))
                 thresholds.append(0.0 if left < 0 else value)
                 leaves.append(round(value * 2**_LEAF_BITS) if left < 0 else 0)

@@ -190,11 +190,13 @@ def test_a_fit_replaces_only_a_gate(tmp_path):
     assert SpawnGate(path).info.scenes == {"b": "b"}
 
 
-def spoil_tree(path, field, value):
+def spoil_tree(path, field, value, at="root"):
     model = json.loads(path.read_text())
     tree = model["learner"]["gradient_booster"]["model"]["trees"][3]
-    # In a leaf's place, `split_conditions` has its value.
-    tree[field][tree["left_children"].index(-1) if field == "split_conditions" else 0] = value
+    if at == "all":
+        tree[field] = value
+    else:
+        tree[field][0 if at == "root" else tree["left_children"].index(-1)] = value
     path.write_text(json.dumps(model))
 
 
@@ -227,7 +229,14 @@ def without_trees(path):
         (lambda path: spoil_tree(path, "left_children", 0), "the nodes of a tree do not form one"),
         (lambda path: spoil_tree(path, "right_children", 1 << 20), "the nodes of a tree do not form one"),
         (lambda path: spoil_tree(path, "split_indices", 99), "a split of feature 99"),
-        (lambda path: spoil_tree(path, "split_conditions", math.inf), "convert float infinity to integer"),
+        (lambda path: spoil_tree(path, "split_indices", 1.5), "a split of feature 1.5"),
+        (lambda path: spoil_tree(path, "split_conditions", math.nan), "without a threshold"),
+        (lambda path: spoil_tree(path, "categories_nodes", [0], at="all"), "without a threshold"),
+        (
+            # In a leaf's place, `split_conditions` has its value.
+            lambda path: spoil_tree(path, "split_conditions", math.inf, at="leaf"),
+            "convert float infinity to integer",
+        ),
         (without_trees, "no trees"),
         (lambda path: path.write_text("[" * 100_000), "is not a binary classifier in XGBoost's JSON"),
         (lambda path: info_path(path).write_text("null"), "is not the metadata of a gate"),
