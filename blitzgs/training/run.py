@@ -18,6 +18,7 @@ import blitzgs
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import GaussianTable
 from blitzgs.training import checkpoint
+from blitzgs.training.checkpoint import CheckpointError
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import ConfigError, from_dict, load_config, to_dict
 from blitzgs.training.guard import bad_column, check_before_saving
@@ -184,7 +185,7 @@ def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> R
         device: device of the Gaussians; None: the ranks' device.
 
     Raises:
-        CheckpointError: there are checkpoints, but all are damaged.
+        CheckpointError: there are checkpoints, but all are damaged, or the newest is of another version.
     """
     loaded = checkpoint.load_latest(folder / CHECKPOINTS, ranks, device or ranks.device, _problem_of_columns)
     if loaded is None:
@@ -192,11 +193,19 @@ def restore(folder: Path, ranks: Ranks, device: torch.device | None = None) -> R
     state = loaded.state
     why = "the newest sound one" if loaded.refused else "the newest"
     skipped = f"; {len(loaded.refused)} newer refused" if loaded.refused else ""
+    try:
+        progress = Progress(**state["progress"])
+        space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
+        config = from_dict(state["config"])
+    except (LookupError, TypeError, ConfigError) as error:
+        raise CheckpointError(
+            f"checkpoint {folder / CHECKPOINTS / loaded.name} belongs to another version of BlitzGS: {error}"
+        ) from error
     return Restored(
         GaussianTable(loaded.columns),
-        Progress(**state["progress"]),
-        Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])})),
-        from_dict(state["config"]),
+        progress,
+        space,
+        config,
         state.get("run", ""),
         f"{loaded.name} ({why}{skipped})",
         loaded.shared,

@@ -215,6 +215,17 @@ def test_what_a_resume_may_change(trained):
         run.check_resumable(saved, half)
 
 
+@pytest.mark.parametrize(
+    "state", [{}, {"progress": {"steps": 1}}, {"progress": [], "space": {"offset": 3}, "config": {}}]
+)
+def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, capsys, state):
+    shutil.copy(trained[1] / "config.yaml", tmp_path)
+    table = run.restore(trained[1], Ranks()).table
+    checkpoint.save(tmp_path / "checkpoints", {name: table[name] for name in table}, state, Ranks())
+    assert main(["eval", str(tmp_path)]) == 1
+    assert "checkpoint_000000 belongs to another version of BlitzGS" in capsys.readouterr().err
+
+
 def test_no_flipped_bit_of_a_manifest_passes(tmp_path):
     columns = {"means": torch.randn(5, 3), "id": torch.arange(5)}
     state = {"progress": {"step": 12, "seconds": 1.5}, "config": {"seed": 0, "scale": 1e-3, "ok": True}}
