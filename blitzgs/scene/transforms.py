@@ -77,37 +77,49 @@ def read_transforms(root: Path) -> Transforms:
             if not isinstance(content["ply_file_path"], str):
                 raise ValueError(f"{path}: ply_file_path must be text, got {content['ply_file_path']!r}")
             points_path = root / content["ply_file_path"]
+        held_out = _held_out(path, content)
         for index, entry in enumerate(entries):
             try:
-                frames.append(_read_frame(root, path, content, entry))
+                frames.append(_read_frame(root, content, entry, held_out))
             except (KeyError, TypeError, ValueError, ArithmeticError) as error:
                 reason = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
                 raise ValueError(f"{path}: frame {index}: {reason}") from error
+        if isinstance(held_out, set) and (lost := held_out - {frame.name for frame in frames}):
+            raise ValueError(
+                f"{path}: test_filenames or val_filenames name {len(lost)} images that are no frames "
+                f"(first: {min(lost)})"
+            )
     return Transforms(frames, points_path)
 
 
-def _read_frame(root: Path, file: Path, content: Mapping[str, Any], entry: Mapping[str, Any]) -> Frame:
+def _held_out(file: Path, content: Mapping[str, Any]) -> set[str] | bool | None:
+    """Return the names of the frames that a file holds out, or whether it holds out all; None: not said."""
+    if file.name != "transforms.json":
+        return file.name == "transforms_test.json"
+    lists = {key: content[key] for key in ("test_filenames", "val_filenames") if key in content}
+    for key, names in lists.items():
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{file}: {key} must be a list of the file_path of frames")
+    return {str(Path(name)) for names in lists.values() for name in names} if lists else None
+
+
+def _read_frame(
+    root: Path, content: Mapping[str, Any], entry: Mapping[str, Any], held_out: set[str] | bool | None
+) -> Frame:
     relative = entry["file_path"]
     if not isinstance(relative, str) or not PurePath(relative).name:
         raise ValueError(f"file_path must name an image, got {relative!r}")
     path = next((p for s in _SUFFIXES if (p := root / (relative + s)).is_file()), root / relative)
     mask = root / str(entry["mask_path"]) if "mask_path" in entry else None
+    name = str(Path(relative))
     return Frame(
-        name=str(Path(relative)),
+        name=name,
         path=path,
         mask_path=mask,
         lens=_read_lens({**content, **entry}, path),
         world_to_camera=_read_pose(entry["transform_matrix"]),
-        is_test=_is_test(file, content, relative),
+        is_test=name in held_out if isinstance(held_out, set) else held_out,
     )
-
-
-def _is_test(file: Path, content: Mapping[str, Any], relative: str) -> bool | None:
-    if file.name != "transforms.json":
-        return file.name == "transforms_test.json"
-    if "test_filenames" not in content and "val_filenames" not in content:
-        return None
-    return relative in content.get("test_filenames", []) or relative in content.get("val_filenames", [])
 
 
 def _read_pose(matrix: object) -> Float64:

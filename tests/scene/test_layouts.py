@@ -122,6 +122,9 @@ def test_blender_transforms(tmp_path):
         ({"file_path": ""}, "frame 0: file_path must name an image, got ''"),
         ({"file_path": None}, "frame 0: file_path must name an image, got None"),
         ({"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}, "frame 0: .* mirrors the scene"),
+        ({"test_filenames": "a.png"}, "test_filenames must be a list"),
+        ({"val_filenames": ["a.png", 3]}, "val_filenames must be a list"),
+        ({"val_filenames": ["./a.png", "b.png"]}, r"name 1 images that are no frames \(first: b.png\)"),
         ({"ply_file_path": None}, "ply_file_path must be text, got None"),
         ({"k1": 1e300}, "the camera of .*a.png: the lens does not see along its own axis"),
     ],
@@ -169,7 +172,7 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     content = {
         **{"fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "camera_model": "OPENCV"},
         **{"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0, "frames": frames, "ply_file_path": "p.ply"},
-        **{"train_filenames": [f"images/f{i}.png" for i in (0, 1, 3)], "test_filenames": ["images/f2.png"]},
+        **{"train_filenames": [f"images/f{i}.png" for i in (0, 1, 3)], "test_filenames": ["./images/f2.png"]},
     }
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(content))
