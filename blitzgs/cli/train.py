@@ -91,8 +91,9 @@ def run(args: argparse.Namespace) -> int:
         job.share_gpus,
         tables_on_host=config.memory.resident_gb > 0,
     ) as ranks:
+        # A capture that cannot be read leaves no empty folder behind.
+        capture, images = open_capture(config, ranks)
         with locked(args.out, ranks):
-            capture, images = open_capture(config, ranks)
             summary = Trainer(config, capture, images, args.out, ranks, args.resume).train()
         if summary is not None and ranks.rank == 0:
             _print_summary(summary, args.out)

@@ -64,6 +64,14 @@ def test_folders_are_checked_on_every_rank(tmp_path):
         assert "ranks 1 do not see what rank 0 writes" in message
 
 
+def test_a_capture_that_cannot_be_read_leaves_no_folder(tmp_path):
+    flags = [f"--{text}" for text in ("config=defaults", *OVERRIDES, "schedule.iterations=2")]
+    command = ["train", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), *flags]
+    assert main(command) == 1 and not (tmp_path / "run").exists()
+    write_tiny_capture(tmp_path / "data")
+    assert main(command) == 0
+
+
 def test_one_run_at_a_time(tmp_path, monkeypatch, capsys):
     from blitzgs.training import folder_checks
 
