@@ -54,7 +54,9 @@ def read_header(path: Path) -> ImageHeader:
             return header
     if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 26:
         width, height = struct.unpack(">II", data[16:24])
-        return ImageHeader(width, height, has_alpha=data[25] in (4, 6))
+        # Palettes and single colours may be transparent too (the chunk tRNS, before the pixels).
+        has_alpha = data[25] in (4, 6) or b"tRNS" in data.partition(b"IDAT")[0]
+        return ImageHeader(width, height, has_alpha=has_alpha)
     pixels = _imdecode(path.read_bytes(), cv2.IMREAD_UNCHANGED, str(path))
     return ImageHeader(pixels.shape[1], pixels.shape[0], has_alpha=pixels.ndim == 3 and pixels.shape[2] == 4)
 
