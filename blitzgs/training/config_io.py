@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import hashlib
@@ -169,12 +170,10 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
         return tuple(
             _convert(o, v, f"{path}[{i}]") for i, (o, v) in enumerate(zip(options, value, strict=True))
         )
-    if hint is float and isinstance(value, str):
+    if hint in (int, float) and isinstance(value, str):
         # YAML 1.1 reads 1e-4 as a string.
-        try:
-            return float(value)
-        except ValueError:
-            pass
+        with contextlib.suppress(ValueError):
+            value = float(value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         try:
             return float(value)

@@ -20,9 +20,11 @@ def test_file_then_overrides(tmp_path):
     (tmp_path / "base.yaml").write_text("schedule: {iterations: 7500, batch_size: 2}\nseed: 5\n")
     (tmp_path / "child.yaml").write_text("base: base.yaml\nschedule: {batch_size: 4}\nloss: {scale: 1e-3}\n")
     config = load_config(
-        tmp_path / "child.yaml", ["--data.downscale=2", "--model.background=[1, 1, 1]", "--data.masks=null"]
+        tmp_path / "child.yaml",
+        ["--data.downscale=2", "--model.background=[1, 1, 1]", "--data.masks=null", "--log.every=1e3"],
     )
     assert (config.schedule.iterations, config.schedule.batch_size, config.seed) == (7500, 4, 5)
+    assert config.log.every == 1000 and isinstance(config.log.every, int)
     assert config.loss.scale == 1e-3
     assert config.data.downscale == 2
     assert config.model.background == (1.0, 1.0, 1.0)
@@ -42,6 +44,7 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--schedule.iteratons=3", "schedule.iteratons: unknown field; did you mean 'iterations'"),
         ("--shedule.iterations=3", "shedule: unknown field; did you mean 'schedule'"),
         ("--schedule.iterations=many", r"schedule.iterations: must be an integer, got 'many' \(str\)"),
+        ("--schedule.iterations=25e-1", "schedule.iterations: must be an integer, got 2.5"),
         ("--schedule.iterations=3.5", "schedule.iterations: must be an integer, got 3.5"),
         ("--schedule.batch_size=true", "schedule.batch_size: must be an integer, got True"),
         ("--schedule.batch_size=33", r"schedule.batch_size: must be in \[1, 32\], got 33"),
