@@ -24,10 +24,10 @@ from blitzgs.view.host_table import HostMemoryError
 from blitzgs.view.residence import ResidenceError
 
 HELP = """\
-Train 3D Gaussian Splatting models of photographs with known cameras, from a desk to a city. From a capture (a
-COLMAP model and its photographs) to a file for viewers:
+Train 3D Gaussian Splatting models of photographs with known cameras: models of a desk, or of a whole city.
+These commands lead from a capture (a COLMAP model and its photographs) to pictures and a file for viewers:
 
-  blitzgs train --config configs/aerial.yaml --data CAPTURE --out RUN
+  blitzgs train --data CAPTURE --out RUN
   blitzgs render RUN --out PICTURES
   blitzgs export RUN --ply MODEL.ply
 """

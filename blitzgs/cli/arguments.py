@@ -75,7 +75,9 @@ def _gigabytes(text: str) -> float:
 def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> None:
     """Add the flag --device and, if `shares_gpus`, --share-gpus."""
     parser.add_argument(
-        "--device", default="auto", help="auto (a GPU when there is one), cpu, cuda or cuda:N (%(default)s)"
+        "--device",
+        default="auto",
+        help="auto (a GPU when there is one), cpu, cuda or cuda:N (default: %(default)s)",
     )
     if shares_gpus:
         parser.add_argument(

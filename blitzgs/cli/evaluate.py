@@ -26,16 +26,22 @@ from blitzgs.training.lod import lod_gate, scene_gate
 from blitzgs.training.run_cameras import input_files
 from blitzgs.training.views import ViewSet, render_options
 
+HELP = """\
+Compare renders of a run's held-out views with their photographs. Prints the mean PSNR and SSIM as JSON, and
+writes the figures of each view (metrics.json) and some pictures to --out. psnr_corrected is the PSNR after
+the colours of each render were fitted to its photograph.
+"""
+
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add the command."""
-    parser = add_command(commands, "eval", run, "measure PSNR and SSIM of a run's held-out views")
+    parser = add_command(commands, "eval", run, "measure PSNR and SSIM of a run's held-out views", HELP)
     add_run(parser)
     add_capture(parser)
     add_device(parser, shares_gpus=True)
     add_pool(parser)
     parser.add_argument(
-        "--split", choices=("test", "train"), default="test", help="which views (%(default)s)"
+        "--split", choices=("test", "train"), default="test", help="views to measure (default: %(default)s)"
     )
     parser.add_argument(
         "--out", type=named_path, metavar="DIR", help="folder for the results (default: RUN/evaluation/SPLIT)"
@@ -45,7 +51,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         type=int,
         default=8,
         metavar="N",
-        help="number of pictures: render, photograph, error (%(default)s)",
+        help="number of pictures that show a render, its photograph and its error (default: %(default)s)",
     )
     parser.add_argument("--lpips", metavar="FILE", help="also measure LPIPS, with this TorchScript module")
     parser.add_argument(

@@ -27,7 +27,7 @@ the distance D * F^(1/2 - l), no level above L, and level 0 at any distance.
 
 A model trained with model.antialiased is marked `comment SplatRenderMode: mip`. For a viewer that does not
 know the mark, --classic writes opacities with the compensation that they have at the distance of the training
-views; nearer and farther it is only nearly right.
+views; at other distances it is an approximation.
 """
 
 
@@ -43,7 +43,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         choices=COORDINATES,
         default="auto",
         help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
-        "capture's if float32 can hold them (%(default)s)",
+        "capture's if float32 can hold them (default: %(default)s)",
     )
     parser.add_argument(
         "--classic",

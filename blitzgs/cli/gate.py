@@ -55,7 +55,8 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         type=float,
         default=ScheduleConfig.gate_from,
         metavar="IMAGES",
-        help="also evaluate the spawns from this time on alone, which a gate is to judge (%(default)s)",
+        help="schedule.gate_from of the runs that will use the gate: spawns from then on are also evaluated "
+        "separately (default: %(default)s)",
     )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     sample.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
@@ -63,7 +64,11 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "--out", type=named_path, required=True, metavar="FILE", help="file for the sample, .parquet"
     )
     sample.add_argument(
-        "--rows", type=int, default=spawn_samples.MOST_ROWS, help="about so many births (%(default)s)"
+        "--rows",
+        type=int,
+        default=spawn_samples.MOST_ROWS,
+        metavar="N",
+        help="approximate number of births in the file (default: %(default)s)",
     )
     judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
     judge.add_argument("gate", type=gate_file, metavar="GATE", help="file of the gate, or: default")
@@ -75,15 +80,15 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         actions,
         "replay",
         run_replay,
-        "train from one checkpoint without a gate, with it, with an oracle and at random",
+        "continue one checkpoint several times: without a gate, with it, with an oracle and with chance",
     )
     again.add_argument("gate", type=gate_file, metavar="GATE", help="file of the gate, or: default")
     again.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
     again.add_argument(
-        "--out", type=named_path, required=True, metavar="DIR", help="folder for one run for each of these"
+        "--out", type=named_path, required=True, metavar="DIR", help="folder for these runs and their figures"
     )
     again.add_argument(
-        "--rate", type=float, default=0.6, help="share of the candidates to withhold (%(default)s)"
+        "--rate", type=float, default=0.6, help="share of the candidates to withhold (default: %(default)s)"
     )
     add_capture(again)
     add_device(again)

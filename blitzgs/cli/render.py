@@ -26,7 +26,7 @@ from blitzgs.training.views import CameraLike, ViewSet, render_options
 
 def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add the command."""
-    parser = add_command(commands, "render", run, "render the views of a run to files, without photographs")
+    parser = add_command(commands, "render", run, "render the views of a run to files (needs no photographs)")
     add_run(parser)
     parser.add_argument(
         "--data", type=named_path, metavar="DIR", help="take the cameras from this capture, not from the run"
@@ -34,7 +34,10 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
     add_device(parser, shares_gpus=True)
     add_pool(parser)
     parser.add_argument(
-        "--split", choices=("test", "train", "all"), default="test", help="which views (%(default)s)"
+        "--split",
+        choices=("test", "train", "all"),
+        default="test",
+        help="views to render (default: %(default)s)",
     )
     parser.add_argument("--out", type=named_path, required=True, metavar="DIR", help="folder for the images")
     parser.add_argument(

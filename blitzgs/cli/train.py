@@ -27,7 +27,8 @@ from blitzgs.training.trainer import Trainer
 
 HELP = """\
 Train a model of a capture, which is a folder DIR with photographs and their cameras: a COLMAP model
-(DIR/sparse/0 and DIR/images) or a transforms.json. At the end the held-out views (every 8th) are measured.
+(DIR/sparse/0 and DIR/images) or a transforms.json. At the end the held-out views are measured: every 8th,
+unless the capture has its own split.
 
   blitzgs train --data DIR --out RUN
 
@@ -40,10 +41,10 @@ the resulting configuration and stops.
 Times in the configuration count the images that were trained on. --schedule.scale=0.5 makes the whole
 schedule half as long; with --minutes=M the run measures its speed and chooses this factor itself.
 
-RUN gets config.yaml, cameras.json, log.jsonl, tensorboard/, checkpoints/, evaluation/ and summary.json. A
-checkpoint is written every 10 minutes (log.checkpoint_seconds) and when the run is interrupted (Ctrl-C,
-SIGTERM or SIGHUP). The same command with --resume continues from the newest checkpoint; without any
-checkpoint it starts a new run and says so.
+RUN gets config.yaml, cameras.json, log.jsonl, checkpoints/, evaluation/, summary.json and trajectory.svg, and
+tensorboard/ if TensorBoard is installed. A checkpoint is written every 10 minutes (log.checkpoint_seconds)
+and when the run is interrupted (Ctrl-C, SIGTERM or SIGHUP). The same command with --resume continues from the
+newest checkpoint; without any checkpoint it starts a new run and says so.
 
 Several processes share the work with torchrun --nproc-per-node=M train.py (the same flags). With --resume and
 --max-restarts=K, a job that loses a process continues from its last checkpoint.

@@ -30,13 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "out",
         type=Path,
         metavar="DIR",
-        help="folder to create; one that has a part of the same city is completed",
+        help="folder to create; if it has a part of the same city, only the rest is made",
     )
     parser.add_argument(
         "--preset",
         choices=PRESETS,
         default="demo",
-        help="values of the flags that are not given (%(default)s)",
+        help="values of the flags that are not given (default: %(default)s)",
     )
     for field in fields(CityOptions):
         parser.add_argument(
