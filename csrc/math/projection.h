@@ -166,9 +166,9 @@ BLITZGS_HD T compensation(const Footprint<T>& s) {
 }
 
 // Gradients of the rows of M from those of the conic (b counted once) and of the compensation. With Q the
-// conic matrix, d(Sigma'^-1) = -Q dSigma' Q and d log det Sigma' = tr(Q dSigma'), so v_M = -2 (Q V + v / 2) Q
-// M. As a matrix product, Q M would lose all digits for a splat that is a thousand times longer than wide.
-// The form (m1 x n + eps m0, n x m0 + eps m1) / det with n = m0 x m1 loses none.
+// conic matrix, d(Sigma'^-1) = -Q dSigma' Q, so the conic's part is v_M = -2 Q V Q M. As a matrix product,
+// Q M would lose all digits for a splat that is a thousand times longer than wide. The form
+// (m1 x n + eps m0, n x m0 + eps m1) / det with n = m0 x m1 loses none.
 template <class T>
 BLITZGS_HD void footprint_vjp(const Footprint<T>& s, const T* v_conic, T v_compensation, Vec3<T>* v_m0,
                               Vec3<T>* v_m1) {
@@ -177,17 +177,17 @@ BLITZGS_HD void footprint_vjp(const Footprint<T>& s, const T* v_conic, T v_compe
   const T shrink = T(1) / (s.root_det * s.root_det * s.magnitude);
   const Vec3<T> qm0 = shrink * (cross(s.m1, s.normal) + s.blur * s.m0);
   const Vec3<T> qm1 = shrink * (cross(s.normal, s.m0) + s.blur * s.m1);
-  const T half = T(0.5) * v_compensation * compensation(s);
-  const T xx = a * p + b * q + half, xy = a * q + b * r, yx = b * p + c * q, yy = b * q + c * r + half;
-  *v_m0 = T(-2) * (xx * qm0 + xy * qm1);
-  *v_m1 = T(-2) * (yx * qm0 + yy * qm1);
+  *v_m0 = T(-2) * ((a * p + b * q) * qm0 + (a * q + b * r) * qm1);
+  *v_m1 = T(-2) * ((b * p + c * q) * qm0 + (b * q + c * r) * qm1);
   if (v_compensation == T(0) || !(s.normal_length > T(0))) return;
-  // The derivative of |m0 x m1|. It does not exist for a splat that is seen exactly edge-on; zero is used
-  // there.
-  const T scale = v_compensation / (s.root_det * s.magnitude * s.normal_length);
-  const Vec3<T> v_normal = scale * s.normal;
-  *v_m0 = *v_m0 + cross(s.m1, v_normal);
-  *v_m1 = *v_m1 + cross(v_normal, s.m0);
+  // The derivatives of log |n| and of log det Sigma' cancel but for a share eps / Sigma' of them. The form
+  // eps / det ((tr(M M^T) + eps) m1 x n / |n|^2 - m0), times the compensation, has only that share. The
+  // derivative does not exist for a splat that is seen exactly edge-on; zero is used there.
+  const T scale = v_compensation * s.blur * shrink / s.root_det;
+  const T trace = (s.cov_xx + s.cov_yy) / s.magnitude - s.blur;
+  const Vec3<T> along = (trace / s.normal_length) * s.normal;
+  *v_m0 = *v_m0 + scale * (cross(s.m1, along) - s.normal_length * s.m0);
+  *v_m1 = *v_m1 + scale * (cross(along, s.m0) - s.normal_length * s.m1);
 }
 
 // From the gradients of the rows of M: sets those of J W (v_gx, v_gy) and adds those of the axes to v_axes.

@@ -187,15 +187,17 @@ def require_finite_and_correct(
     backend: tuple[str, torch.dtype],
     image_bound: float = IMAGE_BOUND,
     gradient_bound: float = GRADIENT_BOUND,
+    antialiased: bool = False,
 ) -> None:
     device, dtype = backend
     if dtype == torch.float64:
         image_bound, gradient_bound = 1e-9, 1e-6
     # The reference sees the inputs as rounded to the backend's dtype.
     rounded = scene.to(dtype).to(torch.float64).leaves()
-    reference = reference_images(rounded)[0]
+    reference = reference_images(rounded, antialiased=antialiased)[0]
     leaves = scene.to(dtype, device).leaves()
-    renders, alphas, _ = blitzgs.rasterization(*leaves.arguments(), sh_degree=3)
+    mode = "antialiased" if antialiased else "classic"
+    renders, alphas, _ = blitzgs.rasterization(*leaves.arguments(), sh_degree=3, rasterize_mode=mode)
     size = max(1.0, reference.image.detach().abs().max().item())
     assert image_error(renders[0], reference.image, reference.cut, most_cut=0.5) <= image_bound * size
     assert image_error(alphas[0, ..., 0], reference.alpha, reference.cut, most_cut=0.5) <= image_bound
@@ -214,6 +216,15 @@ def test_extremes(name, backend):
     require_finite_and_correct(
         SCENES[name](), backend, IMAGE_BOUND, GRADIENT_BOUNDS.get(name, GRADIENT_BOUND)
     )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("pixels", [30.0, 300.0, 3000.0])
+def test_antialiased_splats_much_wider_than_the_blur(pixels, backend):
+    """The compensation of such splats is nearly 1, and its derivative far below that of its parts."""
+    scene = facing_scene(5, 32, 24)
+    scene.scales = pixels / 30.0 * scene.means[:, 2:] * NEARLY_ROUND
+    require_finite_and_correct(scene, backend, antialiased=True)
 
 
 @pytest.mark.parametrize("backend", BACKENDS[1:])
