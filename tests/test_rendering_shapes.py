@@ -2,6 +2,7 @@
 """Batches, any number of views, colours per view and covariances work; wrong shapes are refused."""
 
 import enum
+import math
 from dataclasses import replace
 
 import pytest
@@ -234,7 +235,7 @@ def test_an_argument_that_gsplat_has_not_is_refused(value):
         ({"rasterize_mode": "fast"}, "rasterize_mode must be"),
         ({"tile_size": 65}, "tile_size must be 1 to 64 px, got 65"),
         ({"sh_degree": None}, "colors must be"),
-        ({"sh_degree": 4}, "sh_degree 4 needs 25 SH coefficients, got 16"),
+        ({"colors": torch.zeros(4, 9, 3)}, "sh_degree 3 needs 16 SH coefficients, got 9"),
         (
             {"sh_degree": None, "colors": torch.zeros(3, 4)},
             r"colors must be \[..., N, D\] or \[..., C, N, D\], here with \[\] before N = 4",
@@ -256,6 +257,44 @@ def test_what_is_not_supported_is_refused_by_name(options, message):
         blitzgs.rasterization(**arguments)
 
 
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize(
+    ("option", "error", "message"),
+    [
+        ({"near_plane": math.nan}, ValueError, "near_plane must be less than far_plane, got nan and 1"),
+        ({"far_plane": math.nan}, ValueError, "near_plane must be less than far_plane, got 0.01 and nan"),
+        ({"near_plane": 2.0, "far_plane": 1.0}, ValueError, "near_plane must be less than far_plane"),
+        ({"eps2d": -0.1}, ValueError, "eps2d must be a finite number of px\\^2 of at least 0, got -0.1"),
+        ({"eps2d": math.nan}, ValueError, "eps2d must be .* got nan"),
+        ({"eps2d": math.inf}, ValueError, "eps2d must be .* got inf"),
+        ({"radius_clip": -1.0}, ValueError, "radius_clip must be at least 0 px, got -1.0"),
+        ({"radius_clip": math.nan}, ValueError, "radius_clip must be at least 0 px, got nan"),
+        ({"sh_degree": -1}, ValueError, "sh_degree must be 0 to 3, got -1"),
+        ({"sh_degree": 4}, ValueError, "sh_degree must be 0 to 3, got 4"),
+        ({"sh_degree": 3.0}, TypeError, "sh_degree must be a whole number, got 3.0"),
+        ({"tile_size": 16.0}, TypeError, "tile_size must be a whole number, got 16.0"),
+    ],
+)
+def test_a_number_out_of_range_is_refused_by_name(raw, option, error, message):
+    *geometry, colors, viewmats, Ks, width, height = random_scene(n=4, cameras=1).arguments()
+    colors = torch.zeros(4, 25, 3)  # enough for degree 4
+    given = {"sh_degree": 3, **option}
+    with pytest.raises(error, match=message):
+        if raw:
+            blitzgs.raw_rasterization(
+                *geometry, colors[:, :1], colors[:, 1:], viewmats, Ks, width, height, **given
+            )
+        else:
+            blitzgs.rasterization(*geometry, colors, viewmats, Ks, width, height, **given)
+
+
+@pytest.mark.parametrize("count", [0, 25])
+def test_sh_of_an_unsupported_degree_are_refused_by_name(count):
+    *geometry, _, viewmats, Ks, width, height = random_scene(n=4, cameras=1).arguments()
+    with pytest.raises(ValueError, match=f"sh_degree=None needs 1 to 24 SH coefficients, got {count}"):
+        blitzgs.raw_rasterization(*geometry, torch.zeros(4, count, 3), None, viewmats, Ks, width, height)
+
+
 def test_an_array_of_another_library_is_refused_by_name():
     means, quats, *rest = random_scene(n=4, cameras=1).arguments()
     with pytest.raises(TypeError, match=r"quats must be a torch\.Tensor, got ndarray"):
@@ -269,8 +308,9 @@ def test_an_array_of_another_library_is_refused_by_name():
         ({"colors": torch.Tensor.half}, ValueError, "colors is torch.float16 and means torch.float32"),
         ({"means": torch.Tensor.half}, TypeError, "means must be float32 or float64, got torch.float16"),
         ({"means": torch.Tensor.long}, TypeError, "means must be float32 or float64, got torch.int64"),
-        ({"width": lambda _: 64.5}, TypeError, "width must be a whole number of px, got 64.5"),
-        ({"height": lambda _: 0}, ValueError, "height must be at least 1 px, got 0"),
+        ({"width": lambda _: 64.5}, TypeError, "width must be a whole number, got 64.5"),
+        ({"width": lambda _: 1 << 24}, ValueError, "width must be 1 to 2\\^24 - 1 px"),
+        ({"height": lambda _: 0}, ValueError, "height must be 1 to 2\\^24 - 1 px, got 0"),
     ],
 )
 def test_dtypes_and_sizes_that_do_not_fit_are_refused_by_name(changes, error, message):

@@ -16,6 +16,9 @@ from blitzgs.rendering.covariances import Decomposed, decompose
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
+MAX_SH_DEGREE = 3
+# The kernels count pixels of a row in float32 (checked_options of csrc/project/project_op.h).
+_SIZE_END = 1 << 24
 # Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
 GSPLAT_DEFAULTS: dict[str, Any] = {
     "with_ut": False,
@@ -130,21 +133,42 @@ def check_further(function: str, further: dict[str, Any]) -> None:
 
 
 def check_options(
-    width: int, height: int, render_mode: str, rasterize_mode: str, camera_model: str, tile_size: int
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    sh_degree: int | None,
+    tile_size: int,
+    render_mode: str,
+    rasterize_mode: str,
+    camera_model: str,
 ) -> None:
     """Check the arguments that are not tensors.
 
     Raises:
-        TypeError: a size is not a whole number.
-        ValueError: one has an unknown value.
+        TypeError: a size or the degree is not a whole number.
+        ValueError: one is out of range or has an unknown value.
     """
     for name, size in (("width", width), ("height", height)):
-        # int comes first, because asking an abstract class takes longer.
-        if isinstance(size, (int, Integral)):
-            if size < 1:
-                raise ValueError(f"{name} must be at least 1 px, got {size}")
-        elif not isinstance(size, torch.SymInt):  # while torch traces a function
-            raise TypeError(f"{name} must be a whole number of px, got {size!r}")
+        _check_whole(name, size)
+        if not 1 <= size < _SIZE_END:
+            raise ValueError(f"{name} must be 1 to 2^24 - 1 px, got {size}")
+    _check_whole("tile_size", tile_size)
+    if not 1 <= tile_size <= 64:
+        raise ValueError(f"tile_size must be 1 to 64 px, got {tile_size}")
+    if sh_degree is not None:
+        _check_whole("sh_degree", sh_degree)
+        if not 0 <= sh_degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
+    # NaN fails each of these comparisons.
+    if not near_plane < far_plane:
+        raise ValueError(f"near_plane must be less than far_plane, got {near_plane} and {far_plane}")
+    if not 0 <= eps2d < math.inf:
+        raise ValueError(f"eps2d must be a finite number of px^2 of at least 0, got {eps2d}")
+    if not radius_clip >= 0:
+        raise ValueError(f"radius_clip must be at least 0 px, got {radius_clip}")
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
     if rasterize_mode not in RASTERIZE_MODES:
@@ -153,8 +177,12 @@ def check_options(
         raise ValueError(
             f"blitzgs.rasterization does not support camera_model={camera_model!r}; leave it out"
         )
-    if not 1 <= tile_size <= 64:
-        raise ValueError(f"tile_size must be 1 to 64 px, got {tile_size}")
+
+
+def _check_whole(name: str, value: object) -> None:
+    # int comes first, because asking an abstract class takes longer; torch traces a function with SymInt.
+    if not isinstance(value, (int, Integral, torch.SymInt)):
+        raise TypeError(f"{name} must be a whole number, got {value!r}")
 
 
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:

@@ -73,10 +73,10 @@ def rasterization(
         Ks: [..., C, 3, 3] intrinsics in px.
         width: image width in px.
         height: image height in px.
-        near_plane: Gaussians have z > near_plane, world units.
+        near_plane: Gaussians have z > near_plane, world units; less than far_plane.
         far_plane: Gaussians have z <= far_plane, world units.
-        radius_clip: drop splats that reach no further than this, px.
-        eps2d: variance added to both screen axes, px^2.
+        radius_clip: drop splats that reach no further than this, px, at least 0.
+        eps2d: variance added to both screen axes, px^2, at least 0.
         sh_degree: degree to evaluate, 0 to 3; None when `colors` holds values.
         packed: whether meta's per-splat tensors hold only what is visible ([nnz, ...]) or all
             ([..., C, N, ...], zero where invisible). The image is the same.
@@ -118,13 +118,16 @@ def rasterization(
             this).
 
     Raises:
-        TypeError: an argument is not a tensor, or gsplat has no such argument.
+        TypeError: an argument is not a tensor or not a whole number, or gsplat has no such argument.
         ValueError: an argument is not supported or has a wrong shape or value; the message names it.
         RuntimeError: a tensor has a wrong dtype.
     """
     check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
-    check_options(width, height, render_mode, rasterize_mode, camera_model, tile_size)
+    check_options(
+        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
+        rasterize_mode, camera_model,
+    )  # fmt: skip
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}

@@ -18,6 +18,7 @@ from blitzgs.ops.projection import ProjectionOptions, project_splats
 from blitzgs.ops.render import ShTables
 from blitzgs.ops.sparse_rows import HandOver, full_gradients
 from blitzgs.rendering.arguments import (
+    MAX_SH_DEGREE,
     Gaussians,
     Scene,
     background_rows,
@@ -123,7 +124,10 @@ def raw_rasterization(
         ValueError: likewise; or `direct_grad` is not possible.
         RuntimeError: likewise.
     """
-    check_options(width, height, render_mode, rasterize_mode, "pinhole", tile_size)
+    check_options(
+        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
+        rasterize_mode, "pinhole",
+    )  # fmt: skip
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
     if means.dim() != 2:
@@ -243,7 +247,10 @@ def _checked_degree(harmonics: list[Tensor], count: int, degree: int | None, sha
             raise ValueError(f"{name} must be [N, K, 3] with N = {count}, got {list(part.shape)}")
     given = sum(part.shape[1] for part in harmonics)
     if degree is None:
-        return math.isqrt(given) - 1
+        degree = math.isqrt(given) - 1
+        if shaded and not 0 <= degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree=None needs 1 to 24 SH coefficients, got {given}")
+        return degree
     if shaded and (degree + 1) ** 2 > given:
         raise ValueError(f"sh_degree {degree} needs {(degree + 1) ** 2} SH coefficients, got {given}")
     return degree

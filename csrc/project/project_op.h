@@ -36,6 +36,12 @@ inline ProjectOptions<double> checked_options(const char* op, const IntList& int
                   ": width and height must be in [1, 2^24), got ", width, " x ", height);
   STD_TORCH_CHECK(tile_size > 0 && tile_size < (1 << 24), "blitzgs::", op,
                   ": tile_size must be in [1, 2^24), got ", tile_size);
+  // NaN fails each of these comparisons.
+  STD_TORCH_CHECK(floats[0] < floats[1], "blitzgs::", op, ": near_plane must be less than far_plane, got ",
+                  floats[0], " and ", floats[1]);
+  STD_TORCH_CHECK(floats[2] >= 0 && floats[2] <= FLT_MAX && floats[3] >= 0, "blitzgs::", op,
+                  ": eps2d must be finite, and eps2d and radius_clip at least 0, got ", floats[2], " and ",
+                  floats[3]);
   ProjectOptions<double> options{};
   options.width = static_cast<int>(width);
   options.height = static_cast<int>(height);

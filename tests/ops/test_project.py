@@ -333,6 +333,11 @@ def test_errors_name_the_argument():
         project_scene(scene, sh=scene.colors[:, :4])
     with pytest.raises(RuntimeError, match="sh_degree must be 0 to 3, got 4"):
         project_scene(scene, sh_degree=4)
+    with pytest.raises(RuntimeError, match="near_plane must be less than far_plane, got nan and 1e"):
+        project_scene(scene, near_plane=math.nan)
+    for wrong in ({"eps2d": -0.3}, {"eps2d": math.nan}, {"eps2d": math.inf}, {"radius_clip": math.nan}):
+        with pytest.raises(RuntimeError, match="eps2d must be finite, and eps2d and radius_clip at least 0"):
+            project_scene(scene, **wrong)
     with pytest.raises(RuntimeError, match="at most 32 views in one launch, got 33"):
         project_scene(random_scene(n=1, cameras=33))
     with pytest.raises(RuntimeError, match="active_ids must be Int, got Long"):
