@@ -165,6 +165,27 @@ def test_covariances_of_a_batch():
     assert relative_error(renders, rasterize_scene(batch)[0]) < 1e-4
 
 
+@pytest.mark.parametrize("seed", [10, 18, 25, 28])
+def test_covariances_of_needles_whose_tiles_depend_on_rounding(seed):
+    scene = random_scene(n=200, cameras=1, seed=seed, scale=0.3)
+    scene.scales[:, 1:] *= 1e-3
+    factors = covariance_factors(scene.quats, scene.scales)
+    scene.quats = scene.scales = None
+    renders, _, meta = rasterize_scene(scene, covars=factors @ factors.mT, eps2d=0.0)
+    assert renders.isfinite().all() and len(meta["flatten_ids"]) > 300
+
+
+def test_covariances_without_a_determinant_have_finite_gradients():
+    scene = random_scene(n=200, cameras=1, dtype=torch.float64)
+    scene.scales[:, 1:] *= 1e-9
+    factors = covariance_factors(scene.quats, scene.scales)
+    scene.quats = scene.scales = None
+    covars = (factors @ factors.mT).requires_grad_()
+    renders, _, _ = rasterize_scene(scene, covars=covars, eps2d=0.0)
+    renders.sum().backward()
+    assert renders.isfinite().all() and covars.grad.isfinite().all()
+
+
 def test_a_covariance_that_is_not_finite_is_not_rendered():
     scene = random_scene(n=20, cameras=1)
     factors = covariance_factors(scene.quats, scene.scales)

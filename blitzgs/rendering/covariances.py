@@ -88,13 +88,16 @@ def shaped_by(splats: ProjectedSplats, inputs: ProjectionInputs, decomposed: Dec
     covars = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
     on_screen = jacobians @ covars @ jacobians.mT
     xx, xy, yy = on_screen[:, 0, 0], on_screen[:, 0, 1], on_screen[:, 1, 1]
-    before = xx * yy - xy * xy
-    after = (xx + eps2d) * (yy + eps2d) - xy * xy
-    conics = torch.stack([yy + eps2d, -xy, xx + eps2d], dim=1) / after[:, None]
+    # Rounding may leave nothing of a thin splat's determinant, or less. The blur's part has no cancellation.
+    before = (xx * yy - xy * xy).clamp(min=0)
+    after = before + eps2d * (xx + yy + eps2d)
+    # A conic of zeros touches no pixel; an infinite one would have the gradient NaN.
+    inverse = torch.where(after > 0, 1 / after.clamp(min=1e-300), 0)
+    conics = torch.stack([yy + eps2d, -xy, xx + eps2d], dim=1) * inverse[:, None]
     splats = splats._replace(conics=conics.to(splats.conics.dtype))
     if not antialiased:
         return splats
-    share = (before / after).clamp(min=1e-30).sqrt()  # the root of zero has no derivative
+    share = (before * inverse).clamp(min=1e-30).sqrt()  # the root of zero has no derivative
     compensated = (opacities.index_select(0, ids) * share).to(splats.opacities.dtype)
     # A splat without opacity is hidden: its colour is not finite.
     return splats._replace(opacities=torch.where(splats.opacities == 0, splats.opacities, compensated))

@@ -85,7 +85,9 @@ def render(
     channels, lead = _channels(rendered, gaussians, image.render_mode), gaussians.lead
     if job is not None:
         (rendered, channels), lead = send_splats(rendered, channels, job), (job.views,)
-    count = -1 if compiling or job is not None or ready is not None else int(splats.counts[2])
+    # Conics of covariances differ by rounding from those whose tiles the projection counted.
+    uncounted = compiling or job is not None or ready is not None or groups[0].covariances is not None
+    count = -1 if uncounted else int(splats.counts[2])
     lists, composited_lists = _lists(rendered, math.prod(lead), project, ready, count)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
