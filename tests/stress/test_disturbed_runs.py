@@ -150,10 +150,16 @@ def test_a_disturbed_run_ends_like_any_other(scene, tmp_path, disturb):
     for trial in range(TRIALS):
         own = shutil.copytree(data, tmp_path / f"data{trial}")
         out = tmp_path / f"run{trial}"
-        process = start(own, out)
-        wait_for_first_checkpoint(process, out)
-        time.sleep(choice.uniform(0, 0.7 * seconds))
-        assert process.exitcode is None, "the run is too short for this test"
+        while True:
+            process = start(own, out)
+            wait_for_first_checkpoint(process, out)
+            time.sleep(choice.uniform(0, 0.7 * seconds))
+            if process.exitcode is None:
+                break
+            # The run ended first: the machine was busier when the undisturbed run was timed.
+            assert process.exitcode == 0
+            seconds *= 0.7
+            shutil.rmtree(out)
         worst = max(worst, disturb(process, own, out))
         found = finish(own, out)
         for name in expected:
