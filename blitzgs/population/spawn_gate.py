@@ -30,6 +30,8 @@ from blitzgs.population.candidates import FEATURES, Candidates
 FORMAT = 1
 # Name of the gate that is included in BlitzGS, for configs/compact.yaml.
 DEFAULT = "default"
+# Takes the place of a gate's name: vetoes at random, which a gate has to surpass.
+RANDOM = "random"
 _SHIPPED = Path(__file__).with_name("gates") / "compact.json"
 # Leaf values are rounded to integers in units of 2^-32.
 _LEAF_BITS = 32

@@ -259,7 +259,8 @@ class PopulationConfig:
         phi: from the first pass on, density control multiplies the gradients that it sums with phi: among the
             views that see a Gaussian, the share of those in which it counts.
         gate: model file of a spawn gate (`blitzgs gate fit`), or "default" for the one that comes with
-            BlitzGS, for configs/compact.yaml with schedule.t1=8999 and pass1_keep=0.85; null: none.
+            BlitzGS, for configs/compact.yaml with schedule.t1=8999 and pass1_keep=0.85; or "random" to
+            withhold as many at random, which a gate has to surpass; null: none.
         gate_rate: share of the candidates, clones and splits apart, that the gate withholds at each density
             event from `schedule.gate_from` on.
         lineage: log every birth and death as Parquet files in the run's folder `lineage` (needs pyarrow).

@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.spawn_gate import GateError, RankVeto, SpawnGate, gate_file, info_path
+from blitzgs.population.candidates import Veto
+from blitzgs.population.spawn_gate import (
+    RANDOM,
+    GateError,
+    RandomVeto,
+    RankVeto,
+    SpawnGate,
+    gate_file,
+    info_path,
+)
 from blitzgs.scene.capture import Capture
 from blitzgs.training.config import Config
 from blitzgs.training.config_io import to_dict
@@ -48,7 +57,7 @@ def lineage_subject(config: Config, capture: Capture) -> dict[str, Any]:
     }
 
 
-def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tuple[RankVeto | None, str]:
+def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tuple[Veto | None, str]:
     """Open the gate that a configuration names, and warn if it does not suit the run. Collective.
 
     Args:
@@ -58,7 +67,8 @@ def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tup
         known: digest of the gate that the run has used so far; empty: not known.
 
     Returns:
-        The gate and the digest of its files; None and "" if the configuration names no gate.
+        The veto and the digest of the gate's files. The digest is "" if a random veto takes the gate's place,
+        and if the configuration names no gate; the veto then is None.
 
     Raises:
         GateError: its files are missing, damaged, of another kind, or do not have the digest `known`.
@@ -67,6 +77,8 @@ def open_gate(config: Config, capture: Capture, ranks: Ranks, known: str) -> tup
     population = config.population
     if population.gate is None:
         return None, ""
+    if population.gate == RANDOM:
+        return RandomVeto(population.gate_rate, config.seed), ""
     path = gate_file(population.gate)
     gate = SpawnGate(path)
     digest = hashlib.sha256(path.read_bytes() + info_path(path).read_bytes()).hexdigest()

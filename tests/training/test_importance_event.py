@@ -19,7 +19,7 @@ from blitzgs.population.gate_fit import fit, read_spawns
 from blitzgs.population.importance import PHI, is_culled
 from blitzgs.population.lineage import ABOUT, Cause
 from blitzgs.population.lineage_parts import read_lineage
-from blitzgs.population.spawn_gate import GateError, GateInfo, info_path
+from blitzgs.population.spawn_gate import GateError, GateInfo, RandomVeto, info_path
 from blitzgs.training import run
 from blitzgs.training.events import importance
 from blitzgs.training.gate import life_fields, reasons_against
@@ -227,6 +227,23 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
             train(tmp_path / "gated", *flags, resume=True)
         file.write_text(content)
     assert train(tmp_path / "gated", *flags, resume=True)[1] is not None
+
+
+def test_a_random_veto_takes_the_place_of_a_gate(tmp_path):
+    """It withholds as many candidates as a gate, and the same ones in a repeated run."""
+    flags = ["population.gate=random", "schedule.gate_from=60", "population.gate_rate=0.5"]
+    ids = []
+    for name in ("first", "again"):
+        trainer, _ = train(tmp_path / name, *flags)
+        assert isinstance(trainer.state.veto, RandomVeto)
+        events = {r["t"]: r for r in events_of(tmp_path / name, "densify")}
+        assert events[20]["vetoed"] == events[40]["vetoed"] == 0
+        for t in (60, 80):
+            grown = events[t]["cloned"] + events[t]["split"]
+            assert grown > 10 and grown <= events[t]["vetoed"] <= grown + 2
+        ids.append(trainer.state.table["id"].sort().values)
+    assert torch.equal(*ids)
+    assert train(tmp_path / "first", *flags, resume=True)[1] is not None
 
 
 def test_a_schedule_that_a_gate_was_not_fitted_for_is_named():
