@@ -2,7 +2,7 @@
 """Runs gsplat's training loop with gsplat's parts and with ours, and compares time and quality.
 
     python benchmarks/bm_drop_in.py CAPTURE [--steps 7000] [--arms gsplat import four] [--device cuda]
-        [--sort-every 10] [--profile] [--one-thread]
+        [--profile] [--one-thread]
 
 The loop, learning rates and density strategy are those of gsplat's `simple_trainer.py` 1.5.3
 (`opponents/gsplat_training.py`), with photographs on the device. Arms:
@@ -10,9 +10,8 @@ The loop, learning rates and density strategy are those of gsplat's `simple_trai
 - gsplat: `gsplat.rasterization`, `torch.optim.Adam(fused=True)`, and L1 and SSIM by fused_ssim, or by our
   kernel where fused_ssim is not installed;
 - import: the same with `blitzgs.rasterization` in place of gsplat's function;
-- four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order after every
-  tenth change of the population (`--sort-every`), with gradients that go straight to the optimisers
-  (`direct_grad=True`);
+- four: `blitzgs.raw_rasterization`, `blitzgs.optim.LazyAdam`, `blitzgs.l1_ssim` and Morton order, with
+  gradients that go straight to the optimisers (`direct_grad=True`);
 - four_grad (only if it is named): the same with gradients in `.grad`.
 
 Times are of the whole training, of the two steps around each time at which the strategy may change the
@@ -101,11 +100,9 @@ class FourSwaps(OneImport):
 
     Attributes:
         direct_grad: of the renderer.
-        sort_every: after how many changes of the population the rows are sorted.
     """
 
     direct_grad = True
-    sort_every = 10
 
     def initialise(self, capture: Any) -> Any:
         """Make the parameters and a `LazyAdam` for each."""
@@ -140,7 +137,7 @@ class FourSwaps(OneImport):
         if refines:  # the strategy then reads parameters
             self.catch_up()
         super().change_population(info)
-        if refines and self.step % (self.sort_every * self._strategy.refine_every) == 0:
+        if refines:
             order = blitzgs.morton_order(self.params["means"].detach())
             for name, optimiser in self._optimisers.items():
                 self.params[name] = optimiser.permute(order)[name]
@@ -213,7 +210,6 @@ def psnr(trainer: OneImport, capture: Any, images: ImageStore) -> float:
 def measure(name: str, capture: Any, images: ImageStore, options: argparse.Namespace) -> dict[str, Any]:
     """Train with one arm; returns a row of the report."""
     device = torch.device(options.device)
-    FourSwaps.sort_every = options.sort_every
     changes = {"steps": options.steps, "packed": issubclass(ARMS[name], FourSwaps)}
     trainer = ARMS[name]("default", GsplatOptions.of("default", changes), capture, images, device, 0)
     last = min(99, options.steps // 10)  # between two densifications
@@ -252,7 +248,6 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--downscale", type=float, default=1)
-    parser.add_argument("--sort-every", type=int, default=FourSwaps.sort_every)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["gsplat", "import", "four"])
     parser.add_argument("--profile", action="store_true", help="time the parts of a step of each arm")
     parser.add_argument("--one-thread", action="store_true", help="run autograd in the loop's own thread")
