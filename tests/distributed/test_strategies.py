@@ -42,8 +42,19 @@ RELOCATION = (
     "loss.size=0.01",
     "population.max_gaussians=450",
 )
+# The second importance pass at the end of density control keeps half.
+PRUNED = (
+    "population.importance=true",
+    "population.score=weight",
+    "population.pass2_mass=1",
+    "population.pass2_keep=0.5",
+    "schedule.t1=0",
+    "schedule.densify_until=54",
+    "schedule.t2=54",
+)
 OPTIONS = {
     "relocation": RELOCATION,
+    "relocation, pruned": (*RELOCATION, *PRUNED),
     "absolute": ("population.absolute_gradients=true", "population.absolute_threshold=8e-3"),
     "relocate": ("population.relocate=true", "model.scale_floor=0.447", "population.max_gaussians=490"),
 }
@@ -117,6 +128,14 @@ def test_relocation_keeps_the_population_and_grows_to_the_cap(whole):
         counts = [event["gaussians"] for event in events]
         assert counts == sorted(counts) and counts[-1] == 450
         assert all(event["pruned"] == event["split"] == 0 for event in events)
+
+
+def test_the_second_pass_follows_relocation(whole):
+    options, folder, _ = whole
+    passes = [(event["t"], event["before"], event["gaussians"]) for event in events_of(folder, "pass_2")]
+    assert len(passes) == ("population.importance=true" in options)
+    for time, before, after in passes:  # of the kept half, it prunes those of low opacity
+        assert (time, before) == (54, 450) and 200 < after <= 225
 
 
 def test_births_less_deaths_are_the_living(whole, tmp_path):
