@@ -31,6 +31,7 @@ EXCHANGE = "python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda 
 TRAINING = "benchmarks/bm_training.py --data CAPTURE --config configs/aerial.yaml --images 3000"
 COMMANDS = {
     "render": "python benchmarks/bm_render.py",
+    "call": "python benchmarks/bm_render.py --scenes aerial1 aerial4",
     "step_1": "python benchmarks/bm_step.py --views 1",
     "step_4": "python benchmarks/bm_step.py --views 4",
     "exchange": f"{EXCHANGE} --ranks 1 2",
@@ -72,6 +73,7 @@ GROUPS = (
     ("quality",),
     ("ablation", "adaptive", "oracle"),
     ("offload",),
+    ("call",),
     ("drop_in", "drop_in_1"),
     ("exchange", "training", "training_2"),
     ("city", "city_exchange"),
@@ -369,6 +371,7 @@ SECTIONS = {
     "render": Section(("render",), render_lines),
     "stages": Section(("render",), stage_lines),
     "call": Section(("render",), call_lines),
+    "call_threads": Section(("call",), call_lines),
     "step": Section(("step_1", "step_4"), step_lines),
     "exchange": Section(("exchange",), exchange_lines),
     "training": Section(("training",), row_lines),
