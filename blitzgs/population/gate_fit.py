@@ -202,9 +202,7 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
     xgboost = _xgboost()
     check_no_other(path)
     runs = told_apart(runs)
-    schedules = {json.dumps(run.schedule, sort_keys=True) for run in runs}
-    if len(schedules) > 1:
-        raise ValueError("the runs have different schedules; fit one gate for each: " + "; ".join(schedules))
+    _check_same_schedule(runs)
     scenes = sorted({run.scene for run in runs})
     figures = []
     for run in runs:
@@ -253,6 +251,20 @@ def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str
     if not late.all() and 0 < run.survived[late].sum() < late.sum():
         found["judged"] = judge(run.only(late), scores[late])
     return found
+
+
+def _check_same_schedule(runs: Sequence[Spawns]) -> None:
+    """Check that all runs have the schedule of the first; the message names the fields that differ."""
+    first = runs[0]
+    for run in runs[1:]:
+        fields = sorted(first.schedule.keys() | run.schedule.keys())
+        pairs = [(name, first.schedule.get(name), run.schedule.get(name)) for name in fields]
+        differing = [f"{name} ({mine!r} and {other!r})" for name, mine, other in pairs if mine != other]
+        if differing:
+            raise ValueError(
+                f"{first.name} and {run.name} were trained with different schedules, and need a gate each: "
+                + ", ".join(differing)
+            )
 
 
 def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[np.bool_]], seed: int) -> Any:

@@ -156,8 +156,13 @@ def test_fitting_one_scene_holds_out_parents(tmp_path):
     figures = fit([spawns("a")], tmp_path / "g.json")
     (entry,) = figures["held_out"]
     assert 800 < entry["spawns"] < 1200 and entry["auc"] > 0.85
-    with pytest.raises(ValueError, match="different schedules"):
-        fit([spawns("a"), spawns("b", schedule={"x": 1})], tmp_path / "h.json")
+
+
+def test_runs_of_different_schedules_are_refused_by_the_fields_that_differ(tmp_path):
+    other = SCHEDULE | {"schedule.scale": 0.5}
+    message = r"^a and b were .* different schedules, .* each: schedule.scale \(None and 0.5\)$"
+    with pytest.raises(ValueError, match=message):
+        fit([spawns("a"), spawns("b", schedule=other)], tmp_path / "h.json")
 
 
 def test_scenes_of_the_same_name_are_told_apart(tmp_path):
