@@ -67,7 +67,7 @@ def split_views(
     Raises:
         ValueError: the list names unknown views, or no training view is left.
     """
-    if isinstance(spec, str) and spec.isdigit():
+    if isinstance(spec, str) and spec.removeprefix("-").isdigit():
         spec = int(spec)
     if isinstance(spec, int):
         test = every_nth(len(names), spec)

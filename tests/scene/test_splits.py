@@ -50,8 +50,10 @@ def test_val_folder_is_used_when_it_is_there():
 
 
 def test_invalid_splits_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="data.split: must be 0 .no view is held out. or at least 2, got"):
-        split_views(NAMES, PATHS, ROOT, 1)
+    for number in (1, "-1"):
+        message = f"data.split: must be 0 .no view is held out. or at least 2, got {number}"
+        with pytest.raises(ValueError, match=message):
+            split_views(NAMES, PATHS, ROOT, number)
     with pytest.raises(ValueError, match="neither a number, 'auto', 'val' nor a file"):
         split_views(NAMES, PATHS, ROOT, "missing.txt")
     (tmp_path / "all.txt").write_text("\n".join(NAMES))
