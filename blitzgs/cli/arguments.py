@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -66,7 +67,11 @@ def add_pool(parser: argparse.ArgumentParser) -> None:
 
 
 def _gigabytes(text: str) -> float:
-    value, allowed = float(text), RANGES["memory.resident_gb"]
+    allowed = RANGES["memory.resident_gb"]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan  # which is not in any range
     if value not in allowed:
         raise argparse.ArgumentTypeError(f"must be {allowed}, got {text}")
     return value

@@ -124,9 +124,10 @@ def test_a_run_is_shown_with_another_pool_than_it_was_trained_with(copy, tmp_pat
     assert "--resident-gb" in capsys.readouterr().err
     for gigabytes in ("0", "1"):
         assert main([*arguments, "--resident-gb", gigabytes]) == 0
-    with pytest.raises(SystemExit):
-        main([*arguments, "--resident-gb", "nan"])
-    assert "--resident-gb: must be in [0, 1,000,000], got nan" in capsys.readouterr().err
+    for wrong in ("nan", "all"):
+        with pytest.raises(SystemExit):
+            main([*arguments, "--resident-gb", wrong])
+        assert f"--resident-gb: must be in [0, 1,000,000], got {wrong}" in capsys.readouterr().err
 
 
 def test_a_split_without_views_is_named(copy, tmp_path, capsys):
