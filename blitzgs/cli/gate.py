@@ -128,8 +128,8 @@ def run_evaluate(args: argparse.Namespace) -> int:
     figures = args.out / "evaluation.json"
     output.check(figures)
     args.out.mkdir(parents=True, exist_ok=True)
-    schedule = load_config(args.runs[0] / run_folder.CONFIG).schedule
-    gate_from = Schedule(schedule).pace.image(schedule.gate_from)
+    schedules = [load_config(folder / run_folder.CONFIG).schedule for folder in args.runs]
+    gate_from = [Schedule(schedule).pace.image(schedule.gate_from) for schedule in schedules]
     results = gate_evaluation.evaluate(gate, runs, gate_from, output)
     output.write(figures, (json.dumps(results, indent=1) + "\n").encode())
     for result in results:

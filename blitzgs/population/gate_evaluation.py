@@ -23,14 +23,15 @@ CELLS, LEAST_IN_CELL = 32, 30
 
 
 def evaluate(
-    gate: SpawnGate, runs: Sequence[Spawns], gate_from: float, output: OutputFolder
+    gate: SpawnGate, runs: Sequence[Spawns], gate_from: Sequence[float], output: OutputFolder
 ) -> list[dict[str, Any]]:
     """Evaluate a gate on runs, and draw survival.svg and regions_NAME.svg.
 
     Args:
         gate: the gate.
         runs: the runs; their schedules may differ.
-        gate_from: time in images from which on a gate judges spawns; only later spawns are in the maps.
+        gate_from: for each run, the time in images from which on a gate judges spawns; only later spawns are
+            in the maps.
         output: folder for the pictures.
 
     Returns:
@@ -45,11 +46,11 @@ def evaluate(
     survival = output.root / SURVIVAL
     output.check(survival)
     pictures = output.paths([f"regions_{run.name}" for run in runs], ".svg", flat=True)
-    for run, path in zip(runs, pictures, strict=True):
+    for run, begin, path in zip(runs, gate_from, pictures, strict=True):
         scores = gate.scores(torch.from_numpy(run.features)).double().numpy()
-        late = run.times >= gate_from
+        late = run.times >= begin
         cohorts = survival_by_cohort(run)
-        result = judge(run, scores, gate_from) | {
+        result = judge(run, scores, begin) | {
             "seen": run.scene in gate.info.scenes.values(),
             "initial_survival": run.initial_survival,
             "cohorts": cohorts,

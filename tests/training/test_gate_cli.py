@@ -174,6 +174,18 @@ def test_names_need_not_be_utf_8(lineage_run, tmp_path):
     ElementTree.parse(root / "judged" / "survival.svg")
 
 
+def test_each_run_is_judged_from_its_own_onset_of_the_gate(lineage_run, tmp_path):
+    first, later = lineage_run / "run", tmp_path / "later"
+    shutil.copytree(first, later)
+    config = (later / "config.yaml").read_text()
+    (later / "config.yaml").write_text(config.replace("gate_from: 60", "gate_from: 80"))
+    out = tmp_path / "judged"
+    assert main(["gate", "evaluate", "default", str(first), str(later), "--out", str(out)]) == 0
+    times = read_spawns(first / "lineage").times
+    entries = json.loads((out / "evaluation.json").read_text())
+    assert [entry["judged"]["spawns"] for entry in entries] == [(times >= 60).sum(), (times >= 80).sum()]
+
+
 def test_runs_of_the_same_name_have_pictures_of_their_own(lineage_run, tmp_path):
     run, out = str(lineage_run / "run"), tmp_path / "judged"
     for _ in range(2):  # what an earlier call wrote is replaced
