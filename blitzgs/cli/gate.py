@@ -203,7 +203,8 @@ def _judgement(entry: dict[str, Any]) -> str:
 def _table(results: Sequence[dict[str, Any]]) -> str:
     """Return a Markdown table of the arms, with differences from the first."""
     first = results[0]
-    lines = ["| arm | PSNR | difference | SSIM | peak | difference | final | s | known |", "|---" * 9 + "|"]
+    columns = "arm | PSNR | difference | SSIM | peak | difference | final | seconds | known to the oracle"
+    lines = [f"| {columns} |", "|---" * 9 + "|"]
     for row in results:
         known = f"{row['matched']:.0%}" if "matched" in row else ""
         lines.append(

@@ -196,6 +196,8 @@ def replay(
         ranks.barrier()
         trainer = Trainer(config, capture, images, folder, ranks, resume=True)
         trainer.state.veto, began = veto, trainer.state.progress.seconds
+        if ranks.rank == 0:
+            print(f"arm {name}:", flush=True)
         summary = trainer.train()
         if summary is None:
             raise InterruptedError(f"arm {name} was stopped by a signal")

@@ -88,7 +88,9 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     for name in ("oracle", "oracle_rate", "gate", "random"):
         assert arms[name]["peak"] < arms["reference"]["peak"]
     table = (tmp_path / "replay" / "replay.md").read_text()
-    assert table.count("\n") == 7 and table in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert table.count("\n") == 7 and table in printed
+    assert all(f"arm {name}:\n" in printed for name in arms)
     # The first gated event is the same as in the reference, so the oracle knows each of its candidates.
     assert [r["t"] for r in events_of(tmp_path / "replay" / "oracle", "densify")] == [60, 80]
     assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
