@@ -55,8 +55,8 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         type=float,
         default=ScheduleConfig.gate_from,
         metavar="IMAGES",
-        help="schedule.gate_from of the runs that will use the gate: spawns from then on are also evaluated "
-        "separately (default: %(default)s)",
+        help="spawns from this time on are also evaluated separately: schedule.gate_from of the runs that "
+        "will use the gate, times their schedule.scale (default: %(default)s)",
     )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     sample.add_argument("folder", type=named_path, metavar="RUN", help="folder of a run with lineage")
@@ -98,10 +98,12 @@ def run_fit(args: argparse.Namespace) -> int:
     """Fit a gate; returns the exit status."""
     if args.out.suffix not in (".json", ".ubj"):
         raise ValueError(f"--out {args.out}: a gate's file ends in .json or .ubj")
+    if not args.gate_from >= 0:
+        raise ValueError(f"--gate-from: must be 0 or more, got {args.gate_from}")
     runs = [_spawns(path) for path in args.runs]
     args.out.parent.mkdir(parents=True, exist_ok=True)
     figures = gate_fit.fit(runs, args.out, args.gate_from)
-    print(f"{args.out}: fitted on {len(runs)} runs; {figures['protocol']}:")
+    print(f"{args.out}: fitted on {len(runs)} run{'s' * (len(runs) > 1)}; {figures['protocol']}:")
     for entry in figures["held_out"]:
         print(f"  {_judgement(entry)}")
     return 0
@@ -177,9 +179,12 @@ def _spawns_of(folder: Path) -> gate_fit.Spawns:
     """Read the spawns of a run.
 
     Raises:
+        FileNotFoundError: the folder is no run, or has no lineage.
         ValueError: the run is not finished, so it is not known which Gaussians survive; or its lineage is
             damaged.
     """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is not the folder of a run")
     lineage = folder / run_folder.LINEAGE
     summary = open_run(folder).summary() if lineage.is_dir() else {}
     if lineage.is_dir() and not summary:

@@ -305,6 +305,10 @@ def test_a_run_that_ends_before_the_gate_is_not_replayed(tmp_path):
 def test_what_is_missing_is_named(tmp_path, capsys):
     assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.json")]) == 1
     assert "holds no lineage: train with --population.lineage=true" in capsys.readouterr().err
+    assert main(["gate", "fit", str(tmp_path / "no"), "--out", str(tmp_path / "g.json")]) == 1
+    assert "no is not the folder of a run" in capsys.readouterr().err
+    assert main(["gate", "fit", str(tmp_path), "--gate-from=nan", "--out", str(tmp_path / "g.json")]) == 1
+    assert "--gate-from: must be 0 or more, got nan" in capsys.readouterr().err
     assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.txt")]) == 1
     assert "a gate's file ends in .json or .ubj" in capsys.readouterr().err
     assert main(["gate", "evaluate", str(tmp_path / "g.json"), "x", "--out", str(tmp_path)]) == 1
