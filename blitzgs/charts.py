@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
@@ -23,22 +24,25 @@ def line_chart(
         lines: name -> (x, y), x and y >= 0.
         x_label: below the axis.
         y_label: above the axis.
-        most: the top of the axis; None: a round number above the largest y.
+        most: the top of the axis; None: a round number, at least the largest y.
     """
     points = [point for line in lines.values() for point in line]
-    last = max([x for x, _ in points] + [1e-9])
-    top = most or _round_up(max([y for _, y in points] + [1e-9]))
+    last = max((x for x, _ in points), default=0.0) or 1.0
+    rows = _ticks(most or max((y for _, y in points), default=0.0) or 1.0)
+    top = rows[-1]
     inner_width, inner_height = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
 
     def place(x: float, y: float) -> tuple[float, float]:
         return _LEFT + inner_width * x / last, _TOP + inner_height * (1 - y / top)
 
     parts = []
-    for k in range(5):
-        (x, y), (column, _) = place(0, top * k / 4), place(last * k / 4, 0)
+    for value in rows:
+        x, y = place(0, value)
         parts.append(f'<path d="M{x:.1f} {y:.1f}H{_WIDTH - _RIGHT}" stroke="#ddd"/>')
-        parts.append(_text(x - 8, y + 4, _short(top * k / 4), "end"))
-        parts.append(_text(column, _HEIGHT - _BOTTOM + 18, _short(last * k / 4), "middle"))
+        parts.append(_text(x - 8, y + 4, _short(value), "end"))
+    for value in _ticks(last):
+        if value <= last:
+            parts.append(_text(place(value, 0)[0], _HEIGHT - _BOTTOM + 18, _short(value), "middle"))
     for k, (name, line) in enumerate(lines.items()):
         color = _COLORS[k % len(_COLORS)]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in line))
@@ -83,10 +87,11 @@ def _text(x: float, y: float, text: str, anchor: str = "start", color: str = "bl
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{color}">{escape(text)}</text>'
 
 
-def _round_up(value: float) -> float:
-    """Round up to 1, 2 or 5 times a power of ten."""
-    size = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * size for step in (1, 2, 5, 10) if step * size >= value))
+def _ticks(largest: float) -> list[float]:
+    """Return the multiples of a round number, at most six, from zero to the first that is >= `largest`."""
+    size = 10.0 ** math.floor(math.log10(largest / 5))
+    step = next(factor * size for factor in (1, 2, 2.5, 5, 10) if 5 * factor * size >= largest)
+    return [step * k for k in range(math.ceil(largest / step) + 1)]
 
 
 def _short(value: float) -> str:
