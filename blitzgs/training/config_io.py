@@ -39,6 +39,10 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
     values: dict[str, Any] = {}
     if path is not None:
         values = _read(Path(path), set())
+        try:
+            _build(Config, values, "")
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from error
     for text in overrides:
         name, equals, value = text.lstrip("-").partition("=")
         if not equals:

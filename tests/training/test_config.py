@@ -67,6 +67,17 @@ def test_errors_name_the_field(override, message):
         load_config(None, [override])
 
 
+def test_an_error_of_a_file_names_the_file(tmp_path):
+    file = tmp_path / "mine.yaml"
+    for text, message in (
+        ("loss:\n  sim: 1", "loss.sim: unknown field"),
+        ("loss: 5", "loss: must be a section"),
+    ):
+        file.write_text(text)
+        with pytest.raises(ConfigError, match=f"^{file}: {message}"):
+            load_config(file)
+
+
 def test_unreadable_files(tmp_path):
     with pytest.raises(ConfigError, match="cannot read the configuration"):
         load_config(tmp_path / "missing.yaml")
