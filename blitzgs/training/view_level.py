@@ -51,9 +51,9 @@ def choose_views(state: TrainingState) -> None:
     mean = sum(share if has_gate else 1.0 for share, has_gate in zip(kept, gated, strict=True)) / len(kept)
     values = {"finest_level": state.progress.finest_level, "gated_views": sum(gated), "kept": mean}
     text = (
-        f"the LOD gate keeps levels up to {state.progress.finest_level} of {state.progress.level_count - 1}: "
-        f"it holds in {sum(gated)} of {len(gated)} training views, which keep {mean:.0%} of the Gaussians on "
-        "average over all"
+        f"the LOD gate keeps levels up to {state.progress.finest_level} (the finest is "
+        f"{state.progress.level_count - 1}), and is applied in {sum(gated)} of {len(gated)} training views; "
+        f"a training view keeps {mean:.0%} of the Gaussians on average"
     )
     state.log.event(state.images_seen, "lod_gate", values, text)
 
