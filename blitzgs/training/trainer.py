@@ -286,7 +286,7 @@ class Trainer:
                 save_config(state.config, state.folder / run.CONFIG)
                 if state.lineage is not None:
                     state.lineage.describe(lineage_subject(state.config, state.capture))
-                write_file(state.folder / run.SUMMARY, json.dumps(summary, indent=1))
+                write_file(state.folder / run.SUMMARY, json.dumps(summary, indent=1) + "\n")
             except OSError as error:
                 warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)
         return summary
