@@ -68,7 +68,7 @@ def add_to(commands: Commands[argparse.ArgumentParser]) -> None:
         "--minutes",
         type=float,
         metavar="M",
-        help="end after M minutes of training, with the whole schedule fitted into them",
+        help="end after M minutes of training, with the whole schedule fitted into them (0: no limit)",
     )
     parser.add_argument(
         "--show-config", action="store_true", help="print the resulting configuration and stop"
