@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 
 from blitzgs.cli.arguments import (
     Commands,
@@ -73,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
         check_capture(model.space, capture, args.folder)
         if not getattr(capture, args.split):
             raise ValueError(f"{args.folder} has no {args.split} views: choose another --split")
+        folder = args.out or args.folder / run_folder.EVALUATION / args.split
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
                 model.scene(ranks.device),
@@ -83,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
                 render_options(
                     config, model.space, model.progress.sh_degree, lod_gate(config, model.progress)
                 ),
-                args.out or args.folder / run_folder.EVALUATION / args.split,
+                folder,
                 TileOwners(ranks),
                 pictures=args.pictures,
                 lpips=load_lpips(args.lpips),
@@ -93,4 +95,6 @@ def run(args: argparse.Namespace) -> int:
             )
         if ranks.rank == 0:
             print(json.dumps({name: value for name, value in result.items() if name != "views"}, indent=1))
+            # Standard output has nothing but the JSON.
+            print(f"{folder}: metrics.json and pictures", file=sys.stderr)
     return 0

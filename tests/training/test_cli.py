@@ -49,8 +49,9 @@ def test_the_log_names_the_limit_of_the_population(trained, tmp_path, capsys, st
 def test_eval_repeats_the_metrics_of_training(trained, tmp_path, capsys):
     summary = json.loads((trained[1] / "summary.json").read_text())
     assert main(["eval", str(trained[1]), "--out", str(tmp_path), "--pictures", "1", "--share-gpus"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed == {name: summary[name] for name in ("psnr", "ssim", "psnr_corrected")}
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == {name: summary[name] for name in ("psnr", "ssim", "psnr_corrected")}
+    assert f"{tmp_path}: metrics.json and pictures" in printed.err
     assert len(list(tmp_path.glob("*.jpg"))) == 1
 
 
