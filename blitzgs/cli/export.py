@@ -93,7 +93,9 @@ def _explain(exported: Exported, antialiased: bool, args: argparse.Namespace) ->
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {exported.sidecar} says")
     elif args.coordinates == "capture":
         print(f"coordinates are rounded by up to {exported.rounding:.3g}")
-    if antialiased and args.classic:
+    if args.classic and not antialiased:
+        print("--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr)
+    elif args.classic:
         print("antialiasing is baked into the opacities: right at the training views' distance, else nearly")
     elif antialiased:
         print(

@@ -66,9 +66,10 @@ def test_render_writes_every_view(trained, tmp_path):
         assert np.abs(image.clip(0, 1) * 255 - png).max() <= 0.51
 
 
-def test_export_restores_the_units_of_the_capture(trained, tmp_path):
+def test_export_restores_the_units_of_the_capture(trained, tmp_path, capsys):
     path = tmp_path / "model.ply"
-    assert main(["export", str(trained[1]), "--ply", str(path)]) == 0
+    assert main(["export", str(trained[1]), "--ply", str(path), "--classic"]) == 0
+    assert "--classic changes nothing: the model was trained without" in capsys.readouterr().err
     model, exported = run.open_model(trained[1], Ranks()), read_ply(path)
     means = model.table["means"].double() * model.space.unit + torch.tensor(model.space.offset)
     torch.testing.assert_close(exported.means.double(), means, rtol=1e-6, atol=1e-6)
