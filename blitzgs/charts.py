@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 _COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#7f7f7f")
 _WIDTH, _HEIGHT, _LEFT, _TOP, _BOTTOM, _RIGHT = 720, 360, 70, 30, 45, 20
-_CELLS = 320
+_NAME, _CELLS = 14, 320
 
 
 def line_chart(
@@ -30,10 +30,13 @@ def line_chart(
     last = max((x for x, _ in points), default=0.0) or 1.0
     rows = _ticks(most or max((y for _, y in points), default=0.0) or 1.0)
     top = rows[-1]
+    # The names of the lines are above the chart, one below the other.
+    names = _NAME * (len(lines) - 1)
+    height = _HEIGHT + names
     inner_width, inner_height = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
 
     def place(x: float, y: float) -> tuple[float, float]:
-        return _LEFT + inner_width * x / last, _TOP + inner_height * (1 - y / top)
+        return _LEFT + inner_width * x / last, names + _TOP + inner_height * (1 - y / top)
 
     parts = []
     for value in rows:
@@ -42,15 +45,15 @@ def line_chart(
         parts.append(_text(x - 8, y + 4, _short(value), "end"))
     for value in _ticks(last):
         if value <= last:
-            parts.append(_text(place(value, 0)[0], _HEIGHT - _BOTTOM + 18, _short(value), "middle"))
+            parts.append(_text(place(value, 0)[0], height - _BOTTOM + 18, _short(value), "middle"))
     for k, (name, line) in enumerate(lines.items()):
         color = _COLORS[k % len(_COLORS)]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in line))
         parts.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="2"/>')
         if len(lines) > 1:
-            parts.append(_text(_WIDTH - _RIGHT, 18 + 14 * k, name, "end", color))
-    parts += [_text(_LEFT, 18, y_label), _text(_WIDTH - _RIGHT, _HEIGHT - 8, x_label, "end")]
-    return _picture(_WIDTH, _HEIGHT, parts)
+            parts.append(_text(_WIDTH - _RIGHT, 18 + _NAME * k, name, "end", color))
+    parts += [_text(_LEFT, names + 18, y_label), _text(_WIDTH - _RIGHT, height - 8, x_label, "end")]
+    return _picture(_WIDTH, height, parts)
 
 
 def maps(cells: Mapping[str, NDArray[np.float64]]) -> str:

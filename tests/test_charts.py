@@ -43,3 +43,12 @@ def test_a_label_is_below_its_point():
     (line,) = re.findall(r'polyline points="([^"]*)"', chart)
     x = line.split()[1].split(",")[0]
     assert f'<text x="{x}" y="333.0" text-anchor="middle" fill="black">600</text>' in chart
+
+
+def test_names_of_lines_are_above_the_chart():
+    names = ("one", "two", "three")
+    chart = ElementTree.fromstring(line_chart({name: [(0, 0), (1, 1)] for name in names}, "x", "y"))
+    labels = {label.text: float(label.get("y")) for label in chart.iter(f"{NAMESPACE}text")}
+    top = float(chart.find(f"{NAMESPACE}polyline").get("points").split()[1].split(",")[1])
+    assert labels["one"] < labels["two"] < labels["three"] < top
+    assert float(chart.get("viewBox").split()[3]) == 360 + 2 * 14
