@@ -58,7 +58,8 @@ def evaluate(
         if late.any():
             where, actual, predicted = region_rates(run.only(late), scores[late])
             result["regions"] = {"cells": int(where.sum()), "r": correlation(actual[where], predicted[where])}
-            picture = maps({"survived": actual, "predicted at birth, as many": predicted})
+            names = ("share that survived (orange: none, blue: all)", "share that the gate predicts")
+            picture = maps(dict(zip(names, (actual, predicted), strict=True)))
             output.write(path, _utf8(picture))
         curves[run.name] = [(entry["until"], entry["survived"]) for entry in cohorts]
         results.append(result)
