@@ -20,6 +20,7 @@ UInt8 = npt.NDArray[np.uint8]
 _FULL_ERROR = 0.25
 _LABELS = ("render", "photograph", f"error (red: {_FULL_ERROR} or more)")
 _BAR = 24
+_FONT, _LETTERS, _INDENT = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 6
 _GAP = 4
 
 
@@ -91,7 +92,10 @@ def strip(images: Sequence[Tensor], labels: Sequence[str]) -> Tensor:
         pixels = to_uint8(image)
         panel = np.full((pixels.shape[0] + _BAR, pixels.shape[1], 3), 255, dtype=np.uint8)
         panel[_BAR:] = pixels
-        cv2.putText(panel, label, (6, _BAR - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+        # Above a narrow picture the letters are smaller, so that the label is whole.
+        (width, _), _ = cv2.getTextSize(label, _FONT, _LETTERS, 1)
+        letters = _LETTERS * min(1.0, max(1, panel.shape[1] - 2 * _INDENT) / width)
+        cv2.putText(panel, label, (_INDENT, _BAR - 7), _FONT, letters, (0, 0, 0), 1, cv2.LINE_AA)
         panels += [panel, np.full((panel.shape[0], _GAP, 3), 255, dtype=np.uint8)]
     return torch.from_numpy(np.concatenate(panels[:-1], axis=1))
 

@@ -47,5 +47,6 @@ def test_comparison_strip_holds_all_three(tmp_path):
     np.testing.assert_array_equal(found[24:, 34:64], target)
     np.testing.assert_array_equal(found[24:, 68:], error_map(render, target))
     assert (found[:24, :30] < 128).any(), "the label is drawn"
+    assert all((found[:24, right - 4 : right] > 200).all() for right in (30, 64, 98)), "no label is cut off"
     with pytest.raises(ValueError, match="images of one height"):
         strip([render, render[:5]], ["a", "b"])
