@@ -30,18 +30,21 @@ def test_train_leaves_a_summary(trained):
 
 
 @pytest.mark.parametrize("strategy", ["density", "relocation"])
-def test_the_log_names_the_limit_of_the_population(trained, tmp_path, capsys, strategy):
+@pytest.mark.parametrize("most", [420, 10])
+def test_the_log_names_the_limit_of_the_population(trained, tmp_path, capsys, strategy, most):
     flags = [
         f"--{text}"
         for text in ("config=defaults", *OVERRIDES, "schedule.iterations=22", "population.growth=0.5")
     ]
-    flags += [f"--population.strategy={strategy}", "--population.max_gaussians=420", "--log.pictures=0"]
+    flags += [f"--population.strategy={strategy}", f"--population.max_gaussians={most}", "--log.pictures=0"]
     assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "r"), *flags]) == 0
     lines = (tmp_path / "r" / "log.jsonl").read_text().splitlines()
     event = next(record for record in map(json.loads, lines) if record.get("event") == "densify")
     held_back = event["held_back"]
-    assert held_back > 0 and event["gaussians"] <= 420
-    limit = "population.max_gaussians limits the model to 420 Gaussians"
+    assert held_back > 0 and (event["gaussians"] <= 420 if most == 420 else event["gaussians"] > most)
+    limit = f"population.max_gaussians limits the model to {most} Gaussians"
+    if most == 10:
+        limit += f", fewer than the {event['gaussians']:,} that it has, so it does not grow"
     text = f"{limit}; this event would have added {held_back:,} more"
     assert text in " ".join(capsys.readouterr().out.split())
 

@@ -66,9 +66,12 @@ def run(state: TrainingState, event: Event) -> None:
     if limit is not None:
         record |= {"limit": limit.count, "limited_by": limit.reason}
         if held_back and not state.growth_was_limited:
+            # A limit ends the growth, but removes nothing.
+            more = counts["gaussians"] > limit.count
+            has = f", fewer than the {counts['gaussians']:,} that it has, so it does not grow" if more else ""
             text = (
-                f"{limit.reason} limits the model to {limit.count:,} Gaussians; this event would have added "
-                f"{held_back:,} more"
+                f"{limit.reason} limits the model to {limit.count:,} Gaussians{has}; this event would have "
+                f"added {held_back:,} more"
             )
             state.growth_was_limited = True
     state.log.event(event.time, "densify", record, text)
