@@ -8,6 +8,7 @@ import io
 import sys
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 
@@ -81,8 +82,10 @@ def _message(error: Exception) -> str:
     """Return the error's text; for an error of the operating system, the file and the reason."""
     if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
         return str(error)
-    if isinstance(error, FileExistsError):
-        return f"{error.filename} is a file where a folder is needed: choose another name"
+    if isinstance(error, (FileExistsError, NotADirectoryError)):
+        path = Path(str(error.filename))
+        file = next((part for part in (path, *path.parents) if part.exists() and not part.is_dir()), path)
+        return f"{file} is a file where a folder is needed: choose another name"
     return f"{error.filename}: {error.strerror}"
 
 

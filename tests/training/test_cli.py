@@ -159,7 +159,11 @@ def test_mistakes_with_files_name_them(trained, tmp_path, capsys):
     file.write_bytes(b"\xff\xfe")
     data = ["--data", trained[0], "--out", tmp_path / "x"]
     assert f"{file}: not valid YAML" in fails(capsys, "train", "--config", file, *data)
-    assert f"{file} is a file" in fails(capsys, "render", trained[1], "--out", file)
+    for out in (file, file / "inside"):
+        assert f"{file} is a file where a folder is needed" in fails(
+            capsys, "render", trained[1], "--out", out
+        )
+    assert f"{file} is a file where a folder is needed" in fails(capsys, "synth", file / "inside")
     small = fails(capsys, "train", *data, "--data.downscale=100")
     assert "downscale 100 leaves 1 x 1 pixels" in small
 
