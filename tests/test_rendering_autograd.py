@@ -138,6 +138,22 @@ def test_sparse_gradients_pass_what_was_made_of_opacities_and_colours(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", [*PARAMETERS, "Ks"])
+def test_an_argument_may_have_the_negative_bit(device, name):
+    """Torch negates such a tensor, as the imaginary part of a conjugate, only when it is read."""
+    results = []
+    for with_bit in (False, True):
+        leaves = random_scene(n=30, device=device).leaves()
+        called = leaves
+        if with_bit:
+            called = replace(leaves, **{name: torch._neg_view(-getattr(leaves, name))})
+        rasterize_scene(called)[0].square().sum().backward()
+        results.append([getattr(leaves, parameter).grad for parameter in PARAMETERS])
+    for parameter, expected, actual in zip(PARAMETERS, *results, strict=True):
+        assert relative_error(actual, expected) < 1e-5, parameter
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "RGB+ED"}], ids=str)
 def test_checkpointing_recomputes_the_call(device, options):
     scene = random_scene(n=60, device=device)

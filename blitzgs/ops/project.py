@@ -307,8 +307,10 @@ def _first_gradients(
     )
     # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
     dense = all_dense and not complete and all(needed)
+    # Torch resolves the negative bit of an op's tensors, but not of those in a list of optional ones.
+    cameras = [tensor.resolve_neg() for tensor in saved.cameras]
     *gradients, v_viewmats = torch.ops.blitzgs.project_bwd(
-        saved.gaussians, saved.cameras, saved.splats, ctx.options.ints, ctx.options.floats,
+        saved.gaussians, cameras, saved.splats, ctx.options.ints, ctx.options.floats,
         _splat_gradients(saved, v), v.depths, need_viewmats, dense, saved.level,
     )  # fmt: skip
     found: list[Tensor | None] = gradients[: len(saved.gaussians)]
