@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`blitzgs.rasterization` agrees with the float64 reference: images, gradients, modes."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -90,6 +92,20 @@ def test_random_scenes_against_the_reference(seed, n, scale, degree, width, heig
     scene = random_scene(n=n, seed=seed, cameras=1, scale=scale, width=width, height=height)
     scene.sh_degree = degree
     require_accurate(scene)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_signs_of_scales_do_not_matter(device):
+    scene = random_scene(n=60, width=24, height=20, device=device)
+    scene.means *= 2.0  # some centres are outside of the images
+    results = []
+    for sign in (1.0, -1.0):
+        leaves = replace(scene, scales=sign * scene.scales).leaves()
+        image, _, meta = rasterize_scene(leaves)
+        image.square().sum().backward()
+        results.append([image, meta["radii"].float(), sign * leaves.scales.grad, leaves.means.grad])
+    for expected, actual in zip(*results, strict=True):
+        assert relative_error(actual, expected) < 1e-5
 
 
 @pytest.mark.parametrize("device", DEVICES)

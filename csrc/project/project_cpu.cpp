@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
+#include <cmath>
 #include <mutex>
 #include <utility>
 #include <vector>
@@ -73,7 +74,8 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
   const Vec3<T> scale = activate_scale(in.scales + 3 * id, in.options.raw);
   const T opacity = activate_opacity(in.opacities[id], in.options.raw);
   if (reach(opacity) < T(0)) return 0;
-  const T widest = larger(larger(scale.x, scale.y), scale.z);
+  // A stored scale may be negative; the Gaussian is that of its absolute value.
+  const T widest = larger(larger(std::fabs(scale.x), std::fabs(scale.y)), std::fabs(scale.z));
   const float sigma = opacity <= T(1) ? 1.00001f * static_cast<float>(widest) : kAnyWidth;
   ActiveGaussian<T> gaussian{};
   std::uint32_t seen = 0;

@@ -22,11 +22,12 @@ __device__ __noinline__ void store_frustum(const Camera<float>* camera, int widt
 }
 
 // An upper bound on the Gaussian's largest scale, for may_overlap. That test assumes an opacity of at most 1.
-// A sigmoid always satisfies this; a stored opacity may exceed 1, and then the scale counts as unbounded.
+// A sigmoid always satisfies this; a stored opacity may exceed 1, and then the scale counts as unbounded. A
+// stored scale may be negative; the Gaussian is that of its absolute value.
 __device__ float largest_scale(const Inputs& in, std::int64_t id) {
   const float* s = in.scales + 3 * id;
-  const float widest = fmaxf(s[0], fmaxf(s[1], s[2]));
-  if (in.options.raw) return 1.001f * __expf(widest);
+  if (in.options.raw) return 1.001f * __expf(fmaxf(s[0], fmaxf(s[1], s[2])));
+  const float widest = fmaxf(fabsf(s[0]), fmaxf(fabsf(s[1]), fabsf(s[2])));
   return in.opacities[id] <= 1.f ? widest : kAnyWidth;
 }
 
