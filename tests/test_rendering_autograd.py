@@ -154,6 +154,21 @@ def test_an_argument_may_have_the_negative_bit(device, name):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_autocast_changes_nothing(device):
+    scene = random_scene(n=40, device=device)
+    results = []
+    for enabled in (False, True):
+        leaves = scene.leaves()
+        backgrounds = torch.full((2, 3), 0.5, device=device, requires_grad=True)
+        with torch.autocast(device, dtype=torch.bfloat16, enabled=enabled):
+            renders, _, _ = rasterize_scene(leaves, backgrounds=backgrounds)
+            renders.square().sum().backward()
+        results.append([renders.detach(), backgrounds.grad, *(getattr(leaves, n).grad for n in PARAMETERS)])
+    for expected, actual in zip(*results, strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "RGB+ED"}], ids=str)
 def test_checkpointing_recomputes_the_call(device, options):
     scene = random_scene(n=60, device=device)

@@ -290,7 +290,8 @@ def _first_gradients(
             *saved, v_renders, v_alphas, ctx.grid, absgrad, deterministic
         )
     if ctx.needs_input_grad[4]:
-        v_backgrounds = torch.einsum("bhwd,bhw->bd", v_renders, transmittances)
+        # A matrix product would be of less precision under autocast.
+        v_backgrounds = (v_renders * transmittances[..., None]).sum(dim=(1, 2))
     return (*v_splats, v_backgrounds, v_abs if absgrad else None)
 
 
