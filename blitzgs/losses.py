@@ -33,9 +33,11 @@ def l1_ssim(
         A scalar, dtype of `renders`.
 
     Raises:
+        TypeError: an argument is not a tensor, or has a dtype that is not listed above.
         ValueError: shapes or devices do not fit, or the weight is outside [0, 1].
-        RuntimeError: wrong dtypes.
+        RuntimeError: float64 images are on a GPU.
     """
+    _check_types(renders, targets, masks)
     if renders.dim() < 3 or renders.shape[-1] != 3 or targets.shape != renders.shape:
         raise ValueError(
             f"renders and targets must be [..., H, W, 3], got {list(renders.shape)} and {list(targets.shape)}"
@@ -55,6 +57,21 @@ def l1_ssim(
         return photometric_loss(x, y, masks, ssim_weight).mean()
     loss: Tensor = _L1Ssim.apply(x, y, masks, ssim_weight)  # type: ignore[no-untyped-call]
     return loss
+
+
+def _check_types(renders: object, targets: object, masks: object) -> None:
+    for name, value in (("renders", renders), ("targets", targets), ("masks", masks)):
+        if not isinstance(value, Tensor) and not (value is None and name == "masks"):
+            raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+    assert isinstance(renders, Tensor) and isinstance(targets, Tensor)
+    if renders.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"renders must be float32 or float64, got {renders.dtype}; convert them")
+    if targets.dtype not in (torch.uint8, renders.dtype):
+        raise TypeError(
+            f"targets must be uint8 or {renders.dtype} like renders, got {targets.dtype}; convert them"
+        )
+    if isinstance(masks, Tensor) and masks.dtype not in (torch.bool, torch.uint8):
+        raise TypeError(f"masks must be bool or uint8, got {masks.dtype}; pass masks != 0")
 
 
 class _L1Ssim(torch.autograd.Function):

@@ -90,8 +90,18 @@ def test_wrong_use_is_refused():
     with pytest.raises(ValueError, match=r"must be \[..., H, W, 3\], got \[1, 8, 8, 3\] and \[1, 8, 7, 3\]"):
         blitzgs.l1_ssim(x, x[:, :, :7])
     with pytest.raises(ValueError, match=r"masks must be \[1, 8, 8\], got \[8, 8\]"):
-        blitzgs.l1_ssim(x, x, torch.ones(8, 8))
+        blitzgs.l1_ssim(x, x, torch.ones(8, 8, dtype=torch.bool))
     with pytest.raises(ValueError, match="targets is on meta and renders on cpu; move one"):
         blitzgs.l1_ssim(x, x.to("meta"))
     with pytest.raises(ValueError, match=r"ssim_weight must be in \[0, 1\], got 2"):
         blitzgs.l1_ssim(x, x, ssim_weight=2)
+    with pytest.raises(TypeError, match=r"targets must be a torch\.Tensor, got ndarray"):
+        blitzgs.l1_ssim(x, x.numpy())
+    with pytest.raises(TypeError, match="renders must be float32 or float64, got torch.float16"):
+        blitzgs.l1_ssim(x.half(), x)
+    with pytest.raises(
+        TypeError, match="targets must be uint8 or torch.float32 like renders, got torch.int32"
+    ):
+        blitzgs.l1_ssim(x, x.int())
+    with pytest.raises(TypeError, match="masks must be bool or uint8, got torch.float32; pass masks != 0"):
+        blitzgs.l1_ssim(x, x, torch.ones(1, 8, 8))
