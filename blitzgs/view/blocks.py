@@ -24,9 +24,12 @@ def morton_order(means: Tensor) -> Tensor:
     Rows with the same Morton key keep their order; rows that are not finite come last.
 
     Args:
-        means: float32 [N, 3].
+        means: [N, 3], float32; other dtypes are rounded to it.
+
+    Raises:
+        RuntimeError: a wrong shape.
     """
-    return torch.sort(morton_keys(means), stable=True).indices
+    return torch.sort(morton_keys(means.float()), stable=True).indices
 
 
 class BlockIndex:

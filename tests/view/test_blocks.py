@@ -290,6 +290,7 @@ def test_morton_order_keeps_neighbours_together(device):
     assert int(order[-1]) == 3
     steps = points[order[:-1]].diff(dim=0).norm(dim=1).mean()
     assert steps < 0.2 * points[:3].diff(dim=0).norm(dim=1).mean()
+    assert torch.equal(morton_order(points.double()), order)
     same = torch.zeros(5, 3, device=device)
     assert morton_order(same).tolist() == list(range(5))
     assert morton_keys(points)[3] == 2**63 - 1
