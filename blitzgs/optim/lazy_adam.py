@@ -169,11 +169,13 @@ class LazyAdam(torch.optim.Optimizer):
         move.
 
         Args:
-            params: the parameters to update; None: all.
+            params: the parameters to update, one or several; None: all.
             rows: int32 [A], the rows to update, each once; None: all.
             count: int32 [1] on the device of the rows, how many of them are rows, the first ones; the host
                 does not wait for it. None, or on CUDA a number above A: all of them.
         """
+        if isinstance(params, Tensor):
+            params = [params]
         chosen = None if params is None else {id(param) for param in params}
         wanted = [entry for entry in self._placed() if chosen is None or id(entry[2]) in chosen]
         if self.joint is not None and self.joint.is_current():
@@ -215,9 +217,15 @@ class LazyAdam(torch.optim.Optimizer):
         The parameters must have the values that they had when the state was saved.
 
         Raises:
-            ValueError: the state does not fit, or is of an Adam with weight decay, AMSGrad or maximize.
+            ValueError: the state does not fit, or is of another optimiser, or of an Adam with weight decay,
+                AMSGrad or maximize.
         """
         for group in state_dict["param_groups"]:
+            if missing := {"lr", "betas", "eps"} - group.keys():
+                raise ValueError(
+                    f"LazyAdam: the state has no {', '.join(sorted(missing))}; load one of LazyAdam or "
+                    "torch.optim.Adam"
+                )
             _check_group({"lr_rest": None, **group})
         self.leave_joint()
         super().load_state_dict(state_dict)
@@ -361,6 +369,11 @@ class LazyAdam(torch.optim.Optimizer):
     def state_of(self, param: Tensor) -> dict[str, Any]:
         """Return the state of a parameter; make it on first use, and correct a strategy's dtypes."""
         state: dict[str, Any] = self.state[param]
+        if param.dtype not in (torch.float32, torch.float64):
+            raise ValueError(
+                f"LazyAdam: parameters must be float32 or float64, one of shape {list(param.shape)} is "
+                f"{param.dtype}; convert it"
+            )
         if not param.is_contiguous():
             raise ValueError(
                 f"LazyAdam: a parameter of shape {list(param.shape)} is not contiguous; clone it"

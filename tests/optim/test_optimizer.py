@@ -201,6 +201,8 @@ def test_catching_up_some_rows_of_some_parameters():
     moved = (pair.lazy["means"] != before["means"]).any(dim=1).nonzero()[:, 0]
     assert moved.tolist() == [3, 7]
     assert relative_error(pair.lazy["means"][rows], pair.dense["means"][rows]) < 1e-11
+    pair.ours.catch_up(pair.lazy["means"])  # one parameter, not in a list
+    assert relative_error(pair.lazy["means"], pair.dense["means"]) < 1e-11
     assert torch.equal(pair.lazy["sh"], before["sh"])
     pair.require_equal()
 
@@ -229,6 +231,14 @@ def test_wrong_use_is_refused():
         LazyAdam([{"params": [param], "weight_decay": 0.1}])
     with pytest.raises(ValueError, match="amsgrad=True is not supported"):
         LazyAdam([param]).load_state_dict(torch.optim.Adam([param], amsgrad=True).state_dict())
+    with pytest.raises(
+        ValueError, match="the state has no betas, eps; load one of LazyAdam or torch.optim.Adam"
+    ):
+        LazyAdam([param]).load_state_dict(torch.optim.SGD([param], lr=0.1).state_dict())
+    half = torch.ones(4, 3, dtype=torch.float16, requires_grad=True)
+    half.grad = torch.ones_like(half)
+    with pytest.raises(ValueError, match=r"one of shape \[4, 3\] is torch.float16; convert it"):
+        LazyAdam([half]).step()
     optimizer = LazyAdam([{"params": [param], "name": "means"}])
     with pytest.raises(ValueError, match=r"rows for \['means'\] are needed, got \['x'\]"):
         optimizer.append({"x": torch.ones(1, 3)})
