@@ -174,6 +174,24 @@ def test_infinite_logits_are_fine(recwarn):
     assert not [w for w in recwarn if "blitzgs" in str(w.message)]
 
 
+def test_gsplats_default_of_the_tile_size_is_accepted():
+    scene = random_scene(n=20)
+    p = raw_parameters(scene)
+    assert torch.equal(raw(p, scene, tile_size=None)[0], raw(p, scene)[0])
+
+
+def test_optimizers_may_be_one_of_any_class():
+    scene = random_scene(n=20)
+    p = raw_parameters(scene)
+    expected = raw(p, scene)[0]
+    for optimizer_class in (torch.optim.Adam, LazyAdam):
+        assert torch.equal(raw(p, scene, optimizers=optimizer_class(p.values()))[0], expected)
+    with pytest.raises(
+        TypeError, match="optimizers must be an optimiser, or a mapping or a sequence .* NoneT"
+    ):
+        raw(p, scene, optimizers=None)
+
+
 def test_wrong_shapes_are_refused_by_name():
     scene = random_scene(n=20)
     p = raw_parameters(scene)

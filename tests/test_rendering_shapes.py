@@ -262,6 +262,11 @@ def test_an_argument_that_gsplat_has_not_is_refused(value):
             r"colors must be \[..., N, D\] or \[..., C, N, D\], here with \[\] before N = 4",
         ),
         ({"colors": torch.zeros(2, 4, 16, 3)}, r"colors must be SH coefficients"),
+        ({"sh_degree": None, "colors": torch.zeros(4, 0)}, "colors must have 1 to 4096 channels, got 0"),
+        (
+            {"sh_degree": None, "colors": torch.zeros(4, 4097)},
+            "colors must have 1 to 4096 channels, got 4097",
+        ),
         ({"means": torch.zeros(1, 4, 3)}, r"quats must be \[..., N, 4\] = \[1, 4, 4\], got \[4, 4\]"),
         ({"quats": torch.zeros(4, 3)}, r"quats must be \[..., N, 4\]"),
         ({"Ks": torch.zeros(3, 3)}, r"Ks must be \[..., C, 3, 3\]"),
@@ -293,6 +298,10 @@ def test_what_is_not_supported_is_refused_by_name(options, message):
         ({"sh_degree": -1}, ValueError, "sh_degree must be 0 to 3, got -1"),
         ({"sh_degree": 4}, ValueError, "sh_degree must be 0 to 3, got 4"),
         ({"sh_degree": 3.0}, TypeError, "sh_degree must be a whole number, got 3.0"),
+        ({"near_plane": None}, TypeError, "near_plane must be a number, got None"),
+        ({"far_plane": "1e10"}, TypeError, "far_plane must be a number, got '1e10'"),
+        ({"eps2d": "0.3"}, TypeError, "eps2d must be a number, got '0.3'"),
+        ({"radius_clip": None}, TypeError, "radius_clip must be a number, got None"),
         ({"tile_size": 16.0}, TypeError, "tile_size must be a whole number, got 16.0"),
     ],
 )

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import torch
@@ -17,8 +17,11 @@ from blitzgs.rendering.covariances import Decomposed, decompose
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 MAX_SH_DEGREE = 3
+DEFAULT_TILE_SIZE = 16
 # The kernels count pixels of a row in float32 (checked_options of csrc/project/project_op.h).
 _SIZE_END = 1 << 24
+# What the kernels can composite (csrc/rasterize/rasterize_op.cpp).
+_MAX_CHANNELS = 4096
 # Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
 GSPLAT_DEFAULTS: dict[str, Any] = {
     "with_ut": False,
@@ -148,7 +151,7 @@ def check_options(
     """Check the arguments that are not tensors.
 
     Raises:
-        TypeError: a size or the degree is not a whole number.
+        TypeError: a size or the degree is not a whole number, or another option not a number.
         ValueError: one is out of range or has an unknown value.
     """
     for name, size in (("width", width), ("height", height)):
@@ -162,6 +165,10 @@ def check_options(
         _check_whole("sh_degree", sh_degree)
         if not 0 <= sh_degree <= MAX_SH_DEGREE:
             raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
+    _check_number("near_plane", near_plane)
+    _check_number("far_plane", far_plane)
+    _check_number("eps2d", eps2d)
+    _check_number("radius_clip", radius_clip)
     # NaN fails each of these comparisons.
     if not near_plane < far_plane:
         raise ValueError(f"near_plane must be less than far_plane, got {near_plane} and {far_plane}")
@@ -183,6 +190,12 @@ def _check_whole(name: str, value: object) -> None:
     # int comes first, because asking an abstract class takes longer; torch traces a function with SymInt.
     if not isinstance(value, (int, Integral, torch.SymInt)):
         raise TypeError(f"{name} must be a whole number, got {value!r}")
+
+
+def _check_number(name: str, value: object) -> None:
+    # YAML reads 1e10 as a string. A tensor of one number is taken as torch's own functions take it.
+    if not isinstance(value, (float, Real, torch.SymFloat, Tensor)):
+        raise TypeError(f"{name} must be a number, got {value!r}")
 
 
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
@@ -259,6 +272,8 @@ def gaussians_of(
         raise ValueError("colors may be None for the render modes D and ED alone")
     per_view = colors is not None and _per_view(colors, batch, C, N, sh_degree)
     colors = colors if with_colors else None
+    if colors is not None and not 1 <= colors.shape[-1] <= _MAX_CHANNELS:
+        raise ValueError(f"colors must have 1 to {_MAX_CHANNELS} channels, got {colors.shape[-1]}")
     whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
     degree = sh_degree if with_colors else None
     return Gaussians(_scenes(whole, batch), colors, opacities, degree, per_view, (*batch, C), raw)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from blitzgs.ops.projection import ProjectionOptions
 from blitzgs.rendering.arguments import (
+    DEFAULT_TILE_SIZE,
     Gaussians,
     background_rows,
     check_further,
@@ -19,8 +20,6 @@ from blitzgs.rendering.arguments import (
 )
 from blitzgs.rendering.images import ImageOptions, render
 from blitzgs.rendering.ranks import gather_views
-
-DEFAULT_TILE_SIZE = 16
 
 
 def rasterization(
@@ -63,14 +62,14 @@ def rasterization(
     Args:
         means: [..., N, 3] in world units, float32, or float64 on the CPU.
         quats: [..., N, 4] (w, x, y, z), need not be normalised. Not read, and may be None, with `covars`.
-        scales: [..., N, 3] standard deviations (after the exponential). Not read, and may be None, with
-            `covars`.
+        scales: [..., N, 3] standard deviations (after the exponential); their signs do not matter. Not read,
+            and may be None, with `covars`.
         opacities: [..., N] in [0, 1] (after the sigmoid).
         colors: with `sh_degree`, SH coefficients [..., N, K, 3], or per view [..., C, N, K, 3], which is
-            slower; otherwise values of any channel count, [..., N, D] or per view [..., C, N, D]. May be None
-            for the render modes D and ED.
+            slower; otherwise values of 1 to 4096 channels (a rendered depth counts), [..., N, D] or per view
+            [..., C, N, D]. May be None for the render modes D and ED.
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [..., C, 3, 3] intrinsics in px.
+        Ks: [..., C, 3, 3] intrinsics in px, without skew.
         width: image width in px.
         height: image height in px.
         near_plane: Gaussians have z > near_plane, world units; less than far_plane.
@@ -118,9 +117,11 @@ def rasterization(
             this).
 
     Raises:
-        TypeError: an argument is not a tensor or not a whole number, or gsplat has no such argument.
-        ValueError: an argument is not supported or has a wrong shape or value; the message names it.
-        RuntimeError: a tensor has a wrong dtype.
+        TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
+            argument; or the tensors are neither float32 nor float64.
+        ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
+            the others; the message names it.
+        RuntimeError: float64 tensors are on a GPU.
     """
     check_further("rasterization", further)
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size

@@ -18,6 +18,7 @@ from blitzgs.ops.projection import ProjectionOptions, project_splats
 from blitzgs.ops.render import ShTables
 from blitzgs.ops.sparse_rows import HandOver, full_gradients
 from blitzgs.rendering.arguments import (
+    DEFAULT_TILE_SIZE,
     MAX_SH_DEGREE,
     Gaussians,
     Scene,
@@ -68,7 +69,7 @@ def raw_rasterization(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     sh_degree: int | None = None,
-    tile_size: int = 16,
+    tile_size: int | None = DEFAULT_TILE_SIZE,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = True,
@@ -92,7 +93,7 @@ def raw_rasterization(
         sh0: [N, 1, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
         shN: [N, K - 1, 3], the other SH coefficients.
         viewmats: [C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [C, 3, 3] intrinsics in px.
+        Ks: [C, 3, 3] intrinsics in px, without skew.
         width: image width in px.
         height: image height in px.
         near_plane: as for `blitzgs.rasterization`, like the next three.
@@ -106,7 +107,7 @@ def raw_rasterization(
         sparse_grad: False: dense gradients, for optimisers that take no others.
         absgrad: as for `blitzgs.rasterization`, like the next.
         rasterize_mode: likewise.
-        optimizers: the parameters' optimisers, as a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
+        optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
             among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
             the visible ones.
         direct_grad: whether the backward pass hands the parameters' gradients to `optimizers`, in less time
@@ -124,6 +125,7 @@ def raw_rasterization(
         ValueError: likewise; or `direct_grad` is not possible.
         RuntimeError: likewise.
     """
+    tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
         rasterize_mode, "pinhole",
@@ -183,9 +185,14 @@ def raw_rasterization(
 
 def _lazy(optimizers: Any) -> list[CatchesUp]:
     """Return the optimisers that may have pending steps; those that step together are one."""
+    if isinstance(optimizers, torch.optim.Optimizer) or hasattr(optimizers, "catch_up"):
+        optimizers = [optimizers]
+    if not isinstance(optimizers, Iterable):
+        raise TypeError(
+            "optimizers must be an optimiser, or a mapping or a sequence of them, got "
+            f"{type(optimizers).__name__}"
+        )
     given = optimizers.values() if isinstance(optimizers, Mapping) else optimizers
-    if hasattr(optimizers, "catch_up"):
-        given = [optimizers]
     found: list[CatchesUp] = []
     joints: list[Any] = []
     for optimizer in given:
