@@ -23,9 +23,13 @@ def step_together(optimizers: Iterable[LazyAdam] | Mapping[str, LazyAdam], set_t
         set_to_none: whether to remove the gradients afterwards, as `zero_grad(set_to_none=True)` does.
 
     Raises:
-        TypeError: an optimiser is not a `LazyAdam`.
+        TypeError: an optimiser is not a `LazyAdam`, or there is only one, not in a sequence.
         ValueError: as `LazyAdam.step`.
     """
+    if isinstance(optimizers, LazyAdam):
+        raise TypeError(
+            "step_together takes a mapping or a sequence of optimisers; call `step` of a single one"
+        )
     chosen = list(optimizers.values() if isinstance(optimizers, Mapping) else optimizers)
     for optimizer in chosen:
         if not isinstance(optimizer, LazyAdam):

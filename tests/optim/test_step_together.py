@@ -233,6 +233,8 @@ def test_other_optimisers_are_refused():
     pair = Pair(("cpu", torch.float64))
     with pytest.raises(TypeError, match="every optimiser must be a LazyAdam, got Adam"):
         step_together([*pair.ours, pair.torchs])
+    with pytest.raises(TypeError, match="takes a mapping or a sequence of optimisers; call `step`"):
+        step_together(pair.ours[0])
 
 
 @pytest.mark.parametrize("in_one", [True, False])
