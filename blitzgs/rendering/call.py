@@ -55,7 +55,8 @@ def rasterization(
 
     The image differs from gsplat 1.5.3's where BlitzGS defines it otherwise: alpha is capped at 0.99 (there:
     0.999). Differentiable, once, in means, quats, scales, covars, opacities, colors, viewmats and
-    backgrounds; a second derivative is an error. Works under `torch.compile(fullgraph=True)`.
+    backgrounds; a second derivative is an error. Works under `torch.compile(fullgraph=True)`, except with
+    sparse_grad, absgrad or distributed.
 
     Leading dimensions `...`, the same for all, are a batch of independent scenes.
 
