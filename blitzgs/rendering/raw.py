@@ -104,7 +104,7 @@ def raw_rasterization(
         tile_size: as for `blitzgs.rasterization`, like the next two.
         backgrounds: likewise.
         render_mode: likewise.
-        sparse_grad: False: dense gradients, for optimisers that take no others.
+        sparse_grad: False: dense gradients, for optimisers and gradient clipping that take no others.
         absgrad: as for `blitzgs.rasterization`, like the next.
         rasterize_mode: likewise.
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
