@@ -165,6 +165,19 @@ def test_what_is_not_finite_is_named(name):
     assert {key: value.tolist() for key, value in meta["non_finite"].items()} == {name: [seen]}
 
 
+@pytest.mark.filterwarnings("ignore:blitzgs.raw_rasterization. NaN or infinite values")
+def test_sh_that_are_not_read_are_not_named():
+    scene = random_scene(n=40, cameras=1)
+    p = raw_parameters(scene)
+    p["shN"].data[7, 8] = torch.nan
+    assert raw(p, scene, sh_degree=2)[2]["non_finite"] == {}
+    p["sh0"].data[7] = torch.nan
+    assert raw(p, scene, render_mode="D")[2]["non_finite"] == {}
+    p["shN"].data[5, 7] = torch.nan
+    found = raw(p, scene, sh_degree=2)[2]["non_finite"]
+    assert {key: value.tolist() for key, value in found.items()} == {"sh0": [7], "shN": [5]}
+
+
 def test_infinite_logits_are_fine(recwarn):
     scene = random_scene(n=40, cameras=1)
     p = raw_parameters(scene)

@@ -244,6 +244,16 @@ def test_large_finite_values_are_not_named(per_view):
     assert rasterize_scene(scene)[2]["non_finite"] == {}
 
 
+@pytest.mark.parametrize("per_view", [False, True])
+def test_sh_above_the_degree_are_not_named(per_view):
+    scene = random_scene(n=30)
+    scene.colors[7, 9] = torch.nan
+    if per_view:
+        scene.colors = scene.colors.repeat(2, 1, 1, 1)
+    image, _, meta = rasterize_scene(scene, sh_degree=2)
+    assert image.isfinite().all() and meta["non_finite"] == {} and 7 in meta["gaussian_ids"]
+
+
 def test_reading_all_of_meta_reads_no_parameter(monkeypatch):
     def fail(gaussians):
         raise AssertionError("non_finite was not looked into")

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import count
 
@@ -32,7 +32,7 @@ def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
     """
     activated = {
         name: [_activated(t, name, gaussians.raw) for t in tensors]
-        for name, tensors in gaussians.named.items()
+        for name, tensors in _evaluated(gaussians).items()
     }
     totals = [torch.stack([t.sum() for t in tensors]).sum() for tensors in activated.values()]
     found = {}
@@ -47,6 +47,19 @@ def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
         if len(bad):
             found[name] = bad
     return found
+
+
+def _evaluated(gaussians: Gaussians) -> Mapping[str, Sequence[Tensor]]:
+    """Return the arguments without the SH above the degree, which the image does not depend on."""
+    named: dict[str, Sequence[Tensor]] = dict(gaussians.named)
+    if gaussians.sh_degree is not None:
+        left = (gaussians.sh_degree + 1) ** 2
+        for name in COLOURS:  # in the order of the coefficients
+            if name in named:
+                count = min(left, named[name][0].shape[-2])
+                named[name] = [part.narrow(-2, 0, count) for part in named[name]]
+                left -= count
+    return named
 
 
 def _activated(values: Tensor, name: str, raw: bool) -> Tensor:

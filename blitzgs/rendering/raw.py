@@ -149,8 +149,10 @@ def raw_rasterization(
     hand_over = None
     if direct_grad and torch.is_grad_enabled():
         hand_over = _hand_over(lazy, (*geometry, *(harmonics if shaded else ())), sparse_grad)
-    named = {name: (tensor,) for name, tensor in tensors.items()}
-    named |= {"viewmats": (viewmats,), "Ks": (Ks,), **({} if shN is None else {"shN": (shN,)})}
+    given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
+    if not shaded:
+        del given["sh0"], given["shN"]
+    named = {name: (tensor,) for name, tensor in given.items() if tensor is not None}
     colors, degree = (sh0, sh_degree) if shaded else (None, None)
     gaussians = Gaussians(whole.scenes, colors, opacities, degree, False, whole.lead, True, named)
     image = ImageOptions(
