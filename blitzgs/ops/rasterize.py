@@ -85,7 +85,7 @@ def rasterize(
         means2d: [P, 2], pixels, float32 or (CPU) float64.
         conics: inverse 2D covariances (a, b, c) [P, 3].
         splat_opacities: [P].
-        colors: [P, D], any D.
+        colors: [P, D], D from 1 to 4096.
         isect_splats: int32 [I], from :func:`blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], from the same call.
         n_cameras: number of views B.

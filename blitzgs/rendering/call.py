@@ -89,7 +89,7 @@ def rasterization(
             over all N.
         absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased".
-        channel_chunk: accepted and not needed: any channel count is rendered in one pass.
+        channel_chunk: accepted and not needed: all channels are rendered in one pass.
         distributed: whether Gaussians and views are divided among the ranks of the process group. Each rank
             passes its own Gaussians and views, the same number of views as the others, and gets the images of
             its own views, which show the Gaussians of all ranks. Every rank must make this call and run its
