@@ -25,6 +25,15 @@ _ID_DIGITS = (13, 13, 13, 12, 12)
 _MANTISSA_BITS = 23
 
 
+def decimal_share(share: float) -> Fraction:
+    """Return the number that a configuration's decimal stands for: 99/100 for the float 0.99.
+
+    Selections multiply a share by a number of rows and round. The float 0.99 is slightly less than 99/100, so
+    the floor of its exact product with 100 would be 98.
+    """
+    return Fraction(repr(float(share)))
+
+
 def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor:
     """Draw keys; the k smallest are a sample without replacement, with probability proportional to weight.
 
@@ -101,7 +110,7 @@ def mass_prefix(
     """
     if not 0 <= fraction <= 1:
         raise ValueError(f"mass_prefix: fraction must be in [0, 1], got {fraction}")
-    share = Fraction(repr(float(fraction)))
+    share = decimal_share(fraction)
     n_invalid = ranks.all_reduce((~scores.isfinite() | (scores < 0)).sum()).item()
     if n_invalid:
         raise ValueError(f"mass_prefix: {n_invalid} scores are negative or not finite")
@@ -152,7 +161,7 @@ def integer_mass_prefix(
     Raises:
         ValueError: for a fraction outside [0, 1] or with more places.
     """
-    share = Fraction(repr(float(fraction)))
+    share = decimal_share(fraction)
     if not 0 <= share <= 1 or share.denominator > 10**9:
         raise ValueError(
             f"integer_mass_prefix: fraction must be in [0, 1] with at most 9 decimals, got {fraction}"

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 
 import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import mass_prefix, sampling_keys, smallest
+from blitzgs.distributed.selection import decimal_share, mass_prefix, sampling_keys, smallest
 
 
 def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:
@@ -57,4 +56,4 @@ def top_by_score(score: Tensor, ids: Tensor, mass: float, keep: float, ranks: Ra
 def _share_of_all(share: float, rows: Tensor, ranks: Ranks) -> int:
     """Return the floor of a share, by its decimal value, of the rows of all ranks."""
     total = ranks.all_reduce(torch.tensor(len(rows), device=rows.device))
-    return math.floor(Fraction(repr(float(share))) * int(total))
+    return math.floor(decimal_share(share) * int(total))

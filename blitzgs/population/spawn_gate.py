@@ -13,7 +13,6 @@ import dataclasses
 import json
 import math
 from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import smallest
+from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.tree_sums import tree_sums
 from blitzgs.output import check_replaceable, write_file
@@ -204,7 +203,7 @@ def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Rank
     for group in (~candidates.is_split, candidates.is_split):
         rows = group.nonzero().squeeze(1)
         count = int(ranks.all_reduce(torch.tensor(len(rows), device=rows.device)))
-        k = math.ceil(Fraction(repr(float(rate))) * count)
+        k = math.ceil(decimal_share(rate) * count)
         vetoed[rows] = smallest(scores[rows], candidates.parents[rows], k, ranks)
     return vetoed
 

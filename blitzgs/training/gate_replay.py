@@ -21,7 +21,6 @@ import json
 import math
 import shutil
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import smallest
+from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import hash_keys, uniform
 from blitzgs.population.candidates import Candidates, Veto
 from blitzgs.population.lineage_parts import read_lineage
@@ -79,7 +78,7 @@ class OracleVeto:
         for group in (~candidates.is_split, candidates.is_split):
             counts = torch.stack((group.sum(), (group & dead).sum()))
             total, dying = ranks.all_reduce(counts).tolist()
-            most = math.ceil(Fraction(repr(self._rate)) * total)
+            most = math.ceil(decimal_share(self._rate) * total)
             rows = (group & dead).nonzero().squeeze(1)
             draws = uniform(self._seed, candidates.time, candidates.parents[rows]).float()
             vetoed[rows] = smallest(draws, candidates.parents[rows], min(most, dying), ranks)
