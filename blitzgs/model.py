@@ -86,6 +86,11 @@ def schema(sh_degree: int) -> dict[str, Column]:
     return columns
 
 
+def opacity_logit(opacity: float) -> float:
+    """Return the value of the column `opacities` for an opacity in [0, 1); -inf for 0."""
+    return math.log(opacity / (1.0 - opacity)) if opacity > 0 else -math.inf
+
+
 def as_stored(name: str, column: Tensor) -> Tensor:
     """Return the form in which `GaussianTable.columns` stores a column [N, ...]: unchanged, except `CULL`."""
     return sectors_of_rows(column).view(-1, column.shape[1]) if name == CULL else column

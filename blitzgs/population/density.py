@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
-from blitzgs.model import PARAMETERS, GaussianTable
+from blitzgs.model import PARAMETERS, GaussianTable, opacity_logit
 from blitzgs.ops.counter_random import hash_keys, normal
 from blitzgs.population.candidates import Candidates, Veto, spawn_features
 from blitzgs.population.lineage import Births, Cause, Lineage
@@ -157,7 +157,7 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
         table: changed in place.
         opacity: the cap, in (0, 1).
     """
-    table["opacities"].clamp_(max=math.log(opacity / (1.0 - opacity)))
+    table["opacities"].clamp_(max=opacity_logit(opacity))
     table["exp_avg.opacities"].zero_()
     table["exp_avg_sq.opacities"].zero_()
 
@@ -247,13 +247,12 @@ def rotations(quats: Tensor) -> Tensor:
 
 def death_causes(rows: dict[str, Tensor], radii: Tensor | None, rules: DensityRules) -> Tensor:
     """Return why each row is pruned: `Cause.OPACITY`, else `Cause.SIZE` (screen or world); 0: it is kept."""
-    logit = math.log(rules.min_opacity / (1.0 - rules.min_opacity)) if rules.min_opacity > 0 else -math.inf
     causes = torch.zeros_like(rows["level"])
     if rules.max_scale is not None:
         causes[rows["scales"].amax(dim=1) > math.log(rules.max_scale)] = Cause.SIZE
     if radii is not None and rules.max_screen_radius is not None:
         causes[radii > rules.max_screen_radius] = Cause.SIZE
-    causes[rows["opacities"] < logit] = Cause.OPACITY
+    causes[rows["opacities"] < opacity_logit(rules.min_opacity)] = Cause.OPACITY
     return causes
 
 

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from blitzgs.model import GaussianTable
+from blitzgs.model import GaussianTable, opacity_logit
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.voxel_keys import voxel_keys
 from blitzgs.view.levels import Levels
@@ -72,7 +72,7 @@ def octree_gaussians(
             "means": means.float(),
             "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
             "scales": spacing.log().float()[:, None].repeat(1, 3),
-            "opacities": torch.full((count,), math.log(opacity / (1.0 - opacity))),
+            "opacities": torch.full((count,), opacity_logit(opacity)),
             "sh": sh,
             "level": level_of,
         }

@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import sampling_keys, smallest
-from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable, opacity_logit
 from blitzgs.population.candidates import spawn_features
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
@@ -161,10 +161,8 @@ def draw(weights: Tensor, count: int, ids: Tensor, seed: int, time: int, ranks: 
 def _share(table: GaussianTable, sources: Tensor, copies: Tensor, min_opacity: float) -> None:
     """Set opacities and scales of the rows `sources` to their shares, and their moments to zero."""
     opacities, scales = shared(table["opacities"][sources], table["scales"][sources], copies)
-    if min_opacity > 0:
-        # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead.
-        opacities = opacities.clamp(min=math.log(min_opacity / (1.0 - min_opacity)))
-    table["opacities"][sources] = opacities.float()
+    # Sharing must not reduce the opacity below the limit, or the Gaussian would count as dead.
+    table["opacities"][sources] = opacities.clamp(min=opacity_logit(min_opacity)).float()
     table["scales"][sources] = scales.float()
     for name in (*EXP_AVGS, *EXP_AVG_SQS):
         table[name][sources] = 0

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from typing import cast
 
 import torch
 from torch import Tensor
 
+from blitzgs.model import opacity_logit
 from blitzgs.population.importance import Importance, ScoreRule, ViewBatch, sweep
 from blitzgs.population.lineage import Cause
 from blitzgs.population.pruning import sample_by_score, top_by_score
@@ -110,9 +110,7 @@ def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Te
     # If no Gaussian contributes to any view, the total is zero and no share of it can be kept.
     total = state.ranks.all_reduce(found.score.double().sum())
     if min(population.pass2_mass, population.pass2_keep) < 1 and total.item() > 0:
-        least = population.min_opacity
-        logit = math.log(least / (1.0 - least)) if least > 0 else -math.inf
-        causes[table["opacities"] < logit] = Cause.LATE_OPACITY
+        causes[table["opacities"] < opacity_logit(population.min_opacity)] = Cause.LATE_OPACITY
         kept = top_by_score(found.score, ids, population.pass2_mass, population.pass2_keep, state.ranks)
         causes[~kept] = Cause.PASS_2
     return causes
