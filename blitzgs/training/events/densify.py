@@ -30,20 +30,9 @@ def run(state: TrainingState, event: Event) -> None:
     check_table(state.table, step)
     if state.config.population.opacity_decay > 0:
         decay_opacities(state.table, state.config.population.opacity_decay)
-    population = state.config.population
-    pixels = training_pixels(state)
-    limit = growth_limit(
-        population.max_gaussians,
-        pixels,
-        population.pixels_per_gaussian,
-        len(state.capture.points),
-        population.gaussians_per_point,
-        memory_limit(state.table, state.ranks),
-    )
+    limit = population_limit(state)
     report = change_population(state, event.time, density_rules(state, event.time, limit))
-    counts = dataclasses.asdict(report) | {"gaussians": len(state.table)}
-    values = state.ranks.all_reduce(torch.tensor(list(counts.values()), device=state.ranks.device))
-    counts = dict(zip(counts, values.tolist(), strict=True))
+    counts = _over_all_ranks(state, dataclasses.asdict(report) | {"gaussians": len(state.table)})
     if counts["gaussians"] == 0:
         raise ModelLostError(
             f"the density event after {event.time:,} images pruned the last Gaussian: check that the poses "
@@ -52,7 +41,6 @@ def run(state: TrainingState, event: Event) -> None:
         )
     if state.signals is not None:
         state.signals.densified(counts)
-    held_back = counts["held_back"]
     if redistribute(state.table, state.ranks, state.config.ranks.max_imbalance):
         counts["redistributed"] = 1
         state.sort()
@@ -61,17 +49,41 @@ def run(state: TrainingState, event: Event) -> None:
     state.stepper.reindex()
     peak = max(state.progress.peak_gaussians, counts["gaussians"])
     state.progress = dataclasses.replace(state.progress, peak_gaussians=peak)
-    record = counts | {"pixels_per_gaussian": pixels / max(1, counts["gaussians"])}
+    _log(state, event, counts, limit)
+
+
+def population_limit(state: TrainingState) -> GrowthLimit | None:
+    """Return the tightest limit on the population; None if there is none. Every rank calls this."""
+    population = state.config.population
+    return growth_limit(
+        population.max_gaussians,
+        training_pixels(state),
+        population.pixels_per_gaussian,
+        len(state.capture.points),
+        population.gaussians_per_point,
+        memory_limit(state.table, state.ranks),
+    )
+
+
+def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> dict[str, int]:
+    """Return the sums of named counts over all ranks."""
+    values = state.ranks.all_reduce(torch.tensor(list(counts.values()), device=state.ranks.device))
+    return dict(zip(counts, values.tolist(), strict=True))
+
+
+def _log(state: TrainingState, event: Event, counts: dict[str, int], limit: GrowthLimit | None) -> None:
+    """Log the counts of a density event; print a line when a limit holds growth back for the first time."""
+    record: dict[str, Any] = counts | {"pixels_per_gaussian": training_pixels(state) / counts["gaussians"]}
     text = None
     if limit is not None:
         record |= {"limit": limit.count, "limited_by": limit.reason}
-        if held_back and not state.growth_was_limited:
+        if counts["held_back"] and not state.growth_was_limited:
             # A limit ends the growth, but removes nothing.
             more = counts["gaussians"] > limit.count
             has = f", fewer than the {counts['gaussians']:,} that it has, so it does not grow" if more else ""
             text = (
                 f"{limit.reason} limits the model to {limit.count:,} Gaussians{has}; this event would have "
-                f"added {held_back:,} more"
+                f"added {counts['held_back']:,} more"
             )
             state.growth_was_limited = True
     state.log.event(event.time, "densify", record, text)
