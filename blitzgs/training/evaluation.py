@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs import pipeline
+from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.pixels import collect_images
 from blitzgs.distributed.tiles import TileAssignment
@@ -220,25 +221,42 @@ def evaluate(
             if files is not None and index in chosen:
                 picture = comparison(render, target, mask)
                 files.write(chosen[index], encode_image(picture, ".jpg"))
+    result = _over_all_ranks(per_view, lost, [cameras[index].name for index in indices], ranks)
+    if files is not None and ranks.rank == 0:
+        files.write(files.output.root / "metrics.json", json.dumps(result, indent=1).encode())
+    return result
+
+
+def _over_all_ranks(
+    per_view: dict[str, dict[str, float]], lost: str | None, names: list[str], ranks: Ranks
+) -> dict[str, Any]:
+    """Collect the metrics of all ranks, and return what `evaluate` returns. Collective.
+
+    Args:
+        per_view: the metrics of the views that this rank compared.
+        lost: why this rank could not read a photograph; None: it has read all.
+        names: names of all views, in the order of the result.
+        ranks: the job.
+
+    Raises:
+        PhotographError: a rank could not read a photograph.
+    """
     parts = ranks.all_gather_object((per_view, lost))
     if reasons := [reason for _, reason in parts if reason is not None]:
         raise PhotographError("; ".join(reasons))
     found = {name: view for part, _ in parts for name, view in part.items()}
-    names = [cameras[index].name for index in indices]
     masked = [name for name in names if name not in found]
     if masked and ranks.rank == 0:
         shown = ", ".join(masked[:5]) + (", ..." if len(masked) > 5 else "")
         text = f"{len(masked)} of {len(names)} views cannot be measured, as they are masked: {shown}"
-        warnings.warn(text, stacklevel=2)
-    per_view = {name: found[name] for name in names if name in found}
+        warnings.warn(text, stacklevel=3)
+    views = {name: found[name] for name in names if name in found}
     result: dict[str, Any] = {}
     for metric in METRICS:
-        values = [view[metric] for view in per_view.values() if metric in view]
+        values = [view[metric] for view in views.values() if metric in view]
         if values:
             result[metric] = sum(values) / len(values)
-    result["views"] = per_view
-    if files is not None and ranks.rank == 0:
-        files.write(files.output.root / "metrics.json", json.dumps(result, indent=1).encode())
+    result["views"] = views
     return result
 
 

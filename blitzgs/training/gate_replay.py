@@ -168,21 +168,7 @@ def replay(
         FileNotFoundError: it has no checkpoint from before the onset.
         FileExistsError: `out` holds a replay already.
     """
-    if not config.population.lineage:
-        raise ValueError(
-            f"{source} was trained without --population.lineage=true: there is nothing to branch"
-        )
-    if config.schedule.minutes > 0:
-        raise ValueError(
-            f"{source} was trained with schedule.minutes ({config.schedule.minutes:g}): its arms would "
-            "differ in length, and could not be compared. Train it with schedule.scale instead"
-        )
-    masks = (images.mask(index) for index in capture.test or capture.train)
-    if not any(mask is None or bool(mask.any()) for mask in masks):
-        raise ValueError(
-            f"{source}: its arms could not be compared, because the views that are measured are masked as a "
-            "whole. Train it with another data.split or other masks"
-        )
+    _check_comparable(config, capture, images, source)
     # Rank 0 checks for all, because another rank might check after rank 0 has begun to write.
     if ranks.broadcast_object(any((out / name).exists() for name in (REFERENCE, FIGURES, TABLE))):
         raise FileExistsError(f"{out} already holds a replay: choose another --out, or delete it")
@@ -220,3 +206,27 @@ def replay(
         yield result | {"matched": matched / max(1, seen)}
     yield train("gate", RankVeto(gate, rate))
     yield train("random", RandomVeto(rate, config.seed))
+
+
+def _check_comparable(config: Config, capture: Capture, images: Images, source: Path) -> None:
+    """Check that arms can be branched from a run and that their results can be compared.
+
+    Raises:
+        ValueError: the run logged no lineage, was trained by the clock, or all pixels of the views that are
+            measured are masked.
+    """
+    if not config.population.lineage:
+        raise ValueError(
+            f"{source} was trained without --population.lineage=true: there is nothing to branch"
+        )
+    if config.schedule.minutes > 0:
+        raise ValueError(
+            f"{source} was trained with schedule.minutes ({config.schedule.minutes:g}): its arms would "
+            "differ in length, and could not be compared. Train it with schedule.scale instead"
+        )
+    masks = (images.mask(index) for index in capture.test or capture.train)
+    if not any(mask is None or bool(mask.any()) for mask in masks):
+        raise ValueError(
+            f"{source}: its arms could not be compared, because the views that are measured are masked as a "
+            "whole. Train it with another data.split or other masks"
+        )

@@ -96,11 +96,7 @@ def set_up(
             save_cameras(folder, capture)
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     optimiser = LazyAdam(config.optimiser, schedule, space.extent, ranks.device)
-    owners = TileOwners(ranks)
-    # Tile costs and plans are stored by view index. With other views, they would belong to other images.
-    has_same_views = restored is None or restored.progress.train_views in ("", progress.train_views)
-    if restored is not None and restored.shared and has_same_views and ranks.world_size > 1:
-        owners.restore(restored.shared)
+    owners = _tile_owners(ranks, progress, restored)
     views = ViewSet(list(capture.cameras), space, ranks.device)
     sizes = [(capture.cameras[i].width, capture.cameras[i].height) for i in capture.train]
     sampler = BatchSampler(sizes, config.schedule.batch_size, config.seed)
@@ -151,6 +147,17 @@ def _for_views(config: Config, capture: Capture, restored: run.Restored | None) 
                 loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
     views = len(capture.train)
     return replace(config, schedule=stretched(schedule, views), loss=weighted(loss, views))
+
+
+def _tile_owners(ranks: Ranks, progress: Progress, restored: run.Restored | None) -> TileOwners:
+    """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
+    owners = TileOwners(ranks)
+    if restored is None or not restored.shared or ranks.world_size == 1:
+        return owners
+    # Tile costs and plans are stored by view index. With other views, they would belong to other images.
+    if restored.progress.train_views in ("", progress.train_views):
+        owners.restore(restored.shared)
+    return owners
 
 
 def _stepper(

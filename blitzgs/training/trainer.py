@@ -128,7 +128,7 @@ class Trainer:
             self.close()
 
     def _step_or_save(self, step: int, is_first: bool) -> None:
-        """Take a step; where the views do not fit into the pool, save what there is before failing."""
+        """Take a step; if its Gaussians do not fit into the pool, save the model before raising the error."""
         state = self.state
         try:
             self.step(step)
@@ -256,29 +256,7 @@ class Trainer:
         if not metrics:
             self._log_stop(_stopped_by(agreement.now(step).signal))
             return None
-        summary = (
-            metrics
-            | {
-                "images": state.images_seen,
-                "seconds": state.progress.seconds,
-                "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
-                "gaussians": state.population(),
-                "peak_gaussians": state.progress.peak_gaussians,
-                "population": population,
-                "peak_memory_bytes": run.peak_memory_bytes(state.ranks.device),
-                "config_hash": config_hash(state.config),
-                "run": state.run_id,
-                "versions": run.versions(state.ranks.device),
-            }
-            | residency
-        )
-        if state.config.schedule.minutes > 0:
-            summary |= {
-                "budget_seconds": 60 * state.config.schedule.minutes,
-                "scale": state.images_seen / state.config.schedule.iterations,
-            }
-        if state.signals is not None:
-            summary["placed"] = state.placed_times
+        summary = metrics | self._figures(population) | residency
         if state.ranks.rank == 0:
             write_picture(state, population)
             try:
@@ -290,6 +268,30 @@ class Trainer:
             except OSError as error:
                 warnings.warn(f"the model is saved, its summary is not: {error}", stacklevel=2)
         return summary
+
+    def _figures(self, population: dict[str, Any]) -> dict[str, Any]:
+        """Return the figures of the run for the summary, besides its metrics. Collective."""
+        state = self.state
+        figures = {
+            "images": state.images_seen,
+            "seconds": state.progress.seconds,
+            "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
+            "gaussians": state.population(),
+            "peak_gaussians": state.progress.peak_gaussians,
+            "population": population,
+            "peak_memory_bytes": run.peak_memory_bytes(state.ranks.device),
+            "config_hash": config_hash(state.config),
+            "run": state.run_id,
+            "versions": run.versions(state.ranks.device),
+        }
+        if state.config.schedule.minutes > 0:
+            figures |= {
+                "budget_seconds": 60 * state.config.schedule.minutes,
+                "scale": state.images_seen / state.config.schedule.iterations,
+            }
+        if state.signals is not None:
+            figures["placed"] = state.placed_times
+        return figures
 
 
 def _stopped_by(signal: str | None) -> str:
