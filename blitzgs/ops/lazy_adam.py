@@ -14,6 +14,10 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
+# Columns of the schedule's table, as in csrc/lazy_adam/lazy_adam.h: tails of 4 orders for 6 groups, powers of
+# the decay rates, bias corrections.
+_ORDERS, _GROUPS = 4, 6
+_TAILS, _POWERS, _CORRECTION1, _CORRECTION2, _COLUMNS = slice(0, _ORDERS * _GROUPS), 24, 28, 29, 30
 # Drift terms below this fraction of their sum are lost in rounding.
 _NEGLIGIBLE = {torch.float32: 2.0**-27, torch.float64: 2.0**-56}
 
@@ -249,15 +253,15 @@ def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0)
         )
     ratio, root = beta1 / math.sqrt(beta2), math.sqrt(beta2)
     t = torch.arange(steps, dtype=torch.float64)
-    table = torch.zeros(steps, 30, dtype=torch.float64)
+    table = torch.zeros(steps, _COLUMNS, dtype=torch.float64)
     powers = (beta1**t, beta2**t, ratio**t, root**t)
-    for column, power in enumerate(powers, start=24):
+    for column, power in enumerate(powers, start=_POWERS):
         table[:, column] = power
     t += before
     # -expm1(t log beta) keeps the digits that 1 - beta^t loses while t is small.
     first = 1 / (-torch.expm1(t[1:] * math.log(beta1)) if beta1 > 0 else torch.ones(steps - 1))
     second = (-torch.expm1(t[1:] * math.log(beta2))).rsqrt()
-    table[1:, 28], table[1:, 29] = first, second
+    table[1:, _CORRECTION1], table[1:, _CORRECTION2] = first, second
     return table
 
 
@@ -266,11 +270,11 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
     steps = rates.shape[0]
     table = table_without_rates(steps, beta1, beta2)
     ratio, root = beta1 / math.sqrt(beta2), math.sqrt(beta2)
-    first, second = table[1:, 28], table[1:, 29]
-    orders = range(4)
+    first, second = table[1:, _CORRECTION1], table[1:, _CORRECTION2]
+    orders = range(_ORDERS)
     terms = torch.stack([(first * second ** (k - 1))[:, None] * rates[1:] for k in orders], 1).numpy()
     ratios = np.array([ratio * root**k for k in orders])[:, None]
-    tails = table.numpy()[:, :24].reshape(steps, 4, 6)
+    tails = table.numpy()[:, _TAILS].reshape(steps, _ORDERS, _GROUPS)
     for step in range(steps - 2, -1, -1):
         tails[step] = ratios * (terms[step] + tails[step + 1])
     return table.to(lr_table.device)
