@@ -185,12 +185,14 @@ def forward(
     if transport is None:
         transport = LocalTransport() if assignment is None else open_transport(assignment.ranks)
     for attempt in transport.capacity.attempts():
-        frame = render(table, views, options, active, assignment, transport, attempt, mark, backward_follows)
+        frame = forward_once(
+            table, views, options, active, assignment, transport, attempt, mark, backward_follows
+        )
     assert frame is not None  # or there would be another attempt
     return frame
 
 
-def render(
+def forward_once(
     table: GaussianTable,
     views: Views,
     options: RenderOptions,
@@ -203,12 +205,14 @@ def render(
 ) -> Frame | None:
     """Make one attempt of `forward`: queue all work, then wait for the sizes.
 
+    Arguments as for `forward`; `attempt` has the sizes of the memory to allocate.
+
     Returns:
         The frame; None if the estimated sizes of the active rows or of `attempt` were too small.
     """
     inputs, grid = inputs_of(table, views, options, active), tile_grid(views, options, assignment)
     backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
-    # Past autograd's Python: an op that is differentiable elsewhere spends 20 us of the host's time there.
+    # Skip autograd: for an op with a registered gradient formula, its Python takes 20 us of the host's time.
     with torch._C._AutoDispatchBelowAutograd():
         exchange = transport.start(inputs, assignment, attempt, mark)
         splats, n_splats, n_isects = exchange.arrived
@@ -273,7 +277,7 @@ def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment |
 
 @lru_cache(maxsize=16)
 def _backgrounds(colour: tuple[float, float, float], count: int, device: torch.device) -> Tensor | None:
-    """Return a colour for each of `count` views, [B, 3]; None: black. Cached, because an upload is a wait."""
+    """Return a colour for each of `count` views, [B, 3]; None: black. Cached: the host waits for uploads."""
     return torch.tensor(colour, device=device).repeat(count, 1) if any(colour) else None
 
 

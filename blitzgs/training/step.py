@@ -119,7 +119,7 @@ class Stepper:
             mark("optimiser")
             if rules is not None:
                 gate_views_(active, table["means"], views.viewmats, rules)
-            frame = pipeline.render(
+            frame = pipeline.forward_once(
                 table, views, options, active if views.viewmats.is_cuda else active._replace(blocks=None),
                 assignment, self._transport, attempt, mark, backward_follows=True,
             )  # fmt: skip
@@ -159,8 +159,10 @@ class Stepper:
         table = self.table
         absolute &= keep_means2d
         gradients = pipeline.backward_splats(frame, terms.v_renders, mark, absolute)
-        v_means2d, sums = gradients.means2d_abs if absolute else gradients.means2d, None
+        v_means2d = gradients.means2d_abs if absolute else gradients.means2d
+        sums = None
         if v_means2d is None and keep_means2d:
+            # The gradients are in the memory of several ranks. The optimiser's kernel adds them up.
             v_means2d = sums = torch.empty_like(frame.projected.means2d)
         self._optimiser.step(
             table, frame, gradients, terms.scale_reg, terms.opacity_reg, terms.size_reg, step, sums, absolute

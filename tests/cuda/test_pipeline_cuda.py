@@ -112,7 +112,7 @@ def test_an_active_set_that_did_not_fit_is_found_again():
         asked.clear()
         for attempt in transport.capacity.attempts():
             active = find(None if attempt.sizes is None else attempt.sizes.blocks)
-            frame = pipeline.render(table, views, OPTIONS, active, None, transport, attempt)
+            frame = pipeline.forward_once(table, views, OPTIONS, active, None, transport, attempt)
         return frame
 
     blocks = int(find(None).blocks)
