@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from blitzgs.charts import line_chart, maps
 from blitzgs.output import OutputFolder
-from blitzgs.population.gate_fit import Spawns, judge, told_apart
+from blitzgs.population.gate_fit import Spawns, judge, with_distinct_names
 from blitzgs.population.spawn_gate import SpawnGate
 
 SURVIVAL = "survival.svg"
@@ -42,7 +42,7 @@ def evaluate(
         OSError: a picture cannot be written, or would replace a file that BlitzGS did not write.
     """
     results, curves = [], {}
-    runs = told_apart(runs)
+    runs = with_distinct_names(runs)
     survival = output.root / SURVIVAL
     output.check(survival)
     pictures = output.paths([f"regions_{run.name}" for run in runs], ".svg", flat=True)

@@ -143,8 +143,8 @@ def check_outcomes(survived: NDArray[np.bool_], source: object) -> None:
         )
 
 
-def told_apart(runs: Sequence[Spawns]) -> list[Spawns]:
-    """Number runs of the same name, which is that of the capture's folder: `capture`, `capture_2`."""
+def with_distinct_names(runs: Sequence[Spawns]) -> list[Spawns]:
+    """Number runs that have the same name (of their capture's folder): `capture`, `capture_2`."""
     found: list[Spawns] = []
     names: set[str] = set()
     for run in runs:
@@ -201,7 +201,7 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0, seed: int = 
     """
     xgboost = _xgboost()
     check_no_other(path)
-    runs = told_apart(runs)
+    runs = with_distinct_names(runs)
     _check_same_schedule(runs)
     scenes = sorted({run.scene for run in runs})
     figures = []

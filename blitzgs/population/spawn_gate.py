@@ -73,24 +73,27 @@ def write_info(path: Path, info: GateInfo) -> None:
 
 
 def check_no_other(path: Path) -> None:
-    """Check that a new gate replaces no file of another kind; the metadata tell which models are gates.
+    """Check that a new gate would replace only the files of a gate, which its metadata show.
 
     Raises:
-        FileExistsError: the model file exists without metadata, or what is in their place are none.
+        FileExistsError: there is a model file without metadata, or another file at the path of the metadata.
         OSError: one of the two is no regular file.
     """
-    beside = info_path(path)
-    for file in (path, beside):
+    metadata = info_path(path)
+    for file in (path, metadata):
         check_replaceable(file)
+    foreign = None
     try:
-        content = json.loads(beside.read_text())
-        known = isinstance(content, dict) and {"format", "features"} <= content.keys()
+        content = json.loads(metadata.read_text())
+        if not (isinstance(content, dict) and {"format", "features"} <= content.keys()):
+            foreign = metadata
     except FileNotFoundError:
-        known, beside = not path.exists(), path
+        if path.exists():
+            foreign = path
     except (ValueError, RecursionError):
-        known = False
-    if not known:
-        raise FileExistsError(f"{beside} exists and does not belong to a gate: choose another --out")
+        foreign = metadata
+    if foreign is not None:
+        raise FileExistsError(f"{foreign} exists and does not belong to a gate: choose another --out")
 
 
 def read_info(path: Path) -> GateInfo:

@@ -41,10 +41,13 @@ class LossTerms(NamedTuple):
 
 
 def weighted(config: LossConfig, views: int) -> LossConfig:
-    """Return weights whose `opacity` contains what `opacity_total` asks for, which is 0 in them.
+    """Return the weights for a number of views: if `opacity_total` is set, `opacity` is its share for a view.
+
+    This share, `opacity_total` / `views`, is kept between `LEAST_OPACITY` and `MOST_OPACITY`. The result has
+    `opacity_total` 0, so that a second call changes nothing.
 
     Args:
-        config: of a new run, or of a run that already has its weight.
+        config: weights as configured.
         views: number of training views.
     """
     if config.opacity_total == 0:

@@ -87,11 +87,11 @@ class OffloadingStepper(Stepper):
             residence: this rank's Gaussians and their pool.
             upcoming: the cameras of the next steps.
             optimiser: as for `Stepper`, like the following arguments.
-            owners: learns what the tiles cost.
+            owners: records what the tiles cost.
             loss: weights of the loss.
-            extent: size of the scene.
-            half_exchange: send splats in half precision.
-            noise: of the means.
+            extent: size of the scene in the unit of the means.
+            half_exchange: send splats in half precision, see `open_transport`.
+            noise: noise on the means after each step; None: none.
         """
         self._residence, self._upcoming = residence, upcoming
         self._reported = residence.traffic

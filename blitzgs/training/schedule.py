@@ -55,10 +55,13 @@ def _with_places(config: ScheduleConfig) -> ScheduleConfig:
 
 
 def stretched(config: ScheduleConfig, views: int) -> ScheduleConfig:
-    """Return a configuration whose `scale` contains what `images_per_view` asks for, which is 0 in it.
+    """Return a schedule for a number of views: `scale` times what gives each view `images_per_view` images.
+
+    The factor is between 1 and `MOST_STRETCH`. The result has `images_per_view` 0, so that a second call
+    changes nothing.
 
     Args:
-        config: of a new run, or of a run that already has its scale.
+        config: the schedule as configured.
         views: number of training views.
     """
     factor = min(max(config.images_per_view * views / config.iterations, 1.0), MOST_STRETCH)
