@@ -11,34 +11,21 @@ import torch
 from blitzgs.optim import LazyAdam, drift
 from blitzgs.optim.drift import Drift
 from tests.helpers import BACKENDS, DEVICES, relative_error
+from tests.optim.adam_pair import BOUND, LR, AdamPair
 
 SHAPES = {"means": (3,), "quats": (4,), "opacities": (), "sh": (16, 3), "features": (7,)}
-LR = 2.0**-7  # a float32, as LazyAdam rounds learning rates to
-BOUND = {torch.float32: 3e-5, torch.float64: 1e-11}
 
 
-class Pair:
-    """The same parameters under both optimisers; gradients of a few rows at a time."""
+class Pair(AdamPair):
+    """One `LazyAdam` of all parameters; gradients of a few rows at a time."""
 
     def __init__(self, backend, rows=60, lr=LR, **options):
-        self.device, self.dtype = backend
-        self.generator = torch.Generator().manual_seed(0)
-        start = {name: self.normal(rows, *shape) for name, shape in SHAPES.items()}
-        self.lazy, self.dense = ({k: v.clone().requires_grad_() for k, v in start.items()} for _ in range(2))
+        super().__init__(backend, SHAPES, rows)
         self.ours = LazyAdam(self.groups(self.lazy, lr), **options)
         self.torchs = torch.optim.Adam(self.groups(self.dense, lr), **options)
 
-    def groups(self, params, lr):
-        return [
-            {"params": [p], "lr": lr * (1 + i), "name": name} for i, (name, p) in enumerate(params.items())
-        ]
-
-    def normal(self, *shape):
-        return torch.randn(*shape, generator=self.generator, dtype=torch.float64).to(self.device, self.dtype)
-
     def step(self, share=0.3, dense=False):
-        rows = len(self.dense["means"])
-        ids = (torch.rand(rows, generator=self.generator) < share).nonzero()[:, 0].to(self.device)
+        ids = self.some_rows(share)
         for name, shape in SHAPES.items():
             # From large to so small that eps matters.
             values = self.normal(len(ids), *shape) * 10.0 ** (
@@ -51,10 +38,8 @@ class Pair:
         self.ours.step()
         self.torchs.step()
 
-    def require_equal(self):
+    def catch_up(self):
         self.ours.catch_up()
-        for name in SHAPES:
-            assert relative_error(self.lazy[name], self.dense[name]) < BOUND[self.dtype], name
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

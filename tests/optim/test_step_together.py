@@ -10,37 +10,24 @@ import torch
 from blitzgs.ops.sparse_rows import sparse_rows
 from blitzgs.optim import LazyAdam, drift, step_together
 from tests.helpers import BACKENDS, relative_error
+from tests.optim.adam_pair import BOUND, AdamPair
 
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
-LR = 2.0**-7
-BOUND = {torch.float32: 3e-5, torch.float64: 1e-11}
 
 
-class Pair:
-    """The same parameters under dense Adam and under ours: one optimiser each, or one for all."""
+class Pair(AdamPair):
+    """One `LazyAdam` for each parameter, or one for all."""
 
     def __init__(self, backend, in_one=False, rows=50):
-        self.device, self.dtype = backend
-        self.generator = torch.Generator().manual_seed(0)
-        start = {name: self.normal(rows, *shape) for name, shape in SHAPES.items()}
-        self.lazy, self.dense = ({k: v.clone().requires_grad_() for k, v in start.items()} for _ in range(2))
+        super().__init__(backend, SHAPES, rows)
         groups = self.groups(self.lazy)
         self.ours = [LazyAdam(groups, eps=1e-15)]
         if not in_one:
             self.ours = [LazyAdam([group], eps=1e-15) for group in groups]
         self.torchs = torch.optim.Adam(self.groups(self.dense), eps=1e-15)
 
-    def groups(self, params):
-        return [
-            {"params": [p], "lr": LR * (1 + i), "name": name} for i, (name, p) in enumerate(params.items())
-        ]
-
-    def normal(self, *shape):
-        return torch.randn(*shape, generator=self.generator, dtype=torch.float64).to(self.device, self.dtype)
-
     def step(self, share=0.3, without=()):
-        count = len(self.dense["means"])
-        ids = (torch.rand(count, generator=self.generator) < share).nonzero()[:, 0].to(self.device)
+        ids = self.some_rows(share)
         for name, shape in SHAPES.items():
             if name in without:
                 self.lazy[name].grad = self.dense[name].grad = None
@@ -53,11 +40,9 @@ class Pair:
         assert all(param.grad is None for group in groups for param in group["params"])
         self.torchs.step()
 
-    def require_equal(self):
+    def catch_up(self):
         for optimizer in self.ours:
             optimizer.catch_up()
-        for name in SHAPES:
-            assert relative_error(self.lazy[name], self.dense[name]) < BOUND[self.dtype], name
 
     @property
     def joined(self):

@@ -6,11 +6,12 @@ import torch
 
 from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 from blitzgs.ops.blocks import cull_blocks, morton_keys
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
+from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, schedule_table
 from blitzgs.ops.project import project
 from blitzgs.ops.projection import ProjectionInputs, ProjectionOptions
 from blitzgs.view.blocks import BlockIndex, morton_order
 from tests.helpers import DEVICES
+from tests.view.pending import caught_up, schedule_of, step_some
 
 WIDTH, HEIGHT, NEAR, FAR = 160, 120, 0.2, 60.0
 
@@ -221,14 +222,12 @@ def test_too_small_a_capacity_gives_empty_lists_and_the_needed_number_of_blocks(
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_active_set_covers_thousands_of_pending_steps(device):
     """Only rows of the set are caught up and stepped; dense Adam decides which rows are visible."""
-    steps, beta1, beta2, eps = 2000, 0.9, 0.999, 1e-15
+    steps = 2000
     table = make_table(500, device)
     rates = torch.full((steps + 1, 6), 1e-3, device=device)
     rates[:, 0] = 0.05  # means move far
     rates[:, 2] = 0.02
-    schedule = schedule_table(rates, beta1, beta2)
-    index = BlockIndex(table, schedule)
-    columns = [[table[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)]
+    index = BlockIndex(table, schedule_of(rates))
     generator = torch.Generator().manual_seed(5)
     views = [make_views(2, device, seed=seed) for seed in range(20)]
     crossed = 0
@@ -236,21 +235,12 @@ def test_the_active_set_covers_thousands_of_pending_steps(device):
         viewmats, Ks = views[step * 7 % len(views)]
         ids, _ = active_of(index, table, viewmats, Ks)
         if step % 100 == 0:
-            dense = {name: table[name].clone() for name in table}
-            lazy_adam_catch_up_(
-                *([dense[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)), None,
-                dense["last_step"], dense["moment_step"], rates, step - 1, beta1, beta2, eps,
-            )  # fmt: skip
+            dense = caught_up(table, rates, step - 1)
             expected = {row for row, _ in seen(dense, viewmats, Ks)}
             assert expected <= set(ids.tolist())
             crossed += len({row for row, _ in seen(table, viewmats, Ks)} ^ expected)
         # The other rows are not visible.
-        ids = ids[torch.rand(len(ids), generator=generator).to(device) < 0.5]
-        grads = [torch.randn((len(ids), *p.shape[1:]), generator=generator).to(device) for p in columns[0]]
-        lazy_adam_step_(
-            *columns, grads, ids, table["last_step"], table["moment_step"], rates, step, beta1, beta2, eps
-        )
-        index.update(table, ids)
+        index.update(table, step_some(table, ids, rates, step, generator))
     assert crossed > 0  # pending steps moved rows across the borders of views
     assert int(table["last_step"].min()) < steps - 20
 

@@ -12,9 +12,8 @@ from blitzgs import pipeline
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.tiles import TileAssignment
-from blitzgs.model import CULL, EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.model import CULL, GaussianTable
 from blitzgs.ops.blocks import ActiveRows, GateRules
-from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
 from blitzgs.ops.view_gate import gate_views_
 from blitzgs.pipeline import RenderOptions, Views
 from blitzgs.population.importance import ViewBatch, is_culled, sweep
@@ -27,6 +26,7 @@ from blitzgs.view.gate import SAMPLE, LodGate, SceneGate, ViewGate, centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import DEVICES
 from tests.training.tiny import random_gaussians, tiny_config
+from tests.view.pending import caught_up, schedule_of, step_some
 from tests.view.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 
 # Distances of `make_table` are up to 60 or so: the gate cuts through the scene at every level.
@@ -208,13 +208,12 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_gated_active_set_covers_pending_steps(device):
     """Blocks and rows are dropped by where pending steps may take them; dense Adam decides what is kept."""
-    steps, beta1, beta2, eps = 400, 0.9, 0.999, 1e-15
+    steps = 400
     table = make_scene(1500, device)
     rates = torch.full((steps + 1, 6), 1e-3, device=device)
     rates[:, 0] = 0.2  # means move far
-    index = BlockIndex(table, schedule_table(rates, beta1, beta2))
+    index = BlockIndex(table, schedule_of(rates))
     gate = ViewGate(GATE.reach(), 0b01, (3, 40))
-    columns = [[table[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)]
     generator = torch.Generator().manual_seed(5)
     views = [make_views(2, device, seed=seed) for seed in range(20)]
     crossed, listed, without = 0, 0, 0
@@ -223,27 +222,16 @@ def test_the_gated_active_set_covers_pending_steps(device):
         rules, size = gate.rules(table), (WIDTH, HEIGHT, NEAR, FAR)
         found = allowed(index.active(table, viewmats, Ks, *size, rules=rules).listed())
         if step % 20 == 0:
-            dense = GaussianTable({name: table[name].clone() for name in table})
-            lazy_adam_catch_up_(
-                *([dense[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)), None,
-                dense["last_step"], dense["moment_step"], rates, step - 1, beta1, beta2, eps,
-            )  # fmt: skip
+            dense = caught_up(table, rates, step - 1)
             kept, close = kept_by_definition(dense, viewmats, GATE, (0,), (3, 40))
             expected = {(r, v) for r, v in seen(dense, viewmats, Ks) if kept[r, v] and not close[r, v]}
             assert expected <= found
             early, _ = kept_by_definition(table, viewmats, GATE, (0,), (3, 40))
             crossed += int((early != kept).sum())
-            listed, without = (
-                listed + len(found),
-                without + len(allowed(index.active(table, viewmats, Ks, *size).listed())),
-            )
+            listed += len(found)
+            without += len(allowed(index.active(table, viewmats, Ks, *size).listed()))
         ids = torch.tensor(sorted({r for r, _ in found}), dtype=torch.int32, device=device)
-        ids = ids[torch.rand(len(ids), generator=generator).to(device) < 0.5]
-        grads = [torch.randn((len(ids), *p.shape[1:]), generator=generator).to(device) for p in columns[0]]
-        lazy_adam_step_(
-            *columns, grads, ids, table["last_step"], table["moment_step"], rates, step, beta1, beta2, eps
-        )
-        index.update(table, ids)
+        index.update(table, step_some(table, ids, rates, step, generator))
     assert crossed > 10  # pending steps move rows across the borders of the gate
     assert listed < 0.5 * without
 

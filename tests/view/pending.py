@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Optimiser steps of some rows of a table, for tests of active sets while steps are pending."""
+
+import torch
+from torch import Tensor
+
+from blitzgs.model import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
+from blitzgs.ops.lazy_adam import lazy_adam_catch_up_, lazy_adam_step_, schedule_table
+
+_BETAS, _EPS = (0.9, 0.999), 1e-15
+
+
+def _columns(table: GaussianTable) -> list[list[Tensor]]:
+    return [[table[name] for name in names] for names in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)]
+
+
+def schedule_of(rates: Tensor) -> Tensor:
+    """Return the table of the schedule with these learning rates, [S + 1, 6], for a `BlockIndex`."""
+    return schedule_table(rates, *_BETAS)
+
+
+def caught_up(table: GaussianTable, rates: Tensor, step: int) -> GaussianTable:
+    """Return a copy of a table with no pending steps up to `step`."""
+    copy = GaussianTable({name: table[name].clone() for name in table})
+    lazy_adam_catch_up_(
+        *_columns(copy), None, copy["last_step"], copy["moment_step"], rates, step, *_BETAS, _EPS
+    )
+    return copy
+
+
+def step_some(
+    table: GaussianTable, ids: Tensor, rates: Tensor, step: int, generator: torch.Generator
+) -> Tensor:
+    """Take a step with random gradients of about half of the rows `ids`; return these rows, int32 [U]."""
+    stepped = ids[torch.rand(len(ids), generator=generator).to(ids.device) < 0.5]
+    grads = [
+        torch.randn((len(stepped), *table[name].shape[1:]), generator=generator).to(ids.device)
+        for name in PARAMETERS
+    ]
+    lazy_adam_step_(
+        *_columns(table), grads, stepped, table["last_step"], table["moment_step"], rates, step, *_BETAS, _EPS
+    )
+    return stepped
