@@ -197,6 +197,16 @@ def test_lineage_of_a_run_that_was_stopped_adds_up(tmp_path, monkeypatch):
     assert ledger["births"] == len(births) and ledger["deaths"] == len(deaths)
 
 
+def require_vetoes_from_60(folder):
+    """Check that the density events from image 60 on, and only these, vetoed half of their candidates."""
+    events = {r["t"]: r for r in events_of(folder, "densify")}
+    assert events[20]["vetoed"] == events[40]["vetoed"] == 0
+    for t in (60, 80):
+        grown = events[t]["cloned"] + events[t]["split"]
+        assert grown > 10 and grown <= events[t]["vetoed"] <= grown + 2
+    return events
+
+
 def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
     """A gate that is fitted on the lineage of one run is used in another run, which prints both warnings."""
     pytest.importorskip("pyarrow")
@@ -213,12 +223,8 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
     texts = [str(w.message) for w in warned if "spawn gate" in str(w.message)]
     assert any("fitted on this very capture" in text for text in texts)
     assert any("population.grad_threshold (0.0001, here 0.0002)" in text for text in texts)
-    events = {r["t"]: r for r in events_of(tmp_path / "gated", "densify")}
-    assert events[20]["vetoed"] == events[40]["vetoed"] == 0
-    for t in (60, 80):
-        grown = events[t]["cloned"] + events[t]["split"]
-        assert grown > 10 and grown <= events[t]["vetoed"] <= grown + 2
-        assert events[t]["held_back"] == 0
+    events = require_vetoes_from_60(tmp_path / "gated")
+    assert events[60]["held_back"] == events[80]["held_back"] == 0
     # The gate decides the result, so a run continues only with the gate's files that it began with.
     for file in (path, info_path(path)):
         content = file.read_text()
@@ -236,11 +242,7 @@ def test_a_random_veto_takes_the_place_of_a_gate(tmp_path):
     for name in ("first", "again"):
         trainer, _ = train(tmp_path / name, *flags)
         assert isinstance(trainer.state.veto, RandomVeto)
-        events = {r["t"]: r for r in events_of(tmp_path / name, "densify")}
-        assert events[20]["vetoed"] == events[40]["vetoed"] == 0
-        for t in (60, 80):
-            grown = events[t]["cloned"] + events[t]["split"]
-            assert grown > 10 and grown <= events[t]["vetoed"] <= grown + 2
+        require_vetoes_from_60(tmp_path / name)
         ids.append(trainer.state.table["id"].sort().values)
     assert torch.equal(*ids)
     assert train(tmp_path / "first", *flags, resume=True)[1] is not None
