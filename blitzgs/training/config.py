@@ -93,11 +93,11 @@ class LodConfig:
     base_resolution: float = 0.001
 
 
-# The most that `schedule.images_per_view` makes a run longer.
+# The largest factor by which `schedule.images_per_view` makes a run longer.
 MOST_STRETCH = 4.0
 
-# The least and the most that `loss.opacity_total` makes of `loss.opacity`: about the range that was measured
-# (docs/decisions/recipe.md).
+# The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
+# measured (docs/decisions/recipe.md).
 LEAST_OPACITY, MOST_OPACITY = 0.005, 0.05
 
 
@@ -108,9 +108,10 @@ class ScheduleConfig:
     Attributes:
         iterations: length of the run.
         scale: stretches or compresses the whole schedule without changing its shape.
-        images_per_view: a new run multiplies `scale` such that it sees every training view so often on
-            average, by 1 to `MOST_STRETCH`. The run's own configuration holds the product, and 0 here. With 0
-            or with `minutes` the length does not depend on the number of views.
+        images_per_view: how often a new run sees each training view on average, at least: it multiplies
+            `scale` by the factor that is needed for this, from 1 to `MOST_STRETCH`. The run's own
+            configuration has the product in `scale`, and 0 here. With 0 or with `minutes` the length does not
+            depend on the number of views.
         minutes: wall time of training that the schedule is fitted into (`blitzgs train --minutes`): the run
             measures its speed and changes its pace; `scale` stays 1. 0: no limit.
         pace: pairs (image of the run, factor): from that image on, `scale` is multiplied by the factor. A run
@@ -202,11 +203,10 @@ class LossConfig:
         ssim: weight of the SSIM term.
         opacity: weight of the mean opacity of the visible Gaussians (3DGS-MCMC takes the mean of all
             Gaussians; here the term does not act on Gaussians that a step does not see).
-        opacity_total: weight of the same mean against the sum of the losses of all training views. A new run
-            sets `opacity` to this divided by the number of training views, from `LEAST_OPACITY` to
-            `MOST_OPACITY`: the more photographs speak for a Gaussian, the less the term should speak against
-            it. The run's own configuration holds the result in `opacity`, and 0 here. 0: `opacity` is the
-            weight.
+        opacity_total: weight of the same mean beside the sum of the losses of all training views. A run
+            minimises the mean of these losses, so a new run sets `opacity` to this weight divided by the
+            number of training views, from `LEAST_OPACITY` to `MOST_OPACITY`. The run's own configuration has
+            the result in `opacity`, and 0 here. 0: `opacity` is the weight.
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.
         size: weight of the mean of all three axes of the visible Gaussians, in units of the extent; the other
