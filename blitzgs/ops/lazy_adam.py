@@ -191,7 +191,7 @@ def schedule_tables(lr_table: Tensor, beta1: float, beta2: float, eps: float, li
     """Return the tables of a schedule as the ops take them, made on first use.
 
     Args:
-        lr_table: as for `schedule_table`, like the next two.
+        lr_table: float32 [S + 1, 6], learning rates per step (row 0 unused).
         beta1: decay of the first moment.
         beta2: decay of the second moment.
         eps: added to the root of the second moment.

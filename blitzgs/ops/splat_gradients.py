@@ -106,7 +106,7 @@ class SplatGradients(NamedTuple):
 
         Args:
             values: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats.
-            places: as for `sum_splats`, like the next two.
+            places: from `blitzgs.ops.scatter.scatter_splats`.
             group_sizes: number of splats that this rank sent to each rank.
             splats: number P of this rank's own splats.
         """

@@ -242,14 +242,15 @@ def gaussians_of(
     """Check shapes and fold the batch dimensions into one.
 
     Args:
-        means: as for `blitzgs.rasterization`, like the next seven.
-        quats: likewise.
-        scales: likewise.
-        opacities: likewise.
-        colors: likewise.
-        viewmats: likewise.
-        Ks: likewise.
-        sh_degree: likewise.
+        means: [..., N, 3].
+        quats: [..., N, 4].
+        scales: [..., N, 3].
+        opacities: [..., N].
+        colors: with `sh_degree` [..., N, K, 3] or per view [..., C, N, K, 3], otherwise [..., N, D] or per
+            view [..., C, N, D].
+        viewmats: [..., C, 4, 4].
+        Ks: [..., C, 3, 3].
+        sh_degree: degree to evaluate; None when `colors` holds values.
         with_colors: whether colours are rendered.
         raw: whether scales and opacities are before their activation.
 

@@ -96,17 +96,17 @@ def raw_rasterization(
         Ks: [C, 3, 3] intrinsics in px, without skew.
         width: image width in px.
         height: image height in px.
-        near_plane: as for `blitzgs.rasterization`, like the next three.
-        far_plane: likewise.
-        radius_clip: likewise.
-        eps2d: likewise.
+        near_plane: Gaussians have z > near_plane, world units; less than far_plane.
+        far_plane: Gaussians have z <= far_plane, world units.
+        radius_clip: drop splats that reach no further than this, px, at least 0.
+        eps2d: variance added to both screen axes, px^2, at least 0.
         sh_degree: degree to evaluate, 0 to 3; None: the highest degree that the coefficients have.
-        tile_size: as for `blitzgs.rasterization`, like the next two.
-        backgrounds: likewise.
-        render_mode: likewise.
+        tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding.
+        backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
+        render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
         sparse_grad: False: dense gradients, for optimisers and gradient clipping that take no others.
-        absgrad: as for `blitzgs.rasterization`, like the next.
-        rasterize_mode: likewise.
+        absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
+        rasterize_mode: "classic" or "antialiased".
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
             among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
             the visible ones.
@@ -121,9 +121,10 @@ def raw_rasterization(
         As `blitzgs.rasterization(..., packed=True)`.
 
     Raises:
-        TypeError: as `blitzgs.rasterization`, like the next two.
-        ValueError: likewise; or `direct_grad` is not possible.
-        RuntimeError: likewise.
+        TypeError: an argument is not a tensor or not a whole number.
+        ValueError: an argument is not supported or has a wrong shape or value, or `direct_grad` is not
+            possible; the message names it.
+        RuntimeError: a tensor has a wrong dtype.
     """
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(
