@@ -197,8 +197,8 @@ BLITZGS_HD DistanceRange distances_of(const SweptBox& box, const float* centre, 
   return {range.near2 * (1.0f - 4.0f * slack), range.far2 * (1.0f + 4.0f * slack)};
 }
 
-// One bit for each view. some: the view may see a row of the block. inside: the view's frustum contains all
-// rows. all: the view certainly sees all rows.
+// One bit for each view. any: the view may see a row of the block. inside: the view's frustum certainly
+// contains all rows. all: in addition, neither the LOD gate nor the cull mask drops one of them.
 struct BlockViews {
   std::uint32_t any, inside, all;
 };

@@ -25,7 +25,7 @@ void check_capacity(std::int64_t capacity, std::int64_t count) {
 
 }  // namespace
 
-// list_and_rasterize calls it, too.
+// Not in the unnamed namespace, because list_and_rasterize_op.cpp calls it, too.
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
                                      const Tensor& splat_opacities, const Tensor& depths,
                                      const Tensor& camera_ids, const std::optional<Tensor>& ids,

@@ -8,7 +8,7 @@
 
 namespace blitzgs {
 
-// The op, whose file defines it.
+// Defined in photometric_op.cpp.
 std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(
     const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
     const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size, std::int64_t tile_begin,

@@ -168,7 +168,7 @@ TEST_CASE("a splat: derivative with respect to mean, axes and pose") {
       };
       ProjectOptions<double> options{64, 48, 16, 0, 1, 0.01, 1e10, 0.3, 0.0, antialiased, false};
       const auto gaussian_of = [](const Values& v) {
-        ActiveGaussian<double> gaussian{};
+        ActivatedGaussian<double> gaussian{};
         gaussian.mean = load3(v.data());
         gaussian.axes = columns(&v[3]);
         gaussian.opacity = 0.9;

@@ -131,7 +131,7 @@ Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const std::
 
 }  // namespace
 
-// l1_ssim_fwd_bwd calls it, too.
+// Not in the unnamed namespace, because l1_ssim_op.cpp calls it, too.
 std::tuple<Tensor, Tensor, Tensor> photometric_fwd_bwd(
     const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
     const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size, std::int64_t tile_begin,

@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(kPoseThreads)
     for (std::int64_t r = args.splats.splat_offsets[u]; r < args.splats.splat_offsets[u + 1]; ++r) {
       if (args.splats.camera_ids[r] != view) continue;
       const std::int64_t id = args.splats.visible_ids[u];
-      const ActiveGaussian<float> gaussian = load_gaussian(in, id);
+      const ActivatedGaussian<float> gaussian = load_gaussian(in, id);
       GaussianGradient<float> unused{};
       project_splat_vjp(cameras[view], gaussian, in.options, args.v.geometry(r), &unused, &pose);
       if (!in.sh || !args.v.colored()) continue;

@@ -297,7 +297,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   const Vec3<float> mean = triple.share(mean_part, lane), scale = triple.share(scale_part, lane);
 
   Vec3<float> v_mean{}, v_scale{};
-  const ActiveGaussian<float> gaussian =
+  const ActivatedGaussian<float> gaussian =
       activate_gaussian(mean, quat, activate_scale(&scale.x, in.options.raw),
                         activate_opacity(opacity, in.options.raw), inverse_reach2);
   GaussianGradient<float> gradient{};

@@ -27,7 +27,7 @@ std::int64_t candidate_id(const ProjectInputs<T>& in, std::int64_t candidate) {
 }
 
 template <class T>
-ActiveGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
+ActivatedGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
   return activate_gaussian(
       load3(in.means + 3 * id), in.quats + 4 * id, activate_scale(in.scales + 3 * id, in.options.raw),
       activate_opacity(in.opacities[id], in.options.raw), static_cast<T>(inverse_reach2_of(in.fade, id)));
@@ -73,11 +73,11 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
   if (maybe == 0) return 0;
   const Vec3<T> scale = activate_scale(in.scales + 3 * id, in.options.raw);
   const T opacity = activate_opacity(in.opacities[id], in.options.raw);
-  if (reach(opacity) < T(0)) return 0;
+  if (visible_sigmas(opacity) < T(0)) return 0;
   // A stored scale may be negative; the Gaussian is that of its absolute value.
   const T widest = larger(larger(std::fabs(scale.x), std::fabs(scale.y)), std::fabs(scale.z));
   const float sigma = opacity <= T(1) ? 1.00001f * static_cast<float>(widest) : kAnyWidth;
-  ActiveGaussian<T> gaussian{};
+  ActivatedGaussian<T> gaussian{};
   std::uint32_t seen = 0;
   std::int64_t* by_rank = totals + kTotalViews + in.n_views;
   for (std::uint32_t rest = maybe, first = 1; rest != 0; rest &= rest - 1) {
@@ -128,7 +128,7 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
                   PoseGradient<T>* poses, const ProjectGradients<T>& out) {
   const std::int64_t id = splats.visible_ids[u];
   const std::int64_t stride = 3 * in.options.sh_stride;
-  const ActiveGaussian<T> gaussian = load_gaussian(in, id);
+  const ActivatedGaussian<T> gaussian = load_gaussian(in, id);
   GaussianGradient<T> gradient{};
   T axis_weight = T(0), size_weight = T(0);
   const std::int64_t at = out.dense ? id : u;

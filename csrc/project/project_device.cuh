@@ -38,8 +38,8 @@ __device__ inline void load_quat(const Inputs& in, std::int64_t id, float* quat)
 }
 
 // Activates Gaussian `id`, whose mean and stored scale the caller has loaded.
-__device__ inline ActiveGaussian<float> make_gaussian(const Inputs& in, std::int64_t id,
-                                                      const Vec3<float>& mean, const Vec3<float>& scale) {
+__device__ inline ActivatedGaussian<float> make_gaussian(const Inputs& in, std::int64_t id,
+                                                         const Vec3<float>& mean, const Vec3<float>& scale) {
   float quat[4];
   load_quat(in, id, quat);
   return activate_gaussian(mean, quat, activate_scale(&scale.x, in.options.raw),
@@ -47,7 +47,7 @@ __device__ inline ActiveGaussian<float> make_gaussian(const Inputs& in, std::int
                            inverse_reach2_of(in.fade, id));
 }
 
-__device__ inline ActiveGaussian<float> load_gaussian(const Inputs& in, std::int64_t id) {
+__device__ inline ActivatedGaussian<float> load_gaussian(const Inputs& in, std::int64_t id) {
   return make_gaussian(in, id, load3(in.means + 3 * id), load3(in.scales + 3 * id));
 }
 

@@ -25,7 +25,7 @@ struct ProjectOptions {
 
 // A Gaussian after activation (docs/image.md, section 1). All its splats use the same one.
 template <class T>
-struct ActiveGaussian {
+struct ActivatedGaussian {
   Vec3<T> mean, scale;
   UnitQuaternion<T> quat;
   Columns3<T> rotation, axes;
@@ -53,7 +53,7 @@ BLITZGS_HD T activate_opacity(T opacity, bool raw) {
 // The largest distance from the centre, in standard deviations, at which a splat of this opacity has
 // alpha >= 1/255; negative if alpha is smaller everywhere.
 template <class T>
-BLITZGS_HD T reach(T opacity) {
+BLITZGS_HD T visible_sigmas(T opacity) {
   return opacity >= T(kAlphaCut) && is_finite(opacity)
              ? std::sqrt(T(2) * std::log(larger(T(255) * opacity, T(1))))
              : T(-1);
@@ -77,9 +77,9 @@ BLITZGS_HD Frustum frustum_of(const Camera<T>& camera, const ProjectOptions<T>& 
 }
 
 template <class T>
-BLITZGS_HD ActiveGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* quat, const Vec3<T>& scale,
-                                               T opacity, T inverse_reach2 = T(0)) {
-  ActiveGaussian<T> gaussian;
+BLITZGS_HD ActivatedGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* quat, const Vec3<T>& scale,
+                                                  T opacity, T inverse_reach2 = T(0)) {
+  ActivatedGaussian<T> gaussian;
   gaussian.mean = mean;
   gaussian.scale = scale;
   gaussian.quat = normalize_quaternion(quat);
@@ -92,7 +92,7 @@ BLITZGS_HD ActiveGaussian<T> activate_gaussian(const Vec3<T>& mean, const T* qua
 
 // The factor on a Gaussian's opacity in a view with smooth levels (project.h).
 template <class T>
-BLITZGS_HD T level_weight(const Camera<T>& camera, const ActiveGaussian<T>& gaussian, T slope) {
+BLITZGS_HD T level_weight(const Camera<T>& camera, const ActivatedGaussian<T>& gaussian, T slope) {
   if (!(gaussian.inverse_reach2 > T(0))) return T(1);
   const Vec3<T> offset = gaussian.mean - camera.centre;
   return smaller(larger(slope - slope * gaussian.inverse_reach2 * dot(offset, offset), T(0)), T(1));
@@ -101,7 +101,7 @@ BLITZGS_HD T level_weight(const Camera<T>& camera, const ActiveGaussian<T>& gaus
 // Projects a Gaussian into a view (docs/image.md, section 2). Returns false if the splat does not exist, by
 // the rules at the top of project.h.
 template <class T>
-BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
+BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActivatedGaussian<T>& gaussian,
                               const ProjectOptions<T>& options, Splat<T>* splat) {
   const ProjectedMean p = project_mean(camera, gaussian.mean);
   splat->depth = T(p.z);
@@ -111,7 +111,7 @@ BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActiveGaussian<T>& 
   store_conic(footprint, splat->conic);
   splat->opacity = level_weight(camera, gaussian, options.fade_slope) * gaussian.opacity;
   if (options.antialiased) splat->opacity *= compensation(footprint);
-  const T sigmas = reach(splat->opacity);
+  const T sigmas = visible_sigmas(splat->opacity);
   if (sigmas < T(0) || !is_finite(footprint.conic[0] + footprint.conic[1] + footprint.conic[2])) return false;
   splat->extent[0] = sigmas * std::sqrt(footprint.cov_xx);
   splat->extent[1] = sigmas * std::sqrt(footprint.cov_yy);
@@ -227,7 +227,7 @@ struct GaussianGradient {
 // Adds the gradients of one splat's geometry to `gradient` and to pose (null: not wanted). Recomputes the
 // intermediate values of the projection.
 template <class T>
-BLITZGS_HD void project_splat_vjp(const Camera<T>& camera, const ActiveGaussian<T>& gaussian,
+BLITZGS_HD void project_splat_vjp(const Camera<T>& camera, const ActivatedGaussian<T>& gaussian,
                                   const ProjectOptions<T>& options, const GeometryGradient<T>& v,
                                   GaussianGradient<T>* gradient, PoseGradient<T>* pose) {
   const ProjectedMean p = project_mean(camera, gaussian.mean);
@@ -265,7 +265,7 @@ struct ParameterGradients {
 // and writes them to `out`. axis_weight and size_weight: the weights of the smallest axis and of the mean
 // axis in the regularisers, summed over the splats.
 template <class T>
-BLITZGS_HD void activate_gaussian_vjp(const ActiveGaussian<T>& gaussian, bool raw,
+BLITZGS_HD void activate_gaussian_vjp(const ActivatedGaussian<T>& gaussian, bool raw,
                                       const GaussianGradient<T>& gradient, T axis_weight, T size_weight,
                                       const ParameterGradients<T>& out) {
   store3(gradient.mean, out.mean);

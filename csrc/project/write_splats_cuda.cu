@@ -199,7 +199,7 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
                       scale = triples[warp].gather(in.scales, id, lane);
     std::uint32_t seen = 0;
     if (maybe) {
-      const ActiveGaussian<float> gaussian = make_gaussian(in, id, mean, scale);
+      const ActivatedGaussian<float> gaussian = make_gaussian(in, id, mean, scale);
       for (; maybe; maybe &= maybe - 1, ++p) {
         const int view = __ffs(maybe) - 1;
         Splat<float> splat{};
