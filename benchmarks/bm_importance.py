@@ -90,7 +90,7 @@ def measure(scene: BenchmarkScene, length: int, repeats: int) -> list[dict[str, 
     lists = (frame.isect_splats, frame.tile_offsets)
 
     def composite() -> None:
-        torch.ops.blitzgs.rasterize_fwd(*shapes, splats.colors, None, *lists, grid, None, False, False, None)
+        torch.ops.blitzgs.rasterize_fwd(*shapes, splats.colors, None, *lists, grid, False, False, None)
 
     def contribute() -> None:
         torch.ops.blitzgs.contributions(*shapes, *lists, grid)

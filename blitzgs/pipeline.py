@@ -122,7 +122,8 @@ class Frame(NamedTuple):
         backgrounds: [B, 3]; None: black.
         isect_splats: int32 [I], indices of splats by tile, front to back.
         tile_offsets: int64 [B * T + 1].
-        renders: [B, H, W, 3]; like the next two undefined where other ranks composite.
+        renders: [B, H, W, 3]; undefined, as `transmittances` and `last_ids` are, in pixels that only other
+            ranks composite.
         transmittances: [B, H, W], weight of the background in each pixel.
         last_ids: int32 [B, H, W], for the backward pass.
         tile_work: int32 [B * T], list entries each composited tile went through.
@@ -227,7 +228,7 @@ def forward_once(
             composited = torch.ops.blitzgs.rasterize_fwd_packed_(*arguments, zeros, n_splats)
         else:
             *composited, allocated = torch.ops.blitzgs.rasterize_fwd(
-                *arguments, None, False, backward_follows, n_splats
+                *arguments, False, backward_follows, n_splats
             )
             zeros = allocated if zeros is None else None
         mark("raster")

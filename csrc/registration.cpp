@@ -117,7 +117,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Alpha compositing. composited: (transmittances, last_ids, packed_splats, tile_order) of the forward pass.
   m.def(
       "rasterize_fwd(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, "
-      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, int[] grid, Tensor? means2d_abs=None, "
+      "Tensor? backgrounds, Tensor isect_splats, Tensor tile_offsets, int[] grid, "
       "bool clear_rest=True, bool backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, "
       "Tensor transmittances, Tensor last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, "
       "Tensor splat_gradients)");

@@ -114,7 +114,7 @@ def rasterize(
     if torch.compiler.is_compiling():
         if tell_absgrad is not None:
             raise ValueError("absolute gradients are not supported under torch.compile")
-        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, grid, None, True, False, None)
+        renders, transmittances, *_ = torch.ops.blitzgs.rasterize_fwd(*splats, grid, True, False, None)
         alphas = 1 - transmittances
     else:
         geometry = (means2d, conics, splat_opacities) if through is None else through.columns
@@ -153,7 +153,6 @@ def _(
     isect_splats: Tensor,
     tile_offsets: Tensor,
     grid: Sequence[int],
-    means2d_abs: Tensor | None = None,
     clear_rest: bool = True,
     backward_follows: bool = False,
     n_splats: Tensor | None = None,
@@ -187,7 +186,7 @@ def _(
 ) -> list[Tensor]:
     lists = torch.ops.blitzgs.intersect(*splats[:3], depths, camera_ids, None, grid, n_isects, n_splats, True)
     outputs = torch.ops.blitzgs.rasterize_fwd(
-        *splats, backgrounds, *lists, grid, None, True, backward_follows, n_splats
+        *splats, backgrounds, *lists, grid, True, backward_follows, n_splats
     )
     return [*lists, *outputs, torch.empty_like(outputs[1])]
 
@@ -218,9 +217,8 @@ def _(
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     _, _, *others = output
     ctx.mark_non_differentiable(*others)
-    *splats, grid, means2d_abs, _, _, _ = inputs
+    *splats, grid, _, _, _ = inputs
     _save(ctx, splats, grid, output)
-    ctx.absgrad = means2d_abs is not None and means2d_abs.requires_grad
 
 
 def _save(ctx: Any, splats: Any, grid: Any, output: Sequence[Tensor]) -> None:
@@ -246,16 +244,18 @@ def _backward(
     ctx: Any, v_renders: Tensor | None, v_transmittances: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
     v_alphas = None if v_transmittances is None else -v_transmittances
-    *splat_gradients, v_abs = _gradients(ctx, v_renders, v_alphas, ctx.absgrad)
-    return (*splat_gradients, None, None, None, v_abs, None, None, None)
+    *splat_gradients, _absolute = _gradients(ctx, v_renders, v_alphas, absgrad=False)
+    return (*splat_gradients, None, None, None, None, None, None)
 
 
 def _gradients(
     ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None, absgrad: bool, may_pack: bool = False
 ) -> Sequence[Tensor | None]:
-    """Return the gradients of means2d, conics, splat_opacities, colors, backgrounds and means2d_abs.
+    """Return the gradients of means2d, conics, splat_opacities, colors and backgrounds.
 
-    With `may_pack` they may, on CUDA, be columns of one table, which `project_bwd` reads without copying.
+    A sixth value follows: the sum over pixels of the absolute gradient of means2d; None without `absgrad`.
+    With `may_pack`, the gradients of the splats may, on CUDA, be columns of one table, which `project_bwd`
+    reads without copying.
     """
     if v_renders is None and v_alphas is None:
         return (None,) * 6
@@ -316,7 +316,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
         *_, call = arguments
         if call.composited is None:
-            output = rasterize_fwd(*call.splats, call.grid, None, True, call.backward_follows)
+            output = rasterize_fwd(*call.splats, call.grid, True, call.backward_follows)
             alphas = _ONE - output[1]
         else:
             *output, alphas = call.composited

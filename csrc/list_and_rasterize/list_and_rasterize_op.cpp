@@ -10,7 +10,7 @@
 
 namespace blitzgs {
 
-// The two ops, whose files define them.
+// Defined in intersect_op.cpp and rasterize_op.cpp.
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,
                                      const Tensor& splat_opacities, const Tensor& depths,
                                      const Tensor& camera_ids, const std::optional<Tensor>& ids,
@@ -19,8 +19,8 @@ std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
-    const std::vector<std::int64_t>& grid_numbers, const std::optional<Tensor>& means2d_abs, bool clear_rest,
-    bool backward_follows, const std::optional<Tensor>& known_splats);
+    const std::vector<std::int64_t>& grid_numbers, bool clear_rest, bool backward_follows,
+    const std::optional<Tensor>& known_splats);
 
 namespace {
 
@@ -36,7 +36,7 @@ std::vector<Tensor> list_and_rasterize(const std::vector<Tensor>& splats, const 
                                n_isects, n_splats, /*unchecked=*/true);
   const auto outputs =
       rasterize_fwd(splats[0], splats[1], splats[2], splats[3], backgrounds, std::get<0>(lists),
-                    std::get<1>(lists), grid, std::nullopt, /*clear_rest=*/true, backward_follows, n_splats);
+                    std::get<1>(lists), grid, /*clear_rest=*/true, backward_follows, n_splats);
   const Tensor& transmittances = std::get<1>(outputs);
   Tensor alphas =
       make_empty(transmittances, {transmittances.size(0), transmittances.size(1), transmittances.size(2)});

@@ -94,12 +94,12 @@ CompositedTensors composite(const Splats& splats, std::optional<Tensor> splat_gr
 
 }  // namespace
 
-// list_and_rasterize calls it, too.
+// Not in the unnamed namespace, because list_and_rasterize_op.cpp calls it, too.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
     const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
     const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
-    const std::vector<std::int64_t>& grid_numbers, const std::optional<Tensor>&, bool clear_rest,
-    bool backward_follows, const std::optional<Tensor>& known_splats) {
+    const std::vector<std::int64_t>& grid_numbers, bool clear_rest, bool backward_follows,
+    const std::optional<Tensor>& known_splats) {
   constexpr const char* kOp = "rasterize_fwd";
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,

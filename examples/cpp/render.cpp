@@ -80,7 +80,7 @@ int main(int argc, char** argv) {
                              grid, kCountThem, std::nullopt, /*unchecked=*/false);
   const auto images =
       call<7>("blitzgs::rasterize_fwd", means2d, conics, alphas, colors, std::nullopt, lists[0], lists[1],
-              grid, std::nullopt, /*clear_rest=*/true, /*backward_follows=*/false, std::nullopt);
+              grid, /*clear_rest=*/true, /*backward_follows=*/false, std::nullopt);
 
   const Tensor& image = images[0];
   std::ofstream file(argv[1], std::ios::binary);

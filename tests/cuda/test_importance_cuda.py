@@ -27,7 +27,7 @@ def test_a_crowded_scene_has_the_bits_of_its_image():
     for four in chosen.view(-1, 4):
         channels = torch.zeros(count, 4, device="cuda")
         channels[four, torch.arange(4)] = 1
-        images = ops.rasterize_fwd(*splats, channels, None, *lists, grid, None, True, False)[0]
+        images = ops.rasterize_fwd(*splats, channels, None, *lists, grid, True, False)[0]
         units = (images.double() * 2.0**32).round().long().sum((0, 1, 2))
         assert torch.equal(weights[four.cuda()], units)
         assert torch.equal(pixels[four.cuda()], (images > 0).sum((0, 1, 2)).int())

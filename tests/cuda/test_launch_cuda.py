@@ -36,7 +36,7 @@ class Calls:
         lists = ops.intersect(
             means2d, conics, opacities, self.depths, self.cameras, None, self.grid, self.capacity, None, True
         )
-        image = ops.rasterize_fwd(*self.splats, None, *lists, self.grid, None, True, False)
+        image = ops.rasterize_fwd(*self.splats, None, *lists, self.grid, True, False)
         renders, rest, last, _, packed, order, _ = image
         _, v_renders = photometric_fwd_bwd(renders, self.targets, None, *self.weights)[:2]
         gradients = ops.rasterize_bwd(

@@ -40,7 +40,7 @@ class Job:
         return RasterizeForward(splats, backgrounds, [isect_splats, tile_offsets], kept_by(outputs))
 
     def forward(self, device, dtype=torch.float32, backward_follows=False):
-        return ops.rasterize_fwd(*self.inputs(device, dtype), self.grid, None, True, backward_follows)
+        return ops.rasterize_fwd(*self.inputs(device, dtype), self.grid, True, backward_follows)
 
     def backward(self, device, dtype, saved, v_renders, v_alphas, absgrad, deterministic):
         v = [t.to(device, dtype) for t in (v_renders, v_alphas)]

@@ -93,4 +93,4 @@ def rasterize_into(*arguments):
     """Replaces `rasterize_fwd_packed_` on a CPU."""
     *rest, table, n_splats = arguments
     table[: int(n_splats)] = 0
-    return torch.ops.blitzgs.rasterize_fwd(*rest, None, False, False, n_splats)[:6]
+    return torch.ops.blitzgs.rasterize_fwd(*rest, False, False, n_splats)[:6]

@@ -402,7 +402,7 @@ def test_the_images_do_not_depend_on_a_backward_pass_to_follow():
     splats = random_splats(100, WIDTH, HEIGHT)
     grid = [1, WIDTH, HEIGHT, 16, 0, -1]
     plain, prepared = (
-        torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *lists(splats), grid, None, True, follows)
+        torch.ops.blitzgs.rasterize_fwd(*splats.values(), None, *lists(splats), grid, True, follows)
         for follows in (False, True)
     )
     for x, y in zip(plain[:4], prepared[:4], strict=True):
@@ -415,9 +415,8 @@ def test_opcheck(absgrad):
     splats = random_splats(6, WIDTH, HEIGHT)
     values = [t.requires_grad_() for t in splats.values()]
     backgrounds = torch.rand(1, 3, requires_grad=True)
-    probe = torch.zeros(6, 2, requires_grad=True) if absgrad else None
     tile_lists = lists(splats)
-    arguments = (*values, backgrounds, *tile_lists, [1, WIDTH, HEIGHT, 16, 0, -1], probe)
+    arguments = (*values, backgrounds, *tile_lists, [1, WIDTH, HEIGHT, 16, 0, -1])
     torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, arguments)
     torch.library.opcheck(torch.ops.blitzgs.rasterize_fwd, (*arguments, False, True))
     with torch.no_grad():

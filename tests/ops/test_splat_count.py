@@ -64,7 +64,7 @@ def test_a_number_out_of_range_is_no_splat(number, device):
         assert len(entries) == max(capacity, 0) and not offsets.any()
     background = torch.rand(1, 3, device=device)
     image = ops.rasterize_fwd(
-        *splats.values(), background, entries, offsets, [*VIEW, 0, -1], None, True, True, count
+        *splats.values(), background, entries, offsets, [*VIEW, 0, -1], True, True, count
     )
     assert torch.equal(image[0], background.expand(1, HEIGHT, WIDTH, 3))
     assert (image[1] == 1).all() and not image[2].any() and not image[3].any()
@@ -76,7 +76,7 @@ def test_columns_with_zero_capacity(device):
     lists = ops.intersect(*columns.padded.geometry(), None, [*VIEW, 0, -1], 10, columns.count)
     assert not lists[1].any()
     renders = ops.rasterize_fwd(
-        *columns.padded.values(), None, *lists, [*VIEW, 0, -1], None, True, True, columns.count
+        *columns.padded.values(), None, *lists, [*VIEW, 0, -1], True, True, columns.count
     )[0]
     assert not renders.any()
 
@@ -92,9 +92,9 @@ def test_images_and_gradients_ignore_entries_after_the_last_splat(n, channels, c
     """The backward pass gets columns without spare capacity in both cases."""
     columns = Columns(n, 1500, device, channels)
     lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, *composited], -1)
-    plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *composited], None)
+    plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *composited])
     padded = ops.rasterize_fwd(
-        *columns.padded.values(), None, *lists, [*VIEW, *composited], None, True, True, columns.count
+        *columns.padded.values(), None, *lists, [*VIEW, *composited], True, True, columns.count
     )
     for found, expected in zip(padded[:4], plain[:4], strict=True):
         assert torch.equal(found, expected)
@@ -122,7 +122,7 @@ def test_a_table_of_gradients_is_zeroed_for_the_splats(n, capacity, tiles):
     memory = torch.full((capacity + 100, SPLAT_GRADIENT), float("nan"), device="cuda")
     table = memory[40 : capacity + 60]
     lists = ops.intersect(*columns.alone.geometry(), None, [*VIEW, *tiles], -1)
-    plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *tiles], None, False)
+    plain = ops.rasterize_fwd(*columns.alone.values(), None, *lists, [*VIEW, *tiles], False)
     image = ops.rasterize_fwd_packed_(
         *columns.padded.values(), None, *lists, [*VIEW, *tiles], table, columns.count
     )
@@ -202,7 +202,7 @@ def test_opcheck(device):
     values = [t.requires_grad_() for t in columns.padded.values()]
     torch.library.opcheck(
         ops.rasterize_fwd,
-        (*values, None, *lists, [*VIEW, 0, -1], None, True, False, columns.count),
+        (*values, None, *lists, [*VIEW, 0, -1], True, False, columns.count),
         # Not those that compare the memory between forward and backward, which is not all written.
         test_utils=("test_schema", "test_autograd_registration", "test_faketensor"),
     )
