@@ -47,7 +47,7 @@ class LocalExchange:
         if self._capacity is None:
             self.arrived = Arrived(splats, None, int(self._copy.read()[2]))
         else:
-            self.arrived = Arrived(splats, projected.totals[1:2], self._capacity.isects)
+            self.arrived = Arrived(splats, projected.n_splats, self._capacity.isects)
         self.gradient_table: Tensor | None = None
         mark("exchange")
 

@@ -66,12 +66,13 @@ class Traffic:
     @classmethod
     def of(cls, totals: Sequence[Sequence[int]], n_views: int, rank: int) -> Traffic:
         """Read the numbers from every rank's `Projected.totals`."""
-        first = VIEW_TOTALS + n_views
-        splats = [list(numbers[first::2]) for numbers in totals]
-        most = max(*(n[1] for n in totals), *map(sum, splats), *map(sum, zip(*splats, strict=True)))
-        isects = [sum(column) for column in zip(*(n[first + 1 :: 2] for n in totals), strict=True)]
+        sizes = [Sizes._make(numbers[:VIEW_TOTALS]) for numbers in totals]
+        of_ranks = [numbers[VIEW_TOTALS + n_views :] for numbers in totals]
+        splats = [list(numbers[::2]) for numbers in of_ranks]
+        isects = [sum(column) for column in zip(*(numbers[1::2] for numbers in of_ranks), strict=True)]
+        most = max(*(size.splats for size in sizes), *map(sum, splats), *map(sum, zip(*splats, strict=True)))
         return cls(
-            counts=torch.tensor(totals[rank][:3]),
+            counts=torch.tensor(sizes[rank][:3]),
             splats=splats,
             sent=splats[rank],
             received=[sent[rank] for sent in splats],
@@ -79,7 +80,7 @@ class Traffic:
             most=most,
             n_isects=isects[rank],
             most_isects=max(isects),
-            most_blocks=max(numbers[VIEW_TOTALS - 1] for numbers in totals),
+            most_blocks=max(size.blocks for size in sizes),
         )
 
     @property
