@@ -53,7 +53,7 @@ from blitzgs.training.loss import loss_terms
 from blitzgs.training.optimiser import LazyAdam
 from blitzgs.training.schedule import Schedule
 from blitzgs.training.step import Stepper
-from blitzgs.training.views import Space, ViewSet, camera_centres, render_options
+from blitzgs.training.views import Space, ViewSet, render_options, trained_centres
 from blitzgs.view.blocks import morton_order
 from blitzgs.view.levels import measure_levels
 
@@ -111,7 +111,7 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
     capture, lod = load_capture(args.data, downscale=args.downscale), Config().lod
     space = Space.of(capture.offset, capture.extent)
     points = torch.from_numpy(capture.points) / space.unit
-    centres = camera_centres([capture.cameras[i] for i in capture.train], space).to(device)
+    centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
     table = octree_gaussians(
         points,
         torch.from_numpy(capture.colors),

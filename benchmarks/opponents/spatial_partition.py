@@ -30,7 +30,7 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.model import REQUIRED, GaussianTable
-from blitzgs.scene.cameras import camera_centers
+from blitzgs.scene.cameras import camera_centres
 from blitzgs.scene.capture import Capture
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.batches import Images
@@ -55,7 +55,7 @@ class Grid:
             ValueError: the training cameras, or the points, are on one line.
         """
         self.shape = np.array([columns, rows])
-        centres = camera_centers(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
+        centres = camera_centres(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
         self._middle = centres.mean(axis=0)
         _, spread, axes = np.linalg.svd(centres - self._middle, full_matrices=False)
         if len(centres) < 3 or spread[1] < 1e-6 * max(spread[0], 1e-300):
@@ -109,7 +109,7 @@ def divide(capture: Capture, grid: Grid) -> list[Block]:
     cameras: list[list[int]] = [[] for _ in range(grid.cells)]
     for index in capture.train:
         camera = capture.cameras[index]
-        centre = grid.coordinates(camera_centers(camera.world_to_camera[None]))
+        centre = grid.coordinates(camera_centres(camera.world_to_camera[None]))
         seen = _in_picture(sampled, camera)
         shares = within @ seen / max(int(seen.sum()), 1)
         for cell in range(grid.cells):

@@ -35,7 +35,7 @@ class Camera:
     """Maps the file's pixels to a pinhole image, before downscaling."""
 
 
-def camera_centers(world_to_camera: Float64) -> Float64:
+def camera_centres(world_to_camera: Float64) -> Float64:
     """Return the positions [N, 3] of rigid poses [N, 4, 4]."""
     return np.asarray(-np.einsum("nji,nj->ni", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]))
 

@@ -20,7 +20,7 @@ from blitzgs.scene.cameras import (
     MOST_SIDE,
     Camera,
     Float64,
-    camera_centers,
+    camera_centres,
     downscaled_size,
     same_shape,
     scaled_matrix,
@@ -122,10 +122,10 @@ def load_capture(
         raise ValueError(f"{root}: its COLMAP model or transforms.json lists no images")
     views = sorted(_with_finite_poses(views), key=lambda view: view.name)
     # Use all views, so that a photograph that is lost later changes neither the origin nor the split.
-    centers = camera_centers(np.stack([view.world_to_camera for view in views]))
-    offset = centers.mean(axis=0)
+    centres = camera_centres(np.stack([view.world_to_camera for view in views]))
+    offset = centres.mean(axis=0)
     train, test = _split(views, root, split)
-    train_centers = centers[train] - offset
+    train_centres = centres[train] - offset
     kept = _existing(views, root, images, allow_missing)
     place = {index: position for position, index in enumerate(kept)}
     views = [views[index] for index in kept]
@@ -158,7 +158,7 @@ def load_capture(
         offset=offset,
         train=train,
         test=test,
-        extent=_extent(train_centers, points.positions),
+        extent=_extent(train_centres, points.positions),
         has_alpha=any(header.has_alpha for header in headers),
     )
 
@@ -348,14 +348,14 @@ def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_
     """Return uniform points of random colours in the region that the cameras look at."""
     warnings.warn(f"the capture has no points; {count} random ones take their place", stacklevel=3)
     poses = np.stack([camera.world_to_camera for camera in cameras])
-    centers, axes = camera_centers(poses), poses[:, 2, :3]
+    centres, axes = camera_centres(poses), poses[:, 2, :3]
     # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     target = np.linalg.solve(
         across.sum(axis=0) + 1e-6 * np.eye(3),
-        np.einsum("nij,nj->i", across, centers) + 1e-6 * centers.mean(axis=0),
+        np.einsum("nij,nj->i", across, centres) + 1e-6 * centres.mean(axis=0),
     )
-    half = 0.35 * float(np.linalg.norm(centers - target, axis=1).mean())
+    half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
     if half <= _LEAST_SPREAD * (1 + float(np.abs(offset).max())):
         raise ValueError(
             "the capture has no points and all its cameras are in one place, so the position of the scene is "
@@ -366,9 +366,9 @@ def _random_points(cameras: Sequence[Camera], offset: Float64, count: int = 100_
     return SourcePoints(positions, random.integers(0, 256, (count, 3), dtype=np.uint8))
 
 
-def _extent(centers: Float64, points: Float64) -> float:
-    extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    distance = float(np.median(np.linalg.norm(points - centers[0], axis=1)))
+def _extent(centres: Float64, points: Float64) -> float:
+    extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    distance = float(np.median(np.linalg.norm(points - centres[0], axis=1)))
     if extent > _LEAST_SPREAD * distance:
         return extent
     extent = distance

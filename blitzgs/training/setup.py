@@ -38,7 +38,7 @@ from blitzgs.training.schedule import Schedule, stretched
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import keep_to_views
-from blitzgs.training.views import Space, ViewSet, camera_centres
+from blitzgs.training.views import Space, ViewSet, trained_centres
 from blitzgs.view.blocks import morton_order
 from blitzgs.view.host_table import HostTable
 from blitzgs.view.levels import measure_levels
@@ -218,7 +218,7 @@ def first_gaussians(
     """Make the first Gaussians from the capture's points; each rank keeps its share of them at `home`."""
     lod, device = config.lod, ranks.device
     points = torch.from_numpy(capture.points) / space.unit
-    centres = camera_centres([capture.cameras[i] for i in capture.train], space).to(device)
+    centres = trained_centres([capture.cameras[i] for i in capture.train], space).to(device)
     levels = measure_levels(points.to(device), centres, lod.fork, lod.base_resolution)
     table = octree_gaussians(
         points,

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.pipeline import RenderOptions, Views
+from blitzgs.scene.cameras import camera_centres
 from blitzgs.training.config import Config
 from blitzgs.view.gate import LodGate, centres_of
 
@@ -158,7 +159,6 @@ def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | 
     )
 
 
-def camera_centres(cameras: list[CameraLike], space: Space) -> Tensor:
+def trained_centres(cameras: list[CameraLike], space: Space) -> Tensor:
     """Return the positions of cameras in the trained world, float64 [V, 3]."""
-    poses = np.stack([viewmat(camera, space) for camera in cameras])
-    return torch.from_numpy(-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]))
+    return torch.from_numpy(camera_centres(np.stack([viewmat(camera, space) for camera in cameras])))

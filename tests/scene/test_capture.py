@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from blitzgs.scene import colmap
-from blitzgs.scene.cameras import camera_centers
+from blitzgs.scene.cameras import camera_centres
 from blitzgs.scene.capture import load_capture
 from blitzgs.scene.files import find_mask
 from blitzgs.scene.image_files import apply_orientation, read_header
@@ -42,10 +42,10 @@ def test_recentred_world_projects_points_where_the_original_does(tmp_path):
 
     edit_model(tmp_path, move)
     capture = load_capture(tmp_path)
-    centers = camera_centers(np.stack([c.world_to_camera for c in capture.cameras]))
+    centers = camera_centres(np.stack([c.world_to_camera for c in capture.cameras]))
     np.testing.assert_allclose(centers.mean(axis=0), 0, atol=1e-8)
     poses = colmap.world_to_camera(model.images)
-    np.testing.assert_allclose(capture.offset, far + camera_centers(poses).mean(axis=0), atol=1e-8)
+    np.testing.assert_allclose(capture.offset, far + camera_centres(poses).mean(axis=0), atol=1e-8)
     for camera in capture.cameras:
         pose = poses[model.images.names.index(camera.name)]
         ours = capture.points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
@@ -57,7 +57,7 @@ def test_views_are_sorted_and_every_eighth_is_held_out(tmp_path):
     capture = load_capture(write_capture(tmp_path, NAMES[::-1]))
     assert [c.name for c in capture.cameras] == NAMES
     assert (capture.test, capture.train) == ([0, 8], list(range(1, 8)))
-    train = camera_centers(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
+    train = camera_centres(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
     distances = np.linalg.norm(train - train.mean(axis=0), axis=1)
     assert capture.extent == pytest.approx(1.1 * distances.max())
     assert capture.track_lengths.tolist()[0] == 9 and (capture.errors == -1).all()
