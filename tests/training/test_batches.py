@@ -13,6 +13,7 @@ from tests.helpers import DEVICES
 from tests.training.tiny import Camera, Images, look_at_origin
 
 SIZES = [(48, 32)] * 5 + [(30, 20)] * 3
+EVERY = tuple(range(len(SIZES)))
 STEPS = 25
 
 
@@ -31,15 +32,20 @@ def capture():
     return cameras, Images(images, masks)
 
 
+def make_loader(cameras, images, device, ahead, train=EVERY):
+    """A loader of batches of two views, its sampler, and the views."""
+    views = ViewSet(cameras, Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
+    sampler = BatchSampler([SIZES[camera] for camera in train], 2, seed=3)
+    return BatchLoader(images, views, list(train), sampler, device, ahead), sampler, views
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ahead", [0, 1, 3])
 def test_each_step_gets_its_own_views(capture, device, ahead):
     cameras, images = capture
     device = torch.device(device)
-    views = ViewSet(cameras, Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
     train = [7, 6, 5, 4, 3, 2, 1, 0]
-    sampler = BatchSampler([SIZES[camera] for camera in train], 2, seed=3)
-    loader = BatchLoader(images, views, train, sampler, device, ahead)
+    loader, sampler, views = make_loader(cameras, images, device, ahead, train)
     seen = []
     try:
         for step in range(STEPS):
@@ -69,13 +75,11 @@ def test_each_step_gets_its_own_views(capture, device, ahead):
 def test_photographs_are_decoded_before_their_batches_are_assembled(capture, batches, first, monkeypatch):
     """Up to half of the memory for decoded images, and always those of the batches that are assembled."""
     cameras, images = capture
-    device = torch.device("cpu")
-    views = ViewSet(cameras[:5], Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
-    sampler, wanted = BatchSampler(SIZES[:5], 2, seed=3), []
+    wanted = []
     budget = batches * 2 * 4 * 48 * 32  # images and masks of batches of two views
     monkeypatch.setattr(images, "memory", lambda: ImageMemory(0, 0, 0, budget, 0))
     monkeypatch.setattr(images, "prefetch", lambda indices, masks: wanted.append((indices, masks)))
-    loader = BatchLoader(images, views, list(range(5)), sampler, device, ahead=2)
+    loader, sampler, _ = make_loader(cameras, images, torch.device("cpu"), ahead=2, train=range(5))
     try:
         loader.get(0, STEPS)
         assert [indices for indices, _ in wanted] == [sampler.batch(step) for step in range(first)]
@@ -93,10 +97,7 @@ def test_photographs_are_decoded_before_their_batches_are_assembled(capture, bat
 @pytest.mark.parametrize("ahead", [0, 2])
 def test_memory_is_used_once_though_an_image_could_not_be_read(capture, device, ahead, monkeypatch):
     cameras, images = capture
-    device = torch.device(device)
-    views = ViewSet(cameras, Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
-    sampler = BatchSampler(SIZES, 2, seed=3)
-    loader = BatchLoader(images, views, list(range(len(SIZES))), sampler, device, ahead)
+    loader, sampler, _ = make_loader(cameras, images, torch.device(device), ahead)
     fails, get = True, images.get
 
     def sometimes(index):
@@ -127,10 +128,7 @@ def test_memory_is_used_once_though_an_image_could_not_be_read(capture, device, 
 def test_memory_is_given_back_when_a_batch_cannot_be_assembled(capture, device, monkeypatch):
     """An image of another size than its camera's fails after memory for its batch was taken."""
     cameras, images = capture
-    device = torch.device(device)
-    views = ViewSet(cameras, Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
-    sampler = BatchSampler(SIZES, 2, seed=3)
-    loader = BatchLoader(images, views, list(range(len(SIZES))), sampler, device, 1)
+    loader, sampler, _ = make_loader(cameras, images, torch.device(device), ahead=1)
     get, failures = images.get, 0
 
     def too_narrow(index):
