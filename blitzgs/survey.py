@@ -24,11 +24,13 @@ class Survey(NamedTuple):
         splats: the projected Gaussians.
         weights: int64 [P], sum of alpha T over the pixels in units of 2^-32.
         pixels: int32 [P], the number of pixels at which a splat is composited.
+        squares: int64 [P], sum of (alpha T)^2 over these pixels in the same units, if asked for.
     """
 
     splats: ProjectedSplats
     weights: Tensor
     pixels: Tensor
+    squares: Tensor | None
 
 
 def survey(
@@ -38,6 +40,7 @@ def survey(
     assignment: TileAssignment | None = None,
     transport: Transport | None = None,
     active: ActiveRows | None = None,
+    squares: bool = False,
 ) -> Survey:
     """Measure what each Gaussian contributes to views of a table without pending optimiser steps.
 
@@ -49,6 +52,7 @@ def survey(
             composites all tiles.
         transport: as for `forward`, but not in half precision, which would change the contributions.
         active: as for `forward`.
+        squares: whether to sum the squares as well, in a second rasterisation.
 
     Returns:
         The splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not depend
@@ -68,10 +72,12 @@ def survey(
                 *geometry, splats.depths, splats.camera_ids, splats.ids, grid, n_isects, n_splats, True
             )
             sums = torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats)
+            if squares:
+                sums = (*sums, torch.ops.blitzgs.contributions(*geometry, *lists, grid, n_splats, True)[0])
             counts = exchange.finish()
     assert counts is not None  # or there would be another attempt
-    weights, pixels = (column[: len(counts.splats.depths)] for column in sums)
+    columns = [column[: len(counts.splats.depths)].long() for column in sums]
     if counts.way_back is not None:
-        returned = counts.way_back.return_sums(torch.stack((weights, pixels.long()), 1))
-        weights, pixels = returned[:, 0].contiguous(), returned[:, 1].int()
-    return Survey(counts.projected, weights, pixels)
+        returned = counts.way_back.return_sums(torch.stack(columns, 1))
+        columns = [column.contiguous() for column in returned.unbind(1)]
+    return Survey(counts.projected, columns[0], columns[1].int(), columns[2] if squares else None)

@@ -29,6 +29,7 @@ def splat_contributions(
     tile_begin: int = 0,
     tile_end: int = -1,
     n_splats: Tensor | None = None,
+    squares: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Sum alpha T over the pixels at which each splat is composited, and count these pixels.
 
@@ -50,16 +51,18 @@ def splat_contributions(
         tile_end: end of the tiles to composite, -1 for all.
         n_splats: int64 [1] on the device of the splats: only the first `n_splats` splats are valid. None:
             all.
+        squares: sum (alpha T)^2 instead.
 
     Returns:
-        Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest), and pixels int32 [P].
+        Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest, and its square down), and
+        pixels int32 [P].
 
     Raises:
         RuntimeError: wrong shapes or dtypes, a tile range outside the images, or a tile size that CUDA lacks.
     """
     weights, pixels = torch.ops.blitzgs.contributions(
         means2d, conics, splat_opacities, isect_splats, tile_offsets,
-        [n_cameras, width, height, tile_size, tile_begin, tile_end], n_splats,
+        [n_cameras, width, height, tile_size, tile_begin, tile_end], n_splats, squares,
     )  # fmt: skip
     return weights, pixels
 
@@ -147,6 +150,6 @@ def _contributions_of_splats(
 
 
 @torch.library.register_fake("blitzgs::contributions")
-def _(means2d: Tensor, *_rest: object) -> tuple[Tensor, Tensor]:
+def _(means2d: Tensor, *_rest: object, **_flags: object) -> tuple[Tensor, Tensor]:
     n_splats = means2d.shape[0]
     return means2d.new_empty(n_splats, dtype=torch.int64), means2d.new_empty(n_splats, dtype=torch.int32)

@@ -6,12 +6,14 @@ their number, c_rad tells whether i is visible, and c_vis whether it is in the s
 (ties by id), that holds 99 % of the view's total. Then::
 
     score_i = sum over v with a > 0 of w / (a + SCORE_EPS)^p, p = 1 for "density", 1/2 "root", 0 "weight"
+            = sum over v and these pixels of (alpha T)^2 for "energy"
     phi_i   = (number of v with c_vis) / (number of v with c_rad + PHI_EPS)
     cull_iv = not c_vis
 
 "density" is the paper's score. It is the contribution per pixel, however many pixels a Gaussian covers, so
 large Gaussians are pruned first. "weight" is the total contribution, which the images lose if the Gaussian
-is pruned.
+is pruned. "energy" is proportional to the squared error of the images after it is pruned, if every Gaussian
+differs equally from the colours behind it.
 
 The views see the Gaussians of all ranks. All sums are integers, so every result has the same bits at any
 world size and for any division of the work.
@@ -44,9 +46,9 @@ PHI_EPS = 0.1
 VIEW_MASS = 0.99
 # Column of a table from the first pass on, beside `CULL`.
 PHI = "phi"
-ScoreRule = Literal["density", "root", "weight"]
+ScoreRule = Literal["density", "root", "weight", "energy"]
 # Bits before the binary point of a view's term, for fewer than 2^31 pixels.
-_TERM_BITS: dict[ScoreRule, int] = {"density": 0, "root": 16, "weight": 31}
+_TERM_BITS: dict[ScoreRule, int] = {"density": 0, "root": 16, "weight": 31, "energy": 31}
 
 
 class SweepStoppedError(Exception):
@@ -129,7 +131,9 @@ def sweep(
             raise SweepStoppedError
         assignment = _assign(batch, options, owners)
         visible = find_visible(scene, *batch.views.as_arguments(), options.limits, lod)
-        surveyed = survey(visible.table, batch.views, options, assignment, transport, visible.active)
+        surveyed = survey(
+            visible.table, batch.views, options, assignment, transport, visible.active, rule == "energy"
+        )
         sums.add(surveyed, batch.columns, visible, ranks)
     return sums.result()
 
@@ -175,9 +179,11 @@ class _Sums:
             splats.camera_ids.to(home),
             splats.radii.to(home),
         )
+        # The squares need no division either.
+        terms, rule = (found.weights, self._rule) if found.squares is None else (found.squares, "weight")
         view_sums_(
-            self._sums, lists, found.weights.to(home), found.pixels.to(home), counts.to(home), columns,
-            rule=self._rule, eps=SCORE_EPS, unit=self._unit,
+            self._sums, lists, terms.to(home), found.pixels.to(home), counts.to(home), columns,
+            rule=rule, eps=SCORE_EPS, unit=self._unit,
         )  # fmt: skip
 
     def result(self) -> Importance:

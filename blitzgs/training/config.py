@@ -249,7 +249,8 @@ class PopulationConfig:
         importance: at `schedule.t1` and `schedule.t2` score all Gaussians by their contributions to the
             training views, and prune those of low score.
         score: the score of the passes, summed over the views: "density" (BlitzGS: contribution per pixel),
-            "weight" (contribution) or "root" (contribution over the square root of the number of pixels).
+            "weight" (contribution), "root" (contribution over the square root of the number of pixels) or
+            "energy" (sum of the squared contributions to pixels).
         pass1_keep: share of the Gaussians that the first pass keeps, drawn in proportion to their scores; 1:
             it keeps all and only computes phi and the cull matrix.
         pass2_mass: the second pass keeps the fewest Gaussians that hold this share of the total score,

@@ -62,7 +62,9 @@ struct ContributionArguments {
   ContributionSums sums;
 };
 
-// Sums an entry's weights over the 16 pixels of a subtile and adds the sum to the entry's TileSum.
+// Sums an entry's weights, or their squares, over the 16 pixels of a subtile, and adds the sum to the entry's
+// TileSum.
+template <bool kSquares>
 __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& entry) {
   std::uint64_t weight = 0;
   std::uint32_t pixels = 0;
@@ -70,7 +72,7 @@ __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& en
   for (int i = 0; i < kHalfWarp / 4; ++i) {
     const uint4 four = reinterpret_cast<const uint4*>(words)[i];
     for (const std::uint32_t units : {four.x, four.y, four.z, four.w}) {
-      weight += units;
+      weight += kSquares ? __umulhi(units, units) : units;
       pixels += units != 0;
     }
   }
@@ -80,6 +82,7 @@ __device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& en
 // The contributions of the splats (importance.h). One block of 256 threads per tile, one thread per pixel, as
 // in forward_kernel (rasterize_fwd_cuda.cu). Reads the tile's list and the packed splats; adds to
 // sums.weights and sums.pixels [P] atomically, once per entry and tile.
+template <bool kSquares>
 __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const ContributionArguments args) {
   constexpr int kBatch = kForwardBatch;
   extern __shared__ __align__(16) unsigned char shared_bytes[];
@@ -135,7 +138,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
       __syncwarp();
       if (lane < 4 * filled) {
         const std::uint32_t offset = batch.lists[pixel.subtile][4 * i + lane];
-        sum_pixels(group + lane * kEntryStride, *reinterpret_cast<Entry*>(entries + offset));
+        sum_pixels<kSquares>(group + lane * kEntryStride, *reinterpret_cast<Entry*>(entries + offset));
       }
       __syncwarp();
     }
@@ -161,7 +164,7 @@ void contributions<float>(const ContributionInput<float>& in, const Contribution
   const TileOrder order(in.grid, owned, workspace.allocate<std::int32_t>(TileOrder::words(in.grid, owned)));
   prepare("contributions", input, packed, nullptr, order, stream);
   const ContributionArguments args{packed, in.isect_splats, in.tile_offsets, in.grid, order, sums};
-  launch_early("contributions", contributions_kernel,
+  launch_early("contributions", sums.squares ? contributions_kernel<true> : contributions_kernel<false>,
                {static_cast<unsigned>(order.n_tiles), Tile::kThreads, stream, sizeof(ContributionShared)},
                args);
 }

@@ -14,7 +14,7 @@ std::tuple<Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor&
                                          const Tensor& opacities_in, const Tensor& isect_splats_in,
                                          const Tensor& tile_offsets_in,
                                          const std::vector<std::int64_t>& grid_numbers,
-                                         const std::optional<Tensor>& n_splats) {
+                                         const std::optional<Tensor>& n_splats, bool squares) {
   const TileGrid grid = checked_tile_grid(kOp, grid_numbers);
   const std::int64_t splats = means2d_in.size(0);
   check_floating(kOp, "means2d", means2d_in);
@@ -39,7 +39,8 @@ std::tuple<Tensor, Tensor> contributions(const Tensor& means2d_in, const Tensor&
                                   splat_count.n_splats,
                                   grid,
                                   splat_count.known_splats};
-    const ContributionSums sums{mutable_data<std::int64_t>(weights), mutable_data<std::int32_t>(pixels)};
+    const ContributionSums sums{mutable_data<std::int64_t>(weights), mutable_data<std::int32_t>(pixels),
+                                squares};
     backend::contributions(in, sums, scope.workspace, scope.stream);
   });
   return {weights, pixels};

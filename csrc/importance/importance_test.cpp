@@ -22,11 +22,11 @@ struct Pair {
   std::vector<std::int32_t> pixels{7, 7};
   TestWorkspace workspace;
 
-  void survey(std::int64_t tile_begin, std::int64_t tile_end) {
+  void survey(std::int64_t tile_begin, std::int64_t tile_end, bool squares = false) {
     const TileGrid grid = make_tile_grid(1, 20, 12, 16, tile_begin, tile_end);
     cpu::contributions<T>(
         {means2d.data(), conics.data(), opacities.data(), splats.data(), offsets.data(), 2, grid},
-        {weights.data(), pixels.data()}, workspace, nullptr);
+        {weights.data(), pixels.data(), squares}, workspace, nullptr);
   }
 };
 
@@ -58,6 +58,23 @@ TEST_CASE("contributions are alpha T, summed over pixels in units of 2^-32") {
     // The exponential may differ by rounding, which changes the weight of a pixel by at most one unit.
     REQUIRE(std::abs(pair.weights[splat] - weights[splat]) <= pixels[splat]);
   }
+}
+
+TEST_CASE("squares are rounded down for each pixel") {
+  Pair<double> pair;
+  pair.survey(0, -1, true);
+  std::int64_t squares = 0;
+  std::int32_t pixels = 0;
+  for (int y = 0; y < 12; ++y) {
+    for (int x = 0; x < 20; ++x) {
+      const double alpha = alpha_at(pair, 0, x + 0.5, y + 0.5);
+      squares += static_cast<std::int64_t>(std::floor(alpha * alpha * 4294967296.0));
+      pixels += alpha > 0;
+    }
+  }
+  REQUIRE(pair.pixels[0] == pixels);
+  // A weight that is one unit off changes its square by at most two.
+  REQUIRE(std::abs(pair.weights[0] - squares) <= 2 * pixels);
 }
 
 TEST_CASE("contributions of tile ranges add up") {

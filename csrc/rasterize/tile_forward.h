@@ -226,8 +226,8 @@ std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
   return entries;
 }
 
-// Sums the weights alpha T and the pixels of each splat. The weights are integers in units of 2^-32, so that
-// the order of the tiles does not change the sums.
+// Sums the weights alpha T (or their squares) and the pixels of each splat. The weights are integers in units
+// of 2^-32, so that the order of the tiles does not change the sums.
 template <class Lanes, class T>
 struct ContributionSink {
   const ContributionSums& sums;
@@ -239,7 +239,8 @@ struct ContributionSink {
     alignas(64) T shares[kLanes];
     share.store(shares);
     for (const T alpha_t : shares) {
-      weight += std::llrint(alpha_t * T(kContributionScale));
+      const auto units = static_cast<std::uint64_t>(std::llrint(alpha_t * T(kContributionScale)));
+      weight += static_cast<std::int64_t>(sums.squares ? units * units >> 32 : units);
       pixels += alpha_t > T(0);
     }
   }

@@ -31,6 +31,10 @@ def test_a_crowded_scene_has_the_bits_of_its_image():
         units = (images.double() * 2.0**32).round().long().sum((0, 1, 2))
         assert torch.equal(weights[four.cuda()], units)
         assert torch.equal(pixels[four.cuda()], (images > 0).sum((0, 1, 2)).int())
+        squares = ops.contributions(*splats, *lists, grid, squares=True)[0]
+        # A float64 holds the square of the 24 bits of a float32 exactly.
+        exact = ((images.double() * 2.0**32).round() ** 2 / 2.0**32).floor().long().sum((0, 1, 2))
+        assert torch.equal(squares[four.cuda()], exact)
 
 
 def test_close_to_float64():

@@ -50,6 +50,13 @@ def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
     shares = images.double() * UNITS
     assert torch.equal(weights, shares.round().long().sum((0, 1, 2)))
     assert torch.equal(pixels, (images > 0).sum((0, 1, 2)).int())
+    squares, same_pixels = splat_contributions(*splats, *lists, **grid, squares=True)
+    high, low = shares.round().long() >> 16, shares.round().long() & 0xFFFF
+    exact = high**2 + (
+        (high * low << 17) + low**2 >> 32
+    )  # of 64 bits, of which neither int64 nor float64 holds all
+    assert torch.equal(squares, exact.sum((0, 1, 2)))
+    assert torch.equal(same_pixels, pixels)
     assert pixels.max() > 100 and (pixels == 0).any()
 
 

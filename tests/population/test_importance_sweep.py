@@ -61,20 +61,22 @@ def population(ranks, layout=(0,)):
 
 
 def dense_survey(table):
-    """Units, pixels and visibility [V, N] of the views one by one."""
+    """Units, pixels, visibility and squares [V, N] of the views one by one."""
     units = torch.zeros(N_VIEWS, len(table), dtype=torch.int64)
-    pixels, visible = torch.zeros_like(units), torch.zeros_like(units, dtype=torch.bool)
+    pixels, squares = torch.zeros_like(units), torch.zeros_like(units)
+    visible = torch.zeros_like(units, dtype=torch.bool)
     for batch in view_batches(table.device):
         for k, column in enumerate(batch.columns):
             one = slice(k, k + 1)
             views = Views(
                 batch.views.viewmats[one], batch.views.Ks[one], batch.views.width, batch.views.height
             )
-            found = survey(table, views, OPTIONS)
+            found = survey(table, views, OPTIONS, squares=True)
             ids = found.splats.gaussian_ids.long().cpu()
             units[column, ids], pixels[column, ids] = found.weights.cpu(), found.pixels.long().cpu()
+            squares[column, ids] = found.squares.cpu()
             visible[column, ids] = True
-    return units, pixels, visible
+    return units, pixels, visible, squares
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -82,12 +84,12 @@ def test_sweep_is_the_definition(device):
     ranks = Ranks(device=torch.device(device))
     table = population(ranks)
     found = sweep(table, view_batches(device), N_VIEWS, OPTIONS, ranks)
-    expected = by_definition(*dense_survey(table), table["id"].cpu(), SCORE_EPS, PHI_EPS)
+    units, pixels, visible, squares = dense_survey(table)
+    expected = by_definition(units, pixels, visible, table["id"].cpu(), SCORE_EPS, PHI_EPS)
     assert torch.allclose(found.score.cpu().double(), expected.score, rtol=1e-6, atol=1e-9)
-    units, pixels, _ = dense_survey(table)
-    for rule, power in (("root", 0.5), ("weight", 0.0)):
+    for rule, terms, power in (("root", units, 0.5), ("weight", units, 0.0), ("energy", squares, 0.0)):
         other = sweep(table, view_batches(device), N_VIEWS, OPTIONS, ranks, rule=rule)
-        wanted = (units.double() / 2.0**32 / (pixels.double() + SCORE_EPS) ** power).sum(0)
+        wanted = (terms.double() / 2.0**32 / (pixels.double() + SCORE_EPS) ** power).sum(0)
         assert torch.allclose(other.score.cpu().double(), wanted, rtol=1e-6, atol=1e-5)
         assert torch.equal(other.phi, found.phi) and torch.equal(other.cull, found.cull)
     assert torch.allclose(found.phi.cpu().double(), expected.phi, rtol=1e-6, atol=0)
@@ -103,7 +105,7 @@ def test_survey_equals_contributions(device):
     """They agree up to rounding of the activations; one orders equal depths by id, the other by row."""
     table = population(Ranks(device=torch.device(device)))
     table.permute(table["id"].argsort())
-    units, pixels, visible = dense_survey(table)
+    units, pixels, visible, _ = dense_survey(table)
     for batch in view_batches(device):
         weights, counts, seen = contributions(
             table["means"], table["quats"], table["scales"].exp(), table["opacities"].sigmoid(),
@@ -128,13 +130,14 @@ def _sweep(ranks):
     found = sweep(table, view_batches(ranks.device), N_VIEWS, OPTIONS, ranks, owners)
     again = sweep(table, view_batches(ranks.device)[::-1], N_VIEWS, OPTIONS, ranks)
     assert all(torch.equal(getattr(found, n), getattr(again, n)) for n in ("score", "phi", "cull"))
+    energy = sweep(table, view_batches(ranks.device), N_VIEWS, OPTIONS, ranks, owners, rule="energy")
     ids = table["id"]
     kept = [
         ids[sample_by_score(found.score, ids, 0.7, 3, 16000, ranks)],
         ids[top_by_score(found.score, ids, 0.99, 1, ranks)],
         ids[top_by_score(found.score, ids, 0.99, 0.3, ranks)],
     ]
-    return [t.cpu() for t in (ids, found.score, found.phi, found.cull, *kept)]
+    return [t.cpu() for t in (ids, found.score, found.phi, found.cull, energy.score, *kept)]
 
 
 @pytest.mark.parametrize("transport", ["auto", "collective"])
@@ -146,11 +149,11 @@ def test_the_same_bytes_at_every_world_size(world_size, device, transport):
     answers = run_ranks(_sweep, world_size, device=device, transport=transport)
     joined = [torch.cat(parts) for parts in zip(*answers, strict=True)]
     order, reference = joined[0].argsort(), ids.argsort()
-    for got, want in zip(joined[1:4], expected[:3], strict=True):
+    for got, want in zip(joined[1:5], expected[:4], strict=True):
         assert torch.equal(got[order], want[reference])
-    for got, want in zip(joined[4:], expected[3:], strict=True):
+    for got, want in zip(joined[5:], expected[4:], strict=True):
         assert torch.equal(got.sort().values, want.sort().values)
-    assert len(joined[4]) == 350 and 150 < len(joined[5]) < 480 and len(joined[6]) == 150
+    assert len(joined[5]) == 350 and 150 < len(joined[6]) < 480 and len(joined[7]) == 150
 
 
 def test_pass_1_draws_in_proportion():
