@@ -127,6 +127,8 @@ class RecordedTrainer(Trainer):
         """Measure the trained model."""
         self._record(end=True)
         self.population = population_report(self.state, self.memory)
+        # The report has the peak since the last evaluation, because the recorder resets the device's count.
+        self.population["peak_memory_bytes"] = self.state.ranks.all_gather_object(self.recorder.peak_bytes)
         return {}
 
     def _record(self, end: bool) -> None:
