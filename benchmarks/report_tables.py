@@ -53,6 +53,10 @@ COMMANDS = {
         "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/ablation "
         "--capture NAME=CAPTURE --per-gpu 3"
     ),
+    "energy": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/energy "
+        '--capture "NAME=CAPTURE --population.score=energy" --per-gpu 3'
+    ),
 }
 COMMANDS |= {
     "adaptive": (
@@ -72,6 +76,7 @@ COMMANDS |= {
 GROUPS = (
     ("quality",),
     ("ablation", "adaptive", "oracle"),
+    ("energy",),
     ("offload",),
     ("call",),
     ("drop_in", "drop_in_1"),
@@ -82,6 +87,7 @@ GROUPS = (
 COPIED = {
     "quality": "cp runs/quality/quality.json benchmarks/results/",
     "ablation": "cp runs/ablation/quality.json benchmarks/results/ablation.json",
+    "energy": "cp runs/energy/quality.json benchmarks/results/energy.json",
     "adaptive": "cp runs/adaptive/quality.json benchmarks/results/adaptive.json",
 }
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -102,6 +108,7 @@ OUR_ARMS = {
     "early": "gate from 2,000 on with rate 0.3, pass 2 keeps 0.65",
     "early_60": "gate from 2,000 on, pass 2 keeps 0.75",
     "early_alone": "gate from 2,000 on, no pass 1, pass 2 keeps 0.7",
+    "early_32": "gate from 2,000 on with rate 0.3, 32 pixels for each Gaussian, pass 2 keeps 0.64",
 }
 ADAPTIVE_ARMS = {"fixed": "fixed schedule", "adaptive": "adaptive schedule"}
 # Arms of the tables rho and onset that are arms of the ablation.
@@ -386,6 +393,7 @@ SECTIONS = {
     "accuracy": Section(("accuracy",), accuracy_lines),
     "quality": Section(("quality",), quality_lines),
     "ablation": Section(("ablation",), ablation_lines),
+    "energy": Section(("energy",), ablation_lines),
     "rho": Section(("ablation",), gate_lines("rho")),
     "onset": Section(("ablation",), gate_lines("onset")),
     "oracle": Section(("oracle",), row_lines),
