@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs import rasterization
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.ownership import TileOwners
 from blitzgs.distributed.selection import integer_mass_prefix
@@ -98,6 +99,35 @@ def test_sweep_is_the_definition(device):
     assert found.cull.shape == (500, 2) and not (found.cull[:, 1] >> 5).any()  # nothing from V on
     assert 0.02 < culled.double().mean() < 0.98 and 0 == found.phi.min() < 0.5 < found.phi.max() < 1
     assert not found.score[:20].any() and found.score[300:].min() > 0
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_energy_is_the_squared_error_of_removing(device):
+    """White Gaussians that do not overlap, on black: without one, the image's squared error is its energy."""
+    x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
+    means = torch.stack([0.4 * x.flatten(), 0.4 * y.flatten(), torch.zeros(25)], 1)
+    table = random_gaussians(25)
+    table["means"].copy_(means)
+    table["scales"].sub_(1.0)
+    table["opacities"].copy_(torch.linspace(-2, 4, 25))
+    table = GaussianTable({name: table[name].to(device) for name in table})
+    view = cameras(1, device, 256, 192)
+    view.Ks[:, [0, 1], [0, 1]] *= 4
+    batches = [ViewBatch([0], view)]
+    energy = sweep(table, batches, 1, OPTIONS, Ranks(device=torch.device(device)), rule="energy").score
+
+    def image(kept):
+        return rasterization(
+            table["means"][kept], table["quats"][kept], table["scales"][kept].exp(),
+            table["opacities"][kept].sigmoid(), torch.ones(len(kept), 1, device=device),
+            view.viewmats, view.Ks, view.width, view.height, near_plane=0.05, far_plane=100.0,
+        )[0]  # fmt: skip
+
+    everything = torch.arange(25, device=device)
+    full = image(everything)
+    errors = [(full - image(everything[everything != i])).double().square().sum() for i in range(25)]
+    assert energy.min() > 0.2 and energy.max() > 10
+    assert torch.allclose(energy.double(), torch.stack(errors), rtol=1e-4)
 
 
 @pytest.mark.parametrize("device", DEVICES)
