@@ -8,7 +8,7 @@ r"""Trains a synthetic city with and without the view level: quality, speed by p
 The arms are `configs/city.yaml` with the LOD gate and the cull mask (full), without the one (no_lod), the
 other (no_mask), or both (all_off). Every run is a process on one GPU; each GPU has one at a time. The
 numbers of ranks above 1 follow when these are over: the first of --arms, under torchrun, with the machine to
-itself.
+itself. With several --batch-sizes, the first of --arms is trained with each on every number of ranks.
 
 A run writes its figures into RESULTS/runs after its set-up, training, evaluation and popping. Some seconds
 before --seconds-per-run are over, its training stops where it is and is evaluated there ("finished": false).
@@ -21,6 +21,7 @@ as --section.field=value. In a copy without a repository, BLITZGS_COMMIT names t
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import re
 import signal
@@ -66,6 +67,8 @@ def held_out(city: Path, count: int, path: Path) -> None:
 def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     """Return the runs: all arms on one rank, then the first arm on each further number of ranks.
 
+    The batch sizes after the first are for the first arm alone.
+
     Raises:
         ValueError: an argument cannot be used.
     """
@@ -77,12 +80,14 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     capture = {"city": f"'{args.city}' --data.split={json.dumps(str(split.resolve()))}"}
     common = " ".join([f"--schedule.scale={args.scale}", "--log.every=200", *overrides])
     recipes = {arm: f"'{CONFIG}' {ARMS[arm]} {common}" for arm in args.arms}
+    first, device, sizes = args.arms[0], "cuda" if args.gpus else "cpu", args.batch_sizes or [None]
     runs = []
-    for ranks in args.ranks:
-        chosen = recipes if ranks == 1 else {args.arms[0]: recipes[args.arms[0]]}
-        device = "cuda" if args.gpus else "cpu"
+    for ranks, size in itertools.product(args.ranks, sizes):
+        is_first = ranks == 1 and size == sizes[0]
+        batch = "" if size is None else f" --schedule.batch_size={size}"
+        chosen = {arm: recipes[arm] + batch for arm in (args.arms if is_first else [first])}
         for spec in runs_of(capture, chosen, [0], [], None, device, ranks):
-            frames = args.popping if ranks == 1 and spec.recipe == args.arms[0] else 0
+            frames = args.popping if is_first and spec.recipe == first else 0
             runs.append(
                 CityRun(
                     **dataclasses.asdict(spec),
@@ -122,7 +127,7 @@ def collect(args: Any) -> str:
     """
     order = list(ARMS)
     runs = quality_report.read_runs(args.out / quality_report.RUNS)
-    runs.sort(key=lambda run: (run["ranks"], order.index(run["recipe"])))
+    runs.sort(key=lambda run: (run["ranks"], order.index(run["recipe"]), run.get("batch_size", 0)))
     saved = args.out / "city.json"
     file = {"city": json.loads(saved.read_text()), "results": runs}
     if not runs:
@@ -177,6 +182,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     gpus = torch.cuda.device_count()
     parser.add_argument("--gpus", type=int, default=gpus, help="to use; 0: the CPU (%(default)s)")
     parser.add_argument("--ranks", type=positive, nargs="+", default=[1], help="(%(default)s)")
+    parser.add_argument(
+        "--batch-sizes", type=positive, nargs="+", default=[], metavar="B", help="views a step (the recipe's)"
+    )
     parser.add_argument(
         "--popping", type=int, nargs="?", const=240, default=0, metavar="FRAMES",
         help="measure popping on the first arm's model (240 frames)",

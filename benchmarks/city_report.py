@@ -54,6 +54,15 @@ def trained(file: Json, ranks: int | None = None) -> list[Json]:
     return [run for run in file["results"] if "phases" in run and ranks in (None, run["ranks"])]
 
 
+def compared(file: Json) -> list[tuple[Json, Json]]:
+    """Return the runs that were made on several numbers of ranks, each with the same run on one rank."""
+    runs = [run for run in trained(file) if run["finished"]]
+    several = {(run["recipe"], run["batch_size"]) for run in runs if run["ranks"] > 1}
+    ones = {(run["recipe"], run["batch_size"]): run for run in runs if run["ranks"] == 1}
+    keys = [(run["recipe"], run["batch_size"]) for run in runs]
+    return [(run, ones[key]) for run, key in zip(runs, keys, strict=True) if key in several and key in ones]
+
+
 def city_rows(file: Json) -> Rows:
     """Tabulate what was generated."""
     city, first = file["city"], next((run for run in file["results"] if "views" in run), None)
@@ -155,26 +164,24 @@ def popping_rows(file: Json) -> Rows:
 
 def rank_rows(file: Json) -> Rows:
     """Tabulate runs of one arm on several ranks, against the one on one rank."""
-    runs = [run for run in trained(file) if run["finished"]]
-    several = {run["recipe"] for run in runs if run["ranks"] > 1}
-    ones = {run["recipe"]: run for run in runs if run["ranks"] == 1}
+
+    def cell(rate: float | None, base: float | None) -> str:
+        return NONE if rate is None or not base else f"{rate:,.0f} ({rate / base:.2f} ×)"
+
     rows = []
-    for run in runs:
-        one = ones.get(run["recipe"])
-        if run["recipe"] not in several or one is None:
-            continue
-
-        def cell(rate: float | None, base: float | None) -> str:
-            return NONE if rate is None or not base else f"{rate:,.0f} ({rate / base:.2f} ×)"
-
+    for run, one in compared(file):
         row = {
+            "view level": TITLES[run["recipe"]],
+            "views a step": str(run["batch_size"]),
             "ranks": str(run["ranks"]),
             "PSNR": text(run.get("psnr"), ".2f"),
+            "seconds": f"{run['seconds']:.1f}",
             "images/s, whole run": cell(run["images_per_second"], one["images_per_second"]),
         }
         for i, (phase, base) in enumerate(zip(run["phases"], one["phases"], strict=False), 1):
             rates = phase["median_images_per_second"], base["median_images_per_second"]
             row[f"median in phase {i}"] = cell(*rates)
+        row["decoded by rank 0"] = f"{run['image_memory']['decoded']:,}"
         rows.append(row | {"peak GB of a GPU": gb(run["population"]["peak_memory_bytes"])})
     return rows
 

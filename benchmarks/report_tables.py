@@ -59,6 +59,9 @@ COMMANDS = {
     ),
 }
 COMMANDS |= {
+    "compact": (
+        "python benchmarks/bm_quality.py --plan benchmarks/ablation.yaml --out runs/compact --capture NAME=CAPTURE"
+    ),
     "adaptive": (
         "python benchmarks/bm_quality.py --plan benchmarks/adaptive.yaml --out runs/adaptive "
         "--capture NAME=CAPTURE --per-gpu 3"
@@ -66,6 +69,9 @@ COMMANDS |= {
     "oracle": "blitzgs gate replay GATE RUN --out REPLAY",
     "offload": "python benchmarks/bm_offload.py --ratios 2 4",
     "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --popping",
+    "city_ranks": (
+        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 2 --arms all_off --batch-sizes 4 8"
+    ),
     "city_exchange": (
         "python benchmarks/bm_exchange.py --data CITY --downscale 1 --visible-threshold 0 --ranks 1 2"
     ),
@@ -75,19 +81,23 @@ COMMANDS |= {
 # a page of its own.
 GROUPS = (
     ("quality",),
-    ("ablation", "adaptive", "oracle"),
+    ("ablation", "oracle"),
     ("energy",),
+    ("compact",),
+    ("adaptive",),
     ("offload",),
     ("call",),
     ("drop_in", "drop_in_1"),
     ("exchange", "training", "training_2"),
     ("city", "city_exchange"),
+    ("city_ranks",),
 )
 # bm_quality.py takes no --json: it collects all of its runs in one file.
 COPIED = {
     "quality": "cp runs/quality/quality.json benchmarks/results/",
     "ablation": "cp runs/ablation/quality.json benchmarks/results/ablation.json",
     "energy": "cp runs/energy/quality.json benchmarks/results/energy.json",
+    "compact": "cp runs/compact/quality.json benchmarks/results/compact.json",
     "adaptive": "cp runs/adaptive/quality.json benchmarks/results/adaptive.json",
 }
 QUALITY_COLUMNS = ("recipe", "images", "seeds", "PSNR", "SSIM", "seconds", "Gaussians", "GB")
@@ -289,6 +299,13 @@ def ablation_lines(ablation: Json) -> list[str]:
     return arm_lines(ablation, arms_of("ablation") | ours, ABLATION_COLUMNS)
 
 
+def compact_lines(compact: Json) -> list[str]:
+    """Tabulate configs/compact.yaml against the whole model level and against none of it, with times."""
+    arms = {"half": {"title": "compact.yaml"}, "full": {"title": "full"}, "all_off": {"title": "all off"}}
+    columns = (*ABLATION_COLUMNS, "images/s", "seconds")
+    return arm_lines(compact, arms, columns)
+
+
 def adaptive_lines(adaptive: Json) -> list[str]:
     """Tabulate the fixed and the adaptive schedule."""
     arms = {name: {"title": title} for name, title in ADAPTIVE_ARMS.items()}
@@ -397,10 +414,14 @@ SECTIONS = {
     "rho": Section(("ablation",), gate_lines("rho")),
     "onset": Section(("ablation",), gate_lines("onset")),
     "oracle": Section(("oracle",), row_lines),
+    "compact": Section(("compact",), compact_lines),
     "adaptive": Section(("adaptive",), adaptive_lines),
     "offload": Section(("offload",), offload_lines),
     "summary": Section(("render", "step_1", "step_4"), summary_lines),
     "summary_ranks": Section(("exchange",), summary_ranks_lines),
     "city_exchange": Section(("city_exchange",), exchange_lines),
 }
-SECTIONS |= {name: Section(("city",), city_lines(rows_of)) for name, rows_of in city_report.TABLES.items()}
+SECTIONS |= {
+    name: Section(("city_ranks",) if name == "city_ranks" else ("city",), city_lines(rows_of))
+    for name, rows_of in city_report.TABLES.items()
+}

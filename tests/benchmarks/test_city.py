@@ -43,12 +43,14 @@ def call(city, *flags):
 
 @pytest.mark.slow
 def test_arms_ranks_and_popping_become_tables(city, capsys):
-    flags = ["--arms", "full", "all_off", "--ranks", "1", "2", "--popping", "3"]
+    flags = ["--arms", "full", "all_off", "--ranks", "1", "2", "--batch-sizes", "4", "8", "--popping", "3"]
     status, file = call(city, *flags, "--generation-log", str(city.parent / "log"))
     assert status == 0
     assert file["commit"] == "abc" and file["city"]["seconds"] == 4.5 and file["city"]["images"] == 8
     runs = file["results"]
-    assert [(run["recipe"], run["ranks"]) for run in runs] == [("full", 1), ("all_off", 1), ("full", 2)]
+    assert [(run["recipe"], run["ranks"], run["batch_size"]) for run in runs] == [
+        ("full", 1, 4), ("full", 1, 8), ("all_off", 1, 4), ("full", 2, 4), ("full", 2, 8),
+    ]  # fmt: skip
     for run in runs:
         assert run["finished"] and run["images"] == 104 and run["views"] == {"train": 6, "test": 2}
         assert 5 < run["psnr"] < 60 and len(run["host_peak_bytes"]) == run["ranks"]
@@ -57,14 +59,13 @@ def test_arms_ranks_and_popping_become_tables(city, capsys):
         "growth", "growth + mask", "LOD + mask", "LOD + mask", "LOD",
     ]  # fmt: skip
     assert {event["event"] for event in runs[0]["events"]} == set(city_run.EVENTS)
-    assert [phase["on"] for phase in runs[1]["phases"]] == ["growth", "growth", "–", "–", "–"]
-    assert [("popping" in run) for run in runs] == [True, False, False]
+    assert [phase["on"] for phase in runs[2]["phases"]] == ["growth", "growth", "–", "–", "–"]
+    assert ["popping" in run for run in runs] == [True, False, False, False, False]
     assert "<svg" in (city.parent / "out" / "popping" / "popping.svg").read_text()
     for name, rows_of in city_report.TABLES.items():
         assert rows_of(file), f"{name} is empty"
-    results = {"city": file}
-    page = report.render_page("<!-- table: city_ranks -->\n<!-- end: city_ranks -->\n", results)
-    assert "\n| 2 | " in page and "commit abc" in page
+    page = report.render_page("<!-- table: city_ranks -->\n<!-- end: city_ranks -->\n", {"city_ranks": file})
+    assert "\n| LOD gate and mask | 8 | 2 | " in page and "commit abc" in page
     # The same command trains nothing again.
     before = {path: path.stat().st_mtime_ns for path in (city.parent / "out" / "runs").iterdir()}
     assert call(city, *flags)[0] == 0
