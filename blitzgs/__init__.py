@@ -15,8 +15,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if TYPE_CHECKING:
     from blitzgs import optim
     from blitzgs.losses import l1_ssim
-    from blitzgs.ops.importance import contributions
-    from blitzgs.rendering import rasterization, raw_rasterization
+    from blitzgs.rendering import contributions, rasterization, raw_rasterization
     from blitzgs.training.run_folder import open_run
     from blitzgs.view.blocks import morton_order
 
@@ -32,7 +31,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "contributions": "blitzgs.ops.importance",
+    "contributions": "blitzgs.rendering",
     "l1_ssim": "blitzgs.losses",
     "morton_order": "blitzgs.view.blocks",
     "open_run": "blitzgs.training.run_folder",

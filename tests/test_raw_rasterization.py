@@ -220,6 +220,17 @@ def test_wrong_shapes_are_refused_by_name():
         raw({**p, "shN": p["shN"][:, :3]}, scene, sh_degree=3)
 
 
+def test_sparse_gradients_need_leaves():
+    scene = random_scene(n=20)
+    p = raw_parameters(scene)
+    p["quats"] = torch.nn.functional.normalize(p["quats"], dim=1)
+    with pytest.raises(ValueError, match="quats is not a leaf, and its gradient would be sparse"):
+        raw(p, scene)
+    raw(p, scene, sparse_grad=False)[0].sum().backward()
+    with torch.no_grad():
+        raw(p, scene)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_second_derivative_is_refused(device, name):

@@ -73,7 +73,9 @@ def test_a_gradient_with_a_graph_may_be_used_as_a_value():
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "RGB+ED"}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"packed": False}, *({"render_mode": mode} for mode in ("RGB+ED", "ED", "D"))], ids=str
+)
 def test_images_may_be_changed_in_place(device, options):
     """As gsplat's trainer does with the pixels outside of a mask."""
     scene = random_scene(n=40, device=device)
@@ -81,15 +83,17 @@ def test_images_may_be_changed_in_place(device, options):
     gradients = []
     for in_place in (True, False):
         leaves = scene.leaves()
-        renders, _, _ = rasterize_scene(leaves, **options)
+        renders, alphas, _ = rasterize_scene(leaves, **options)
         if in_place:
             renders[~mask] = 0
+            alphas.mul_(mask[..., None])
         else:
-            renders = renders * mask[..., None]
-        renders.square().sum().backward()
+            renders, alphas = renders * mask[..., None], alphas * mask[..., None]
+        (renders.square().sum() + alphas.square().sum()).backward()
         gradients.append([getattr(leaves, name).grad for name in PARAMETERS])
     for name, actual, expected in zip(PARAMETERS, *gradients, strict=True):
-        assert relative_error(actual, expected) < 1e-5, name
+        assert (actual is None) == (expected is None)
+        assert actual is None or relative_error(actual, expected) < 1e-5, name
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -248,9 +252,10 @@ def test_a_graph_of_many_views_and_one_of_covariances():
         assert relative_error(found, wanted) < 1e-5
 
 
-def test_a_second_derivative_of_a_compiled_call_is_refused():
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_second_derivative_of_a_compiled_call_is_refused(device):
     torch._dynamo.reset()
-    leaves = random_scene(n=20).leaves()
+    leaves = random_scene(n=20, device=device).leaves()
     image = torch.compile(lambda s: rasterize_scene(s)[0], fullgraph=True, backend="aot_eager")(leaves)
     with pytest.raises(RuntimeError, match="create_graph=False|double backward"):
         (gradient,) = torch.autograd.grad(image.sum(), leaves.means, create_graph=True)

@@ -112,9 +112,10 @@ def test_sh_may_differ_from_view_to_view(device):
         assert relative_error(leaves.colors.grad[view], one.colors.grad) < 1e-5
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("mode", ["D", "ED"])
-def test_depth_needs_no_colours(mode):
-    scene = random_scene(n=30)
+def test_depth_needs_no_colours(device, mode):
+    scene = random_scene(n=30, device=device)
     expected, _, _ = rasterize_scene(scene, render_mode=mode)
     scene.colors = None
     for degree in (None, 3):
@@ -156,8 +157,17 @@ def test_covariances_are_rotations_and_scales(device, rasterize_mode):
     assert relative_error(quats, expected.quats.grad) < 10 * bound
 
 
-def test_covariances_of_a_batch():
-    scenes = [random_scene(n=20, cameras=2, seed=seed) for seed in range(2)]
+def test_covariances_have_no_sparse_gradients():
+    scene = random_scene(n=20)
+    scene.quats = scene.scales = None
+    covars = torch.eye(3).expand(20, 3, 3)
+    with pytest.raises(ValueError, match="sparse_grad does not support covars; leave one of them out"):
+        rasterize_scene(scene, covars=covars, sparse_grad=True)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_covariances_of_a_batch(device):
+    scenes = [random_scene(n=20, cameras=2, seed=seed, device=device) for seed in range(2)]
     batch = batch_of(scenes)
     factors = covariance_factors(batch.quats.flatten(0, 1), batch.scales.flatten(0, 1))
     covars = (factors @ factors.mT).view(2, 20, 3, 3)

@@ -14,6 +14,7 @@ from blitzgs.ops.color_rows import VisibleRows, colored_rows
 from blitzgs.ops.host import HostCopy
 from blitzgs.ops.project import TableRows
 from blitzgs.ops.projection import (
+    VIEW_TOTALS,
     Projected,
     ProjectedSplats,
     ProjectionInputs,
@@ -33,6 +34,7 @@ class Rendered(NamedTuple):
         tile_offsets: where they begin.
         composited: what `rasterize_fwd` returned, and alphas.
         rows: the visible rows, if the SH are in tables of which only these are read.
+        has_blank_view: whether some view sees no Gaussian.
     """
 
     splats: ProjectedSplats
@@ -40,6 +42,7 @@ class Rendered(NamedTuple):
     tile_offsets: Tensor
     composited: Sequence[Tensor]
     rows: TableRows | None
+    has_blank_view: bool
 
 
 class ShTables(NamedTuple):
@@ -90,8 +93,8 @@ def render_queued(
             if tables is not None:
                 splats, rows = _colored(projected, inputs, tables, spare=capacity is not None)
             if capacity is None:
-                counts = copy.read()[:3]
-                sizes, n_splats = Sizes(*counts.tolist()), None
+                totals = copy.read()
+                sizes, n_splats = Sizes(*totals[:3].tolist()), None
             else:
                 sizes, n_splats = capacity, projected.n_splats
             isect_splats, tile_offsets, *composited = torch.ops.blitzgs.list_and_rasterize(
@@ -99,16 +102,17 @@ def render_queued(
                 splats.camera_ids, backgrounds, grid, sizes.isects, backward_follows, n_splats,
             )  # fmt: skip
             if capacity is not None:
-                counts = copy.read()[:3]
-                sizes = Sizes(*counts.tolist())
+                totals = copy.read()
+                sizes = Sizes(*totals[:3].tolist())
             attempt.end(sizes[:3], capacity is None or capacity.holds(sizes))
-        splats = splats._replace(counts=counts)
+        splats = splats._replace(counts=totals[:3])
         if capacity is not None:
             splats, isect_splats, rows = _without_spare(splats, isect_splats, rows, sizes)
         of_tables = None
         if tables is not None and rows is not None:
             of_tables = TableRows(rows, tables.parts, tables.hand_over)
-        return Rendered(splats, isect_splats, tile_offsets, composited, of_tables)
+        in_views = totals[VIEW_TOTALS : VIEW_TOTALS + inputs.n_views].tolist()
+        return Rendered(splats, isect_splats, tile_offsets, composited, of_tables, 0 in in_views)
 
 
 def _colored(

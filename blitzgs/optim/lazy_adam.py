@@ -397,11 +397,14 @@ class LazyAdam(torch.optim.Optimizer):
 
 
 def _check_group(group: dict[str, Any]) -> None:
-    """Check the options of a group.
+    """Check the parameters and options of a group.
 
     Raises:
-        ValueError: an option is outside its range, or is one of `torch.optim.Adam` that is not supported.
+        ValueError: a parameter has no rows, or an option is outside its range, or is one of
+            `torch.optim.Adam` that is not supported.
     """
+    if any(isinstance(param, Tensor) and param.dim() == 0 for param in group["params"]):
+        raise ValueError("LazyAdam: a parameter must have rows, [N, ...], got a single number; use Adam")
     beta1, beta2 = group["betas"]
     if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 * beta1 < beta2):
         raise ValueError(f"LazyAdam: betas must satisfy 0 <= beta1 < sqrt(beta2) < 1, got {group['betas']}")

@@ -84,9 +84,9 @@ def rasterization(
             fastest there.
         backgrounds: [..., C, D] behind everything; None for zero. Depth channels have none.
         render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
-        sparse_grad: whether means, quats and scales, and with `sh_degree` also opacities and colors that are
-            leaves, get sparse gradients, which have only the visible Gaussians. Dense gradients cost a pass
-            over all N.
+        sparse_grad: whether means, quats and scales, and with `sh_degree` also opacities and colors (not
+            per view) that are leaves, get sparse gradients, which have only the visible Gaussians. Dense
+            gradients cost a pass over all N. Not with covars or batch dimensions.
         absgrad: whether backward also sets `meta["means2d"].absgrad`, the sums of absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased".
         channel_chunk: accepted and not needed: all channels are rendered in one pass.
@@ -114,8 +114,8 @@ def rasterization(
         first read.
 
     Warns:
-        RuntimeWarning: an argument has values that are NaN or infinite (on CUDA, every 32nd call checks
-            this).
+        RuntimeWarning: an argument has values that are NaN or infinite. On CUDA every 32nd call looks for
+            them, and every call with a view that sees no Gaussian looks at the cameras.
 
     Raises:
         TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
@@ -143,6 +143,8 @@ def rasterization(
     )
     if sparse_grad and len(gaussians.lead) > 1:
         raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
+    if sparse_grad and covars is not None:
+        raise ValueError("sparse_grad does not support covars; leave one of them out")
     if covars is not None:
         gaussians = with_covariances(gaussians, covars)
     antialiased = rasterize_mode == "antialiased"

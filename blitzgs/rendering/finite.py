@@ -15,8 +15,9 @@ import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.rendering.arguments import Gaussians
 from blitzgs.rendering.layout import Layout
 
-# On CUDA, the first of this many calls of a size checks the parameters: the check is a pass over all of them,
-# and values that are not finite stay so.
+# On CUDA, the first of this many calls of a size checks all arguments: the check is a pass over all
+# Gaussians, and their values that are not finite stay so. Cameras differ from call to call; a call with a
+# view that sees nothing, as one with a bad camera does, checks the cameras.
 EVERY_CUDA_CALLS = 32
 COLOURS = ("colors", "sh0", "shN")
 
@@ -78,21 +79,38 @@ def _rows_not_finite(values: Tensor) -> Tensor:
     return bad
 
 
-def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> None:
-    """Warn about arguments with values that are not finite; their Gaussians or views are not rendered.
+def watch_for_non_finite(
+    gaussians: Gaussians, layout: Layout, function: str, zeros: Sequence[Tensor], has_blank_view: bool
+) -> None:
+    """Warn, now and then on CUDA, about arguments with values that are not finite.
 
-    One pass over the arguments tells whether a closer check is needed. SH coefficients, the largest part of a
-    Gaussian, are only checked for visible Gaussians.
+    SH coefficients, the largest part of a Gaussian, are only checked for visible Gaussians.
+
+    Args:
+        gaussians: the arguments of a call.
+        layout: its splats.
+        function: name of the public function.
+        zeros: NaN for Gaussians whose colours are values that are not finite.
+        has_blank_view: whether some view may see no Gaussian.
     """
     named = gaussians.named
     first = named["means"][0]
     if first.is_cuda and next(_calls(first.device, first.shape[0])) % EVERY_CUDA_CALLS:
+        if has_blank_view:
+            _warn(gaussians, [*named["viewmats"], *named["Ks"]], [], function)
         return
     columns = [t for name, given in named.items() if name not in COLOURS for t in given]
+    # Splats whose SH are not finite have no opacity, and no other splat is below 1/255.
+    _warn(gaussians, [*columns, *zeros], [layout.splats.opacities], function)
+
+
+def _warn(gaussians: Gaussians, columns: Sequence[Tensor], nonzero: Sequence[Tensor], function: str) -> None:
+    """Warn if `columns` have values that are not finite, or `nonzero` has zeros, because of an argument.
+
+    One pass over the columns tells whether a closer check is needed.
+    """
     with torch._C._AutoDispatchBelowAutograd():  # in less of the host's time than no_grad
-        # Splats whose colour is not finite have no opacity, and no other splat is below 1/255.
-        bad = torch.ops.blitzgs.find_non_finite(columns, [layout.splats.opacities])
-        if not bad.item():
+        if not torch.ops.blitzgs.find_non_finite(columns, nonzero).item():
             return
     names = ", ".join(non_finite(gaussians))
     if names:
@@ -100,7 +118,26 @@ def warn_of_non_finite(gaussians: Gaussians, layout: Layout, function: str) -> N
             f"blitzgs.{function}: NaN or infinite values in {names}; the Gaussians or views that have them "
             "are not rendered. meta['non_finite'] has their indices.",
             RuntimeWarning,
-            stacklevel=4,
+            stacklevel=5,
+        )
+
+
+def warn_of_non_finite(gaussians: Gaussians, function: str, stacklevel: int) -> None:
+    """Warn about arguments with values that are not finite, and name the first of them.
+
+    Args:
+        gaussians: the arguments of a call, without colours.
+        function: name of the public function.
+        stacklevel: how many calls away the public function's caller is, from 1 for this function.
+    """
+    found = {name: indices[:5].tolist() for name, indices in non_finite(gaussians).items()}
+    if found:
+        shown = "; ".join(f"{name}, first at {', '.join(map(str, at))}" for name, at in found.items())
+        warnings.warn(
+            f"blitzgs.{function}: NaN or infinite values in {shown}; the Gaussians or views that have them "
+            "contribute nothing",
+            RuntimeWarning,
+            stacklevel=stacklevel,
         )
 
 

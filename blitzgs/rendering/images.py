@@ -14,8 +14,8 @@ from torch import Tensor
 from blitzgs.ops.projection import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import Through, rasterize
 from blitzgs.ops.render import Rendered, ShTables, render_queued
-from blitzgs.rendering.arguments import Gaussians
-from blitzgs.rendering.finite import warn_of_non_finite
+from blitzgs.rendering.arguments import Gaussians, Scene
+from blitzgs.rendering.finite import watch_for_non_finite
 from blitzgs.rendering.groups import Group, groups_of, project_groups
 from blitzgs.rendering.layout import Layout
 from blitzgs.rendering.meta import Lists, make_meta
@@ -23,6 +23,7 @@ from blitzgs.rendering.ranks import Job, send_splats
 
 # The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
 CUDA_TILE_SIZE = 16
+_CHANNELS_AT_A_TIME = 64
 
 
 class ImageOptions(NamedTuple):
@@ -64,9 +65,13 @@ def render(
         groups: `groups_of` the Gaussians, which have SH, if they are already known.
     """
     compiling = torch.compiler.is_compiling()
+    zeros: list[Tensor] = []
     if groups is None:
-        by_value = gaussians.colors is not None and gaussians.sh_degree is None
-        groups = groups_of(_without_non_finite(gaussians) if by_value else gaussians, project)
+        shown = gaussians
+        if gaussians.colors is not None and gaussians.sh_degree is None:
+            zeros = [_zeros_of(scene) for scene in gaussians.scenes]
+            shown = _without_non_finite(gaussians, zeros)
+        groups = groups_of(shown, project)
     ready = None
     if job is None and not compiling and may_queue(groups):
         ready = _queued(groups[0], gaussians, image, tables)
@@ -97,11 +102,15 @@ def render(
         composited=None if ready is None else ready.composited, through=through,
     )  # fmt: skip
     if not compiling:
-        warn_of_non_finite(gaussians, layout, function)
+        # Only calls whose work was queued know the numbers of splats of each view.
+        has_blank_view = ready is None or ready.has_blank_view
+        watch_for_non_finite(gaussians, layout, function, zeros, has_blank_view)
     size = (*lead, project.height, project.width)
     alphas = alphas.unsqueeze(-1)
     if image.render_mode.endswith("ED"):
-        renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
+        # Of a copy, which autograd saves, so that the caller may change alphas in place.
+        covered = alphas.clone().clamp_(min=1e-10)
+        renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
     if len(lead) > 1:
         renders, alphas = renders.view(*size, renders.shape[-1]), alphas.view(*size, 1)
     meta = make_meta(gaussians, layout, arranged, lists, lead, None if job is None else rendered)
@@ -170,15 +179,22 @@ def _lists(
     return lists, lists_of(CUDA_TILE_SIZE, -1)
 
 
-def _without_non_finite(gaussians: Gaussians) -> Gaussians:
-    """Zero the opacity of Gaussians with a NaN or infinite value, so that it spreads to no pixel."""
-    scenes = []
-    for scene in gaussians.scenes:
-        assert scene.colors is not None
-        # Zero times a number is zero unless the number is NaN or infinite.
-        zeros = (scene.colors.detach() * 0).sum(dim=-1 if scene.colors.dim() == 2 else (0, 2))
-        opacities = scene.opacities.masked_fill(zeros != 0, 0)
-        scenes.append(scene._replace(opacities=opacities))
+def _zeros_of(scene: Scene) -> Tensor:
+    """Return [N]: 0, or NaN for a Gaussian with a colour, in some view, that is not finite."""
+    assert scene.colors is not None
+    # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
+    # time needs little memory.
+    parts = [(part * 0).sum(dim=-1) for part in scene.colors.detach().split(_CHANNELS_AT_A_TIME, dim=-1)]
+    total = parts[0] if len(parts) == 1 else torch.stack(parts).sum(dim=0)
+    return total if total.dim() == 1 else total.sum(dim=0)
+
+
+def _without_non_finite(gaussians: Gaussians, zeros: Sequence[Tensor]) -> Gaussians:
+    """Zero the opacity of Gaussians whose `zeros` are NaN, so that NaN spreads to no pixel."""
+    scenes = [
+        scene._replace(opacities=scene.opacities.masked_fill(zero != 0, 0))
+        for scene, zero in zip(gaussians.scenes, zeros, strict=True)
+    ]
     return replace(gaussians, scenes=tuple(scenes))
 
 

@@ -121,10 +121,12 @@ def raw_rasterization(
         As `blitzgs.rasterization(..., packed=True)`.
 
     Raises:
-        TypeError: an argument is not a tensor or not a whole number.
-        ValueError: an argument is not supported or has a wrong shape or value, or `direct_grad` is not
-            possible; the message names it.
-        RuntimeError: a tensor has a wrong dtype.
+        TypeError: an argument is not a tensor, or not the kind of number it should be; or the tensors are
+            neither float32 nor float64.
+        ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
+            the others; a parameter is not a leaf, but would get a sparse gradient; or `direct_grad` is not
+            possible. The message names it.
+        RuntimeError: float64 tensors are on a GPU.
     """
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     check_options(
@@ -143,6 +145,8 @@ def raw_rasterization(
     )
     geometry = (means, quats, scales, opacities)
     whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, False, raw=True)
+    if sparse_grad and torch.is_grad_enabled():
+        _check_leaves({**tensors, "shN": shN})
     lazy = _lazy(optimizers)
     for optimizer in lazy:
         optimizer.catch_up(geometry)
@@ -184,6 +188,16 @@ def raw_rasterization(
     assert isinstance(meta, LazyDict)
     meta.change("gaussian_ids", lambda index_in_visible: ids.long()[index_in_visible])
     return renders, alphas, meta
+
+
+def _check_leaves(params: Mapping[str, Tensor | None]) -> None:
+    """Check that parameters with gradients are leaves: few operations accept a sparse gradient."""
+    for name, param in params.items():
+        if param is not None and param.requires_grad and not param.is_leaf:
+            raise ValueError(
+                f"{name} is not a leaf, and its gradient would be sparse: pass the parameter itself, or "
+                "sparse_grad=False"
+            )
 
 
 def _lazy(optimizers: Any) -> list[CatchesUp]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The instrumented rasterisation has the renderer's bits and agrees with the definition in float64."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -111,9 +112,13 @@ def test_hidden_and_missing_gaussians_contribute_nothing():
     scene = random_scene(4, 1)
     scene.means[:, 2] -= 100.0
     scene.scales[3] = float("nan")
-    weights, pixels, visible = blitzgs.contributions(
-        scene.means, scene.quats, scene.scales, scene.opacities, scene.viewmats, scene.Ks, 40, 32
-    )
+    with pytest.warns(
+        RuntimeWarning, match="contributions: NaN or infinite values in scales, first at 3;"
+    ) as w:
+        weights, pixels, visible = blitzgs.contributions(
+            scene.means, scene.quats, scene.scales, scene.opacities, scene.viewmats, scene.Ks, 40, 32
+        )
+    assert w[0].filename == __file__
     assert not weights.any() and not pixels.any() and not visible.any()
     none = [scene.means[:0], scene.quats[:0], scene.scales[:0], scene.opacities[:0]]
     assert blitzgs.contributions(*none, scene.viewmats, scene.Ks, 40, 32)[0].shape == (1, 0)
@@ -129,3 +134,24 @@ def test_bad_arguments_are_named():
         splat_contributions(*splats, *lists, **grid, tile_begin=5, tile_end=99)
     with pytest.raises(ValueError, match="rasterize_mode must be 'classic' or 'antialiased', got 'ewa'"):
         blitzgs.contributions(*splats, splats[2], *lists, 4, 4, rasterize_mode="ewa")
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"means": np.zeros((5, 3))}, TypeError, "means must be a torch.Tensor, got ndarray"),
+        ({"quats": torch.zeros(5, 3)}, ValueError, "quats must be"),
+        ({"Ks": torch.zeros(1, 3, 3).double()}, ValueError, "Ks is torch.float64 and means torch.float32"),
+        ({"means": torch.zeros(1, 5, 3)}, ValueError, r"means must be \[N, 3\]"),
+        ({"width": 0}, ValueError, "width must be 1 to"),
+        ({"eps2d": -1.0}, ValueError, "eps2d must be"),
+    ],
+    ids=str,
+)
+def test_bad_arguments_of_contributions_are_named(change, error, message):
+    scene = random_scene(5, 1)
+    given = {
+        name: getattr(scene, name) for name in ("means", "quats", "scales", "opacities", "viewmats", "Ks")
+    }
+    with pytest.raises(error, match=message):
+        blitzgs.contributions(**{**given, "width": 40, "height": 32, **change})

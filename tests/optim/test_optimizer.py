@@ -210,6 +210,8 @@ def test_wrong_use_is_refused():
     param = torch.ones(4, 3, requires_grad=True)
     with pytest.raises(ValueError, match=r"betas must satisfy .* got \(0.99, 0.9\)"):
         LazyAdam([param], betas=(0.99, 0.9))
+    with pytest.raises(ValueError, match="a parameter must have rows"):
+        LazyAdam([torch.nn.Parameter(torch.tensor(1.0))])
     with pytest.raises(ValueError, match="lr must be 0 or more, got -1"):
         LazyAdam([param], lr=-1)
     with pytest.raises(ValueError, match="weight_decay=0.1 is not supported"):
