@@ -184,6 +184,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "report_(Tensor? parts, Tensor? tile_work, int tile_begin, int tile_end, int rank, int n_ranks, "
       "Tensor(a!)[] targets) -> ()");
+  // The costs of tiles as they are stored for each view, and the division that follows from them (CPU).
+  m.def("tile_costs(Tensor sums, int first, int views, int grain) -> Tensor[] costs");
+  m.def(
+      "divide_tiles(Tensor[] costs, Tensor[] similar, int tiles, int grain, float tile_cost, int parts) -> "
+      "int[] bounds");
   // The loss of whole images, and its gradient. weights: (l1_weights, ssim_weights, samples) of each view,
   // for the gradient; factors: (l1, ssim, offset), by which the loss follows from the sums over all views.
   m.def(
