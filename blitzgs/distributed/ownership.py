@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
-from itertools import groupby, islice
-from typing import Any, NamedTuple
+from itertools import groupby, islice, repeat
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,12 +16,11 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.distributed.tiles import TileRanges
+from blitzgs.distributed.tiles import TileRanges, count_tiles
+from blitzgs.ops.tile_costs import divide_tiles, tile_costs
 
 # Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
 TILE_COST = 8
-# Number of neighbouring costs that `divide` adds up first.
-_STRETCH = 128
 # Largest number of costs that are stored for a view, 16 KB; a view with fewer tiles has one for each tile.
 _MOST_NUMBERS = 8192
 # The costs of this number of latest batches are not used for a division. The host has read the sums of
@@ -29,6 +28,8 @@ _MOST_NUMBERS = 8192
 _LATE = 2
 # The cost of a view that was not visited yet is estimated as the mean cost of this number of other views.
 _SIMILAR = 16
+# Stands for the costs of such a view.
+_UNKNOWN = torch.empty(0, dtype=torch.float16)
 
 
 class _ViewCost(NamedTuple):
@@ -36,7 +37,7 @@ class _ViewCost(NamedTuple):
 
     key: Hashable
     tiles: int
-    pieces: NDArray[np.float16]
+    pieces: Tensor
 
 
 def _grain(tiles: int) -> int:
@@ -46,24 +47,9 @@ def _grain(tiles: int) -> int:
 
 def _measured(sums: HostSum, keys: Sequence[Hashable], tiles: int, first: int) -> list[_ViewCost]:
     """Read the costs of the views of a batch; in the sums, those of the first view begin at `first`."""
-    means, grain = sums.read().numpy()[first:].reshape(len(keys), tiles), _grain(tiles)
-    if grain > 1:
-        begins = np.arange(0, tiles, grain)
-        totals = np.add.reduceat(means, begins, axis=1, dtype=np.float32)
-        means = (totals / np.minimum(grain, tiles - begins)).astype(np.float32)
-    # Torch converts to and from float16 with the processor's instructions, numpy without. This runs in
-    # every step while the GPU waits for its next work, so all views of a batch are converted together.
-    halves = torch.from_numpy(means).clamp(max=torch.finfo(torch.float16).max).half().numpy()
-    # Each view has its own memory, because the views of a batch are not visited again together.
-    return [_ViewCost(key, tiles, pieces.copy()) for key, pieces in zip(keys, halves, strict=True)]
-
-
-def _of_tiles(costs: Sequence[_ViewCost], tiles: int) -> NDArray[np.float32]:
-    """Return the cost of each tile, [V, tiles], of V >= 1 views that have this number of tiles."""
-    halves = torch.from_numpy(np.concatenate([cost.pieces for cost in costs]))
-    table: NDArray[np.float32] = halves.float().numpy().reshape(len(costs), -1)
     grain = _grain(tiles)
-    return table if grain == 1 else table.repeat(grain, axis=1)[:, :tiles]
+    costs = tile_costs(sums.read(), first, len(keys), grain)
+    return list(map(_ViewCost, keys, repeat(tiles), costs))
 
 
 class TileOwners:
@@ -77,7 +63,6 @@ class TileOwners:
         self.ranks = ranks
         self._costs: dict[Hashable, _ViewCost] = {}  # by view, in the order of the last visits
         self._late: deque[Callable[[], Sequence[_ViewCost]]] = deque()  # read the costs of the latest batches
-        self._typical: dict[int, NDArray[np.float32]] = {}  # by number of tiles, for views without a visit
         self._planned: dict[int, tuple[int, ...]] = {}
 
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
@@ -112,11 +97,10 @@ class TileOwners:
         batches = [list(self._costs.values()), *(measured() for measured in self._late)]
         ages = [age for age, batch in enumerate(batches) for _ in batch]
         costs = [cost for batch in batches for cost in batch]
-        pieces = [torch.from_numpy(cost.pieces) for cost in costs]
         return {
             "views": torch.tensor([int(str(cost.key)) for cost in costs], dtype=torch.int64),
             "tiles": torch.tensor([cost.tiles for cost in costs], dtype=torch.int64),
-            "costs": torch.cat([torch.empty(0, dtype=torch.float16), *pieces]),
+            "costs": torch.cat([_UNKNOWN, *(cost.pieces for cost in costs)]),
             "ages": torch.tensor(ages, dtype=torch.int64),
             "steps": torch.tensor(list(self._planned), dtype=torch.int64),
             "bounds": torch.tensor(list(self._planned.values()), dtype=torch.int64),
@@ -134,14 +118,14 @@ class TileOwners:
     def _restore_costs(self, columns: Mapping[str, Tensor]) -> None:
         tiles = columns["tiles"].tolist()
         pieces = columns["costs"].split([-(-count // _grain(count)) for count in tiles])
-        costs = map(_ViewCost, columns["views"].tolist(), tiles, (piece.numpy() for piece in pieces))
+        costs = map(_ViewCost, columns["views"].tolist(), tiles, pieces)
         dated = zip(columns["ages"].tolist(), costs, strict=True)
         for age, batch in groupby(dated, key=lambda pair: pair[0]):
-            views = [cost for _, cost in batch]
+            measured: Callable[[], list[_ViewCost]] = partial(list, [cost for _, cost in batch])
             if age == 0:
-                self._learn(views)
+                self._learn(measured)
             else:
-                self._late.append(partial(list, views))
+                self._late.append(measured)
 
     def divide(
         self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, halo: int = 0
@@ -158,10 +142,13 @@ class TileOwners:
         Returns:
             Ranges whose costs differ from equal shares by at most the cost of one tile.
         """
-        unit = TileRanges((0,), len(keys), width, height, tile_size)
-        cost = self._expected(keys, unit.tiles_per_view)
-        cost += TILE_COST
-        bounds = divide(cost, self.ranks.world_size)
+        tiles = count_tiles(width, height, tile_size)
+        found = [self._costs.get(key) for key in keys]
+        costs = [_UNKNOWN if cost is None or cost.tiles != tiles else cost.pieces for cost in found]
+        # Views have costs in common: in oblique views the far (upper) tiles cost more than the near ones. A
+        # view without a visit is therefore expected to cost what similar views do.
+        similar = self._latest(tiles) if any(cost is _UNKNOWN for cost in costs) else ()
+        bounds = divide_tiles(costs, similar, tiles, _grain(tiles), TILE_COST, self.ranks.world_size)
         return TileRanges(bounds, len(keys), width, height, tile_size, halo)
 
     def record(
@@ -185,67 +172,22 @@ class TileOwners:
             The sums; see `HostSum.read`.
         """
         if len(self._late) == _LATE:
-            self._learn(self._late.popleft()())
+            self._learn(self._late.popleft())
         sums = HostSum(self.ranks, parts, tile_work, ranges.of(self.ranks.rank))
         first = 0 if parts is None else 2 * len(parts)
         self._late.append(partial(_measured, sums, list(keys), ranges.tiles_per_view, first))
         return sums
 
-    def _learn(self, costs: Sequence[_ViewCost]) -> None:
+    def _learn(self, measured: Callable[[], Sequence[_ViewCost]]) -> None:
         """Use the costs of views for later divisions."""
-        for cost in costs:
+        for cost in measured():
             self._costs.pop(cost.key, None)
             self._costs[cost.key] = cost
-        self._typical.clear()
 
-    def _expected(self, keys: Sequence[Hashable], tiles: int) -> NDArray[np.float32]:
-        """Return the costs of the tiles of B views, [B * tiles]; the caller may change the result.
-
-        They are those of a view's last visit, or the mean of other views.
-        """
-        found = (self._costs.get(key) for key in keys)
-        known = [cost if cost is not None and cost.tiles == tiles else None for cost in found]
-        visited = [cost for cost in known if cost is not None]
-        if len(visited) == len(keys):
-            return _of_tiles(visited, tiles).ravel()
-        rows = iter(_of_tiles(visited, tiles) if visited else ())
-        return np.concatenate([self._typical_cost(tiles) if cost is None else next(rows) for cost in known])
-
-    def _typical_cost(self, tiles: int) -> NDArray[np.float32]:
-        """Return the costs that a view without a visit is expected to have, [tiles]."""
-        if tiles not in self._typical:
-            # Views have costs in common: in oblique views the far (upper) tiles cost more than the near ones.
-            alike = (cost for cost in reversed(self._costs.values()) if cost.tiles == tiles)
-            latest = list(islice(alike, _SIMILAR))
-            mean = _of_tiles(latest, tiles).mean(0) if latest else np.zeros(tiles, np.float32)
-            self._typical[tiles] = mean
-        return self._typical[tiles]
-
-
-def divide(cost: NDArray[Any], parts: int) -> tuple[int, ...]:
-    """Cut a sequence of costs into contiguous parts of nearly equal sums.
-
-    Args:
-        cost: [n], n >= 1, >= 0.
-        parts: how many, M.
-
-    Returns:
-        M + 1 ascending bounds, 0 and n included; each is the one nearest to its share of the total.
-    """
-    # First sum whole stretches, then only the stretches that contain a bound. A running sum over all tiles
-    # takes four times as long, and every step waits for it.
-    stretches = np.add.reduceat(cost, np.arange(0, len(cost), _STRETCH), dtype=np.float64)
-    ends = np.concatenate(([0.0], stretches.cumsum()))
-    bounds = [0]
-    for part in range(1, parts):
-        target = ends[-1] * part / parts
-        stretch = max(int(np.searchsorted(ends, target)) - 1, 0)
-        first = stretch * _STRETCH
-        within = cost[first : first + _STRETCH].cumsum(dtype=np.float64) + ends[stretch]
-        after = min(int(np.searchsorted(within, target)), len(within) - 1)  # sums are rounded
-        start = within[after - 1] if after > 0 else ends[stretch]
-        bounds.append(first + after + int(target - start >= within[after] - target))
-    return (*bounds, len(cost))
+    def _latest(self, tiles: int) -> list[Tensor]:
+        """Return the stored costs of the latest views with this number of tiles, the latest first."""
+        alike = (cost.pieces for cost in reversed(self._costs.values()) if cost.tiles == tiles)
+        return list(islice(alike, _SIMILAR))
 
 
 def cost_balance(cost: NDArray[np.float64], bounds: Sequence[int]) -> float:

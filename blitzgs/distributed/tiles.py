@@ -16,6 +16,11 @@ from blitzgs.distributed.group import Ranks
 LOSS_HALO = 10
 
 
+def count_tiles(width: int, height: int, tile_size: int) -> int:
+    """Return the number of tiles of an image; all arguments are in pixels."""
+    return -(-width // tile_size) * -(-height // tile_size)
+
+
 @dataclass(frozen=True)
 class TileRanges:
     """The tiles of B views of one size, one contiguous range per rank.
@@ -48,7 +53,7 @@ class TileRanges:
     @cached_property
     def tiles_per_view(self) -> int:
         """Tiles of one view, T."""
-        return self.tiles_x * -(-self.height // self.tile_size)
+        return count_tiles(self.width, self.height, self.tile_size)
 
     def of(self, rank: int) -> tuple[int, int]:
         """Return a rank's [first, one past last) tile."""
