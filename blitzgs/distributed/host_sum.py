@@ -4,14 +4,78 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.report import report_
+
+
+class _Place(NamedTuple):
+    """Pinned memory of the host for the numbers of one step.
+
+    Attributes:
+        memory: float32 [words].
+        numbers: the same memory.
+        written: event that is recorded after the copy to the memory.
+    """
+
+    memory: Tensor
+    numbers: NDArray[np.float32]
+    written: torch.cuda.Event
+
+
+class _Side:
+    """A second stream of a device, for work that the step does not wait for, and what is used with it again.
+
+    Attributes:
+        stream: the second stream.
+        ready: event that is recorded on the step's stream before each use of the second one. It can be
+            recorded again at once: what a stream waits for is fixed when it is told to wait.
+        idle: places that no sums use at present. Making a place takes more of the host's time than the copy.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.stream = torch.cuda.Stream(device)
+        self.ready = torch.cuda.Event()
+        self.idle: list[_Place] = []
+
+    def place(self, words: int) -> _Place:
+        """Return a place with this number of words; one of another size is given back to torch."""
+        if self.idle and len((found := self.idle.pop()).numbers) == words:
+            return found
+        memory = torch.empty(words, pin_memory=True)
+        return _Place(memory, memory.numpy(), torch.cuda.Event())
+
+
+class _Queued:
+    """What the second stream uses for sums that the host has not read yet.
+
+    Torch knows that the tensors of the step are used on the step's stream alone. It would give their memory
+    to new tensors as soon as nothing refers to them, so they are kept until the second stream has read them.
+    """
+
+    def __init__(self, side: _Side, words: int, tensors: tuple[Tensor | None, ...]) -> None:
+        self.place = side.place(words)
+        self._side, self._tensors = side, tensors
+
+    def has_ended(self) -> None:
+        """Let later work use all this again: the host has waited for `written` and copied the numbers."""
+        self._side.idle.append(self.place)
+        self._tensors = ()
+
+    def __del__(self) -> None:
+        # If nothing has waited for the sums, torch makes the next use of the tensors' memory wait for the
+        # second stream, and that of the place for the copy. The host does not wait here, because the sums of
+        # a rank that has failed may never come.
+        for tensor in self._tensors:
+            if tensor is not None:
+                tensor.record_stream(self._side.stream)
 
 
 class HostSum:
@@ -39,53 +103,44 @@ class HostSum:
         """
         self._ranks = ranks
         self._sums = 0 if parts is None else 2 * parts.shape[0]
-        self._copied: torch.cuda.Event | None = None
-        words = ranks.world_size * self._sums + (0 if tile_work is None else tile_work.shape[0])
         self._total: Tensor | None = None
-        stream = _side_stream(ranks.device)
-        if stream is None:
-            self._value = torch.zeros(words)
-            report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [self._value])
-            ranks.all_reduce(self._value)
+        self._queued: _Queued | None = None
+        words = ranks.world_size * self._sums + (0 if tile_work is None else tile_work.shape[0])
+        side = _side_of(ranks.device)
+        if side is None:
+            value = torch.zeros(words)
+            report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [value])
+            self._numbers = ranks.all_reduce(value).numpy()
             return
+        self._queued = _Queued(side, words, (parts, tile_work))
+        self._numbers = self._queued.place.numbers
         main = current_stream(ranks.device)
-        stream.wait_stream(main)
+        side.ready.record(main)
+        side.stream.wait_event(side.ready)
         # The context manager of a stream takes longer: it asks for the current device and stream again.
-        torch.cuda.set_stream(stream)
+        torch.cuda.set_stream(side.stream)
         try:
-            self._copied = self._queue(parts, tile_work, tiles, words, stream)
+            total = self._queue(parts, tile_work, tiles, words)
+            self._queued.place.memory.copy_(total, non_blocking=True)
+            self._queued.place.written.record(side.stream)
         finally:
             torch.cuda.set_stream(main)
-        for tensor in (parts, tile_work):
-            if tensor is not None:
-                tensor.record_stream(stream)
 
     def _queue(
-        self,
-        parts: Tensor | None,
-        tile_work: Tensor | None,
-        tiles: tuple[int, int],
-        words: int,
-        stream: torch.cuda.Stream,
-    ) -> torch.cuda.Event:
-        """Queue the sums, of `words` words, and their copy to the host on `stream`, the current one."""
+        self, parts: Tensor | None, tile_work: Tensor | None, tiles: tuple[int, int], words: int
+    ) -> Tensor:
+        """Queue the report of all ranks, float32 [words] on the device, on the current stream."""
         ranks = self._ranks
         if ranks.memory is not None:
             with ranks.watchdog.waiting("boards"):
                 boards = ranks.memory.boards(words)
             report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, boards)
             ranks.memory.side_barrier()
-            total = boards[ranks.rank]
-        else:
-            new = torch.empty if ranks.world_size == 1 else torch.zeros
-            total = new(words, device=ranks.device)
-            report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [total])
-            ranks.all_reduce(total)
-        self._value = torch.empty(words, pin_memory=True)
-        self._value.copy_(total, non_blocking=True)
-        copied = torch.cuda.Event()
-        copied.record(stream)
-        return copied
+            return boards[ranks.rank]
+        new = torch.empty if ranks.world_size == 1 else torch.zeros
+        total = new(words, device=ranks.device)
+        report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [total])
+        return ranks.all_reduce(total)
 
     def read(self) -> Tensor:
         """Return the sums, float32 on the CPU, the same bits on every rank. The first call waits for them.
@@ -94,21 +149,26 @@ class HostSum:
         of each view, then the cost of each of the T tiles.
         """
         if self._total is None:
-            if self._copied is not None:
+            if self._queued is not None:
                 with self._ranks.watchdog.waiting("read_sums"):
-                    self._copied.synchronize()
-            self._total = self._folded(self._value)
-            del self._value  # so that the next object can use its pinned memory
+                    self._queued.place.written.synchronize()
+            self._total = self._folded(self._numbers)
+            del self._numbers
+            if self._queued is not None:
+                self._queued.has_ended()
+                self._queued = None
         return self._total
 
-    def _folded(self, value: Tensor) -> Tensor:
+    def _folded(self, numbers: NDArray[np.float32]) -> Tensor:
         """Add up the sums of the ranks in the order of the ranks; the result is a copy."""
-        numbers, end = value.numpy(), self._ranks.world_size * self._sums
-        total = numbers[:end].reshape(self._ranks.world_size, self._sums).sum(0)
-        return torch.from_numpy(np.concatenate((total, numbers[end:])))
+        end = self._ranks.world_size * self._sums
+        total = numbers[end - self._sums :].copy()  # those of the last rank, then the costs
+        of_ranks = numbers[:end].reshape(self._ranks.world_size, self._sums)
+        np.add.reduce(of_ranks, 0, out=total[: self._sums])
+        return torch.from_numpy(total)
 
 
 @lru_cache(maxsize=16)
-def _side_stream(device: torch.device) -> torch.cuda.Stream | None:
-    """Return the device's stream for work that the step does not wait for; None on the CPU."""
-    return torch.cuda.Stream(device) if device.type == "cuda" else None
+def _side_of(device: torch.device) -> _Side | None:
+    """Return the second stream of a device; None on the CPU."""
+    return _Side(device) if device.type == "cuda" else None
