@@ -81,19 +81,19 @@ class TileRanges:
         pixels = owned.repeat_interleave(self.tile_size, 1).repeat_interleave(self.tile_size, 2)
         return pixels[:, : self.height, : self.width]
 
-    def pixel_rows(self, rank: int, view: int, margin: int = LOSS_HALO) -> tuple[int, int]:
-        """Return the rows [y0, y1) of a view's image that a rank's tiles and a margin around them cover.
+    def pixel_rows(self, rank: int, margin: int = LOSS_HALO) -> list[tuple[int, int]]:
+        """Return the rows [y0, y1) of each view's image that a rank's tiles and a margin around them cover.
 
-        (0, 0) when the rank owns no tile of the view.
+        (0, 0) for a view of which the rank owns no tile.
         """
-        first = view * self.tiles_per_view
-        begin = max(self.bounds[rank] - first, 0)
-        end = min(self.bounds[rank + 1] - first, self.tiles_per_view)
-        if begin >= end:
-            return 0, 0
-        y0 = begin // self.tiles_x * self.tile_size - margin
-        y1 = ((end - 1) // self.tiles_x + 1) * self.tile_size + margin
-        return max(y0, 0), min(y1, self.height)
+        (begin, end), tiles_x, tiles_per_view = self.of(rank), self.tiles_x, self.tiles_per_view
+        rows = []
+        for first in range(0, self.n_views * tiles_per_view, tiles_per_view):
+            low, high = max(begin - first, 0), min(end - first, tiles_per_view)
+            y0 = low // tiles_x * self.tile_size - margin
+            y1 = ((high - 1) // tiles_x + 1) * self.tile_size + margin
+            rows.append((max(y0, 0), min(y1, self.height)) if low < high else (0, 0))
+        return rows
 
 
 class TileAssignment:

@@ -291,7 +291,7 @@ class BatchLoader:
         """Return the pixel rows [y0, y1) of each view that this rank needs."""
         if ranges is None or self._owners is None:
             return [(0, self._views.size([index])[1]) for index in indices]
-        return [ranges.pixel_rows(self._owners.ranks.rank, view) for view in range(len(indices))]
+        return ranges.pixel_rows(self._owners.ranks.rank)
 
     def _load(
         self, indices: list[int], ranges: TileRanges | None, rows: list[tuple[int, int]]

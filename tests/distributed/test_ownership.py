@@ -111,11 +111,10 @@ def test_pixel_rows_and_composited_tiles():
     assert ranges.composited(3) == (32, 56)
     plain = TileRanges(ranges.bounds, 2, 100, 60)
     assert [plain.composited(rank) for rank in range(4)] == [plain.of(rank) for rank in range(4)]
-    assert ranges.pixel_rows(0, 0) == (0, 42)
-    assert ranges.pixel_rows(0, 1) == (0, 0)
-    assert ranges.pixel_rows(2, 0) == (6, 60)
-    assert ranges.pixel_rows(2, 1, margin=0) == (0, 32)
-    assert ranges.pixel_rows(1, 0) == (0, 0)
+    assert ranges.pixel_rows(0) == [(0, 42), (0, 0)]
+    assert ranges.pixel_rows(2) == [(6, 60), (0, 42)]
+    assert ranges.pixel_rows(2, margin=0) == [(16, 60), (0, 32)]
+    assert ranges.pixel_rows(1) == [(0, 0), (0, 0)]
 
 
 @pytest.mark.parametrize("tile_size", [4, 8, 16])

@@ -93,8 +93,7 @@ def _render(ranks):
             tile_work = tile_work[slice(*assignment.tiles)]
         targets, masks, samples = photographs(n_views)
         if ranges is not None:
-            for view in range(n_views):  # this rank did not get these pixels
-                y0, y1 = ranges.pixel_rows(ranks.rank, view)
+            for view, (y0, y1) in enumerate(ranges.pixel_rows(ranks.rank)):  # it did not get the other pixels
                 targets[view, :y0], targets[view, y1:] = 77, 77
         on_device = [tensor.to(ranks.device) for tensor in (targets, masks, samples)]
         batch = Batch(list(range(n_views)), views, *on_device, ranges)
